@@ -1,0 +1,1 @@
+"""Video diffusion models for persist (entry points: persist.backbones)."""

@@ -1,0 +1,1 @@
+"""Memories of a scene and their encoders (entry points: persist.memories, persist.encoders)."""

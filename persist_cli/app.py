@@ -1,0 +1,215 @@
+"""The command line: signatures only; each command imports its work when it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from persist_cli import __version__
+from persist_cli.world.errors import PersistError
+
+app = typer.Typer(
+    name="persist",
+    help="Persistent embodied world models: a video diffusion model with a memory of the scene.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; what the user can mend ends in one line and exit code 1."""
+    try:
+        app(args=arguments)
+    except PersistError as error:
+        typer.secho(f"error: {error}", fg=typer.colors.RED, err=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
+        sys.exit(130)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"persist {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True)] = False,
+) -> None:
+    """Persistent embodied world models."""
+
+
+@app.command()
+def collect(
+    simulator: Annotated[str, typer.Argument(help="A simulator; `persist plugins` lists them.")],
+    out: Annotated[Path, typer.Option(help="Data set folder; what is there already is kept.")],
+    scenes: Annotated[str, typer.Option(help="Scene seeds A:B, B not included.")],
+    frames: Annotated[int, typer.Option(min=2, help="Frames a trajectory.")] = 96,
+    size: Annotated[str, typer.Option(help="Image size HxW in pixels.")] = "64x64",
+    seed: Annotated[int, typer.Option(help="Seed of the paths through the scenes.")] = 0,
+    split: Annotated[str, typer.Option(help="train or test: scenes of one never appear in the other.")] = "train",
+    policy: Annotated[str, typer.Option(help="explore, path or there-and-back.")] = "explore",
+    step: Annotated[float, typer.Option(min=0.01, help="Metres of a step.")] = 0.25,
+    turn: Annotated[float, typer.Option(min=0.1, max=180.0, help="Degrees of a turn.")] = 15.0,
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one a core.")] = 0,
+    json: JsonOption = False,
+) -> None:
+    """Collect trajectories in a simulator.
+
+    persist collect miniworld --out runs/houses --scenes 0:100 --frames 96 --size 64x64
+    """
+    from persist_cli.simulators.collect import CollectPlan, run_collect
+
+    plan = CollectPlan(
+        simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split,
+        policy=policy, step=step, turn=turn,
+    )  # fmt: skip
+    run_collect(plan, out, workers, json)
+
+
+@app.command("import")
+def import_(
+    format: Annotated[str, typer.Argument(help="A format; `persist plugins` lists them.")],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder or file of that format.")],
+    out: Annotated[Path, typer.Option(help="Data set folder.")],
+    size: Annotated[str | None, typer.Option(help="Resize (after cropping to the aspect) to HxW.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Keep every n-th frame.")] = 1,
+    json: JsonOption = False,
+) -> None:
+    """Import posed RGB-D of another format.
+
+    persist import 7scenes captures/kitchen --out runs/kitchen --size 64x64
+    """
+    from persist_cli.importers.run import run_import
+
+    run_import(format, source, out, size, every, json)
+
+
+@app.command()
+def inspect(
+    data: Annotated[str, typer.Argument(metavar="DATA", help="DATA or DATA#trajectory or DATA#trajectory:frames.")],
+    pairs: Annotated[int, typer.Option(min=1, help="Frame pairs to reproject.")] = 64,
+    json: JsonOption = False,
+) -> None:
+    """Say what a data set holds and check its cameras, depth and poses against each other."""
+    from persist_cli.trajectories.inspect import run_inspect
+
+    run_inspect(data, pairs, json)
+
+
+@app.command(context_settings={"allow_interspersed_args": True})
+def finetune(
+    recipe: Annotated[str, typer.Argument(help="A recipe's name (`persist recipes`) or a YAML file.")],
+    overrides: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Data set folder.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Run folder.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on from the run's last checkpoint.")] = False,
+) -> None:
+    """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
+
+    persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
+    """
+    from persist_cli.training.finetune import run_finetune
+
+    run_finetune(recipe, overrides or [], data, out, resume)
+
+
+@app.command()
+def memorize(
+    data: Annotated[list[str] | None, typer.Argument(metavar="DATA[#trajectory[:frames]]")] = None,
+    out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
+    memory: Annotated[str, typer.Option(help="A memory; `persist plugins` lists them.")] = "voxel",
+    encoder: Annotated[str, typer.Option(help="An encoder; `persist plugins` lists them.")] = "patches",
+    settings: Annotated[list[str] | None, typer.Option("--set", help="As in memory.cell=[0.25,1,0.25].")] = None,
+    merge: Annotated[list[Path] | None, typer.Option(help="Memory files to join: --merge A B.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Build a memory from posed RGB-D, or join memories of one frame of reference.
+
+    persist memorize runs/houses#0:0-48 --memory voxel --out house.safetensors
+    """
+    from persist_cli.memorizing.memorize import run_memorize, run_merge
+
+    if merge:
+        run_merge([*merge, *(Path(name) for name in data or [])], out, json)
+    else:
+        run_memorize(data or [], memory, encoder, settings or [], out, json)
+
+
+@app.command()
+def rollout(
+    checkpoint: Annotated[Path, typer.Argument(help="A finetune run, or a checkpoint folder.")],
+    start: Annotated[str, typer.Option(help="Where to start: DATA#trajectory:frame.")],
+    out: Annotated[Path, typer.Option(help="Folder for videos, sheets, maps and poses.")],
+    actions: Annotated[str | None, typer.Option(help='Actions, as in "left*4 forward*6".')] = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Take the trajectory's own actions.")] = False,
+    frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
+    memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
+    adapter: Annotated[str | None, typer.Option(help="Memory adapter; the checkpoint's own when it has one.")] = None,
+    write: Annotated[bool, typer.Option(help="Write what is generated into the memory.")] = True,
+    seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
+    steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 50,
+    sampler: Annotated[str, typer.Option(help="ddim or dpm.")] = "ddim",
+    guidance: Annotated[float, typer.Option(help="Weight of guidance over memory; 1 is none.")] = 1.0,
+    json: JsonOption = False,
+) -> None:
+    """Roll out a world model from a start frame along actions, clip by clip.
+
+    persist rollout runs/voxel --start runs/houses#0:48 --actions "left*4 forward*6" --out runs/rollout
+    """
+    from persist_cli.rollout.run import RolloutPlan, run_rollout
+
+    plan = RolloutPlan(
+        start=start, actions=actions, follow=follow, frames=frames, memory=memory, adapter=adapter, write=write,
+        seed=seed, steps=steps, sampler=sampler, guidance=guidance,
+    )  # fmt: skip
+    run_rollout(checkpoint, plan, out, json)
+
+
+@app.command("eval")
+def evaluate(
+    checkpoints: Annotated[list[Path], typer.Argument(metavar="CHECKPOINT...", help="Finetune runs or checkpoints.")],
+    data: Annotated[Path, typer.Option(help="Data set of held-out scenes.")],
+    memories: Annotated[str, typer.Option(help="Memories to compare, separated by commas.")] = "none,voxel",
+    seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
+    clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
+    steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 50,
+    sampler: Annotated[str, typer.Option(help="ddim or dpm.")] = "ddim",
+    batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
+    out: Annotated[Path, typer.Option(help="Folder for metrics.json and the contact sheet.")] = Path("runs/eval"),
+    json: JsonOption = False,
+) -> None:
+    """Compare memories on clips that return to places seen before.
+
+    persist eval runs/none runs/voxel --data runs/houses-test --memories none,voxel --seeds 3
+    """
+    from persist_cli.evaluation.run import EvalPlan, run_eval
+
+    plan = EvalPlan(
+        memories=memories, seeds=seeds, clips=clips, steps=steps, sampler=sampler, batch=batch
+    )  # fmt: skip
+    run_eval(checkpoints, data, plan, out, json)
+
+
+@app.command()
+def plugins(json: JsonOption = False) -> None:
+    """List every backbone, memory, encoder, simulator and importer; a broken one shows its cause."""
+    from persist_cli.viewing.plugins import show_plugins
+
+    show_plugins(json)
+
+
+@app.command()
+def recipes(json: JsonOption = False) -> None:
+    """List the recipes that come with persist."""
+    from persist_cli.viewing.recipes import show_recipes
+
+    show_recipes(json)

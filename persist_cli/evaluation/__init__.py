@@ -1,0 +1,1 @@
+"""Comparison of memories on clips that return to places seen before."""

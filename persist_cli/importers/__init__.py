@@ -1,0 +1,1 @@
+"""Built-in importers of foreign posed RGB-D formats."""

@@ -1,0 +1,1 @@
+"""The world model loop: recall, denoise, observe, memorize."""

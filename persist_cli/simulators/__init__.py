@@ -1,0 +1,1 @@
+"""Built-in simulators and the collection of trajectories in them."""

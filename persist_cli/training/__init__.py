@@ -1,0 +1,1 @@
+"""Training of backbones and memory adapters in stages."""

@@ -1,0 +1,1 @@
+"""Pictures for people: videos, contact sheets, maps, curves, tables."""

@@ -1,0 +1,143 @@
+"""The abstract backbone: a video model that predicts RGB-D clips, trained in stages."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.settings import NoSettings
+from persist_cli.world.tokens import MemoryTokens
+
+Stage = Literal["codec", "1", "2"]
+STAGES: tuple[Stage, ...] = ("codec", "1", "2")
+Interactions = tuple[str | None, ...]  # one for each step between two frames of a clip
+
+
+@dataclass(frozen=True)
+class Clips:
+    """A batch of RGB-D clips with what conditions them.
+
+    Args:
+        rgb: uint8.
+        depth: float32 metres, planar z, 0 = missing.
+        cameras: in each sample's world.
+        interactions: for each sample, what the agent did to the world between the frames.
+        tokens: memory tokens of the batch, ``None`` without a memory.
+        seeds: one for each sample; everything random about it is drawn from this.
+    """
+
+    rgb: UInt8[Tensor, "batch frame height width 3"]
+    depth: Float[Tensor, "batch frame height width"]
+    cameras: Cameras
+    interactions: Sequence[Interactions]
+    tokens: MemoryTokens | None
+    seeds: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a clip is drawn.
+
+    Args:
+        steps: denoising steps.
+        sampler: one of the backbone's samplers.
+        memory_guidance: weight of classifier-free guidance over memory; 1 means none.
+    """
+
+    steps: int = 50
+    sampler: str = "ddim"
+    memory_guidance: float = 1.0
+
+
+class Backbone(nn.Module, ABC):
+    """A video diffusion model over RGB-D clips; ``forward`` is the training loss of a stage.
+
+    Args:
+        settings: an instance of ``settings_type``.
+    """
+
+    settings_type: ClassVar[type] = NoSettings
+    name: str = ""  # set by the registry
+
+    def __init__(self, settings: Any) -> None:
+        super().__init__()
+        self.settings = settings
+
+    @property
+    @abstractmethod
+    def frames_per_clip(self) -> int:
+        """Frames of a clip, the given first one included."""
+
+    @property
+    @abstractmethod
+    def image_size(self) -> tuple[int, int]:
+        """Height and width in pixels of the images it takes."""
+
+    @property
+    @abstractmethod
+    def samplers(self) -> tuple[str, ...]:
+        """Names that ``Sampling.sampler`` may have."""
+
+    @abstractmethod
+    def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
+        """Freeze all that the stage does not train and return the rest by name."""
+
+    @abstractmethod
+    def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
+        """Scalars of one training step; ``"loss"`` is minimised, the others are logged."""
+
+    @abstractmethod
+    def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
+        """Clips that begin with the given frames.
+
+        Args:
+            first: clips whose rgb and depth hold the first frame only, whose cameras hold all frames.
+            sampling: steps, sampler and guidance.
+
+        Returns:
+            rgb uint8 ``[batch, frame, height, width, 3]`` and depth float32 metres, the first frame as given.
+        """
+
+    @abstractmethod
+    def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
+        """RGB and depth after the codec alone: the ceiling of what can be generated."""
+
+    @abstractmethod
+    def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
+        """Add a fresh memory adapter for tokens of ``channels`` channels and use it."""
+
+    @abstractmethod
+    def use_adapter(self, name: str | None) -> None:
+        """Use one of the adapters, or none: plain stage 1."""
+
+    @property
+    @abstractmethod
+    def token_budget(self) -> int:
+        """How many memory tokens the adapter in use asks for."""
+
+    @abstractmethod
+    def save_base(self, folder: Path) -> None:
+        """Write all but the adapters into an existing folder, safetensors and JSON only."""
+
+    @abstractmethod
+    def save_adapter(self, folder: Path) -> None:
+        """Write the adapter in use into an existing folder."""
+
+    @abstractmethod
+    def load_base(self, folder: Path) -> None:
+        """Take the weights that ``save_base`` wrote.
+
+        Raises:
+            CheckpointError: when a file is missing, corrupt or of another shape.
+        """
+
+    @abstractmethod
+    def load_adapter(self, name: str, folder: Path) -> None:
+        """Add the adapter that ``save_adapter`` wrote, and use it."""

@@ -1,0 +1,1 @@
+"""Recipes in YAML, read with importlib.resources."""
