@@ -91,7 +91,7 @@ def import_plugin(plugin: Plugin) -> type[Any]:
         raise PluginError(f"{plugin} is broken: {cause}") from error
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
         raise PluginError(f"{plugin} is broken: it is no subclass of {base_target.replace(':', '.')}")
-    loaded.name = plugin.name
+    loaded.name = plugin.name  # type: ignore[attr-defined]
     return loaded
 
 

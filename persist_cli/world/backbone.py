@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -93,6 +94,9 @@ class Backbone(nn.Module, ABC):
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
         """Scalars of one training step; ``"loss"`` is minimised, the others are logged."""
 
+    def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
+        """Last act of a stage: measure on some clips what training cannot learn; nothing by default."""
+
     @abstractmethod
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
         """Clips that begin with the given frames.
@@ -121,6 +125,10 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def token_budget(self) -> int:
         """How many memory tokens the adapter in use asks for."""
+
+    def checkpoint_settings(self) -> dict[str, Any]:
+        """Plain settings to make this backbone again and then ``load_base`` into it."""
+        return dataclasses.asdict(self.settings)
 
     @abstractmethod
     def save_base(self, folder: Path) -> None:

@@ -50,7 +50,7 @@ def _unknown_keys(kind: Any, values: Any, prefix: str) -> typing.Iterator[str]:
     for key, value in values.items():
         if key not in known:
             close = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known) or 'none'}"
+            hint = f"did you mean '{prefix}{close[0]}'?" if close else f"known: {', '.join(known) or 'none'}"
             yield f"unknown key '{prefix}{key}', {hint}"
         else:
             yield from _unknown_keys(_dataclass_in(types_of[key]), value, f"{prefix}{key}.")

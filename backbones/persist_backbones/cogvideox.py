@@ -1,0 +1,248 @@
+"""The backbone ``cogvideox``: CogVideoX that predicts RGB-D from cameras, interactions and memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, make_adapter
+from persist_backbones.codec import Codec
+from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
+from persist_backbones.diffusion import SAMPLERS, denoise, draw_timesteps, generators_of, loss_weights, noise_like
+from persist_backbones.parts import (
+    DiffusersParts,
+    check_fit,
+    load_exactly,
+    load_parts,
+    load_world,
+    make_parts,
+    save_world,
+    widen,
+)
+from persist_backbones.presets import CogVideoXSettings
+from persist_backbones.rotary import rotary_positions
+from persist_backbones.world_transformer import Conditions
+from persist_cli.world.backbone import Backbone, Clips, Sampling, Stage
+from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
+from persist_cli.world.settings import parse_settings
+from persist_cli.world.tokens import MemoryTokens
+
+
+class CogVideoX(Backbone):
+    """diffusers' CogVideoX image-to-video, widened to RGB-D, cameras, interactions and memory (PEWM).
+
+    Args:
+        settings: preset or pretrained directory, and sizes.
+    """
+
+    settings_type = CogVideoXSettings
+    settings: CogVideoXSettings
+
+    def __init__(self, settings: CogVideoXSettings) -> None:
+        super().__init__(settings)
+        self.adapters = nn.ModuleDict()
+        self.adapter_name: str | None = None
+        self.set_parts(load_parts(Path(settings.pretrained)) if settings.pretrained else make_parts(settings))
+
+    def set_parts(self, parts: DiffusersParts) -> None:
+        """Build the model around diffusers' parts; what is new starts at zero."""
+        check_fit(parts, self.settings)
+        self.codec = Codec(parts.vae)
+        self.transformer = widen(parts, self.settings)
+        self.scheduler = parts.scheduler
+        config = parts.transformer.config
+        self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
+
+    @property
+    def frames_per_clip(self) -> int:
+        """Frames of a clip, the given first one included."""
+        return self.settings.frames
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.settings.height, self.settings.width
+
+    @property
+    def samplers(self) -> tuple[str, ...]:
+        """DDIM and DPM of diffusers."""
+        return tuple(SAMPLERS)
+
+    @property
+    def adapter(self) -> Adapter | None:
+        """The memory adapter in use."""
+        return None if self.adapter_name is None else self.adapters[self.adapter_name]  # type: ignore[return-value]
+
+    @property
+    def token_budget(self) -> int:
+        """Tokens that the adapter in use asks for; none without one."""
+        return self.adapter.settings.token_budget if self.adapter else 0
+
+    def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
+        """The VAE's, the transformer's, or the adapter's, everything else frozen."""
+        self.requires_grad_(False)
+        modules: dict[Stage, nn.Module | None] = {"codec": self.codec, "1": self.transformer, "2": self.adapter}
+        module = modules[stage]
+        if module is None:
+            raise CheckpointError("stage 2 trains a memory adapter; add one first")
+        module.requires_grad_(True)
+        return {name: each for name, each in self.named_parameters() if each.requires_grad}
+
+    def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
+        """The codec's loss, or the velocity loss of RGB and depth latents (v-prediction)."""
+        generators = generators_of(clips.seeds)
+        if stage == "codec":
+            return self.codec.loss(clips.rgb, clips.depth, self.settings.kl_weight, generators)
+        with torch.no_grad():
+            latents, image = self.codec.encode(clips.rgb, clips.depth), self.encode_first(clips)
+        timesteps = draw_timesteps(self.scheduler, generators).to(latents.device)
+        noise = noise_like(latents, generators)
+        target = self.scheduler.get_velocity(latents, noise, timesteps)
+        noisy = self.scheduler.add_noise(latents, noise, timesteps)
+        memory = self.drop_memory(self.prepare_memory(clips), generators)
+        predicted = self.predict(noisy, image, self.conditions(clips, timesteps, memory))
+        weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
+        error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
+        color, depth = error.chunk(2, dim=2)
+        return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+
+    @torch.no_grad()
+    def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
+        """Clips denoised from each sample's own noise; the first frame is the given one."""
+        generators = generators_of(first.seeds)
+        image = self.encode_first(first)
+        memory = self.prepare_memory(first)
+        conditions = self.conditions(first, torch.zeros(len(first.seeds), dtype=torch.long), memory)
+
+        def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
+            given = dataclasses.replace(conditions, timestep=timesteps)
+            velocity = self.predict(latents, image, given)
+            if sampling.memory_guidance == 1.0 or memory is None:
+                return velocity
+            blind = self.predict(latents, image, dataclasses.replace(given, memory=memory.emptied()))
+            return blind + sampling.memory_guidance * (velocity - blind)
+
+        noise = noise_like(image, generators)
+        latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
+        rgb, depth = self.codec.decode(latents)
+        rgb[:, 0], depth[:, 0] = first.rgb[:, 0], first.depth[:, 0]
+        return rgb, depth
+
+    @torch.no_grad()
+    def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
+        """RGB and depth after encoding and decoding."""
+        return self.codec.decode(self.codec.encode(clips.rgb, clips.depth))
+
+    def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
+        """Latents of the first frame alone, followed by zeros: the image condition, scaled like all latents."""
+        first = self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1])
+        later = (self.settings.frames - 1) // self.codec.temporal
+        return torch.cat([first, first.new_zeros(first.shape[0], later, *first.shape[2:])], dim=1)
+
+    def prepare_memory(self, clips: Clips) -> PreparedMemory | None:
+        """The batch's tokens embedded by the adapter in use, ``None`` without adapter."""
+        if self.adapter is None:
+            return None
+        empty = [MemoryTokens.empty(self.adapter.channels)] * len(clips.seeds)
+        tokens = clips.tokens or MemoryTokens.stack(empty)
+        if tokens.features.shape[-1] != self.adapter.channels:
+            raise CheckpointError(
+                f"the memory gives features of {tokens.features.shape[-1]} channels, adapter {self.adapter_name!r} "
+                f"was trained with {self.adapter.channels}; use the encoder it was trained with"
+            )
+        device = self.prompt.device
+        return self.adapter.prepare(tokens.to(device), clips.cameras.to(device))
+
+    def drop_memory(self, memory: PreparedMemory | None, generators: list[torch.Generator]) -> PreparedMemory | None:
+        """Hide the memory of some training samples, for guidance over memory."""
+        if memory is None or self.adapter is None or self.adapter.settings.dropout == 0:
+            return memory
+        draws = torch.cat([torch.rand(1, generator=each) for each in generators])
+        kept = (draws >= self.adapter.settings.dropout).to(memory.mask.device)
+        return dataclasses.replace(memory, mask=memory.mask & kept[:, None])
+
+    def conditions(self, clips: Clips, timesteps: Tensor, memory: PreparedMemory | None) -> Conditions:
+        """Prompt, interactions, cameras and memory of a batch."""
+        device, config = self.prompt.device, self.transformer.base.config
+        steps = self.settings.frames - 1
+        return Conditions(
+            text=self.prompt.expand(len(clips.seeds), -1, -1),
+            timestep=timesteps,
+            interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(device),
+            camera=self.camera_latents(clips),
+            rotary=rotary_positions(config, steps // self.codec.temporal + 1, device),
+            memory=memory,
+        )
+
+    def camera_latents(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
+        """Plücker rays at the latents' size."""
+        printed = self.settings.rays == "printed"
+        cameras = clips.cameras.to(self.prompt.device)
+        return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed)
+
+    def predict(self, noisy: Tensor, image: Tensor, given: Conditions) -> Tensor:
+        """Velocities: channels are noisy RGB, RGB image, noisy depth, depth image, camera, the originals first."""
+        color, depth = noisy.chunk(2, dim=2)
+        color_image, depth_image = image.chunk(2, dim=2)
+        latents = torch.cat([color, color_image, depth, depth_image, given.camera.to(noisy.dtype)], dim=2)
+        patch = self.transformer.base.config.patch_size
+        given = dataclasses.replace(given, camera=camera_tokens(given.camera, patch))
+        velocity: Tensor = self.transformer(latents, given, self.adapter)
+        return velocity
+
+    def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
+        """After the codec's stage, measure the scale of its latents on these clips."""
+        if stage == "codec":
+            scales = [self.codec.measure_scale(each.rgb, each.depth) for each in clips]
+            self.codec.vae.register_to_config(scaling_factor=sum(scales) / len(scales))
+
+    def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
+        """Add a fresh memory adapter and use it."""
+        parsed = parse_settings(AdapterSettings, settings, f"adapter {name!r}")
+        self.adapters[name] = make_adapter(channels, parsed, self.transformer.shape).to(self.prompt.device)
+        self.adapter_name = name
+
+    def use_adapter(self, name: str | None) -> None:
+        """Use one of the adapters, or none: plain stage 1."""
+        if name is not None and name not in self.adapters:
+            raise CheckpointError(f"no memory adapter {name!r}; there are: {', '.join(self.adapters) or 'none'}")
+        self.adapter_name = name
+
+    def checkpoint_settings(self) -> dict[str, Any]:
+        """The settings without the directory that the weights once came from."""
+        return super().checkpoint_settings() | {"pretrained": None}
+
+    def save_base(self, folder: Path) -> None:
+        """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
+        self.transformer.base.save_pretrained(folder / "transformer")
+        self.codec.vae.save_pretrained(folder / "vae")
+        self.scheduler.save_pretrained(folder / "scheduler")
+        save_world(self.transformer, self.prompt, folder)
+
+    def load_base(self, folder: Path) -> None:
+        """Take diffusers' parts and ours from a folder that ``save_base`` wrote."""
+        self.set_parts(load_parts(folder))
+        self.prompt = load_world(self.transformer, folder)
+
+    def save_adapter(self, folder: Path) -> None:
+        """Write the adapter in use."""
+        adapter = self.adapter
+        if adapter is None:
+            raise CheckpointError("no memory adapter is in use, so none can be saved")
+        write_json(folder / "adapter.json", {"channels": adapter.channels} | dataclasses.asdict(adapter.settings))
+        write_tensors(folder / "adapter.safetensors", adapter.state_dict())
+
+    def load_adapter(self, name: str, folder: Path) -> None:
+        """Add the adapter that ``save_adapter`` wrote, and use it."""
+        settings = dict(read_json(folder / "adapter.json"))
+        path = folder / "adapter.safetensors"
+        tensors, _ = read_tensors(path)
+        self.add_adapter(name, int(settings.pop("channels")), settings)
+        load_exactly(self.adapters[name], tensors, set(self.adapters[name].state_dict()), path)

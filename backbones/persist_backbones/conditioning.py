@@ -1,0 +1,64 @@
+"""Cameras and interactions as the transformer takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from persist_cli.world.backbone import Interactions
+from persist_cli.world.cameras import Cameras, invert_rigid
+from persist_cli.world.errors import DataError
+from persist_cli.world.geometry import plucker
+
+RAY_CHANNELS = 6
+
+
+def camera_latents(
+    cameras: Cameras, spatial: int, temporal: int, printed: bool
+) -> Float[Tensor, "batch latent_frame channel height width"]:
+    """Plücker rays relative to each clip's first camera, at the VAE's compression.
+
+    Mean-pooled in space; in time frames are folded into channels (unpixelshuffle). As for the VAE, the first frame
+    stands alone in the first latent frame, here repeated to fill its channels: 9×512×512×6 → 3×64×64×24.
+
+    Args:
+        cameras: ``[batch, frame]``, 4n + 1 frames.
+        spatial: compression in height and width.
+        temporal: compression in time.
+        printed: directions as the paper prints them.
+    """
+    first = invert_rigid(cameras.world_from_camera[:, :1].double())
+    local = Cameras(first @ cameras.world_from_camera.double(), cameras.intrinsics, cameras.height, cameras.width)
+    rays = plucker(local, printed).permute(0, 1, 4, 2, 3).float()
+    pooled = F.avg_pool2d(rays.flatten(0, 1), spatial).unflatten(0, rays.shape[:2])
+    padded = torch.cat([pooled[:, :1].expand(-1, temporal - 1, -1, -1, -1), pooled], dim=1)
+    return padded.unflatten(1, (-1, temporal)).flatten(2, 3)
+
+
+def camera_tokens(
+    latents: Float[Tensor, "batch frame channel height width"], patch: int
+) -> Float[Tensor, "batch token channel"]:
+    """The camera embedding at each video token: the mean over its patch."""
+    pooled = F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, latents.shape[:2])
+    return pooled.flatten(3).transpose(2, 3).flatten(1, 2)
+
+
+def interaction_rows(clips: Sequence[Interactions], names: Sequence[str], steps: int) -> Int[Tensor, "batch step"]:
+    """Rows of the interaction embedding for each step of each clip, 0 where nothing but motion happens.
+
+    Raises:
+        DataError: for an interaction that the model has no embedding for.
+    """
+    rows = torch.zeros(len(clips), steps, dtype=torch.long)
+    for sample, interactions in enumerate(clips):
+        for step, name in enumerate(interactions[:steps]):
+            if name is None:
+                continue
+            if name not in names:
+                raise DataError(f"the model knows no interaction {name!r}; it has {', '.join(names) or 'none'}")
+            rows[sample, step] = 1 + step * len(names) + list(names).index(name)
+    return rows

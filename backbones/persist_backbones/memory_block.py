@@ -1,0 +1,97 @@
+"""The paper's memory block, and the position code of map tokens."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+SHORTEST, LONGEST = 0.5, 128.0  # wavelengths of the position code in metres: two cells, twice the paper's map
+
+
+class Modulation(NamedTuple):
+    """Scale, shift and gate of the expert adaptive layer norm, for video and memory."""
+
+    video_shift: Tensor
+    video_scale: Tensor
+    video_gate: Tensor
+    memory_shift: Tensor
+    memory_scale: Tensor
+    memory_gate: Tensor
+
+
+def position_code(positions: Float[Tensor, "*batch 3"], frequencies: int) -> Float[Tensor, "*batch code"]:
+    """3D sinusoidal code: sine and cosine of each coordinate (metres) at geometric wavelengths, 6 × frequencies."""
+    steps = torch.linspace(0, 1, frequencies, dtype=torch.float64, device=positions.device)
+    rates = 2 * math.pi / (SHORTEST * (LONGEST / SHORTEST) ** steps)
+    angles = positions.double()[..., None] * rates
+    return torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2).float()
+
+
+class MemoryBlock(nn.Module):
+    """Cross-attention of the video to memory tokens and a feed-forward, modulated by time (PEWM, memory block).
+
+    Gates start at one and the two output projections at zero: a fresh block is the identity to the bit, yet every
+    parameter has a gradient after the first step. A gate at zero in front of a zero projection would never learn.
+
+    Args:
+        video_channels: of the hidden states H.
+        camera_channels: of the camera embedding concatenated to H in the query.
+        width: of the memory tokens M and of the attention.
+        heads: of the attention.
+        ff_factor: hidden width of the feed-forward over ``video_channels``.
+        time_channels: of the time embedding t.
+    """
+
+    def __init__(
+        self, video_channels: int, camera_channels: int, width: int, heads: int, ff_factor: float, time_channels: int
+    ) -> None:
+        super().__init__()
+        self.heads = heads
+        self.sizes = [video_channels] * 3 + [width] * 2 + [video_channels]
+        self.modulation = nn.Linear(time_channels, sum(self.sizes))
+        self.video_norm = nn.LayerNorm(video_channels, elementwise_affine=False)
+        self.memory_norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.to_query = nn.Linear(video_channels + camera_channels, width)
+        self.to_key = nn.Linear(width, width)
+        self.to_value = nn.Linear(width, width)
+        self.to_out = nn.Linear(width, video_channels)
+        self.norm2 = nn.LayerNorm(video_channels)
+        hidden = int(video_channels * ff_factor)
+        self.ff = nn.Sequential(nn.Linear(video_channels, hidden), nn.GELU("tanh"), nn.Linear(hidden, video_channels))
+        for layer in (self.modulation, self.to_out, self.ff[2]):
+            for parameter in layer.parameters():
+                nn.init.zeros_(parameter)
+
+    def forward(
+        self,
+        video: Float[Tensor, "batch token channel"],
+        memory: Float[Tensor, "batch place width"],
+        mask: Bool[Tensor, "batch place"],
+        camera: Float[Tensor, "batch token camera"],
+        time: Float[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch token channel"]:
+        """H + α_M · CrossAttn(H_n, M_n), then H + α_H · FF(norm2(H)); a sample without tokens attends to nothing."""
+        parts = Modulation(*self.modulation(F.silu(time))[:, None].split(self.sizes, dim=-1))
+        query = self.video_norm(video) * (1 + parts.video_scale) + parts.video_shift
+        context = self.memory_norm(memory) * (1 + parts.memory_scale) + parts.memory_shift
+        seen = self.attend(torch.cat([query, camera.to(query.dtype)], dim=-1), context, mask)
+        video = video + (1 + parts.memory_gate) * seen
+        changed: Tensor = video + (1 + parts.video_gate) * self.ff(self.norm2(video))
+        return changed
+
+    def attend(self, query: Tensor, context: Tensor, mask: Bool[Tensor, "batch place"]) -> Tensor:
+        """Attention to the tokens before the mask's padding, exactly zero for a sample that has none."""
+        some = mask.any(dim=1)
+        allowed = mask | ~some[:, None]  # an all-masked softmax is NaN; these rows are zeroed below
+        q, k, v = (
+            part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for part in (self.to_query(query), self.to_key(context), self.to_value(context))
+        )
+        out = F.scaled_dot_product_attention(q, k, v, attn_mask=allowed[:, None, None])
+        seen: Tensor = self.to_out(out.transpose(1, 2).flatten(2))
+        return seen * some[:, None, None]

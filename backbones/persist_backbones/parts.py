@@ -1,0 +1,134 @@
+"""The parts of a CogVideoX world model: made from a preset or a plain diffusers directory, saved and loaded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
+from torch import Tensor, nn
+
+from persist_backbones.conditioning import RAY_CHANNELS
+from persist_backbones.presets import PRESETS, CogVideoXSettings
+from persist_backbones.world_transformer import WorldTransformer
+from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import read_tensors, write_tensors
+
+SUBFOLDERS = {
+    "transformer": CogVideoXTransformer3DModel,
+    "vae": AutoencoderKLCogVideoX,
+    "scheduler": CogVideoXDDIMScheduler,
+}
+
+
+@dataclass(frozen=True)
+class DiffusersParts:
+    """What diffusers brings: transformer, autoencoder and scheduler."""
+
+    transformer: CogVideoXTransformer3DModel
+    vae: AutoencoderKLCogVideoX
+    scheduler: CogVideoXDDIMScheduler
+
+
+def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
+    """Freshly initialised parts of the settings' preset and sizes."""
+    preset = PRESETS[settings.preset]
+    vae = AutoencoderKLCogVideoX(
+        **(preset["vae"] | {"sample_height": settings.height, "sample_width": settings.width} | settings.vae)
+    )
+    spatial = 2 ** (len(vae.config.block_out_channels) - 1)
+    size = {
+        "sample_height": settings.height // spatial,
+        "sample_width": settings.width // spatial,
+        "sample_frames": settings.frames,
+    }
+    transformer = CogVideoXTransformer3DModel(**(preset["transformer"] | size | settings.transformer))
+    return DiffusersParts(transformer, vae, CogVideoXDDIMScheduler(**preset["scheduler"]))
+
+
+def load_parts(folder: Path) -> DiffusersParts:
+    """The parts of a diffusers directory with ``transformer/``, ``vae/`` and ``scheduler/``.
+
+    Raises:
+        CheckpointError: one line when a part is missing, corrupt or does not fit its configuration.
+    """
+    return DiffusersParts(*(_load_part(folder, name) for name in SUBFOLDERS))
+
+
+def _load_part(folder: Path, name: str) -> Any:
+    if not (folder / name).is_dir():
+        raise CheckpointError(
+            f"{folder}: no {name}/ folder; a diffusers CogVideoX directory has {', '.join(SUBFOLDERS)}"
+        )
+    options = {} if name == "scheduler" else {"use_safetensors": True, "low_cpu_mem_usage": False}
+    try:
+        return SUBFOLDERS[name].from_pretrained(folder, subfolder=name, local_files_only=True, **options)
+    except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
+        cause = str(error).strip().splitlines()
+        raise CheckpointError(
+            f"{folder / name}: cannot be loaded ({cause[0] if cause else type(error).__name__})"
+        ) from error
+
+
+def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
+    """Raise ``CheckpointError`` when the parts do not work together at the settings' size."""
+    config, vae = parts.transformer.config, parts.vae.config
+    spatial = 2 ** (len(vae.block_out_channels) - 1)
+    temporal = int(vae.temporal_compression_ratio)
+    unit = spatial * config.patch_size
+    if config.patch_size_t is not None or config.ofs_embed_dim:
+        raise CheckpointError("CogVideoX 1.5 (patch_size_t, ofs) is not supported yet; use a CogVideoX 1.0 checkpoint")
+    if settings.height % unit or settings.width % unit:
+        raise CheckpointError(f"image size {settings.height}x{settings.width} must be a multiple of {unit}")
+    if (settings.frames - 1) % temporal or settings.frames <= temporal:
+        raise CheckpointError(f"frames a clip must be {temporal}n + 1 with n > 0, not {settings.frames}")
+    if config.in_channels not in (vae.latent_channels, 2 * vae.latent_channels):
+        raise CheckpointError(
+            f"a transformer of {config.in_channels} channels does not fit a VAE of {vae.latent_channels}"
+        )
+    given = (config.sample_height * spatial, config.sample_width * spatial)
+    if config.use_learned_positional_embeddings and given != (settings.height, settings.width):
+        raise CheckpointError(
+            f"learned positions are for {given[0]}x{given[1]} images, not {settings.height}x{settings.width}"
+        )
+
+
+def widen(parts: DiffusersParts, settings: CogVideoXSettings) -> WorldTransformer:
+    """The transformer with zero-initialised inputs and outputs for RGB-D, cameras and interactions."""
+    latents = parts.vae.config.latent_channels
+    camera = RAY_CHANNELS * int(parts.vae.config.temporal_compression_ratio)
+    slots = (settings.frames - 1) * len(settings.interactions)
+    return WorldTransformer(parts.transformer, 4 * latents + camera, 2 * latents, slots, camera)
+
+
+def save_world(transformer: WorldTransformer, prompt: Tensor, folder: Path) -> None:
+    """Write what is ours beside diffusers' parts: widening, interactions and the prompt's embedding."""
+    own = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
+    write_tensors(folder / "world.safetensors", own | {"prompt": prompt})
+
+
+def load_world(transformer: WorldTransformer, folder: Path) -> Tensor:
+    """Take what ``save_world`` wrote; returns the prompt's embedding."""
+    path = folder / "world.safetensors"
+    tensors, _ = read_tensors(path)
+    prompt = tensors.pop("prompt", None)
+    if prompt is None:
+        raise CheckpointError(f"{path}: no prompt embedding in it")
+    own = {name for name in transformer.state_dict() if not name.startswith("base.")}
+    load_exactly(transformer, tensors, own, path)
+    return prompt
+
+
+def load_exactly(module: nn.Module, tensors: dict[str, Tensor], names: set[str], path: Path) -> None:
+    """Load tensors under exactly these names and shapes, or raise a one-line ``CheckpointError``."""
+    state = module.state_dict()
+    different = sorted(names ^ set(tensors))
+    different += sorted(name for name in names & set(tensors) if state[name].shape != tensors[name].shape)
+    if different:
+        raise CheckpointError(
+            f"{path}: does not fit this model; {len(different)} tensors differ, first {different[0]!r}"
+        )
+    with torch.no_grad():
+        module.load_state_dict(tensors, strict=False, assign=any(state[name].is_meta for name in names))

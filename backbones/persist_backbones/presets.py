@@ -1,0 +1,104 @@
+"""Configurations of diffusers' CogVideoX classes: a tiny one for laptops, and the published 2b and 5b."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+VAE_8X = {
+    "down_block_types": ("CogVideoXDownBlock3D",) * 4,
+    "up_block_types": ("CogVideoXUpBlock3D",) * 4,
+    "block_out_channels": (128, 256, 256, 512),
+    "layers_per_block": 3,
+    "latent_channels": 16,
+    "norm_num_groups": 32,
+    "temporal_compression_ratio": 4,
+}
+VAE_TINY = {
+    "down_block_types": ("CogVideoXDownBlock3D",) * 3,
+    "up_block_types": ("CogVideoXUpBlock3D",) * 3,
+    "block_out_channels": (16, 32, 32),
+    "layers_per_block": 1,
+    "latent_channels": 16,
+    "norm_num_groups": 8,
+    "temporal_compression_ratio": 4,
+    "scaling_factor": 1.0,
+}
+SCHEDULER = {
+    "beta_start": 0.00085,
+    "beta_end": 0.0120,
+    "beta_schedule": "scaled_linear",
+    "clip_sample": False,
+    "prediction_type": "v_prediction",
+    "rescale_betas_zero_snr": True,
+    "set_alpha_to_one": True,
+    "timestep_spacing": "trailing",
+}
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "tiny": {
+        "vae": VAE_TINY,
+        "transformer": {
+            "num_attention_heads": 4,
+            "attention_head_dim": 64,
+            "num_layers": 6,
+            "in_channels": 32,
+            "out_channels": 16,
+            "time_embed_dim": 256,
+            "text_embed_dim": 32,
+            "max_text_seq_length": 1,
+            "spatial_interpolation_scale": 1.0,
+        },
+        "scheduler": SCHEDULER | {"snr_shift_scale": 1.0},
+    },
+    "2b": {
+        "vae": VAE_8X | {"scaling_factor": 1.15258426},
+        "transformer": {"num_attention_heads": 30, "num_layers": 30, "in_channels": 16, "out_channels": 16},
+        "scheduler": SCHEDULER | {"snr_shift_scale": 3.0},
+    },
+    "5b": {
+        "vae": VAE_8X | {"scaling_factor": 0.7, "invert_scale_latents": False},
+        "transformer": {
+            "num_attention_heads": 48,
+            "num_layers": 42,
+            "in_channels": 32,
+            "out_channels": 16,
+            "use_rotary_positional_embeddings": True,
+            "use_learned_positional_embeddings": True,
+        },
+        "scheduler": SCHEDULER | {"snr_shift_scale": 1.0},
+    },
+}
+
+
+@dataclass(frozen=True)
+class CogVideoXSettings:
+    """The video model.
+
+    Args:
+        preset: sizes of transformer, VAE and scheduler.
+        pretrained: a plain diffusers CogVideoX directory (``transformer/``, ``vae/``, ``scheduler/``) to start from;
+            its configuration replaces the preset's.
+        height: pixels.
+        width: pixels.
+        frames: frames a clip, 4n + 1.
+        interactions: actions that change the world; each gets an embedding for each step of a clip.
+        rays: ``correct`` Plücker directions, or as the paper ``printed`` them, with the translation added.
+        weighting: of the v-prediction loss over noise levels, ``uniform`` or ``min-snr``.
+        snr_gamma: of min-SNR.
+        kl_weight: of the codec's latent prior.
+        transformer: changes to the preset's transformer configuration.
+        vae: changes to the preset's VAE configuration.
+    """
+
+    preset: Literal["tiny", "2b", "5b"] = "tiny"
+    pretrained: str | None = None
+    height: int = 64
+    width: int = 64
+    frames: int = 9
+    interactions: tuple[str, ...] = ("pick_up", "drop", "toggle")
+    rays: Literal["correct", "printed"] = "correct"
+    weighting: Literal["uniform", "min-snr"] = "uniform"
+    snr_gamma: float = 5.0
+    kl_weight: float = 1e-6
+    transformer: dict[str, Any] = field(default_factory=dict)
+    vae: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,117 @@
+"""CogVideoX's transformer widened for depth, image condition, cameras, interactions and memory.
+
+The published weights stay in their own module, untouched and loadable by diffusers; what is new stands beside them,
+zero-initialised: a second patch embedding added to the first, more output channels, an embedding added to the time
+embedding. Sums with exact zeros keep the widened model equal to the original to the bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from diffusers import CogVideoXTransformer3DModel
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What the transformer sees beside the noisy latents.
+
+    Args:
+        text: prompt embedding.
+        timestep: noise levels.
+        interactions: rows of the interaction embedding, 0 for none.
+        camera: camera embedding at each video token, for the queries of memory blocks.
+        rotary: cosines and sines, for models with rotary positions.
+        memory: prepared tokens, with the adapter that made them.
+    """
+
+    text: Float[Tensor, "batch word channel"]
+    timestep: Int[Tensor, " batch"]
+    interactions: Int[Tensor, "batch step"]
+    camera: Float[Tensor, "batch token camera"]
+    rotary: tuple[Tensor, Tensor] | None = None
+    memory: PreparedMemory | None = None
+
+
+class WorldTransformer(nn.Module):
+    """Predicts velocities of RGB and depth latents.
+
+    Args:
+        base: diffusers' transformer.
+        in_channels: all input channels: noisy RGB, RGB image, noisy depth, depth image, camera.
+        out_channels: RGB and depth.
+        interactions: rows of the interaction embedding without the first, which is none.
+        camera_channels: of the camera embedding at a token.
+    """
+
+    def __init__(
+        self,
+        base: CogVideoXTransformer3DModel,
+        in_channels: int,
+        out_channels: int,
+        interactions: int,
+        camera_channels: int,
+    ) -> None:
+        super().__init__()
+        config = base.config
+        inner = config.num_attention_heads * config.attention_head_dim
+        patch = config.patch_size
+        self.base = base
+        self.extra_in = nn.Conv2d(in_channels - config.in_channels, inner, patch, stride=patch, bias=False)
+        self.extra_out = nn.Linear(inner, patch * patch * (out_channels - config.out_channels))
+        self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
+        self.shape = VideoShape(inner, camera_channels, config.time_embed_dim, config.num_layers)
+        for module in (self.extra_in, self.extra_out, self.interactions):
+            for parameter in module.parameters():
+                nn.init.zeros_(parameter)
+
+    def forward(
+        self, latents: Float[Tensor, "batch frame channel height width"], given: Conditions, adapter: Adapter | None
+    ) -> Float[Tensor, "batch frame out height width"]:
+        """Velocities of RGB and depth latents, concatenated on channels."""
+        time = self.embed_time(given, latents.dtype)
+        text, video = self.embed_patches(latents, given.text.to(latents.dtype))
+        for layer, block in enumerate(self.base.transformer_blocks):
+            video, text = self.run_block(block, video, text, time, given.rotary)
+            if adapter is not None and given.memory is not None:
+                video = adapter.after_block(layer, video, given.memory, given.camera, time)
+        video = self.base.norm_out(self.base.norm_final(video), temb=time)
+        parts = (self.unpatchify(self.base.proj_out(video), latents), self.unpatchify(self.extra_out(video), latents))
+        return torch.cat(parts, dim=2)
+
+    def embed_time(self, given: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
+        """The time embedding with the interactions of the clip added."""
+        time: Tensor = self.base.time_embedding(self.base.time_proj(given.timestep).to(dtype))
+        return time + self.interactions(given.interactions).sum(dim=1).to(time.dtype)
+
+    def embed_patches(self, latents: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
+        """Text and video tokens: diffusers' patch embedding of its own channels plus that of the new ones."""
+        known = self.base.config.in_channels
+        tokens: Tensor = self.base.patch_embed(text, latents[:, :, :known])
+        extra = self.extra_in(latents[:, :, known:].flatten(0, 1)).flatten(2).transpose(1, 2)
+        words = text.shape[1]
+        video = tokens[:, words:] + extra.unflatten(0, latents.shape[:2]).flatten(1, 2)
+        return tokens[:, :words], self.base.embedding_dropout(video)
+
+    def run_block(
+        self, block: nn.Module, video: Tensor, text: Tensor, time: Tensor, rotary: Any
+    ) -> tuple[Tensor, Tensor]:
+        """One of diffusers' blocks, recomputed in the backward pass when checkpointing is on."""
+        if torch.is_grad_enabled() and self.base.gradient_checkpointing:
+            return self.base._gradient_checkpointing_func(block, video, text, time, rotary)  # type: ignore[no-any-return]
+        return block(  # type: ignore[no-any-return]
+            hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=rotary
+        )
+
+    def unpatchify(self, tokens: Tensor, like: Tensor) -> Tensor:
+        """Tokens of ``patch × patch × channel`` values back to frames of the latents' size."""
+        batch, frames, _, height, width = like.shape
+        patch = self.base.config.patch_size
+        grid = tokens.reshape(batch, frames, height // patch, width // patch, -1, patch, patch)
+        return grid.permute(0, 1, 4, 2, 5, 3, 6).flatten(5, 6).flatten(3, 4)

@@ -1,0 +1,119 @@
+"""DINOv2 patch features (PEWM, memory), from a local directory or the hub."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, UInt8
+from pydantic import PositiveInt
+from torch import Tensor
+
+from persist_cli.world.encoder import Encoder
+from persist_cli.world.errors import CheckpointError
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True)
+class DinoV2Settings:
+    """Which weights, and what is taken from them.
+
+    Args:
+        weights: a directory that transformers wrote (``config.json`` and ``model.safetensors``), or a hub id.
+        size: pixels of the image's longer side when it is encoded; ``None`` keeps its own. Both sides are then
+            rounded to whole patches.
+        layer: the block whose output is taken, counted from 1; ``None`` for the last. The final layer norm
+            follows in either case.
+        batch: frames encoded at once. More is faster on a GPU, but then the last bits of a feature depend on
+            the frames beside it, and a map on how its frames were grouped.
+    """
+
+    weights: str = "facebook/dinov2-small"
+    size: PositiveInt | None = None
+    layer: PositiveInt | None = None
+    batch: PositiveInt = 1
+
+
+class DinoV2(Encoder):
+    """Features of a frozen DINOv2; its files are opened when first needed."""
+
+    settings_type = DinoV2Settings
+    settings: DinoV2Settings
+
+    def __init__(self, settings: DinoV2Settings) -> None:
+        super().__init__(settings)
+        self._device = torch.device("cpu")
+
+    @property
+    def channels(self) -> int:
+        """Width of the model.
+
+        Raises:
+            CheckpointError: when neither directory nor hub has its configuration.
+        """
+        return int(self._config.hidden_size)
+
+    def to(self, device: torch.device | str) -> DinoV2:
+        """The encoder on ``device``."""
+        self._device = torch.device(device)
+        return self
+
+    @torch.no_grad()
+    def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
+        """Normalised patch features of the chosen block, without class and register tokens."""
+        model = self._model.to(self._device)
+        rows, columns = self._rows_and_columns(rgb.shape[1], rgb.shape[2])
+        layer = self.settings.layer or self._config.num_hidden_layers
+        parts = []
+        for part in torch.split(rgb, self.settings.batch):
+            pixels = self._pixels(part.to(self._device), rows, columns)
+            states = model(pixels, output_hidden_states=True).hidden_states[layer]
+            parts.append(model.layernorm(states)[:, -rows * columns :].reshape(len(part), rows, columns, -1))
+        return torch.cat(parts).float()
+
+    @cached_property
+    def _config(self) -> Any:
+        from transformers import Dinov2Config
+
+        config = self._opened(Dinov2Config)
+        if self.settings.layer is not None and self.settings.layer > config.num_hidden_layers:
+            raise CheckpointError(
+                f"{self.settings.weights}: it has {config.num_hidden_layers} blocks, no block {self.settings.layer}"
+            )
+        return config
+
+    @cached_property
+    def _model(self) -> Any:
+        from transformers import Dinov2Model
+
+        return self._opened(Dinov2Model, use_safetensors=True, config=self._config).eval().requires_grad_(False)
+
+    def _opened(self, kind: Any, **options: Any) -> Any:
+        weights = self.settings.weights
+        local = Path(weights).is_dir()
+        try:
+            return kind.from_pretrained(weights, local_files_only=local, **options)
+        except (OSError, ValueError, RuntimeError) as error:
+            cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            tried = "the directory" if local else "no such directory, and the hub"
+            hint = "download it once and set encoder.weights to its directory, or use the encoder 'patches'"
+            raise CheckpointError(f"DINOv2 weights {weights!r}: {tried} failed ({cause}); {hint}") from error
+
+    def _rows_and_columns(self, height: int, width: int) -> tuple[int, int]:
+        scale = (self.settings.size or max(height, width)) / max(height, width)
+        patch = self._config.patch_size
+        return max(1, math.floor(height * scale / patch + 0.5)), max(1, math.floor(width * scale / patch + 0.5))
+
+    def _pixels(self, rgb: Tensor, rows: int, columns: int) -> Float[Tensor, "frame 3 height width"]:
+        patch = self._config.patch_size
+        image = rgb.permute(0, 3, 1, 2).float() / 255
+        size = (rows * patch, columns * patch)
+        image = torch.nn.functional.interpolate(image, size=size, mode="bicubic", antialias=True, align_corners=False)
+        mean, std = (image.new_tensor(values)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD))
+        return (image.clamp(0, 1) - mean) / std

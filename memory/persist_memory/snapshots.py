@@ -1,0 +1,165 @@
+"""A memory of images (3D-Mem): the few snapshots that show most of what is in view.
+
+3D-Mem chooses its snapshots by detected objects; this is the form without a detector. Nothing in it depends on
+axes or origin of the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from pydantic import PositiveInt
+from torch import Tensor
+
+from persist_cli.world.cameras import Cameras, check_intrinsics, check_poses
+from persist_cli.world.encoder import Encoder
+from persist_cli.world.errors import CheckpointError
+from persist_cli.world.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
+from persist_cli.world.observations import Observations
+from persist_cli.world.tokens import MemoryTokens
+from persist_memory.snapshot_cover import covered_view, greedy_cover, most_redundant, seen_patches
+from persist_memory.snapshot_store import SnapshotStore
+from persist_memory.stored import check_mergeable, check_observations, check_tensors
+
+FRAMES_AT_ONCE = 16
+
+
+@dataclass(frozen=True)
+class SnapshotsSettings:
+    """How many images are kept and given.
+
+    Args:
+        count: images that a reading gives at most.
+        capacity: images that are kept at most.
+        grid: rows and columns of tokens of an image; the encoder's features are averaged into them.
+    """
+
+    count: PositiveInt = 8
+    capacity: PositiveInt = 64
+    grid: tuple[PositiveInt, PositiveInt] = (8, 8)
+
+
+class Snapshots(Memory):
+    """A bounded album of posed images, read as the tokens of the few that show most of what is in view.
+
+    Writing keeps every frame that has any depth, until there are ``capacity``. Then each new frame drives out the
+    one, itself included, of whose patches the greatest share is shown at the same depth by another kept image.
+    A frame that is kept already is not kept twice. Up to ``capacity`` frames the order of writing leaves no trace.
+
+    Reading lays the token grid over each asked camera's image. A snapshot shows such a place when one of its patches
+    falls into it and lies not far behind the nearest patch there. Snapshots are taken greedily, each the one that
+    shows most places not shown yet; see ``greedy_cover``. Their tokens follow snapshot by snapshot and row by row, at
+    the patches' points in space; patches without depth give none.
+    """
+
+    settings_type = SnapshotsSettings
+    settings: SnapshotsSettings
+
+    def __init__(self, settings: SnapshotsSettings, encoder: Encoder, reference: FrameOfReference) -> None:
+        super().__init__(settings, encoder, reference)
+        self._album: SnapshotStore | None = None
+        self._seen: Tensor | None = None  # which patches of one snapshot another shows; made when first full
+
+    @property
+    def album(self) -> SnapshotStore:
+        """What is kept; made when first wanted, since an encoder may have to open a file to know its channels."""
+        if self._album is None:
+            self._album = SnapshotStore.empty(self.settings.grid, self.encoder.channels)
+        return self._album
+
+    def write(self, observations: Observations) -> None:
+        """Keep the frames; one without any valid depth is left out.
+
+        Raises:
+            DataError: when a pose is not finite and rigid, and nothing is written.
+        """
+        check_observations(observations, f"memory {self.name!r}")
+        for begin in range(0, len(observations), FRAMES_AT_ONCE):
+            part = observations[begin : begin + FRAMES_AT_ONCE]
+            features = self.encoder.encode(part.rgb).to(part.depth.device)
+            self._keep(SnapshotStore.of(part, features, self.settings.grid))
+
+    def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
+        """At most ``budget`` tokens of at most ``count`` snapshots, the one that shows most of the view first."""
+        album = self.album
+        if not len(album):
+            return MemoryTokens.empty(self.encoder.channels)
+        cameras = cameras.to(album.content.device)
+        poses, intrinsics = cameras.world_from_camera.double(), cameras.intrinsics.double()
+        size = torch.tensor([[cameras.height, cameras.width]], device=poses.device).expand(len(poses), 2)
+        covered = covered_view(album, poses, intrinsics, size)
+        distances = torch.cdist(album.world_from_camera[:, :3, 3], poses[:, :3, 3]).amin(1)
+        chosen = torch.tensor(greedy_cover(covered, distances, self.settings.count), dtype=torch.int64)
+        picked = album[chosen.to(poses.device)]
+        placed = picked.depth > 0
+        return MemoryTokens.of(picked.features[placed][:budget], picked.points[placed][:budget])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The album in the order of the images' contents."""
+        return self.album.tensors() if len(self.album) else {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Replace the album by what ``tensors()`` gave.
+
+        Raises:
+            CheckpointError: when they are not tensors of this memory; what was kept is still kept.
+        """
+        album = SnapshotStore.empty(self.settings.grid, self.encoder.channels)
+        if tensors:
+            where = f"memory {self.name!r}"
+            shapes = {name: (tensor.dtype, (None, *tensor.shape[1:])) for name, tensor in album.tensors().items()}
+            check_tensors(tensors, shapes, where)
+            check_poses(tensors["world_from_camera"], where)
+            for intrinsics in tensors["intrinsics"]:
+                check_intrinsics(intrinsics, where)
+            if bool((tensors["size"] < 1).any()):
+                raise CheckpointError(f"{where}: an image size below one pixel")
+            album = SnapshotStore(self.settings.grid, **tensors)
+        self._album, self._seen = album, None
+
+    def merge(self, other: Memory) -> None:
+        """Keep the snapshots of another album, one after the other, as if they came as frames."""
+        check_mergeable(self, other)
+        if isinstance(other, Snapshots):
+            self._keep(other.album)
+
+    def points(self) -> MapPoints:
+        """All patches that have depth."""
+        placed = self.album.depth > 0
+        return MapPoints(self.album.points[placed], self.album.colors[placed])
+
+    def figures(self) -> MemoryFigures:
+        """How many snapshots, their bytes, and the bounds of their patches."""
+        figures = super().figures()
+        return MemoryFigures(len(self.album), figures.bytes, figures.bounds)
+
+    def _keep(self, snapshots: SnapshotStore) -> None:
+        """Take in snapshots one by one, so that it does not matter how frames were grouped."""
+        for frame in range(len(snapshots)):
+            new = snapshots[torch.tensor([frame], device=snapshots.content.device)]
+            if not bool((new.depth > 0).any()) or self._is_kept(new):
+                continue
+            if len(self.album) >= self.settings.capacity:
+                self._replace(new)
+            else:
+                self._album, self._seen = self.album.joined(new), None
+
+    def _is_kept(self, new: SnapshotStore) -> bool:
+        same = (self.album.content == new.content.to(self.album.content.device)).nonzero()[:, 0]
+        poses = self.album.world_from_camera[same]
+        return bool((poses == new.world_from_camera.to(poses.device)).all(-1).all(-1).any())
+
+    def _replace(self, new: SnapshotStore) -> None:
+        """Join a snapshot to a full album and drop the most redundant one."""
+        seen = self._seen if self._seen is not None else seen_patches(self.album, self.album)
+        joined = self.album.joined(new)
+        at = int(torch.searchsorted(self.album.content, new.content.to(self.album.content.device), right=True))
+        old = torch.arange(len(joined), device=seen.device) != at
+        single = joined[~old]
+        grown = seen.new_zeros(len(joined), len(joined), seen.shape[-1])
+        grown[old.nonzero(), old.nonzero()[:, 0]] = seen
+        grown[at] = seen_patches(single, joined)[0]
+        grown[:, at] = seen_patches(joined, single)[:, 0]
+        kept = torch.arange(len(joined), device=seen.device) != most_redundant(grown, joined)
+        self._album, self._seen = joined[kept], grown[kept][:, kept]

@@ -1,0 +1,169 @@
+"""Checkpoints: one base and small memory adapters that load onto it by name.
+
+A checkpoint folder holds ``persist.json``, the backbone's own files and ``adapters/NAME/``; that of a stage-2 run
+holds adapters only and says where its base is. A run folder stands for its newest checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from persist_cli.recipe import MemoryChoice
+from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import read_json, write_json
+from persist_cli.world.settings import parse_settings
+
+if TYPE_CHECKING:
+    from persist_cli.world.backbone import Backbone
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint that was found, its weights not loaded yet.
+
+    Args:
+        folder: of ``persist.json``.
+        name: what tables call it, the run's or folder's name.
+        base_folder: where the backbone's own files are.
+        backbone: name of the plugin.
+        settings: for the plugin.
+        fingerprint: of the base's weights.
+        adapters: folders of the memory adapters by name.
+    """
+
+    folder: Path
+    name: str
+    base_folder: Path
+    backbone: str
+    settings: dict[str, Any]
+    fingerprint: str
+    adapters: dict[str, Path]
+
+    def memory_choice(self, adapter: str) -> MemoryChoice:
+        """What the adapter's memory is made of."""
+        path = self.adapter_folder(adapter) / "memory.json"
+        return parse_settings(MemoryChoice, read_json(path), str(path))
+
+    def adapter_folder(self, adapter: str) -> Path:
+        """The adapter's folder; a one-line error that names the others when there is none."""
+        if adapter not in self.adapters:
+            known = ", ".join(self.adapters) or "none"
+            raise CheckpointError(f"{self.folder}: no memory adapter {adapter!r} in it; it has {known}")
+        return self.adapters[adapter]
+
+    def default_adapter(self) -> str | None:
+        """The only adapter, or none when there is none; an error when there are several to choose from."""
+        if len(self.adapters) > 1:
+            raise CheckpointError(f"{self.folder}: choose an adapter of {', '.join(self.adapters)} with --adapter")
+        return next(iter(self.adapters), None)
+
+
+def step_folders(run: Path) -> list[Path]:
+    """Whole checkpoints of a run, the newest last."""
+    return sorted(folder for folder in run.glob("step-*") if folder.is_dir())
+
+
+def find_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint in a folder, or the newest of a run.
+
+    Raises:
+        CheckpointError: when there is none, it is damaged, or its base is gone or another.
+    """
+    folder = _model_folder(path)
+    card = _read_card(folder)
+    base_folder, fingerprint = folder, str(card.get("fingerprint", ""))
+    if card.get("base"):
+        base_folder = _model_folder((folder / card["base"]).resolve())
+        base_card = _read_card(base_folder)
+        if base_card["fingerprint"] != fingerprint:
+            raise CheckpointError(f"{folder}: was trained on another base than the one now at {base_folder}")
+        card = base_card
+    adapters = {each.name: each for each in sorted((folder / "adapters").glob("*")) if each.is_dir()}
+    name = folder.parent.parent.name if folder.name == "model" else folder.name
+    return Checkpoint(folder, name, base_folder, card["backbone"], card["settings"], fingerprint, adapters)
+
+
+def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
+    """The base's backbone without adapters, with changed settings where given."""
+    import torch
+
+    from persist_cli.registry import make_backbone
+
+    with torch.device("meta"):  # the weights come from the files
+        backbone = make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
+    backbone.load_base(checkpoint.base_folder)
+    return backbone
+
+
+def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:
+    """Load an adapter of the checkpoint onto its backbone and use it; ``None`` is plain stage 1."""
+    if adapter is None:
+        backbone.use_adapter(None)
+    else:
+        backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
+
+
+def save_base(backbone: Backbone, folder: Path) -> None:
+    """Write the backbone's own files and its card into an existing folder."""
+    backbone.save_base(folder)
+    settings = backbone.checkpoint_settings()
+    card = {"backbone": backbone.name, "settings": settings, "fingerprint": fingerprint(folder)}
+    write_json(folder / "persist.json", {"format": "persist-checkpoint", "version": VERSION} | card)
+
+
+def save_adapter(backbone: Backbone, base: Checkpoint, choice: MemoryChoice, folder: Path, home: Path) -> None:
+    """Write the adapter in use and a card that points to its base.
+
+    Args:
+        backbone: with the adapter in use.
+        base: what the adapter was trained on.
+        choice: its memory.
+        folder: to write into.
+        home: where the folder will stand in the end; the way to the base is relative to it.
+    """
+    adapter = folder / "adapters" / choice.name
+    adapter.mkdir(parents=True)
+    backbone.save_adapter(adapter)
+    write_json(adapter / "memory.json", dataclasses.asdict(choice))
+    run = base.base_folder.parent.parent if base.base_folder.name == "model" else base.base_folder
+    way = os.path.relpath(run.resolve(), home.resolve())
+    card = {"base": way, "fingerprint": base.fingerprint}
+    write_json(folder / "persist.json", {"format": "persist-checkpoint", "version": VERSION} | card)
+
+
+def fingerprint(folder: Path) -> str:
+    """SHA-256 over every weight file under a folder, in order of their names."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.safetensors")):
+        digest.update(str(path.relative_to(folder)).encode())
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _model_folder(path: Path) -> Path:
+    if (path / "persist.json").is_file():
+        return path
+    steps = step_folders(path)
+    if not steps:
+        raise CheckpointError(f"{path}: no checkpoint there (neither persist.json nor a finetune run's step-* folder)")
+    return steps[-1] / "model"
+
+
+def _read_card(folder: Path) -> dict[str, Any]:
+    path = folder / "persist.json"
+    card = read_json(path)
+    if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
+        raise CheckpointError(f"{path}: not the card of a persist checkpoint")
+    if card.get("version") != VERSION:
+        raise CheckpointError(f"{path}: checkpoint version {card.get('version')}, this persist reads {VERSION}")
+    if not card.get("fingerprint") or not (card.get("base") or {"backbone", "settings"} <= set(card)):
+        raise CheckpointError(f"{path}: the card is incomplete")
+    return card

@@ -1,0 +1,65 @@
+"""From a choice of memory to memories, and from clips to batches with their tokens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from persist_cli.recipe import MemoryChoice
+from persist_cli.registry import make_encoder, make_memory
+from persist_cli.trajectories.clips import ClipSample
+from persist_cli.world.backbone import Clips
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.encoder import Encoder
+from persist_cli.world.memory import FrameOfReference, Memory
+from persist_cli.world.observations import TrajectoryInfo
+from persist_cli.world.tokens import MemoryTokens
+
+
+@dataclass(frozen=True)
+class MemoryMaker:
+    """Makes empty memories of one choice that share one encoder."""
+
+    choice: MemoryChoice
+    encoder: Encoder
+
+    @staticmethod
+    def of(choice: MemoryChoice) -> MemoryMaker:
+        """The maker of this choice, its encoder loaded once."""
+        return MemoryMaker(choice, make_encoder(choice.encoder, choice.encoder_settings))
+
+    def empty(self, info: TrajectoryInfo) -> Memory:
+        """An empty memory in the frame of reference of a trajectory."""
+        reference = FrameOfReference(info.scene, info.world_up)
+        return make_memory(self.choice.name, self.choice.settings, self.encoder, reference)
+
+
+def collate(samples: Sequence[ClipSample], maker: MemoryMaker | None, budget: int) -> Clips:
+    """A batch of clips; with a maker, each with the tokens that a memory of its context gives its cameras."""
+    import torch
+
+    tokens = None
+    if maker is not None:
+        tokens = MemoryTokens.stack([recall(sample, maker, budget) for sample in samples])
+    first = samples[0].observations.cameras
+    return Clips(
+        rgb=torch.stack([sample.observations.rgb for sample in samples]),
+        depth=torch.stack([sample.observations.depth for sample in samples]),
+        cameras=Cameras(
+            torch.stack([sample.observations.cameras.world_from_camera for sample in samples]),
+            torch.stack([sample.observations.cameras.intrinsics for sample in samples]),
+            first.height,
+            first.width,
+        ),
+        interactions=[sample.interactions for sample in samples],
+        tokens=tokens,
+        seeds=[sample.seed for sample in samples],
+    )
+
+
+def recall(sample: ClipSample, maker: MemoryMaker, budget: int) -> MemoryTokens:
+    """What a memory of the sample's context says to the clip's cameras."""
+    memory = maker.empty(sample.info)
+    if sample.context is not None:
+        memory.write(sample.context)
+    return memory.read(sample.observations.cameras, budget)

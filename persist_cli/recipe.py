@@ -1,0 +1,234 @@
+"""Recipes: what a training run is, as YAML checked strictly, with KEY=VALUE changes."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from persist_cli.world.backbone import Stage
+from persist_cli.world.errors import RecipeError
+from persist_cli.world.settings import parse_settings
+
+
+@dataclass(frozen=True)
+class BackboneChoice:
+    """Which video model.
+
+    Args:
+        name: of the plugin.
+        settings: for the plugin; on top of the base checkpoint's where there is one.
+    """
+
+    name: str = "cogvideox"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MemoryChoice:
+    """Which memory and what it is made of.
+
+    Args:
+        name: of the memory plugin.
+        settings: for it.
+        encoder: name of the encoder plugin.
+        encoder_settings: for it.
+    """
+
+    name: str = "voxel"
+    settings: dict[str, Any] = field(default_factory=dict)
+    encoder: str = "patches"
+    encoder_settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """Which clips.
+
+    Args:
+        path: data set folder; ``--data`` sets it.
+        strides: every n-th frame; one of these is drawn for each clip.
+        context_frames: most earlier frames that a clip's memory is made of (stage 2).
+    """
+
+    path: str = ""
+    strides: tuple[int, ...] = (1, 2, 3)
+    context_frames: int = 48
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How long and how.
+
+    Args:
+        steps: optimizer steps.
+        batch: samples an optimizer step, over all processes and accumulated micro-batches.
+        accumulation: micro-batches that a step is split into.
+        learning_rate: of AdamW, after the warm-up.
+        warmup: steps of linear warm-up.
+        weight_decay: of AdamW.
+        clip: largest gradient norm.
+        ema: decay of the averaged weights that are kept; 0 keeps the last ones.
+        precision: ``no`` or ``bf16``.
+        seed: of weights, samples and noise.
+        checkpoint_every: steps between checkpoints.
+        checkpoint_minutes: most minutes between checkpoints.
+        workers: processes that read data.
+        tracker: ``none`` or ``tensorboard``.
+    """
+
+    steps: int = 1000
+    batch: int = 16
+    accumulation: int = 1
+    learning_rate: float = 1e-4
+    warmup: int = 50
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    ema: float = 0.999
+    precision: Literal["no", "bf16"] = "bf16"
+    seed: int = 0
+    checkpoint_every: int = 500
+    checkpoint_minutes: float = 5.0
+    workers: int = 1
+    tracker: Literal["none", "tensorboard"] = "none"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A training run.
+
+    Args:
+        stage: ``codec`` (the VAE), ``1`` (the video model) or ``2`` (a memory adapter on the frozen rest).
+        description: one line for ``persist recipes``.
+        base: run or checkpoint to start from.
+        backbone: the video model.
+        memory: stage 2 only.
+        adapter: settings of the memory adapter, stage 2 only.
+        data: clips.
+        training: steps, batch, optimizer.
+    """
+
+    stage: Stage
+    description: str = ""
+    base: str | None = None
+    backbone: BackboneChoice = field(default_factory=BackboneChoice)
+    memory: MemoryChoice | None = None
+    adapter: dict[str, Any] = field(default_factory=dict)
+    data: DataSettings = field(default_factory=DataSettings)
+    training: TrainingSettings = field(default_factory=TrainingSettings)
+
+
+def recipe_names() -> list[str]:
+    """Names of the recipes that come with persist."""
+    files = resources.files("persist_recipes").iterdir()
+    return sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml"))
+
+
+def read_recipe(name: str) -> dict[str, Any]:
+    """Plain values of a recipe by name, or of a YAML file.
+
+    Raises:
+        RecipeError: when it is unknown or no YAML mapping.
+    """
+    path = Path(name)
+    if path.suffix in {".yaml", ".yml"}:
+        if not path.is_file():
+            raise RecipeError(f"{path}: no such recipe file")
+        text = path.read_text(encoding="utf-8")
+    elif name in recipe_names():
+        text = (resources.files("persist_recipes") / f"{name}.yaml").read_text(encoding="utf-8")
+    else:
+        close = difflib.get_close_matches(name, recipe_names(), n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(recipe_names())}"
+        raise RecipeError(f"unknown recipe {name!r}; {hint} (a file of your own ends in .yaml)")
+    return parse_yaml_mapping(text, name)
+
+
+def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
+    """A YAML mapping.
+
+    Raises:
+        RecipeError: one line with the place where it stops being YAML.
+    """
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise RecipeError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(values, dict):
+        raise RecipeError(f"{where}: a recipe is a mapping of settings, not {type(values).__name__}")
+    return values
+
+
+def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """The mapping with ``a.b=value`` changes, values read as YAML."""
+    changed: dict[str, Any] = _copy(values)
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals or not key:
+            raise RecipeError(f"cannot read {override!r}; write KEY=VALUE, as in training.steps=200")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise RecipeError(f"cannot read the value in {override!r}") from error
+        *parents, last = key.split(".")
+        place = changed
+        for parent in parents:
+            if not isinstance(place.get(parent), dict):
+                place[parent] = {}
+            place = place[parent]
+        place[last] = value
+    return changed
+
+
+def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
+    """A recipe of plain values, every problem reported at once."""
+    values = dict(values)
+    if isinstance(values.get("stage"), int):
+        values["stage"] = str(values["stage"])
+    recipe = parse_settings(Recipe, values, where)
+    problems = list(_inconsistencies(recipe))
+    if problems:
+        raise RecipeError(f"{where}: " + "; ".join(problems))
+    return recipe
+
+
+def _inconsistencies(recipe: Recipe) -> list[str]:
+    """What is well-formed but makes no sense."""
+    training = recipe.training
+    positive = {"steps": training.steps, "batch": training.batch, "accumulation": training.accumulation}
+    problems = [f"training.{name} must be at least 1, not {value}" for name, value in positive.items() if value < 1]
+    if (recipe.stage == "2") != (recipe.memory is not None):
+        problems.append("stage 2 needs a memory, the other stages take none")
+    if recipe.stage == "2" and recipe.base is None:
+        problems.append("stage 2 needs base: the stage-1 run it stands on")
+    if not recipe.data.strides or min(recipe.data.strides) < 1:
+        problems.append("data.strides must be whole numbers of at least 1")
+    if training.batch % max(1, training.accumulation):
+        problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
+    return problems
+
+
+def to_plain(recipe: Recipe) -> dict[str, Any]:
+    """The resolved recipe as plain values, fit for YAML and JSON."""
+    plain: dict[str, Any] = _copy(dataclasses.asdict(recipe))
+    return plain
+
+
+def to_yaml(recipe: Recipe) -> str:
+    """The resolved recipe as YAML, saved beside every output."""
+    return yaml.safe_dump(to_plain(recipe), sort_keys=False)
+
+
+def _copy(value: Any) -> Any:
+    """A deep copy in YAML's own types."""
+    if isinstance(value, Mapping):
+        return {key: _copy(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_copy(part) for part in value]
+    return value

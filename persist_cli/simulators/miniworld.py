@@ -1,0 +1,243 @@
+"""MiniWorld: generated houses with MiniWorld's textures and meshes, exact poses and metric depth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from persist_cli.simulators.building import build_house
+from persist_cli.simulators.houses import Ground, House, Thing
+from persist_cli.simulators.rendering import Renderer
+from persist_cli.world.actions import ActionVocabulary, walking_actions
+from persist_cli.world.errors import DataError
+from persist_cli.world.observations import Frame, TrajectoryInfo
+from persist_cli.world.simulator import AgentSettings, Simulator
+
+GRAIN = 2.0**32  # positions are whole multiples of this part of a metre, so that going back is exact
+STRIDE = 0.1  # metres between the places that are checked along a step
+REACH = 0.9  # metres to a thing that can be picked up or toggled
+CARRIED_HEIGHT = 0.6  # metres above the floor
+UP = (0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class MiniWorldSettings(AgentSettings):
+    """The agent's camera, gait and body.
+
+    Args:
+        fov: degrees from the top of the image to its bottom.
+        camera_height: metres above the floor.
+        radius: metres of the agent's body.
+    """
+
+    fov: float = 75.0
+    camera_height: float = 1.25
+    radius: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not (self.height > 0 and self.width > 0):
+            raise ValueError(f"an image of {self.height}x{self.width} pixels has none")
+        if not 10.0 <= self.fov <= 150.0:
+            raise ValueError(f"fov {self.fov} is not between 10 and 150 degrees")
+        if not 0.1 <= self.radius <= 0.25:
+            raise ValueError(f"radius {self.radius} is not between 0.1 and 0.25 m, for which the houses are furnished")
+        if not 0.1 <= self.camera_height <= 2.5:
+            raise ValueError(f"camera_height {self.camera_height} is not between 0.1 and 2.5 m")
+
+
+class MiniWorld(Simulator):
+    """An agent in a house of up to six rooms; scene numbers are the houses' seeds.
+
+    Ground positions are (x, z); heading 0 looks along +x, and 90 degrees to the left of that is -z.
+    """
+
+    settings_type = MiniWorldSettings
+
+    def __init__(self, settings: MiniWorldSettings) -> None:
+        super().__init__(settings)
+        self.vocabulary: ActionVocabulary = walking_actions(settings.step, settings.turn)
+        self._renderer = Renderer(settings.height, settings.width)
+        self._house: House | None = None
+        self._things: list[Thing] = []
+        self._carried: Thing | None = None
+        self._stale = True  # whether the renderer has yet to hear of a change
+        self._ground: Ground = (0.0, 0.0)
+        self._start_heading, self._turned = 0.0, 0.0  # radians and degrees to the left
+
+    @property
+    def house(self) -> House:
+        """The open house.
+
+        Raises:
+            DataError: before ``open_scene``.
+        """
+        if self._house is None:
+            raise DataError("no scene is open; open_scene comes first")
+        return self._house
+
+    def open_scene(self, scene: int) -> None:
+        """Build the house of this seed, its things in their places and the agent not yet in it."""
+        if scene < 0:
+            raise DataError(f"scene {scene}: seeds of houses are not negative")
+        self._house = build_house(scene)
+        self._things, self._carried, self._stale = self.house.things, None, True
+
+    def place(self, ground: tuple[float, float], heading: float) -> None:
+        """Put the agent at a free ground position with a heading in radians; it drops what it carries.
+
+        Raises:
+            DataError: when a wall or a thing is there.
+        """
+        exact = _exact(ground[0]), _exact(ground[1])
+        if self._carried is not None:
+            self.act("drop")
+        if not self.is_free(exact):
+            raise DataError(f"house {self.house.seed}: ({ground[0]:.2f}, {ground[1]:.2f}) is not free")
+        self._ground, self._start_heading, self._turned = exact, heading, 0.0
+
+    def observe(self) -> Frame:
+        """What the agent sees now."""
+        if self._stale:
+            carried = [self._carried_thing(self._ground, self._heading)] if self._carried is not None else []
+            self._renderer.load(self.house, [*self._things, *carried])
+            self._stale = False
+        pose = self._world_from_camera()
+        rgb, depth = self._renderer.render(pose[:3, 3].tolist(), pose[:3, 2].tolist(), self.settings.fov)
+        return Frame(rgb, depth, pose)
+
+    def act(self, action: str) -> bool:
+        """Do an action; false, and nothing changed, where a wall or thing is in the way or there is nothing to do it to.
+
+        Raises:
+            DataError: for an unknown action.
+        """
+        known = self.vocabulary[action]
+        if known.interaction:
+            return {"pick_up": self._pick_up, "drop": self._drop, "toggle": self._toggle}[action]()
+        turned = self._turned + known.turn
+        ahead_x, ahead_z = self.ahead(self._heading)
+        ground = (
+            self._ground[0] + _exact(known.forward * ahead_x),
+            self._ground[1] + _exact(known.forward * ahead_z),
+        )
+        if not self._can_go(ground, turned):
+            return False
+        self._stale = self._stale or self._carried is not None
+        self._ground, self._turned = ground, turned
+        return True
+
+    @property
+    def agent(self) -> tuple[tuple[float, float], float]:
+        """Ground position in metres and heading in radians."""
+        return self._ground, self._heading
+
+    def is_free(self, ground: tuple[float, float]) -> bool:
+        """Whether the agent could stand there."""
+        return self.house.is_free(ground, self.settings.radius, self._things)
+
+    def ahead(self, heading: float) -> tuple[float, float]:
+        """Unit ground direction of a heading."""
+        return math.cos(heading), -math.sin(heading)
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Lowest and highest ground corner of the house in metres."""
+        return self.house.bounds
+
+    @property
+    def info(self) -> TrajectoryInfo:
+        """Camera, up axis, vocabulary and provenance of the open house."""
+        height, width = self.settings.height, self.settings.width
+        focal = height / 2 / math.tan(math.radians(self.settings.fov) / 2)
+        return TrajectoryInfo(
+            scene=f"miniworld/house-{self.house.seed}",
+            intrinsics=np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]),
+            height=height,
+            width=width,
+            world_up=UP,
+            vocabulary=self.vocabulary,
+            source={"simulator": "miniworld", "house": self.house.seed, "rooms": len(self.house.rooms)},
+        )
+
+    @property
+    def _heading(self) -> float:
+        return self._start_heading + math.radians(self._turned)
+
+    def _world_from_camera(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """OpenCV axes: right, down, forward."""
+        (forward_x, forward_z), pose = self.ahead(self._heading), np.eye(4)
+        pose[:3, 0] = -forward_z, 0.0, forward_x
+        pose[:3, 1] = 0.0, -1.0, 0.0
+        pose[:3, 2] = forward_x, 0.0, forward_z
+        pose[:3, 3] = self._ground[0], self.settings.camera_height, self._ground[1]
+        return pose
+
+    def _can_go(self, ground: Ground, turned: float) -> bool:
+        """Whether the agent, with what it carries, passes nothing on the straight way there."""
+        strides = max(1, math.ceil(math.dist(self._ground, ground) / STRIDE))
+        shares = [stride / strides for stride in range(1, strides + 1)]
+        way = [tuple(a + share * (b - a) for a, b in zip(self._ground, ground, strict=True)) for share in shares]
+        if not all(self.is_free((x, z)) for x, z in way):
+            return False
+        if self._carried is None:
+            return True
+        carried = self._carried_thing(ground, self._start_heading + math.radians(turned))
+        return self.house.is_free(carried.ground, carried.radius, self._things)
+
+    def _carried_thing(self, ground: Ground, heading: float) -> Thing:
+        """What the agent carries, as it hangs before an agent at this place."""
+        if self._carried is None:
+            raise DataError("nothing is carried")
+        distance = self.settings.radius + self._carried.radius + 0.3
+        (x, z) = self.ahead(heading)
+        before = ground[0] + distance * x, ground[1] + distance * z
+        return replace(self._carried, ground=before, heading=heading, elevation=CARRIED_HEIGHT)
+
+    def _within_reach(self) -> Thing | None:
+        """The nearest movable thing ahead."""
+        x, z = self.ahead(self._heading)
+        near = []
+        for thing in self._things:
+            offset = thing.ground[0] - self._ground[0], thing.ground[1] - self._ground[1]
+            distance, along = math.hypot(*offset), offset[0] * x + offset[1] * z
+            if thing.movable and distance < REACH + thing.radius and along > 0.8 * distance:
+                near.append((distance, thing))
+        return min(near, key=lambda item: item[0])[1] if near else None
+
+    def _pick_up(self) -> bool:
+        thing = self._within_reach()
+        if self._carried is not None or thing is None:
+            return False
+        others = [other for other in self._things if other is not thing]
+        self._carried = thing
+        carried = self._carried_thing(self._ground, self._heading)
+        if not self.house.is_free(carried.ground, carried.radius, others):
+            self._carried = None
+            return False
+        self._things, self._stale = others, True
+        return True
+
+    def _drop(self) -> bool:
+        if self._carried is None:
+            return False
+        down = replace(self._carried_thing(self._ground, self._heading), elevation=0.0)
+        self._things, self._carried, self._stale = [*self._things, down], None, True
+        return True
+
+    def _toggle(self) -> bool:
+        """Turn the colour of the thing ahead into its complement, and back again."""
+        thing = self._within_reach()
+        if thing is None or thing.is_mesh:
+            return False
+        red, green, blue = thing.paint.tint
+        toggled = replace(thing, paint=replace(thing.paint, tint=(1 - red, 1 - green, 1 - blue)))
+        self._things = [toggled if other is thing else other for other in self._things]
+        self._stale = True
+        return True
+
+
+def _exact(metres: float) -> float:
+    """The nearest multiple of the grain: sums of such numbers are exact."""
+    return round(metres * GRAIN) / GRAIN

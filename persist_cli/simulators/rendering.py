@@ -1,0 +1,262 @@
+"""Rendering of houses with OpenGL, off screen: colour with four samples a pixel, depth at the pixel's centre.
+
+MiniWorld's own frame buffer keeps depth in 16 bits and takes it from one of the samples, off the pixel's
+centre; at 64×64 pixels both cost centimetres. Here depth has 32 bits and its own pass.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.util
+import math
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from persist_cli.simulators.houses import House, Thing
+from persist_cli.simulators.meshes import Mesh, MeshPart, read_mesh
+from persist_cli.simulators.panels import Panel, house_panels
+from persist_cli.world.errors import PluginError
+
+NEAR, FAR = 0.04, 100.0  # metres
+SKY = 99.0  # what seems farther away is missing
+SKY_COLOUR = (0.25, 0.82, 1.0)
+SAMPLES = 4
+LARGEST_TEXTURE = 256  # pixels of a side
+AMBIENT, DIFFUSE = 0.62, 0.42  # light from everywhere, and from the house's own direction
+EGL_PACKAGES = "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri"
+
+Array = np.ndarray[Any, Any]
+
+
+@functools.cache
+def assets() -> Path:
+    """MiniWorld's folder, with its ``textures`` and ``meshes``.
+
+    Raises:
+        PluginError: when the package is not installed.
+    """
+    found = importlib.util.find_spec("miniworld")
+    if found is None or not found.submodule_search_locations:
+        raise PluginError(
+            "simulator 'miniworld' needs the package miniworld; install it with `pip install 'persist-cli[miniworld]'`"
+        )
+    return Path(found.submodule_search_locations[0])
+
+
+@functools.cache
+def _graphics() -> Any:
+    """OpenGL's functions, with the one context of this process made current.
+
+    Raises:
+        PluginError: when OpenGL cannot be had without a screen.
+    """
+    assets()
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads only get in each other's way on small images
+    import pyglet
+
+    pyglet.options["headless"] = True
+    pyglet.options["debug_gl"] = False
+    try:
+        from pyglet import gl
+        from pyglet.window import NoSuchConfigException, NoSuchDisplayException, Window
+    except (ImportError, ValueError, AttributeError) as error:
+        raise PluginError(_no_egl(error)) from error
+    try:
+        gl.persist_window = Window(width=1, height=1, visible=False)
+    except (NoSuchConfigException, NoSuchDisplayException, gl.ContextException, gl.lib.GLException) as error:
+        raise PluginError(_no_egl(error)) from error
+    return gl
+
+
+def _no_egl(error: Exception) -> str:
+    cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return f"simulator 'miniworld' renders with Mesa's EGL ({cause}); install it with `apt-get install {EGL_PACKAGES}`"
+
+
+class Renderer:
+    """Draws one house at a time into images of one size.
+
+    Args:
+        height: pixels.
+        width: pixels.
+    """
+
+    def __init__(self, height: int, width: int) -> None:
+        self.height, self.width = height, width
+        self._gl = _graphics()
+        self._scene = self._gl.glGenLists(1)
+        self._sampled, self._resolved, self._single = (self._frame_buffer(count) for count in (SAMPLES, 0, 0))
+        self._set_up()
+
+    def load(self, house: House, things: Sequence[Thing]) -> None:
+        """Take a house, with its things as they are now, for the images to come."""
+        gl = self._gl
+        panels = list(house_panels(house, things))
+        textures = [texture(panel.texture) for panel in panels]
+        meshes = [(thing, mesh(thing.shape)) for thing in things if thing.is_mesh]
+        gl.glNewList(self._scene, gl.GL_COMPILE)
+        gl.glLightfv(gl.GL_LIGHT0, gl.GL_POSITION, (gl.GLfloat * 4)(*house.light, 0.0))
+        for panel, number in zip(panels, textures, strict=True):
+            self._draw_panel(panel, number)
+        for thing, (number, shape) in meshes:
+            self._draw_mesh(thing, number, shape)
+        gl.glEndList()
+
+    def render(self, eye: Sequence[float], forward: Sequence[float], fov: float) -> tuple[Array, Array]:
+        """The view from ``eye`` towards ``forward`` (world, metres), +y up, ``fov`` degrees from top to bottom.
+
+        Returns:
+            rgb uint8 ``[height, width, 3]``, and planar depth float32 metres ``[height, width]``, 0 for the sky.
+        """
+        gl = self._gl
+        self._draw(self._sampled, eye, forward, fov)
+        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._sampled)
+        gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._resolved)
+        whole = (0, 0, self.width, self.height)
+        gl.glBlitFramebuffer(*whole, *whole, gl.GL_COLOR_BUFFER_BIT, gl.GL_NEAREST)
+        rgb = np.empty((self.height, self.width, 3), np.uint8)
+        self._read(self._resolved, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, rgb)
+        self._draw(self._single, eye, forward, fov)
+        buffer = np.empty((self.height, self.width), np.float32)
+        self._read(self._single, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, buffer)
+        depth = NEAR * FAR / (FAR - buffer.astype(np.float64) * (FAR - NEAR))
+        depth[depth >= SKY] = 0.0
+        return np.ascontiguousarray(rgb[::-1]), np.ascontiguousarray(depth[::-1]).astype(np.float32)
+
+    def _draw(self, frame_buffer: Any, eye: Sequence[float], forward: Sequence[float], fov: float) -> None:
+        gl = self._gl
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, frame_buffer)
+        gl.glViewport(0, 0, self.width, self.height)
+        gl.glClearColor(*SKY_COLOUR, 1.0)
+        gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
+        gl.glMatrixMode(gl.GL_PROJECTION)
+        gl.glLoadIdentity()
+        gl.gluPerspective(fov, self.width / self.height, NEAR, FAR)
+        gl.glMatrixMode(gl.GL_MODELVIEW)
+        gl.glLoadIdentity()
+        target = [start + offset for start, offset in zip(eye, forward, strict=True)]
+        gl.gluLookAt(*eye, *target, 0.0, 1.0, 0.0)
+        gl.glCallList(self._scene)
+
+    def _read(self, frame_buffer: Any, channels: int, kind: int, into: Array) -> None:
+        gl = self._gl
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, frame_buffer)
+        gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
+        gl.glReadPixels(0, 0, self.width, self.height, channels, kind, into.ctypes.data_as(ctypes.c_void_p))
+
+    def _frame_buffer(self, samples: int) -> Any:
+        """A frame buffer with eight bits a colour and 32 bits of depth; 0 samples for a plain one."""
+        gl = self._gl
+        frame_buffer = gl.GLuint()
+        gl.glGenFramebuffers(1, frame_buffer)
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, frame_buffer)
+        attachments = ((gl.GL_COLOR_ATTACHMENT0, gl.GL_RGB8), (gl.GL_DEPTH_ATTACHMENT, gl.GL_DEPTH_COMPONENT32F))
+        for attachment, kind in attachments:
+            buffer = gl.GLuint()
+            gl.glGenRenderbuffers(1, buffer)
+            gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
+            gl.glRenderbufferStorageMultisample(gl.GL_RENDERBUFFER, samples, kind, self.width, self.height)
+            gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, attachment, gl.GL_RENDERBUFFER, buffer)
+        if gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER) != gl.GL_FRAMEBUFFER_COMPLETE:
+            size = f"{self.height}x{self.width}"
+            raise PluginError(
+                f"simulator 'miniworld': this OpenGL has no frame buffer of {size} pixels; take a smaller one"
+            )
+        return frame_buffer
+
+    def _set_up(self) -> None:
+        gl = self._gl
+        gl.glColorMaterial(gl.GL_FRONT_AND_BACK, gl.GL_AMBIENT_AND_DIFFUSE)
+        switches = (gl.GL_DEPTH_TEST, gl.GL_CULL_FACE, gl.GL_TEXTURE_2D, gl.GL_LIGHTING, gl.GL_LIGHT0)
+        for switch in (*switches, gl.GL_COLOR_MATERIAL, gl.GL_NORMALIZE, gl.GL_MULTISAMPLE):
+            gl.glEnable(switch)
+        gl.glLightModelfv(gl.GL_LIGHT_MODEL_AMBIENT, (gl.GLfloat * 4)(0.0, 0.0, 0.0, 1.0))
+        gl.glLightfv(gl.GL_LIGHT0, gl.GL_AMBIENT, (gl.GLfloat * 4)(AMBIENT, AMBIENT, AMBIENT, 1.0))
+        gl.glLightfv(gl.GL_LIGHT0, gl.GL_DIFFUSE, (gl.GLfloat * 4)(DIFFUSE, DIFFUSE, DIFFUSE, 1.0))
+
+    def _draw_panel(self, panel: Panel, number: Any) -> None:
+        gl = self._gl
+        gl.glBindTexture(gl.GL_TEXTURE_2D, number)
+        gl.glColor3f(*panel.tint)
+        gl.glBegin(gl.GL_QUADS)
+        gl.glNormal3f(*panel.normal)
+        for tile, corner in zip(panel.tiles, panel.corners, strict=True):
+            gl.glTexCoord2f(*tile)
+            gl.glVertex3f(*corner)
+        gl.glEnd()
+
+    def _draw_mesh(self, thing: Thing, number: int, shape: Mesh) -> None:
+        gl = self._gl
+        scale = min(thing.size[1] / shape.height, thing.radius / shape.radius)
+        gl.glPushMatrix()
+        gl.glTranslatef(thing.ground[0], thing.elevation, thing.ground[1])
+        gl.glRotatef(math.degrees(thing.heading), 0.0, 1.0, 0.0)
+        gl.glScalef(scale, scale, scale)
+        gl.glCallList(number)
+        gl.glPopMatrix()
+
+
+@functools.cache
+def texture(name: str) -> Any:
+    """OpenGL's number of one of MiniWorld's textures; ``portraits/7`` is the eighth portrait by name."""
+    folder = assets() / "textures"
+    if name.startswith("portraits/"):
+        portraits = sorted((folder / "portraits").glob("*.png"))
+        return _upload(portraits[int(name.removeprefix("portraits/")) % len(portraits)])
+    return _upload(folder / f"{name}.png")
+
+
+@functools.cache
+def _upload(path: Path) -> Any:
+    """OpenGL's number of an image file, with smaller copies for the distance."""
+    gl = _graphics()
+    with Image.open(path) as file:
+        image = file.convert("RGB")
+    image = image.resize([min(side, LARGEST_TEXTURE) for side in image.size], Image.Resampling.BOX)
+    number = gl.GLuint()
+    gl.glGenTextures(1, number)
+    gl.glBindTexture(gl.GL_TEXTURE_2D, number)
+    gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
+    pixels = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM).tobytes()
+    gl.glTexImage2D(
+        gl.GL_TEXTURE_2D, 0, gl.GL_RGB8, *image.size, 0, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, pixels
+    )  # fmt: skip
+    gl.glGenerateMipmap(gl.GL_TEXTURE_2D)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MIN_FILTER, gl.GL_LINEAR_MIPMAP_LINEAR)
+    gl.glTexParameteri(gl.GL_TEXTURE_2D, gl.GL_TEXTURE_MAG_FILTER, gl.GL_LINEAR)
+    return number
+
+
+@functools.cache
+def mesh(name: str) -> tuple[int, Mesh]:
+    """OpenGL's display list of one of MiniWorld's meshes, in the file's units, and the mesh."""
+    gl = _graphics()
+    shape = read_mesh(assets() / "meshes" / f"{name}.obj")
+    textures = [_upload(part.image) if part.image else texture("white_1") for part in shape.parts]
+    number = gl.glGenLists(1)
+    gl.glNewList(number, gl.GL_COMPILE)
+    for part, image in zip(shape.parts, textures, strict=True):
+        _draw_part(gl, part, image)
+    gl.glEndList()
+    return number, shape
+
+
+def _draw_part(gl: Any, part: MeshPart, image: Any) -> None:
+    gl.glBindTexture(gl.GL_TEXTURE_2D, image)
+    gl.glColor3f(*part.colour)
+    gl.glBegin(gl.GL_TRIANGLES)
+    for tile, normal, vertex in _rows(part.tiles, part.normals, part.vertices):
+        gl.glTexCoord2f(*tile)
+        gl.glNormal3f(*normal)
+        gl.glVertex3f(*vertex)
+    gl.glEnd()
+
+
+def _rows(*arrays: Array) -> Iterable[tuple[list[float], ...]]:
+    return zip(*(array.tolist() for array in arrays), strict=True)

@@ -1,0 +1,45 @@
+"""What a run writes down: a line of JSON a step, and the loss as a picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+
+class StepLog:
+    """``log.jsonl`` of a run, one line for each optimizer step.
+
+    Args:
+        path: of the file.
+        step: the step to go on from; later lines, of a run that was stopped after its last checkpoint, are dropped.
+    """
+
+    def __init__(self, path: Path, step: int) -> None:
+        self.path = path
+        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        self.rows: list[dict[str, float]] = [row for row in map(_parse, lines) if row and row["step"] <= step]
+        path.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
+
+    def add(self, step: int, values: Mapping[str, float]) -> None:
+        """Append a step's values."""
+        row = {"step": float(step)} | dict(values)
+        self.rows.append(row)
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def draw(self, path: Path) -> None:
+        """The loss curve as PNG."""
+        from persist_cli.viewing.curves import draw_curve
+
+        if self.rows:
+            draw_curve([row["step"] for row in self.rows], [row["loss"] for row in self.rows], path)
+
+
+def _parse(line: str) -> dict[str, float] | None:
+    """A row, or nothing for the half line of a killed run."""
+    try:
+        row: dict[str, float] = json.loads(line)
+    except ValueError:
+        return None
+    return row
