@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
+from persist_cli.world.errors import CheckpointError
 
 
 class Codec(nn.Module):
@@ -76,6 +77,22 @@ class Codec(nn.Module):
         prior = posterior.kl().mean()
         psnr = -10 * torch.log10((error[: len(rgb)] / 2).square().mean())
         return {"loss": reconstruction + kl_weight * prior, "kl": prior, "psnr": psnr}
+
+    def windows(
+        self, rgb: Tensor, depth: Tensor, size: tuple[int, int, int], generators: list[torch.Generator]
+    ) -> tuple[Tensor, Tensor]:
+        """A window of frames × height × width at a random place of each clip.
+
+        Raises:
+            CheckpointError: when a window is larger than the clips.
+        """
+        room = [whole - part for whole, part in zip(depth.shape[1:], size, strict=True)]
+        if min(room) < 0:
+            raise CheckpointError(f"codec_window {size} is larger than the clips, {tuple(depth.shape[1:])}")
+        corners = [[int(torch.randint(0, free + 1, (1,), generator=each)) for free in room] for each in generators]
+        places = [tuple(slice(low, low + part) for low, part in zip(corner, size, strict=True)) for corner in corners]
+        pairs = [(rgb[number][place], depth[number][place]) for number, place in enumerate(places)]
+        return torch.stack([pair[0] for pair in pairs]), torch.stack([pair[1] for pair in pairs])
 
     @torch.no_grad()
     def measure_scale(self, rgb: Tensor, depth: Tensor) -> float:

@@ -36,7 +36,8 @@ def camera_latents(
     rays = plucker(local, printed).permute(0, 1, 4, 2, 3).float()
     pooled = F.avg_pool2d(rays.flatten(0, 1), spatial).unflatten(0, rays.shape[:2])
     padded = torch.cat([pooled[:, :1].expand(-1, temporal - 1, -1, -1, -1), pooled], dim=1)
-    return padded.unflatten(1, (-1, temporal)).flatten(2, 3)
+    folded: Tensor = padded.unflatten(1, (-1, temporal)).flatten(2, 3)
+    return folded
 
 
 def camera_tokens(
@@ -44,7 +45,8 @@ def camera_tokens(
 ) -> Float[Tensor, "batch token channel"]:
     """The camera embedding at each video token: the mean over its patch."""
     pooled = F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, latents.shape[:2])
-    return pooled.flatten(3).transpose(2, 3).flatten(1, 2)
+    tokens: Tensor = pooled.flatten(3).transpose(2, 3).flatten(1, 2)
+    return tokens
 
 
 def interaction_rows(clips: Sequence[Interactions], names: Sequence[str], steps: int) -> Int[Tensor, "batch step"]:

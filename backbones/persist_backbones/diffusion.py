@@ -41,7 +41,8 @@ def loss_weights(
         return torch.ones(len(timesteps), device=timesteps.device)
     signal = scheduler.alphas_cumprod.to(timesteps.device)[timesteps].float()
     snr = signal / (1 - signal).clamp_min(1e-8)
-    return snr.clamp_max(gamma) / (snr + 1)
+    weights: Tensor = snr.clamp_max(gamma) / (snr + 1)
+    return weights
 
 
 def denoise(

@@ -82,8 +82,10 @@ def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
         raise CheckpointError("CogVideoX 1.5 (patch_size_t, ofs) is not supported yet; use a CogVideoX 1.0 checkpoint")
     if settings.height % unit or settings.width % unit:
         raise CheckpointError(f"image size {settings.height}x{settings.width} must be a multiple of {unit}")
-    if (settings.frames - 1) % temporal or settings.frames <= temporal:
-        raise CheckpointError(f"frames a clip must be {temporal}n + 1 with n > 0, not {settings.frames}")
+    for name, frames in (("frames", settings.frames), ("codec_window's frames", (settings.codec_window or (1,))[0])):
+        # diffusers' decoder doubles time in halves and tells a first frame from an odd number of latent frames
+        if (frames - 1) % (2 * temporal) or (name == "frames" and frames == 1):
+            raise CheckpointError(f"{name} must be {2 * temporal}n + 1 with n > 0, not {frames}")
     if config.in_channels not in (vae.latent_channels, 2 * vae.latent_channels):
         raise CheckpointError(
             f"a transformer of {config.in_channels} channels does not fit a VAE of {vae.latent_channels}"

@@ -80,12 +80,14 @@ class CogVideoXSettings:
             its configuration replaces the preset's.
         height: pixels.
         width: pixels.
-        frames: frames a clip, 4n + 1.
+        frames: frames a clip, 8n + 1.
         interactions: actions that change the world; each gets an embedding for each step of a clip.
         rays: ``correct`` Plücker directions, or as the paper ``printed`` them, with the translation added.
         weighting: of the v-prediction loss over noise levels, ``uniform`` or ``min-snr``.
         snr_gamma: of min-SNR.
         kl_weight: of the codec's latent prior.
+        codec_window: frames (1 or 8n + 1), height and width of the random windows that the codec is trained on; one of a
+            quarter of the pixels costs a quarter, and the codec, a convolution, does not mind.
         transformer: changes to the preset's transformer configuration.
         vae: changes to the preset's VAE configuration.
     """
@@ -100,5 +102,6 @@ class CogVideoXSettings:
     weighting: Literal["uniform", "min-snr"] = "uniform"
     snr_gamma: float = 5.0
     kl_weight: float = 1e-6
+    codec_window: tuple[int, int, int] | None = None
     transformer: dict[str, Any] = field(default_factory=dict)
     vae: dict[str, Any] = field(default_factory=dict)

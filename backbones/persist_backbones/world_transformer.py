@@ -88,7 +88,8 @@ class WorldTransformer(nn.Module):
     def embed_time(self, given: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
         """The time embedding with the interactions of the clip added."""
         time: Tensor = self.base.time_embedding(self.base.time_proj(given.timestep).to(dtype))
-        return time + self.interactions(given.interactions).sum(dim=1).to(time.dtype)
+        done: Tensor = self.interactions(given.interactions).sum(dim=1)
+        return time + done.to(time.dtype)
 
     def embed_patches(self, latents: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
         """Text and video tokens: diffusers' patch embedding of its own channels plus that of the new ones."""

@@ -133,7 +133,8 @@ class GridMemory(Memory):
         """The cells' centres, in the colours of their nearest observations."""
         packed = self.grid.values("colors")
         colors = torch.stack([packed >> shift & 255 for shift in (16, 8, 0)], dim=-1)
-        return MapPoints(self._in_world(self._centers(self.grid.keys)), colors.to(torch.uint8))
+        centers = self._in_world(self._centers(self.grid.keys))
+        return MapPoints(centers, colors.to(torch.uint8), self.lattice.across)
 
     def figures(self) -> MemoryFigures:
         """Cells, bytes, and the corners of the least world-aligned box around all cells."""

@@ -38,7 +38,7 @@ class Map2D(GridMemory):
     def make_lattice(self) -> Lattice:
         """Cells on the plane perpendicular to up, of any direction."""
         size = torch.tensor([self.settings.cell[0], 1.0, self.settings.cell[1]], dtype=torch.float64)
-        return Lattice(size, ground_basis(self.reference.world_up), flat=True)
+        return Lattice(size, ground_basis(self.reference.world_up), max(self.settings.cell), flat=True)
 
     def views(self, cameras: Cameras) -> Views:
         """The cameras' horizontal fields of view."""

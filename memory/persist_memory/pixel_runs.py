@@ -23,8 +23,9 @@ from persist_memory.sparse_grid import LIMIT, pack
 # there would split each in two by the noise of depth. The millionth keeps a point that lies on a boundary to the
 # last bit on one side of it, wherever the world's origin is.
 CENTERED = 0.5 + 1e-6
-NOWHERE = -1  # the key of a pixel that falls into no cell
-CHUNK = 1 << 19  # numbers computed at once: they stay in the cache
+AXIS_BITS = 21
+NOWHERE = torch.iinfo(torch.int64).min  # the cell of a pixel that falls into none
+CHUNK = 1 << 17  # numbers computed at once: they stay in the cache
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,13 @@ class Lattice:
     Args:
         size: metres of a cell along each axis of the grid.
         grid_from_world: the rotation into the grid's axes, float64.
+        across: metres of a cell along the ground, the longer way.
         flat: the middle axis is left out: all heights fall into one cell.
     """
 
     size: Float[Tensor, " 3"]
     grid_from_world: Float[Tensor, "3 3"]
+    across: float
     flat: bool = False
 
 
@@ -61,8 +64,8 @@ class PixelRuns:
 
     Args:
         cell: position of each run's cell in ``keys``.
-        keys: the cells, sorted.
-        colors: for each cell its nearest observation, as ``packed_colors``.
+        keys: of the cells, sorted.
+        colors: for each cell the nearest first pixel of its runs, as ``packed_colors``.
         frame: of each run.
         row: of each run.
         first: column of the first pixel.
@@ -81,60 +84,72 @@ class PixelRuns:
 def pixel_cells(
     observations: Observations, lattice: Lattice, sampling: Sampling
 ) -> Int64[Tensor, "frame height width"]:
-    """The key of the cell of every strided pixel, ``NOWHERE`` without valid depth.
+    """The cell of every strided pixel in one number, ``NOWHERE`` without valid depth or beyond the grid.
 
     The same as dividing ``geometry.unproject``, but axis by axis, without an array of points.
     """
-    stride, size = sampling.stride, lattice.size.to(observations.depth.device)
+    stride, cameras = sampling.stride, observations.cameras
     depth = observations.depth[:, ::stride, ::stride].double()
-    valid = torch.isfinite(depth) & (depth > 0)
-    if sampling.max_depth is not None:
-        valid &= depth <= sampling.max_depth
-    depth = torch.where(valid, depth, 0.0)
-    pose = observations.cameras.world_from_camera.double()
-    turn = lattice.grid_from_world.to(pose.device)
-    rays = turn @ pose[:, :3, :3] @ torch.linalg.inv(observations.cameras.intrinsics.double()) / size[:, None]
+    size, turn = lattice.size.to(depth.device), lattice.grid_from_world.to(depth.device)
+    pose, intrinsics = cameras.world_from_camera.double(), cameras.intrinsics.double()
+    rays = turn @ pose[:, :3, :3] @ torch.linalg.inv(intrinsics) / size[:, None]
     start = pose[:, :3, 3] @ turn.T / size + CENTERED
-    v = torch.arange(0, observations.depth.shape[1], stride, device=depth.device)[:, None] + 0.5
-    u = torch.arange(0, observations.depth.shape[2], stride, device=depth.device) + 0.5
-    axes = []
-    for axis in range(3):
+    v = torch.arange(0, cameras.height, stride, device=depth.device)[:, None] + 0.5
+    u = torch.arange(0, cameras.width, stride, device=depth.device) + 0.5
+    reach = rays.abs() @ rays.new_tensor([cameras.width, cameras.height, 1.0])
+    farthest = float(((LIMIT - 1 - start.abs()) / reach).amin())  # metres that surely stay within the grid
+    cells = torch.zeros(depth.shape, dtype=torch.int64, device=depth.device)
+    for axis in (0, 2) if lattice.flat else (0, 1, 2):
         a, b, c = (rays[:, axis, i, None, None] for i in range(3))
-        cell = torch.floor(depth * (a * u + (b * v + c)) + start[:, axis, None, None])
-        if lattice.flat and axis == 1:
-            cell.zero_()
-        valid &= (cell >= -LIMIT) & (cell < LIMIT)
-        axes.append(cell)
-    keys = pack(*(torch.where(valid, cell, 0.0).long() for cell in axes))
-    return torch.where(valid, keys, NOWHERE)
+        cell = (a * u + (b * v + c)).mul_(depth).add_(start[:, axis, None, None]).floor_()
+        cells.add_(cell.long() << AXIS_BITS * axis)
+    valid = (depth > 0) & (depth <= min(sampling.max_depth or math.inf, farthest))
+    return torch.where(valid, cells, NOWHERE)
 
 
-def packed_colors(observations: Observations, stride: int) -> Int64[Tensor, "frame height width"]:
-    """Depth in millimetres and RGB in one integer: the least one is the nearest observation, in any order."""
-    depth = observations.depth[:, ::stride, ::stride].nan_to_num(0.0, 0.0, 0.0)
-    red, green, blue = observations.rgb[:, ::stride, ::stride].long().unbind(-1)
-    return (depth.double() * 1000).round().long() << 24 | red << 16 | green << 8 | blue
+def keys_of(cells: Int64[Tensor, " cell"]) -> Int64[Tensor, " cell"]:
+    """Keys of the cells that ``pixel_cells`` has put into one number."""
+    axes = []
+    for _ in range(3):
+        axes.append((cells + LIMIT & 2 * LIMIT - 1) - LIMIT)
+        cells = (cells - axes[-1]) >> AXIS_BITS
+    return pack(*axes)
+
+
+def packed_colors(observations: Observations, frame: Tensor, row: Tensor, column: Tensor) -> Int64[Tensor, " pixel"]:
+    """Depth in millimetres and RGB of pixels in one integer: the least one is the nearest, in any order."""
+    depth = (observations.depth[frame, row, column].double() * 1000).round().long()
+    red, green, blue = observations.rgb[frame, row, column].long().unbind(-1)
+    return depth << 24 | red << 16 | green << 8 | blue
 
 
 def find_runs(observations: Observations, lattice: Lattice, sampling: Sampling, feature_columns: int) -> PixelRuns:
     """The runs of some frames; none when no pixel has valid depth."""
-    keys = pixel_cells(observations, lattice, sampling)
-    _, height, width = keys.shape
-    tile = torch.floor(_source(torch.arange(width, device=keys.device), observations, sampling, feature_columns))
-    starts = torch.ones_like(keys, dtype=torch.bool)
-    starts[..., 1:] = (keys[..., 1:] != keys[..., :-1]) | (tile[1:] != tile[:-1])
-    first = starts.flatten().nonzero()[:, 0]
-    length = torch.diff(first, append=first.new_tensor([keys.numel()]))
-    run_keys = keys.flatten()[first]
-    placed = run_keys != NOWHERE
-    unique, cell = torch.unique(run_keys[placed], return_inverse=True)
-    colors = packed_colors(observations, sampling.stride).flatten()
-    where = torch.full_like(run_keys, len(unique)).masked_scatter_(placed, cell).repeat_interleave(length)
-    nearest = torch.full((len(unique) + 1,), torch.iinfo(torch.int64).max, device=keys.device)
-    nearest = nearest.scatter_reduce(0, where, colors, "amin")[:-1]
-    first, length = first[placed], length[placed]
-    frame, row, column = first // (height * width), first // width % height, first % width
-    return PixelRuns(cell, unique, nearest, frame, row, column, column + length - 1)
+    cells = pixel_cells(observations, lattice, sampling)
+    _, height, width = cells.shape
+    tile = torch.floor(_source(torch.arange(width, device=cells.device), observations, sampling, feature_columns))
+    starts = torch.ones_like(cells, dtype=torch.bool)
+    starts[..., 1:] = (cells[..., 1:] != cells[..., :-1]) | (tile[1:] != tile[:-1])
+    frame, row, column = starts.nonzero(as_tuple=True)
+    first = (frame * height + row) * width + column
+    length = torch.diff(first, append=first.new_tensor([cells.numel()]))
+    run_cells = cells.flatten()[first]
+    placed = run_cells != NOWHERE
+    frame, row, column, length = (values[placed] for values in (frame, row, column, length))
+    keys, cell = _sorted_keys(run_cells[placed])
+    stride = sampling.stride
+    colors = packed_colors(observations, frame, row * stride, column * stride)
+    nearest = torch.full_like(keys, torch.iinfo(torch.int64).max).scatter_reduce(0, cell, colors, "amin")
+    return PixelRuns(cell, keys, nearest, frame, row, column, column + length - 1)
+
+
+def _sorted_keys(cells: Int64[Tensor, " run"]) -> tuple[Int64[Tensor, " cell"], Int64[Tensor, " run"]]:
+    """The sorted keys of cells, and for each cell the position of its key."""
+    distinct, to_distinct = torch.unique_consecutive(cells, return_inverse=True)  # leaves less to sort
+    unique, to_unique = torch.unique(distinct, return_inverse=True)
+    keys, order = keys_of(unique).sort()
+    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+    return keys, rank[to_unique[to_distinct]]
 
 
 class RunFeatures:

@@ -99,7 +99,8 @@ class SnapshotStore:
             [u.repeat(rows) * width, v.repeat_interleave(columns) * height, torch.ones_like(self.depth).double()], -1
         )
         local = pixels @ torch.linalg.inv(self.intrinsics).mT * self.depth.double()[..., None]
-        return local @ self.world_from_camera[:, :3, :3].mT + self.world_from_camera[:, None, :3, 3]
+        points: Tensor = local @ self.world_from_camera[:, :3, :3].mT + self.world_from_camera[:, None, :3, 3]
+        return points
 
 
 def patch_depth(
@@ -111,7 +112,7 @@ def patch_depth(
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.nan)
     patches = depth.reshape(len(depth), grid[0], whole[0] // grid[0], grid[1], whole[1] // grid[1])
     median = torch.nanmedian(patches.transpose(2, 3).flatten(3), dim=-1).values
-    return torch.nan_to_num(median, nan=0.0)
+    return torch.where(torch.isnan(median), 0.0, median)
 
 
 def content_number(observations: Observations, frame: int) -> int:

@@ -23,6 +23,7 @@ from persist_memory.snapshot_store import SnapshotStore
 from persist_memory.stored import check_mergeable, check_observations, check_tensors
 
 FRAMES_AT_ONCE = 16
+DRAWN = 0.12  # metres across of a drawn patch
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class Snapshots(Memory):
     def points(self) -> MapPoints:
         """All patches that have depth."""
         placed = self.album.depth > 0
-        return MapPoints(self.album.points[placed], self.album.colors[placed])
+        return MapPoints(self.album.points[placed], self.album.colors[placed], DRAWN)
 
     def figures(self) -> MemoryFigures:
         """How many snapshots, their bytes, and the bounds of their patches."""

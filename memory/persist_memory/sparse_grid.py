@@ -107,7 +107,7 @@ class SparseGrid:
         """
         if not len(self) and keys.device != self.device:
             self._start(keys.device)
-        keys = keys.to(self.device)
+        keys, values = keys.to(self.device), {name: value.to(self.device) for name, value in values.items()}
         places = torch.searchsorted(self.keys, keys)
         known = self._holds(keys, places)
         self._reduce(self._rows[places[known]], known, values)
@@ -141,7 +141,7 @@ class SparseGrid:
     def _reduce(self, rows: Tensor, chosen: Tensor, values: Mapping[str, Tensor]) -> None:
         for name, column in self.columns.items():
             buffer = self._buffers[name]
-            buffer[rows] = _REDUCE[column.reduction](buffer[rows], values[name][chosen].to(buffer))
+            buffer[rows] = _REDUCE[column.reduction](buffer[rows], values[name][chosen])
 
     def _append(self, keys: Tensor, places: Tensor, chosen: Tensor, values: Mapping[str, Tensor]) -> None:
         old, new = len(self), len(keys)
@@ -151,7 +151,7 @@ class SparseGrid:
                 grown = column.rows(max(2 * len(buffer), old + new), self.device)
                 grown[:old] = buffer[:old]
                 self._buffers[name] = buffer = grown
-            buffer[old : old + new] = values[name][chosen].to(buffer)
+            buffer[old : old + new] = values[name][chosen]
         at = places + torch.arange(new, device=self.device)
         kept = torch.ones(old + new, dtype=torch.bool, device=self.device)
         kept[at] = False

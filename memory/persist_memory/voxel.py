@@ -37,9 +37,10 @@ class VoxelMemory(GridMemory):
     def make_lattice(self) -> Lattice:
         """Cells along the world's axes, their height along the one nearest to up."""
         size = list(self.settings.cell)
+        across = max(size[0], size[2])
         vertical = int(torch.tensor(self.reference.world_up).abs().argmax())
         size[1], size[vertical] = size[vertical], size[1]
-        return Lattice(torch.tensor(size, dtype=torch.float64), torch.eye(3, dtype=torch.float64))
+        return Lattice(torch.tensor(size, dtype=torch.float64), torch.eye(3, dtype=torch.float64), across)
 
     def views(self, cameras: Cameras) -> Views:
         """The cameras' frustums."""

@@ -28,7 +28,7 @@ FRAME = re.compile(r"^(?P<stem>frame-(?P<number>\d+))\.(?P<part>color\.jpg|color
 SEQUENCE = re.compile(r"^seq-?\d+$")
 NO_DEPTH = (0, 65535)
 FRAMES_PER_SECOND = 30.0
-DAMPING = 0.05  # how far the mean of the cameras' own up counts against their horizontal axes
+ROLL = 0.07  # radians, four degrees: how much a person holding a camera rolls it
 
 
 @dataclass(frozen=True)
@@ -66,14 +66,15 @@ def estimate_up(poses: np.ndarray[Any, Any]) -> tuple[float, float, float]:
     """Up in the world, which 7-Scenes does not say: nearly across all the cameras' horizontal (x) axes.
 
     A hand-held camera pitches a lot and rolls little. The mean of the cameras' -y axes is taken, and what of it
-    lies along the x axes is damped; where all cameras look the same way it stays as it is.
+    lies where the x axes spread by more than the usual roll is damped. On the kitchen of 7-Scenes this is 9° off
+    the normal of the work top, the plain mean 26°.
 
     Args:
         poses: world_from_camera ``[frame, 4, 4]``.
     """
     right, up = poses[:, :3, 0], -poses[:, :3, 1].mean(0)
     spread = right.T @ right / len(right)
-    estimate = np.linalg.solve(spread + DAMPING * np.eye(3), up)
+    estimate = np.linalg.solve(spread + ROLL**2 * np.eye(3), up)
     length = float(np.linalg.norm(estimate))
     if length < 1e-6:  # as many cameras upside down as upright
         return 0.0, -1.0, 0.0
@@ -132,7 +133,9 @@ def _intrinsics(folder: Path) -> np.ndarray[Any, Any]:
     candidates = [folder / INTRINSICS, folder.parent / INTRINSICS]
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
     if path is None:
-        raise DataError(f"{candidates[0]}: no such file; write the 3×3 matrix there (7-Scenes: 585 0 320 0 585 240 0 0 1)")
+        raise DataError(
+            f"{candidates[0]}: no such file; write the 3×3 matrix there (7-Scenes: 585 0 320 0 585 240 0 0 1)"
+        )
     matrix = read_matrix(path, 3, 3)
     check_intrinsics(torch.from_numpy(matrix), str(path))
     matrix[:2, 2] += 0.5

@@ -20,7 +20,7 @@ from persist_cli.simulators.houses import (
     door_span,
 )
 
-MOST_PICTURES = 3  # a wall
+PICTURES = (1, 5)  # tries a wall, the last not included
 PORTRAITS = 82  # in MiniWorld's folder of them
 BESIDE = 0.15  # metres between a picture and the next, or a doorway
 WALL_TEXTURES = (
@@ -69,12 +69,12 @@ def paint_ceiling(random: np.random.Generator) -> Paint:
 
 def paint(textures: tuple[str, ...], random: np.random.Generator) -> Paint:
     """One of the textures in a random colour, its tiles one to two and a half metres wide."""
-    return Paint(pick(textures, random), tint(random, 0.75), float(random.uniform(1.0, 2.5)))
+    return Paint(pick(textures, random), tint(random, 0.6), float(random.uniform(1.0, 2.5)))
 
 
 def tint(random: np.random.Generator, saturation: float) -> Colour:
     """A bright colour, at most this saturated."""
-    hue, value = float(random.random()), float(random.uniform(0.7, 1.0))
+    hue, value = float(random.random()), float(random.uniform(0.8, 1.0))
     return colorsys.hsv_to_rgb(hue, float(random.uniform(0.0, saturation)), value)
 
 
@@ -89,7 +89,7 @@ def _pictures(ground: Rectangle, wall: int, doors: tuple[Door, ...], random: np.
     spans = [door_span(ground, wall, door.passage) for door in doors]
     taken = [(span[0] - BESIDE, span[1] + BESIDE) for span in spans if span is not None]
     pictures = []
-    for _ in range(int(random.integers(0, MOST_PICTURES + 1))):
+    for _ in range(int(random.integers(*PICTURES))):
         picture = _picture(wall, length, random)
         low, high = picture.along - picture.width / 2 - BESIDE, picture.along + picture.width / 2 + BESIDE
         if low > 0 and high < length and all(high < other[0] or low > other[1] for other in taken):

@@ -6,6 +6,7 @@ be joined in loops; half a wall's thickness is then taken from each side.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +14,12 @@ import numpy as np
 from persist_cli.simulators.houses import EAST, NORTH, SOUTH, WALL_THICKNESS, Rectangle
 
 LATTICE = 0.5  # metres
-SIDES = (7, 13)  # lattice steps of a room's side, the last not included
+SIDES = (8, 13)  # lattice steps of a room's side, the last not included
 ALONE = (9, 15)  # of the only room of a house
 DOOR_WIDTHS = (0.95, 1.3)
 DOOR_CORNER = 0.3  # metres of wall left beside a doorway
 SECOND_DOOR = 0.6  # how often rooms that happen to touch get a doorway, too
-TRIES = 400
+TRIES = 12  # for each room; of those that fit, the one nearest the middle is taken: houses are compact
 
 
 @dataclass(frozen=True)
@@ -35,19 +36,30 @@ def plan_floor(random: np.random.Generator, count: int) -> tuple[list[Rectangle]
     width, depth = _size(random, ALONE if count == 1 else SIDES)
     outlines = [Rectangle(0.0, 0.0, width, depth)]
     doorways: list[Doorway] = []
-    for _ in range(TRIES):
-        if len(outlines) == count:
+    while len(outlines) < count:
+        additions = [addition for _ in range(TRIES) if (addition := _addition(outlines, random)) is not None]
+        if not additions:
             break
-        parent = int(random.integers(len(outlines)))
-        outline = _beside(outlines[parent], int(random.integers(4)), random)
-        if any(outline.overlaps(other) for other in outlines):
-            continue
-        doorway = _doorway(outlines[parent], outline, (parent, len(outlines)), random)
-        if doorway is not None:
-            outlines.append(outline)
-            doorways.append(doorway)
+        outline, doorway = min(additions, key=lambda addition: math.dist(addition[0].center, _middle(outlines)))
+        outlines.append(outline)
+        doorways.append(doorway)
     doorways += _second_doorways(outlines, doorways, random)
     return [outline.grown(-WALL_THICKNESS / 2, -WALL_THICKNESS / 2) for outline in outlines], doorways
+
+
+def _addition(outlines: list[Rectangle], random: np.random.Generator) -> tuple[Rectangle, Doorway] | None:
+    """A further room and the doorway to it, ``None`` where it does not fit."""
+    parent = int(random.integers(len(outlines)))
+    outline = _beside(outlines[parent], int(random.integers(4)), random)
+    if any(outline.overlaps(other) for other in outlines):
+        return None
+    doorway = _doorway(outlines[parent], outline, (parent, len(outlines)), random)
+    return None if doorway is None else (outline, doorway)
+
+
+def _middle(outlines: list[Rectangle]) -> tuple[float, float]:
+    x, z = np.mean([outline.center for outline in outlines], axis=0)
+    return float(x), float(z)
 
 
 def _size(random: np.random.Generator, sides: tuple[int, int]) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from persist_cli.simulators.houses import NORTH, SOUTH, Door, Ground, Paint, Rec
 
 FEWEST_THINGS = 3
 TRIES = 80
-GAP = 0.55  # metres between any two things, and from things to a doorway: an agent of radius 0.25 passes
+GAP = 0.8  # metres between any two things, and from things to a doorway: an agent of radius 0.25 passes easily
 
 BOX_TEXTURES = (
     "cardboard_1", "cardboard_2", "wood_1", "wood_planks_1", "metal_grill_2", "door_steel_red", "door_steel_grey",
@@ -53,8 +53,8 @@ def furnish(ground: Rectangle, doors: tuple[Door, ...], random: np.random.Genera
     near = [door.passage.center for door in doors if door.passage.grown(0.1, 0.1).overlaps(ground)]
     wanted = FEWEST_THINGS + int(random.integers(0, 2 + int(ground.width * ground.depth / 6)))
     things: list[Thing] = []
-    for attempt in range(TRIES):
-        if len(things) >= wanted:
+    for attempt in range(10 * TRIES):
+        if len(things) >= (wanted if attempt < TRIES else FEWEST_THINGS):
             break
         thing = _thing(ground, random, small=attempt > TRIES // 3)
         if _fits(thing, ground, things, near):
@@ -72,7 +72,7 @@ def _fits(thing: Thing, ground: Rectangle, things: list[Thing], doorways: list[G
     reach = thing.radius + GAP / 2
     if any(math.dist(thing.ground, other.ground) < thing.radius + other.radius + GAP for other in things):
         return False
-    if any(math.dist(thing.ground, doorway) < thing.radius + GAP + 0.45 for doorway in doorways):
+    if any(math.dist(thing.ground, doorway) < thing.radius + GAP + 0.2 for doorway in doorways):
         return False
     to_x, to_z = min(x - ground.low_x, ground.high_x - x), min(z - ground.low_z, ground.high_z - z)
     border = GAP / 2

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 Ground = tuple[float, float]
 Colour = tuple[float, float, float]
@@ -159,7 +160,7 @@ class Thing:
         """Whether it is drawn from a mesh."""
         return self.shape not in ("box", "table")
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Metres of the circle around its ground."""
         return self.size[0] / 2 if self.is_mesh else math.hypot(self.size[0], self.size[2]) / 2
@@ -219,12 +220,16 @@ class House:
         """The number of the room around a position, ``None`` in doorways and outside."""
         return next((number for number, room in enumerate(self.rooms) if room.ground.contains(ground)), None)
 
-    def is_free(self, ground: Ground, radius: float, things: Iterable[Thing]) -> bool:
-        """Whether a circle on the ground touches neither a wall nor one of the things."""
-        inside = any(room.ground.grown(-radius, -radius).contains(ground) for room in self.rooms)
-        if not inside and not any(door.walkway(radius).contains(ground) for door in self.doors):
-            return False
-        return all(thing.distance(ground) >= radius for thing in things)
+    def walkable(self, radius: float) -> list[Rectangle]:
+        """Where the centre of a circle on the ground may be without touching a wall."""
+        rooms = [room.ground.grown(-radius, -radius) for room in self.rooms]
+        return rooms + [door.walkway(radius) for door in self.doors]
+
+
+def is_clear(ground: Ground, radius: float, things: Iterable[Thing]) -> bool:
+    """Whether a circle on the ground touches none of the things."""
+    near = [thing for thing in things if math.dist(ground, thing.ground) < thing.radius + radius]
+    return all(thing.distance(ground) >= radius for thing in near)
 
 
 def door_span(ground: Rectangle, wall: int, passage: Rectangle) -> tuple[float, float] | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from persist_cli.simulators.building import build_house
-from persist_cli.simulators.houses import Ground, House, Thing
+from persist_cli.simulators.houses import Ground, House, Rectangle, Thing, is_clear
 from persist_cli.simulators.rendering import Renderer
 from persist_cli.world.actions import ActionVocabulary, walking_actions
 from persist_cli.world.errors import DataError
@@ -17,7 +17,7 @@ from persist_cli.world.simulator import AgentSettings, Simulator
 
 GRAIN = 2.0**32  # positions are whole multiples of this part of a metre, so that going back is exact
 STRIDE = 0.1  # metres between the places that are checked along a step
-REACH = 0.9  # metres to a thing that can be picked up or toggled
+REACH = 1.5  # metres to a thing that can be picked up or toggled: nearer ones are below the image
 CARRIED_HEIGHT = 0.6  # metres above the floor
 UP = (0.0, 1.0, 0.0)
 
@@ -60,6 +60,7 @@ class MiniWorld(Simulator):
         self.vocabulary: ActionVocabulary = walking_actions(settings.step, settings.turn)
         self._renderer = Renderer(settings.height, settings.width)
         self._house: House | None = None
+        self._walkable: list[Rectangle] = []
         self._things: list[Thing] = []
         self._carried: Thing | None = None
         self._stale = True  # whether the renderer has yet to hear of a change
@@ -82,6 +83,7 @@ class MiniWorld(Simulator):
         if scene < 0:
             raise DataError(f"scene {scene}: seeds of houses are not negative")
         self._house = build_house(scene)
+        self._walkable = self.house.walkable(self.settings.radius)
         self._things, self._carried, self._stale = self.house.things, None, True
 
     def place(self, ground: tuple[float, float], heading: float) -> None:
@@ -108,7 +110,7 @@ class MiniWorld(Simulator):
         return Frame(rgb, depth, pose)
 
     def act(self, action: str) -> bool:
-        """Do an action; false, and nothing changed, where a wall or thing is in the way or there is nothing to do it to.
+        """Do an action; false, and nothing changed, where something is in the way or there is nothing to do it to.
 
         Raises:
             DataError: for an unknown action.
@@ -135,7 +137,8 @@ class MiniWorld(Simulator):
 
     def is_free(self, ground: tuple[float, float]) -> bool:
         """Whether the agent could stand there."""
-        return self.house.is_free(ground, self.settings.radius, self._things)
+        between_walls = any(rectangle.contains(ground) for rectangle in self._walkable)
+        return between_walls and is_clear(ground, self.settings.radius, self._things)
 
     def ahead(self, heading: float) -> tuple[float, float]:
         """Unit ground direction of a heading."""
@@ -176,15 +179,22 @@ class MiniWorld(Simulator):
 
     def _can_go(self, ground: Ground, turned: float) -> bool:
         """Whether the agent, with what it carries, passes nothing on the straight way there."""
-        strides = max(1, math.ceil(math.dist(self._ground, ground) / STRIDE))
-        shares = [stride / strides for stride in range(1, strides + 1)]
-        way = [tuple(a + share * (b - a) for a, b in zip(self._ground, ground, strict=True)) for share in shares]
-        if not all(self.is_free((x, z)) for x, z in way):
+        if not all(self.is_free(place) for place in self._way(ground)):
             return False
         if self._carried is None:
             return True
-        carried = self._carried_thing(ground, self._start_heading + math.radians(turned))
-        return self.house.is_free(carried.ground, carried.radius, self._things)
+        return self._has_room(self._carried_thing(ground, self._start_heading + math.radians(turned)), self._things)
+
+    def _way(self, ground: Ground) -> list[Ground]:
+        """Places along the straight way from the agent, the last one included."""
+        strides = max(1, math.ceil(math.dist(self._ground, ground) / STRIDE))
+        (x, z), (to_x, to_z) = self._ground, ground
+        return [(x + n / strides * (to_x - x), z + n / strides * (to_z - z)) for n in range(1, strides + 1)]
+
+    def _has_room(self, carried: Thing, others: list[Thing]) -> bool:
+        """Whether what is carried touches neither walls nor other things."""
+        between_walls = any(area.contains(carried.ground) for area in self.house.walkable(carried.radius))
+        return between_walls and is_clear(carried.ground, carried.radius, others)
 
     def _carried_thing(self, ground: Ground, heading: float) -> Thing:
         """What the agent carries, as it hangs before an agent at this place."""
@@ -203,8 +213,13 @@ class MiniWorld(Simulator):
             offset = thing.ground[0] - self._ground[0], thing.ground[1] - self._ground[1]
             distance, along = math.hypot(*offset), offset[0] * x + offset[1] * z
             if thing.movable and distance < REACH + thing.radius and along > 0.8 * distance:
-                near.append((distance, thing))
+                near += [(distance, thing)] if self._no_wall_before(thing.ground) else []
         return min(near, key=lambda item: item[0])[1] if near else None
+
+    def _no_wall_before(self, ground: Ground) -> bool:
+        """Whether the straight way from the agent stays within rooms and doorways."""
+        areas = self.house.walkable(0.0)
+        return all(any(area.contains(place) for area in areas) for place in self._way(ground))
 
     def _pick_up(self) -> bool:
         thing = self._within_reach()
@@ -212,8 +227,7 @@ class MiniWorld(Simulator):
             return False
         others = [other for other in self._things if other is not thing]
         self._carried = thing
-        carried = self._carried_thing(self._ground, self._heading)
-        if not self.house.is_free(carried.ground, carried.radius, others):
+        if not self._has_room(self._carried_thing(self._ground, self._heading), others):
             self._carried = None
             return False
         self._things, self._stale = others, True

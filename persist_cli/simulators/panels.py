@@ -51,8 +51,9 @@ class Panel:
     @property
     def normal(self) -> Points:
         """Unit vector out of its front."""
-        normal = np.cross(self.corners[1] - self.corners[0], self.corners[3] - self.corners[0])
-        return normal / np.linalg.norm(normal)
+        normal: Points = np.cross(self.corners[1] - self.corners[0], self.corners[3] - self.corners[0])
+        normal /= np.linalg.norm(normal)
+        return normal
 
 
 def house_panels(house: House, things: Iterable[Thing]) -> Iterator[Panel]:

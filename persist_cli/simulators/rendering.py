@@ -11,7 +11,9 @@ import functools
 import importlib.util
 import math
 import os
+import warnings
 from collections.abc import Iterable, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,7 @@ SKY = 99.0  # what seems farther away is missing
 SKY_COLOUR = (0.25, 0.82, 1.0)
 SAMPLES = 4
 LARGEST_TEXTURE = 256  # pixels of a side
-AMBIENT, DIFFUSE = 0.62, 0.42  # light from everywhere, and from the house's own direction
+AMBIENT, DIFFUSE = 0.75, 0.4  # light from everywhere, and from the house's own direction
 EGL_PACKAGES = "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri"
 
 Array = np.ndarray[Any, Any]
@@ -42,7 +44,7 @@ def assets() -> Path:
         PluginError: when the package is not installed.
     """
     found = importlib.util.find_spec("miniworld")
-    if found is None or not found.submodule_search_locations:
+    if found is None or not found.submodule_search_locations or importlib.util.find_spec("pyglet") is None:
         raise PluginError(
             "simulator 'miniworld' needs the package miniworld; install it with `pip install 'persist-cli[miniworld]'`"
         )
@@ -50,8 +52,8 @@ def assets() -> Path:
 
 
 @functools.cache
-def _graphics() -> Any:
-    """OpenGL's functions, with the one context of this process made current.
+def _context() -> tuple[Any, Any]:
+    """OpenGL's functions, and the one invisible window of this process that they draw for.
 
     Raises:
         PluginError: when OpenGL cannot be had without a screen.
@@ -61,16 +63,25 @@ def _graphics() -> Any:
     import pyglet
 
     pyglet.options["headless"] = True
-    pyglet.options["debug_gl"] = False
+    pyglet.options["debug_gl"] = False  # else every call asks for errors
+    pyglet.options["shadow_window"] = False  # else the import opens a window, and fails where it cannot
     try:
         from pyglet import gl
         from pyglet.window import NoSuchConfigException, NoSuchDisplayException, Window
     except (ImportError, ValueError, AttributeError) as error:
         raise PluginError(_no_egl(error)) from error
     try:
-        gl.persist_window = Window(width=1, height=1, visible=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what pyglet tries instead fails, too, and that is told below
+            return gl, Window(width=1, height=1, visible=False)
     except (NoSuchConfigException, NoSuchDisplayException, gl.ContextException, gl.lib.GLException) as error:
         raise PluginError(_no_egl(error)) from error
+
+
+def _graphics() -> Any:
+    """OpenGL's functions, drawing for persist whatever else this process draws."""
+    gl, window = _context()
+    window.switch_to()
     return gl
 
 
@@ -96,14 +107,14 @@ class Renderer:
 
     def load(self, house: House, things: Sequence[Thing]) -> None:
         """Take a house, with its things as they are now, for the images to come."""
-        gl = self._gl
-        panels = list(house_panels(house, things))
-        textures = [texture(panel.texture) for panel in panels]
+        gl = _graphics()
+        panels = sorted(house_panels(house, things), key=lambda panel: panel.texture)
+        painted = [(texture(name), list(group)) for name, group in groupby(panels, key=lambda panel: panel.texture)]
         meshes = [(thing, mesh(thing.shape)) for thing in things if thing.is_mesh]
         gl.glNewList(self._scene, gl.GL_COMPILE)
         gl.glLightfv(gl.GL_LIGHT0, gl.GL_POSITION, (gl.GLfloat * 4)(*house.light, 0.0))
-        for panel, number in zip(panels, textures, strict=True):
-            self._draw_panel(panel, number)
+        for number, group in painted:
+            self._draw_panels(group, number)
         for thing, (number, shape) in meshes:
             self._draw_mesh(thing, number, shape)
         gl.glEndList()
@@ -114,7 +125,7 @@ class Renderer:
         Returns:
             rgb uint8 ``[height, width, 3]``, and planar depth float32 metres ``[height, width]``, 0 for the sky.
         """
-        gl = self._gl
+        gl = _graphics()
         self._draw(self._sampled, eye, forward, fov)
         gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._sampled)
         gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._resolved)
@@ -122,7 +133,9 @@ class Renderer:
         gl.glBlitFramebuffer(*whole, *whole, gl.GL_COLOR_BUFFER_BIT, gl.GL_NEAREST)
         rgb = np.empty((self.height, self.width, 3), np.uint8)
         self._read(self._resolved, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, rgb)
+        self._paint(False)
         self._draw(self._single, eye, forward, fov)
+        self._paint(True)
         buffer = np.empty((self.height, self.width), np.float32)
         self._read(self._single, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, buffer)
         depth = NEAR * FAR / (FAR - buffer.astype(np.float64) * (FAR - NEAR))
@@ -149,6 +162,13 @@ class Renderer:
         gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, frame_buffer)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
         gl.glReadPixels(0, 0, self.width, self.height, channels, kind, into.ctypes.data_as(ctypes.c_void_p))
+
+    def _paint(self, wanted: bool) -> None:
+        """Whether what is drawn has colours, or depth alone."""
+        gl = self._gl
+        gl.glColorMask(*(4 * [wanted]))
+        for switch in (gl.GL_TEXTURE_2D, gl.GL_LIGHTING):
+            (gl.glEnable if wanted else gl.glDisable)(switch)
 
     def _frame_buffer(self, samples: int) -> Any:
         """A frame buffer with eight bits a colour and 32 bits of depth; 0 samples for a plain one."""
@@ -180,15 +200,17 @@ class Renderer:
         gl.glLightfv(gl.GL_LIGHT0, gl.GL_AMBIENT, (gl.GLfloat * 4)(AMBIENT, AMBIENT, AMBIENT, 1.0))
         gl.glLightfv(gl.GL_LIGHT0, gl.GL_DIFFUSE, (gl.GLfloat * 4)(DIFFUSE, DIFFUSE, DIFFUSE, 1.0))
 
-    def _draw_panel(self, panel: Panel, number: Any) -> None:
+    def _draw_panels(self, panels: Sequence[Panel], number: Any) -> None:
+        """All panels of one texture at once: each change of texture costs as much as thirty panels."""
         gl = self._gl
         gl.glBindTexture(gl.GL_TEXTURE_2D, number)
-        gl.glColor3f(*panel.tint)
         gl.glBegin(gl.GL_QUADS)
-        gl.glNormal3f(*panel.normal)
-        for tile, corner in zip(panel.tiles, panel.corners, strict=True):
-            gl.glTexCoord2f(*tile)
-            gl.glVertex3f(*corner)
+        for panel in panels:
+            gl.glColor3f(*panel.tint)
+            gl.glNormal3f(*panel.normal)
+            for tile, corner in zip(panel.tiles.tolist(), panel.corners.tolist(), strict=True):
+                gl.glTexCoord2f(*tile)
+                gl.glVertex3f(*corner)
         gl.glEnd()
 
     def _draw_mesh(self, thing: Thing, number: int, shape: Mesh) -> None:

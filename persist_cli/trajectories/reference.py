@@ -79,7 +79,9 @@ class Reference:
             return 0
         first, end = int(self.frames.start), int(self.frames.stop)
         if end - first != 1:
-            raise DataError(f"{self.text}: names {end - first} frames where one is wanted, as in {self.folder}#0:{first}")
+            raise DataError(
+                f"{self.text}: names {end - first} frames where one is wanted, as in {self.folder}#0:{first}"
+            )
         return first
 
     def read(self) -> list[Trajectory]:

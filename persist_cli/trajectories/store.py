@@ -107,8 +107,8 @@ class TrajectoryFile:
         Raises:
             DataError: naming the file, when frames lie outside it or something in it is damaged.
         """
-        wanted = self._numbers(frames)
         info = self.info
+        wanted = self.numbers(frames)
         rows = self._rows(wanted)
         rgb = [self._image(row["rgb"], decode_rgb, number) for number, row in zip(wanted, rows, strict=True)]
         depth = [self._image(row["depth"], decode_depth, number) for number, row in zip(wanted, rows, strict=True)]
@@ -146,7 +146,12 @@ class TrajectoryFile:
         sizes = [self._metadata.row_group(group).num_rows for group in range(self._metadata.num_row_groups)]
         return [sum(sizes[:group]) for group in range(len(sizes))]
 
-    def _numbers(self, frames: slice | Sequence[int]) -> list[int]:
+    def numbers(self, frames: slice | Sequence[int]) -> list[int]:
+        """The frame numbers that a slice or sequence asks for.
+
+        Raises:
+            DataError: when there are none, or frames lie outside the trajectory.
+        """
         length = self.length
         if isinstance(frames, slice):
             wanted = list(range(*frames.indices(length)))
@@ -210,7 +215,9 @@ class Store:
             raise DataError(f"{self.folder}: no such data set folder")
         found = sorted(path for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(ASIDE))
         if not found:
-            raise DataError(f"{self.folder}: no trajectory in it (*{SUFFIX}); `persist collect` or `import` writes some")
+            raise DataError(
+                f"{self.folder}: no trajectory in it (*{SUFFIX}); `persist collect` or `import` writes some"
+            )
         self._files = {file.name: file for file in map(TrajectoryFile, found)}
         self.names = list(self._files)
 
@@ -228,7 +235,9 @@ class Store:
                 raise DataError(f"{self.folder}: no trajectory {key!r}; {hint}")
             return self._files[key]
         if not -len(self) <= key < len(self):
-            raise DataError(f"{self.folder}: has {len(self)} trajectories (0-{len(self) - 1}), there is no number {key}")
+            raise DataError(
+                f"{self.folder}: has {len(self)} trajectories (0-{len(self) - 1}), there is no number {key}"
+            )
         return self._files[self.names[key]]
 
 

@@ -59,10 +59,12 @@ class MapPoints:
     Args:
         positions: world metres, float64.
         colors: uint8 RGB.
+        spread: metres across of what each point stands for.
     """
 
     positions: Float[Tensor, "point 3"]
     colors: UInt8[Tensor, "point 3"]
+    spread: float = 0.05
 
 
 class Memory(ABC):

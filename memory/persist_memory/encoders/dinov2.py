@@ -95,11 +95,13 @@ class DinoV2(Encoder):
         return self._opened(Dinov2Model, use_safetensors=True, config=self._config).eval().requires_grad_(False)
 
     def _opened(self, kind: Any, **options: Any) -> Any:
+        from safetensors import SafetensorError
+
         weights = self.settings.weights
         local = Path(weights).is_dir()
         try:
             return kind.from_pretrained(weights, local_files_only=local, **options)
-        except (OSError, ValueError, RuntimeError) as error:
+        except (OSError, ValueError, RuntimeError, SafetensorError) as error:
             cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             tried = "the directory" if local else "no such directory, and the hub"
             hint = "download it once and set encoder.weights to its directory, or use the encoder 'patches'"

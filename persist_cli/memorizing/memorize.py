@@ -1,0 +1,140 @@
+"""``persist memorize``: posed RGB-D into a memory file, or several memory files into one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from torch import Tensor
+
+from persist_cli.memorizing.memory_file import load_memory
+from persist_cli.memorizing.sources import Source, common_reference, find_sources
+from persist_cli.registry import make_encoder, make_memory
+from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
+from persist_cli.viewing.map import draw_map
+from persist_cli.world.errors import CheckpointError, RecipeError
+from persist_cli.world.files import ASIDE
+from persist_cli.world.memory import Memory
+
+
+def run_memorize(data: list[str], memory: str, encoder: str, settings: list[str], out: Path, json: bool) -> None:
+    """Write the memory of some frames and its map from above, and say what is in it.
+
+    Args:
+        data: references to frames of one scene.
+        memory: name of the memory.
+        encoder: name of its encoder.
+        settings: ``memory.KEY=VALUE`` and ``encoder.KEY=VALUE``, values as in YAML.
+        out: memory file; the map is written beside it as PNG.
+        json: print JSON instead of a table.
+    """
+    _check_out(out)
+    chosen = plugin_settings(settings)
+    sources = find_sources(data)
+    made = make_memory(memory, chosen["memory"], make_encoder(encoder, chosen["encoder"]), common_reference(sources))
+    seconds = write_sources(made, sources)
+    frames = sum(len(source.frames) for source in sources)
+    paths = {source.file.name: source.file.poses()[source.frames.start : source.frames.stop] for source in sources}
+    _finish(made, paths, out, json, {"frames": frames, "frames_per_second": frames / seconds})
+
+
+def run_merge(paths: list[Path], out: Path, json: bool) -> None:
+    """Write what several memory files of one frame of reference hold together, with its map from above.
+
+    Args:
+        paths: memory files.
+        out: memory file to write.
+        json: print JSON instead of a table.
+    """
+    if len(paths) < 2:
+        raise CheckpointError("nothing to merge; name two memory files or more, as in --merge A B")
+    _check_out(out)
+    merged = load_memory(paths[0])
+    for path in paths[1:]:
+        try:
+            merged.merge(load_memory(path))
+        except CheckpointError as error:
+            raise CheckpointError(f"{paths[0]} and {path}: {error}") from error
+    _finish(merged, {}, out, json, {"merged": len(paths)})
+
+
+def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Settings of the memory and of the encoder, from texts like ``memory.cell=[0.25,1,0.25]``.
+
+    Raises:
+        RecipeError: when a text is not of this form.
+    """
+    settings: dict[str, dict[str, Any]] = {"memory": {}, "encoder": {}}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        kind, dot, name = key.strip().partition(".")
+        if not (equals and dot and name) or kind not in settings:
+            raise RecipeError(f"cannot read setting {text!r}; write memory.KEY=VALUE or encoder.KEY=VALUE")
+        try:
+            settings[kind][name] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise RecipeError(f"cannot read the value of {text!r}: {str(error).splitlines()[0]}") from error
+    return settings
+
+
+def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
+    """Write all frames into the memory, a few at a time, and return the seconds that it took."""
+    start = time.perf_counter()
+    with progress() as bar:
+        task = add_task(bar, "memorizing", sum(len(source.frames) for source in sources), "frames")
+        for source in sources:
+            bar.update(task, note=source.file.name)
+            for piece in source.pieces():
+                memory.write(piece)
+                bar.advance(task, len(piece))
+    return time.perf_counter() - start
+
+
+def _finish(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, extra: dict[str, Any]) -> None:
+    for leftover in out.parent.glob(f"{ASIDE}*-{out.stem}.*"):  # of a run that was killed
+        leftover.unlink(missing_ok=True)
+    memory.save(out)
+    picture = out.with_suffix(".png")
+    draw_map(memory.points(), memory.reference.world_up, paths, picture)
+    figures = memory.figures()
+    result = {
+        "file": str(out),
+        "map": str(picture),
+        "memory": memory.name,
+        "encoder": memory.encoder.name,
+        "channels": memory.encoder.channels,
+        "scene": memory.reference.name,
+        "cells": figures.cells,
+        "bytes": figures.bytes,
+        "bounds": figures.bounds,
+        **extra,
+    }
+    if json:
+        print_json(result)
+    else:
+        print_table(f"memory of {memory.reference.name}", ["", "value"], _rows(result))
+        say(f"memory: {out}\nmap: {picture}")
+
+
+def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The result for people: large numbers grouped, bounds as ranges, paths left for a line of their own."""
+    shown = {name: value for name, value in result.items() if name not in ("file", "map")}
+    shown["bytes"] = f"{result['bytes']:,}"
+    shown["cells"] = f"{result['cells']:,}"
+    if result["bounds"] is None:
+        shown["bounds"] = "empty"
+    else:
+        shown["bounds"] = (
+            " × ".join(f"{low:.2f}…{high:.2f}" for low, high in zip(*result["bounds"], strict=True)) + " m"
+        )
+    if "frames_per_second" in result:
+        shown["frames_per_second"] = f"{result['frames_per_second']:.3g}"
+    return [(name.replace("_per_second", "/s"), str(value)) for name, value in shown.items()]
+
+
+def _check_out(out: Path) -> None:
+    if out.is_dir() or out.suffix == ".png":
+        raise CheckpointError(f"{out}: name a file to write, as in memory.safetensors (its map is drawn to .png)")

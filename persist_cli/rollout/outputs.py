@@ -1,0 +1,63 @@
+"""What a rollout leaves: videos, contact sheet, maps, poses, the memory and its figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from persist_cli.evaluation.metrics import METRICS
+from persist_cli.trajectories.tum import write_poses
+from persist_cli.viewing.map import draw_map
+from persist_cli.viewing.sheet import write_sheet
+from persist_cli.viewing.video import beside, color_depth, write_video
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.files import write_json
+from persist_cli.world.memory import Memory
+from persist_cli.world.observations import Observations
+
+if TYPE_CHECKING:
+    from persist_cli.rollout.run import Rollout
+
+
+def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[str, Any]:
+    """Write everything into ``out``; returns the figures with those against ground truth added."""
+    start, seen, truth = rollout.walk.start, rollout.seen, rollout.walk.truth
+    rgb = torch.cat([start.rgb, seen.rgb])
+    depth = torch.cat([start.depth, seen.depth])
+    write_video(out / "rgb.mp4", rgb)
+    write_video(out / "depth.mp4", color_depth(depth))
+    rows = [("generated", rgb), ("depth", color_depth(depth))]
+    if truth is not None:
+        true_rgb = torch.cat([start.rgb, truth.rgb])
+        write_video(out / "compare.mp4", beside([true_rgb, rgb]))
+        rows.insert(0, ("ground truth", true_rgb))
+        figures = figures | {"against_ground_truth": compare(seen, truth)}
+    write_sheet(out / "sheet.png", rows)
+    write_poses(out / "poses.txt", [float(number) for number in range(len(rgb))], path_of(rollout))
+    write_maps(rollout, out)
+    write_json(out / "rollout.json", figures)
+    return figures
+
+
+def compare(seen: Observations, truth: Observations) -> dict[str, list[float]]:
+    """Every metric for each frame."""
+    return {
+        name: metric.measure(seen.rgb, seen.depth, truth.rgb, truth.depth).tolist() for name, metric in METRICS.items()
+    }
+
+
+def path_of(rollout: Rollout) -> torch.Tensor:
+    """Poses of the start and every imagined frame."""
+    return Cameras.concatenate([rollout.walk.start.cameras, rollout.seen.cameras]).world_from_camera
+
+
+def write_maps(rollout: Rollout, out: Path) -> None:
+    """The memory as a file, and as it was and is from above, for memories that have something to draw."""
+    memories: dict[str, Memory | None] = {"map-before": rollout.before, "map-after": rollout.memory}
+    for name, memory in memories.items():
+        if memory is not None and len(memory.points().positions):
+            draw_map(memory.points(), memory.reference.world_up, {"rollout": path_of(rollout)}, out / f"{name}.png")
+    if rollout.memory is not None:
+        rollout.memory.save(out / "memory.safetensors")

@@ -1,0 +1,199 @@
+"""``persist rollout``: from a start frame along actions, to videos, maps, poses and a memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone
+from persist_cli.memorizing.memory_file import load_memory
+from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.rollout.outputs import write_outputs
+from persist_cli.rollout.world_model import WorldModel, interactions_of
+from persist_cli.trajectories.clips import check_size
+from persist_cli.trajectories.reference import parse_reference
+from persist_cli.trajectories.store import TrajectoryFile
+from persist_cli.viewing.console import add_task, print_json, progress, say
+from persist_cli.world.actions import format_actions
+from persist_cli.world.backbone import Backbone, Interactions, Sampling
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.errors import CheckpointError, DataError, PersistError
+from persist_cli.world.memory import Memory
+from persist_cli.world.observations import Observations, TrajectoryInfo
+
+
+@dataclass(frozen=True)
+class RolloutPlan:
+    """The options of ``persist rollout``; see its help."""
+
+    start: str
+    actions: str | None
+    follow: bool
+    frames: int
+    memory: Path | None
+    adapter: str | None
+    write: bool
+    seed: int
+    steps: int
+    sampler: str
+    guidance: float
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Where a rollout goes.
+
+    Args:
+        start: the first frame, observed.
+        cameras: of the frames to imagine.
+        interactions: one for each of them.
+        actions: in text form.
+        truth: what is really seen there, when the trajectory is followed.
+        info: of the trajectory.
+    """
+
+    start: Observations
+    cameras: Cameras
+    interactions: Interactions
+    actions: str
+    truth: Observations | None
+    info: TrajectoryInfo
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout gave.
+
+    Args:
+        walk: where it went.
+        seen: the frames imagined.
+        before: the memory as it was, ``None`` without one.
+        memory: the memory as it is now.
+        seconds: that it took, without loading.
+    """
+
+    walk: Walk
+    seen: Observations
+    before: Memory | None
+    memory: Memory | None
+    seconds: float
+
+
+def run_rollout(path: Path, plan: RolloutPlan, out: Path, json: bool) -> None:
+    """Roll out and leave a folder; see ``persist rollout --help``."""
+    if (plan.actions is None) == (not plan.follow):
+        raise PersistError("give either --actions TEXT or --follow")
+    checkpoint = find_checkpoint(path)
+    adapter = plan.adapter or checkpoint.default_adapter()
+    walk = plan_walk(plan)
+    backbone = load_backbone(checkpoint)
+    check_size(walk.info, backbone.image_size, plan.start)
+    if plan.sampler not in backbone.samplers:
+        raise PersistError(f"unknown sampler {plan.sampler!r}; this backbone has {', '.join(backbone.samplers)}")
+    load_adapter(backbone, checkpoint, adapter)
+    backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    rollout = roll(backbone, open_memory(checkpoint, adapter, plan, walk.info), walk, plan)
+    figures = write_outputs(rollout, out, describe(checkpoint, adapter, plan, rollout))
+    if json:
+        print_json(figures)
+    else:
+        say(f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {walk.actions!r}; written to {out}")
+
+
+def plan_walk(plan: RolloutPlan) -> Walk:
+    """The start frame and the cameras to come, by actions or by the trajectory's own poses."""
+    reference = parse_reference(plan.start)
+    file = reference.single()
+    start = file.read([reference.frame])
+    if plan.follow:
+        return follow_trajectory(file, reference.frame, plan.frames)
+    names = file.info.vocabulary.parse(plan.actions or "")
+    camera = start.observations.cameras
+    poses = file.info.vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
+    cameras = Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
+    interactions = interactions_of(names, file.info.vocabulary)
+    return Walk(start.observations, cameras, interactions, format_actions(names), None, file.info)
+
+
+def follow_trajectory(file: TrajectoryFile, first: int, frames: int) -> Walk:
+    """The trajectory's own way from a frame on, with what is really seen there."""
+    last = min(len(file), first + 1 + frames) if frames else len(file)
+    if last - first < 2:
+        raise DataError(f"{file.name}: frame {first} is the last; there is nothing to follow")
+    span = file.read(slice(first, last))
+    names = tuple(name or "stay" for name in span.actions[:-1])
+    return Walk(
+        start=span.observations[:1],
+        cameras=span.observations.cameras[1:],
+        interactions=interactions_of(span.actions[:-1], file.info.vocabulary),
+        actions=format_actions(names),
+        truth=span.observations[1:],
+        info=file.info,
+    )
+
+
+def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
+    """The memory file given, or an empty memory of the adapter's kind; none without adapter."""
+    if adapter is None:
+        if plan.memory is not None:
+            raise CheckpointError(f"{checkpoint.folder}: has no memory adapter that could read {plan.memory}")
+        return None
+    maker = MemoryMaker.of(checkpoint.memory_choice(adapter))
+    empty = maker.empty(info)
+    if plan.memory is None:
+        return empty
+    memory = load_memory(plan.memory)
+    check_memory(memory, empty, plan.memory)
+    return memory
+
+
+def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
+    """Raise ``CheckpointError`` when a memory file is not what the adapter was trained to read here."""
+    has, wants = memory.header(), wanted.header()
+    for key in ("memory", "encoder", "encoder_settings", "channels", "reference"):
+        if has[key] != wants[key]:
+            raise CheckpointError(f"{path}: its {key.replace('_', ' ')} is {has[key]!r}, wanted here is {wants[key]!r}")
+
+
+def roll(backbone: Backbone, memory: Memory | None, walk: Walk, plan: RolloutPlan) -> Rollout:
+    """Imagine the walk, clip by clip, with a progress bar."""
+    sampling = Sampling(plan.steps, plan.sampler, plan.guidance)
+    before = copy_of(memory)
+    model = WorldModel(backbone, memory, sampling, plan.seed, plan.write)
+    began = time.monotonic()
+    model.reset(walk.start, walk.info)
+    parts = []
+    with progress() as bar:
+        task = add_task(bar, "rollout", len(walk.cameras), "frame")
+        for part in model.imagine(walk.cameras, walk.interactions):
+            parts.append(part)
+            bar.advance(task, len(part))
+    return Rollout(walk, Observations.concatenate(parts), before, memory, time.monotonic() - began)
+
+
+def copy_of(memory: Memory | None) -> Memory | None:
+    """Another memory that holds the same."""
+    if memory is None:
+        return None
+    copy = type(memory)(memory.settings, memory.encoder, memory.reference)
+    copy.restore({name: tensor.clone() for name, tensor in memory.tensors().items()})
+    return copy
+
+
+def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
+    """What is needed to roll out again, JSON values."""
+    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
+    memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
+    return {
+        "checkpoint": str(checkpoint.folder),
+        "fingerprint": checkpoint.fingerprint,
+        "plan": options | {"adapter": adapter, "actions": rollout.walk.actions},
+        "frames": len(rollout.seen),
+        "seconds": rollout.seconds,
+        "memory": memory,
+    }

@@ -1,0 +1,185 @@
+"""Policies: how an agent walks through a scene, as generators of actions.
+
+A policy yields an action and is sent whether the world allowed it; only allowed actions are recorded. Policies
+know a scene through the ``Simulator`` interface alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from persist_cli.simulators.routes import FreeGrid, Ground, clear_distance
+from persist_cli.world.actions import STAY
+from persist_cli.world.errors import DataError
+from persist_cli.world.observations import Frame
+from persist_cli.world.simulator import Simulator
+
+Walk = Generator[str, bool, None]
+Policy = Callable[[Simulator, np.random.Generator, int], Walk]
+
+SIGHT = 4.0  # metres that explore looks ahead
+EFFORT = 3.0  # metres of new ground that explore gives for not turning right round
+PATCH = 0.5  # metres of the squares in which explore counts its visits
+NEAR_GOAL = 0.4  # metres at which a goal counts as reached
+LOOK_AROUND = 0.3  # how often path looks around before it sets out
+PATIENCE = 4  # steps without getting nearer, after which path gives up a goal
+MOST_REFUSALS = 200  # in a row
+
+
+def walk(simulator: Simulator, policy: Policy, random: np.random.Generator, frames: int) -> Iterator[Frame]:
+    """Exactly ``frames`` observations along a policy's path from where the agent stands.
+
+    Each frame holds the action taken at it, the last none; timestamps count one second an action.
+
+    Raises:
+        DataError: when the world refuses whatever the policy wants.
+    """
+    actions = policy(simulator, random, frames - 1)
+    for number in range(frames - 1):
+        frame = simulator.observe()
+        yield replace(frame, action=_next_allowed(simulator, actions, first=number == 0), timestamp=float(number))
+    yield replace(simulator.observe(), action=None, timestamp=float(frames - 1))
+
+
+def _next_allowed(simulator: Simulator, actions: Walk, first: bool) -> str:
+    """Do what the policy wants next that the world allows; its name."""
+    action = next(actions) if first else actions.send(True)
+    for _ in range(MOST_REFUSALS):
+        if simulator.act(action):
+            return action
+        action = actions.send(False)
+    raise DataError(f"{simulator.info.scene}: the agent cannot move; the last {MOST_REFUSALS} actions were refused")
+
+
+def explore(simulator: Simulator, random: np.random.Generator, count: int) -> Walk:
+    """A random walk in straight runs, towards open and rarely visited ground; it turns away from what blocks it."""
+    visits: Counter[tuple[int, int]] = Counter()
+    _, turn = _gait(simulator)
+    while True:
+        turns = _inviting_turn(simulator, random, visits)
+        yield from _turned(turns)
+        steps = yield from _run(simulator, int(random.integers(3, 13)), visits)
+        if turns == 0 and steps == 0:  # whatever the way looked like, it is blocked
+            yield from _turned(int(random.choice([-1, 1])) * max(1, round(90 / turn)))
+
+
+def _run(simulator: Simulator, most: int, visits: Counter[tuple[int, int]]) -> Generator[str, bool, int]:
+    """Steps straight ahead until something is in the way; how many they were."""
+    step, _ = _gait(simulator)
+    for done in range(most):
+        ground, heading = simulator.agent
+        visits[_patch(ground)] += 1
+        if clear_distance(simulator, ground, heading, step, step) < step or not (yield "forward"):
+            return done
+    return most
+
+
+def path(simulator: Simulator, random: np.random.Generator, count: int) -> Walk:
+    """Shortest ways between random places, one after another, sometimes with a look around before setting out."""
+    grid = FreeGrid(simulator)
+    reachable = sorted(grid.distances(simulator.agent[0]))
+    _, turn = _gait(simulator)
+    while True:
+        if random.random() < LOOK_AROUND:
+            yield from _turned(round(360 / turn))
+        goal = grid.place(reachable[int(random.integers(len(reachable)))]) if reachable else simulator.agent[0]
+        steps = yield from _go_to(simulator, grid, goal)
+        if steps == 0:
+            yield from _turned(int(random.choice([-1, 1])) * int(random.integers(1, max(2, round(90 / turn)))))
+
+
+def there_and_back(simulator: Simulator, random: np.random.Generator, count: int) -> Walk:
+    """Out along a path or a random walk for half of ``count`` actions, then the reversed actions back."""
+    out = path if random.random() < 0.5 else explore
+    outward = out(simulator, random, count // 2)
+    vocabulary = simulator.info.vocabulary
+    done: list[str] = []
+    action = next(outward) if count >= 2 else STAY
+    while len(done) < count // 2:
+        allowed = yield action
+        done += [action] if allowed else []
+        action = outward.send(allowed)
+    for action in [STAY] * (count % 2) + list(vocabulary.reversed(done)):
+        yield action
+
+
+POLICIES: dict[str, Policy] = {"explore": explore, "path": path, "there-and-back": there_and_back}
+
+
+def _gait(simulator: Simulator) -> tuple[float, float]:
+    """Metres of a step forward and degrees of a turn to the left."""
+    vocabulary = simulator.info.vocabulary
+    return vocabulary["forward"].forward, vocabulary["left"].turn
+
+
+def _turned(turns: int) -> Walk:
+    """Turns to the left, or to the right where negative."""
+    for _ in range(abs(turns)):
+        yield "left" if turns > 0 else "right"
+
+
+def _patch(ground: Ground) -> tuple[int, int]:
+    return math.floor(ground[0] / PATCH), math.floor(ground[1] / PATCH)
+
+
+def _inviting_turn(simulator: Simulator, random: np.random.Generator, visits: Counter[tuple[int, int]]) -> int:
+    """How many turns to the left (negative: right) face the way that is longest and least visited, by chance."""
+    step, turn = _gait(simulator)
+    ground, heading = simulator.agent
+    most = int(180 // turn)
+    options = range(-most, most + 1)
+    scores = []
+    for turns in options:
+        way = heading + math.radians(turns * turn)
+        length = clear_distance(simulator, ground, way, SIGHT, step)
+        x, z = simulator.ahead(way)
+        seen = [visits[_patch((ground[0] + d * x, ground[1] + d * z))] for d in np.arange(step, length + 1e-9, PATCH)]
+        novelty = sum(1 / (1 + count) ** 2 for count in seen) * PATCH
+        effort = EFFORT * abs(turns) / max(most, 1)
+        scores.append(novelty + 0.25 * min(length, 2.0) - effort + float(random.gumbel(0, 0.25)) - (length < step) * 9)
+    return options[int(np.argmax(scores))]
+
+
+def _go_to(simulator: Simulator, grid: FreeGrid, goal: Ground) -> Generator[str, bool, int]:
+    """Turn and step along the shortest way until near the goal, or until it gets no nearer; how many steps."""
+    distances = grid.distances(goal)
+    step, _ = _gait(simulator)
+    best, patience, steps = math.inf, 0, 0
+    while patience < PATIENCE:
+        ground, _ = simulator.agent
+        distance = grid.remaining(ground, distances)
+        best, patience = (distance, 0) if distance < best - 1e-9 else (best, patience + 1)
+        turns = _nearer_turn(simulator, grid, distances)
+        if distance < max(NEAR_GOAL, step) or turns is None:
+            break
+        yield from _turned(turns)
+        if not (yield "forward"):
+            break
+        steps += 1
+    return steps
+
+
+def _nearer_turn(simulator: Simulator, grid: FreeGrid, distances: dict[tuple[int, int], float]) -> int | None:
+    """How many turns face the way whose first steps lead nearest to the goal; ``None`` where all are blocked."""
+    step, turn = _gait(simulator)
+    ground, heading = simulator.agent
+    most = int(180 // turn)
+    best: tuple[float, int] | None = None
+    for turns in sorted(range(-most, most + 1), key=abs):
+        way = heading + math.radians(turns * turn)
+        if clear_distance(simulator, ground, way, step, step) < step:
+            continue
+        x, z = simulator.ahead(way)
+        for walked in (step, 2 * step, 3 * step):
+            there = ground[0] + walked * x, ground[1] + walked * z
+            cost = grid.remaining(there, distances) + walked + 0.02 * abs(turns)
+            if math.isinf(cost):
+                break
+            if best is None or cost < best[0] - 1e-9:
+                best = cost, turns
+    return None if best is None else best[1]

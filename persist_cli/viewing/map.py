@@ -1,0 +1,162 @@
+"""A memory seen from above, with the paths that cameras took through it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from persist_cli.world.files import written_aside
+from persist_cli.world.memory import MapPoints
+
+PATH_COLORS = ("#d81b60", "#1e88e5", "#ffb300", "#004d40", "#8e24aa")
+UNSEEN = (0.94, 0.94, 0.95, 1.0)
+MARGIN = 0.5  # metres around what is drawn
+ABOVE_CAMERA = 0.1  # metres over the cameras at which the ceiling is cut away
+DOTS_ACROSS = 5  # of the square that stands for a point
+MOST_DOTS = 900  # across the picture
+LONG_SIDE = 8.0  # inches
+ARROW = 0.06  # of the long side
+Array = np.ndarray[Any, Any]
+
+
+def draw_map(
+    points: MapPoints,
+    world_up: Sequence[float],
+    paths: Mapping[str, Float[Tensor, "frame 4 4"]] | Sequence[Float[Tensor, "frame 4 4"]],
+    out: Path,
+) -> None:
+    """Write a PNG of the map from above, true to scale, without what lies over the cameras' heads.
+
+    Args:
+        points: of a memory; none gives a picture of the paths alone.
+        world_up: unit vector.
+        paths: world_from_camera of each path, by the name that the legend shows, or in order without names.
+        out: PNG file.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    ground = ground_axes(world_up)
+    named = dict(paths) if isinstance(paths, Mapping) else {str(number): path for number, path in enumerate(paths)}
+    lines = {name: path.detach().cpu().double() for name, path in named.items() if len(path)}
+    places = {name: (path[:, :3, 3] @ ground.T).numpy() for name, path in lines.items()}
+    image, extent = paint(points, ground, _ceiling(places))
+    low, high = _limits(extent, places)
+    width, height = high - low
+    scale = LONG_SIDE / max(width, height)
+    figure = Figure(figsize=(max(3.2, width * scale + 1.0), max(2.6, height * scale + 0.8)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_facecolor(UNSEEN)
+    if image is not None:
+        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
+    for number, (name, place) in enumerate(places.items()):
+        headings = (lines[name][:, :3, 2] @ ground[:2].T).numpy()
+        end = headings[-1] / max(float(np.linalg.norm(headings[-1])), 1e-9) * ARROW * max(width, height)
+        _draw_path(axes, place[:, :2], end, PATH_COLORS[number % len(PATH_COLORS)], name)
+    _finish_axes(axes, low, high, len(places) if isinstance(paths, Mapping) else 0)
+    with written_aside(out) as aside:
+        figure.savefig(aside, dpi=150, format="png")
+
+
+def ground_axes(world_up: Sequence[float]) -> Float[Tensor, "3 3"]:
+    """Rows: right and up in the picture, and the height; as seen from above, never mirrored. Float64.
+
+    Right is the world axis farthest from up, laid onto the ground.
+    """
+    up = torch.nn.functional.normalize(torch.tensor(list(world_up), dtype=torch.float64), dim=0)
+    right = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
+    right = torch.nn.functional.normalize(right - up * (up @ right), dim=0)
+    return torch.stack([right, torch.linalg.cross(up, right), up])
+
+
+def paint(
+    points: MapPoints, ground: Float[Tensor, "3 3"], ceiling: float | None
+) -> tuple[Array | None, tuple[float, float, float, float] | None]:
+    """The picture of some points, each square in the colour of the highest point under the ceiling.
+
+    Args:
+        points: what to draw.
+        ground: rows as ``ground_axes`` gives them.
+        ceiling: height in metres; ``None`` for 60 % of the points' own height.
+
+    Returns:
+        RGBA ``[row, column, 4]`` in 0…1, the lowest row first, and its left, right, bottom and top in metres;
+        ``None`` for both without points.
+    """
+    if not len(points.positions):
+        return None, None
+    places = (points.positions.detach().cpu().double() @ ground.T).numpy()
+    heights = places[:, 2]
+    if ceiling is None:
+        ceiling = heights.min() + 0.6 * np.ptp(heights)
+    kept = heights <= ceiling
+    if not kept.any():
+        kept[:] = True
+    order = np.argsort(heights[kept], kind="stable")
+    colors = points.colors.cpu().numpy()[kept][order] / 255.0
+    return _stamp(places[kept][order, :2], colors, points.spread)
+
+
+def _stamp(places: Array, colors: Array, spread: float) -> tuple[Array, tuple[float, float, float, float]]:
+    """Paint a square for each place, later ones over earlier ones."""
+    dot = max(spread / DOTS_ACROSS, float(np.ptp(places, axis=0).max()) / MOST_DOTS)
+    low = places.min(0) - spread / 2
+    across = max(1, round(spread / dot))
+    columns, rows = np.ceil((places.max(0) + spread / 2 - low) / dot).astype(int) + 1
+    corner = np.round((places - spread / 2 - low) / dot).astype(int)
+    shift = np.arange(across)
+    x = (corner[:, 0, None, None] + shift).repeat(across, axis=1)
+    y = (corner[:, 1, None, None] + shift[:, None]).repeat(across, axis=2)
+    image = np.zeros((rows, columns, 4))
+    image[y, x] = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)[:, None, None]
+    return image, (low[0], low[0] + columns * dot, low[1], low[1] + rows * dot)
+
+
+def _ceiling(places: Mapping[str, Array]) -> float | None:
+    if not places:
+        return None
+    return float(np.median(np.concatenate([place[:, 2] for place in places.values()]))) + ABOVE_CAMERA
+
+
+def _limits(extent: tuple[float, float, float, float] | None, places: Mapping[str, Array]) -> tuple[Array, Array]:
+    corners = [place[:, :2] for place in places.values()]
+    if extent is not None:
+        corners.append(np.array([[extent[0], extent[2]], [extent[1], extent[3]]]))
+    everything = np.concatenate(corners) if corners else np.zeros((1, 2))
+    return everything.min(0) - MARGIN, everything.max(0) + MARGIN
+
+
+def _draw_path(axes: Any, place: Array, look: Array, color: str, name: str) -> None:
+    """A line with white rims, a dot at the start, an arrow ``look`` along the last view at the end."""
+    axes.plot(*place.T, color="white", linewidth=4.0, solid_capstyle="round", zorder=2)
+    axes.plot(*place.T, color=color, linewidth=2.0, solid_capstyle="round", zorder=3, label=name)
+    axes.scatter(*place[0], s=90, color="white", edgecolor=color, linewidth=2.5, zorder=5)
+    arrow = {"arrowstyle": "-|>,head_width=0.35,head_length=0.6", "color": color, "linewidth": 2.5}
+    axes.annotate("", xy=place[-1] + look, xytext=place[-1], arrowprops=arrow, zorder=6)
+    axes.scatter(*place[-1], s=60, color=color, edgecolor="white", linewidth=1.5, zorder=6)
+    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "boxstyle": "round,pad=0.15"}
+    for text, at, offset in (("start", place[0], (8, 8)), ("end", place[-1], (8, -14))):
+        axes.annotate(text, at, offset, textcoords="offset points", color=color, fontsize=8, bbox=box, zorder=7)
+
+
+def _finish_axes(axes: Any, low: Array, high: Array, names: int) -> None:
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
+    axes.set_xlabel("metres")
+    axes.tick_params(labelsize=8)
+    for spine in axes.spines.values():
+        spine.set_color("#b0b0b0")
+    bar = 1.0 if max(high - low) < 12 else 5.0
+    x, y = low + 0.04 * (high - low)
+    axes.plot([x, x + bar], [y, y], color="black", linewidth=3, solid_capstyle="butt", zorder=8)
+    axes.annotate(f"{bar:g} m", (x + bar / 2, y), (0, 4), textcoords="offset points", ha="center", fontsize=8, zorder=8)
+    if names:
+        axes.legend(loc="upper right", fontsize=8, framealpha=0.85)

@@ -1,0 +1,66 @@
+"""Videos: H.264 in MP4, images enlarged to be seen, depth in colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from persist_cli.world.files import written_aside
+
+SMALLEST = 256  # pixels of the shorter side of a written image
+
+
+def color_depth(
+    depth: Float[Tensor, "frame height width"], farthest: float | None = None
+) -> UInt8[Tensor, "frame height width 3"]:
+    """Depth as colours from near (dark red) to far (dark blue), missing black.
+
+    Args:
+        depth: metres, 0 = missing.
+        farthest: metres at the end of the scale; the 98th percentile when not given.
+    """
+    from matplotlib import colormaps
+
+    known = depth[depth > 0]
+    limit = farthest or (float(torch.quantile(known.flatten()[:1_000_000], 0.98)) if len(known) else 1.0)
+    colors = colormaps["turbo_r"]((depth / max(limit, 1e-6)).clamp(0, 1).numpy())[..., :3]
+    colors[depth.numpy() <= 0] = 0
+    return torch.from_numpy((colors * 255).astype(np.uint8))
+
+
+def beside(
+    videos: Sequence[UInt8[Tensor, "frame height width 3"]], gap: int = 2
+) -> UInt8[Tensor, "frame height all 3"]:
+    """Videos of one length side by side with a white gap."""
+    parts: list[Tensor] = []
+    for number, video in enumerate(videos):
+        if number:
+            parts.append(torch.full((*video.shape[:2], gap, 3), 255, dtype=torch.uint8))
+        parts.append(video)
+    return torch.cat(parts, dim=2)
+
+
+def enlarge(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame height width 3"]:
+    """Pixels repeated until the shorter side is at least 256 pixels."""
+    factor = max(1, -(-SMALLEST // min(video.shape[1:3])))
+    return video.repeat_interleave(factor, dim=1).repeat_interleave(factor, dim=2)
+
+
+def write_video(path: Path, video: UInt8[Tensor, "frame height width 3"], frames_per_second: int = 8) -> None:
+    """An MP4 (H.264) of the frames, whole or not at all."""
+    import av
+
+    frames = enlarge(video)
+    height, width = (side - side % 2 for side in frames.shape[1:3])  # H.264 wants even sides
+    with written_aside(path) as aside, av.open(str(aside), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=Fraction(frames_per_second), options={"crf": "18"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for image in frames[:, :height, :width].numpy():
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
+        container.mux(stream.encode())

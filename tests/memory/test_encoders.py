@@ -1,0 +1,117 @@
+import pytest
+import torch
+
+from persist_cli.registry import make_encoder
+from persist_cli.world.errors import CheckpointError, RecipeError
+from persist_memory.encoders.patches import EXACT, PatchesSettings, projection
+from tests.memory.views_of_room import walked
+
+
+@pytest.fixture(scope="module")
+def tiny_dino(tmp_path_factory):
+    from transformers import Dinov2Config, Dinov2Model
+
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("dinov2-tiny")
+    config = Dinov2Config(
+        hidden_size=24, num_hidden_layers=3, num_attention_heads=2, image_size=56, patch_size=14, mlp_ratio=2
+    )
+    Dinov2Model(config).save_pretrained(folder)
+    return folder
+
+
+def test_the_first_three_channels_of_a_patch_are_its_mean_colour():
+    rgb = torch.randint(0, 256, (1, 16, 24, 3), dtype=torch.uint8)
+    features = make_encoder("patches", {}).encode(rgb)
+    mean = rgb.float().reshape(1, 2, 8, 3, 8, 3).mean((2, 4)) / 127.5 - 1
+    torch.testing.assert_close(features[..., :3], mean, atol=1e-4, rtol=0)
+
+
+def test_features_do_not_depend_on_what_else_is_encoded_to_the_bit():
+    rgb = walked(5).rgb
+    encoder = make_encoder("patches", {})
+    assert torch.equal(encoder.encode(rgb)[3], encoder.encode(rgb[3:4])[0])
+
+
+def test_weights_are_exact_binary_fractions_fixed_by_the_seed():
+    weight = projection(PatchesSettings(seed=3))
+    assert torch.equal(weight * EXACT, (weight * EXACT).round())
+    assert torch.equal(weight, projection(PatchesSettings(seed=3)))
+    assert not torch.equal(weight, projection(PatchesSettings(seed=4)))
+
+
+def test_detail_channels_are_orthogonal_to_each_other_and_to_colour():
+    weight = projection(PatchesSettings())
+    gram = weight.T @ weight
+    assert (gram - gram.diag().diag()).abs().max() < 1e-4 * gram.diag().max()
+
+
+def test_features_of_real_looking_images_are_of_order_one():
+    spread = make_encoder("patches", {}).encode(walked(6).rgb).std((0, 1, 2))
+    assert spread.min() > 0.01
+    assert spread.max() < 3
+
+
+@pytest.mark.parametrize(("height", "width", "rows", "columns"), [(48, 64, 6, 8), (50, 61, 6, 8), (5, 3, 1, 1)])
+def test_images_that_are_no_multiple_of_the_patch_are_resized_to_the_nearest(height, width, rows, columns):
+    rgb = torch.full((2, height, width, 3), 200, dtype=torch.uint8)
+    features = make_encoder("patches", {}).encode(rgb)
+    assert features.shape == (2, rows, columns, 32)
+    torch.testing.assert_close(features[..., 0], torch.full((2, rows, columns), 200 / 127.5 - 1), atol=1e-4, rtol=0)
+
+
+def test_more_channels_than_numbers_in_a_patch_are_refused():
+    with pytest.raises(RecipeError, match="13 channels are more than the 12 numbers"):
+        make_encoder("patches", {"patch": 2, "channels": 13})
+
+
+def test_dinov2_gives_the_patch_tokens_of_the_last_block_after_the_layer_norm(tiny_dino):
+    from transformers import Dinov2Model
+
+    encoder = make_encoder("dinov2", {"weights": str(tiny_dino)})
+    rgb = walked(1).rgb[:, :42, :56]
+    features = encoder.encode(rgb)
+    assert features.shape == (1, 3, 4, encoder.channels)
+    model = Dinov2Model.from_pretrained(tiny_dino).eval()
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    pixels = ((rgb / 255 - mean) / std).permute(0, 3, 1, 2)
+    with torch.no_grad():
+        expected = model(pixels).last_hidden_state[:, 1:].reshape(1, 3, 4, 24)
+    torch.testing.assert_close(features, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_dinov2_takes_any_size_and_a_block_in_the_middle(tiny_dino):
+    settings = {"weights": str(tiny_dino), "size": 100, "layer": 2}
+    features = make_encoder("dinov2", settings).encode(walked(3).rgb)
+    assert features.shape == (3, 5, 7, 24)  # 75 × 100 pixels in patches of 14
+    last = make_encoder("dinov2", settings | {"layer": None}).encode(walked(3).rgb)
+    assert not torch.allclose(features, last)
+
+
+def test_dinov2_frames_do_not_depend_on_their_neighbours_to_the_bit(tiny_dino):
+    encoder, rgb = make_encoder("dinov2", {"weights": str(tiny_dino)}), walked(3).rgb
+    assert torch.equal(encoder.encode(rgb)[1], encoder.encode(rgb[1:2])[0])
+
+
+@pytest.mark.parametrize("broken", ["absent", "no_weights", "truncated", "pickle"])
+def test_dinov2_without_usable_weights_says_in_one_line_what_to_do(tiny_dino, tmp_path, monkeypatch, broken):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    folder = tmp_path / "dino"
+    if broken != "absent":
+        folder.mkdir()
+        (folder / "config.json").write_bytes((tiny_dino / "config.json").read_bytes())
+    if broken == "truncated":
+        (folder / "model.safetensors").write_bytes((tiny_dino / "model.safetensors").read_bytes()[:500])
+    if broken == "pickle":
+        torch.save({}, folder / "pytorch_model.bin")
+    with pytest.raises(CheckpointError) as caught:
+        make_encoder("dinov2", {"weights": str(folder)}).encode(walked(1).rgb)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(folder) in message
+    assert "patches" in message
+
+
+def test_a_block_that_dinov2_does_not_have_is_refused(tiny_dino):
+    with pytest.raises(CheckpointError, match="has 3 blocks, no block 9"):
+        _ = make_encoder("dinov2", {"weights": str(tiny_dino), "layer": 9}).channels

@@ -1,0 +1,66 @@
+import torch
+
+from persist_memory.sparse_grid import BLOCK, LIMIT, Column, SparseGrid, pack, unpack
+
+
+def some_cells(count: int, reach: int = 40, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(-reach, reach, (count, 3), generator=generator)
+
+
+def a_grid() -> SparseGrid:
+    return SparseGrid({"best": Column(2, torch.float32, "max"), "count": Column(0, torch.int64, "sum")})
+
+
+def absorb(grid: SparseGrid, cells: torch.Tensor, best: torch.Tensor) -> None:
+    keys, order = pack(*cells.unbind(-1)).sort()
+    grid.absorb(keys, {"best": best[order], "count": torch.ones_like(keys)})
+
+
+def test_unpacking_a_key_gives_the_cell_back_up_to_the_limits():
+    cells = torch.cat([some_cells(500, LIMIT), torch.tensor([[-LIMIT, LIMIT - 1, 0], [0, -1, -LIMIT]])])
+    keys = pack(*cells.unbind(-1))
+    assert torch.equal(unpack(keys), cells)
+    assert (keys >= 0).all()
+
+
+def test_different_cells_have_different_keys():
+    cells = some_cells(5000).unique(dim=0)
+    assert len(pack(*cells.unbind(-1)).unique()) == len(cells)
+
+
+def test_cells_of_a_block_lie_together_in_the_order_of_keys():
+    cells = unpack(pack(*some_cells(5000).unbind(-1)).sort().values)
+    blocks = torch.unique_consecutive(torch.div(cells, BLOCK, rounding_mode="floor"), dim=0)
+    assert len(blocks) == len(blocks.unique(dim=0))
+
+
+def test_a_grid_holds_the_same_whatever_the_order_of_writing():
+    cells = [some_cells(200, 6, seed).unique(dim=0) for seed in range(5)]
+    values = [torch.randn(len(part), 2) for part in cells]
+    forward, backward = a_grid(), a_grid()
+    for number in range(5):
+        absorb(forward, cells[number], values[number])
+        absorb(backward, cells[4 - number], values[4 - number])
+    assert torch.equal(forward.keys, backward.keys)
+    assert torch.equal(forward.values("best"), backward.values("best"))
+    assert torch.equal(forward.values("count"), backward.values("count"))
+
+
+def test_a_cell_holds_the_greatest_value_and_the_count_of_its_writes():
+    grid, cell = a_grid(), torch.tensor([[1, -2, 3]])
+    for value in ([1.0, 5.0], [4.0, 2.0]):
+        absorb(grid, cell, torch.tensor([value]))
+    assert grid.values("best").tolist() == [[4.0, 5.0]]
+    assert grid.values("count").tolist() == [2]
+
+
+def test_blocks_cover_all_cells_once():
+    grid = a_grid()
+    cells = some_cells(3000).unique(dim=0)
+    absorb(grid, cells, torch.zeros(len(cells), 2))
+    blocks, starts, counts = grid.blocks()
+    assert int(counts.sum()) == len(cells)
+    owner = torch.arange(len(blocks)).repeat_interleave(counts)
+    assert torch.equal(torch.div(unpack(grid.keys), BLOCK, rounding_mode="floor"), blocks[owner])
+    assert torch.equal(starts, counts.cumsum(0) - counts)

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from persist_cli.simulators.collect import TEST_SEEDS, CollectPlan, claim_folder, run_collect
+from persist_cli.trajectories.store import Store
+from persist_cli.world.errors import DataError, PersistError
+
+from .conftest import make_world
+
+SMALL = CollectPlan("miniworld", "0:3", frames=6, size="16x24")
+COMMAND = "collect miniworld --scenes 0:4 --frames 40 --size 32x32 --workers 2"
+
+
+def persist(arguments: str, out: Path) -> subprocess.Popen[str]:
+    command = [str(Path(sys.executable).with_name("persist")), *arguments.split(), "--out", str(out)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, text=True, start_new_session=True, **pipes)  # type: ignore[call-overload,no-any-return]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    make_world()  # skips where nothing can be rendered
+    out = tmp_path_factory.mktemp("collected")
+    run_collect(SMALL, out, 1, json=True)
+    return out
+
+
+def test_a_collected_trajectory_reads_back_as_planned(collected: Path) -> None:
+    store = Store(collected)
+    trajectory = store[2].read()
+    assert store.names == ["house-000000", "house-000001", "house-000002"]
+    assert trajectory.observations.rgb.shape == (6, 16, 24, 3)
+    assert trajectory.info.scene == "miniworld/house-2"
+    assert trajectory.info.source["split"] == "train"
+
+
+def test_collecting_again_changes_nothing(collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(collected)
+    run_collect(SMALL, collected, 1, json=True)
+    assert contents(collected) == before
+    assert json.loads(capsys.readouterr().out)["new_trajectories"] == 0
+
+
+def test_more_scenes_may_be_added_later(collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_collect(replace(SMALL, scenes="1:4"), collected, 1, json=True)
+    figures = json.loads(capsys.readouterr().out)
+    assert (figures["trajectories"], figures["new_trajectories"], figures["frames"]) == (3, 1, 18)
+    assert len(Store(collected)) == 4
+
+
+def test_test_scenes_never_share_a_seed_with_training_scenes() -> None:
+    train, test = (replace(SMALL, split=split, scenes="0:5000").generator_seeds for split in ("train", "test"))
+    assert not set(train) & set(test)
+    assert max(replace(SMALL, scenes=f"0:{TEST_SEEDS}").generator_seeds) < min(test)
+    with pytest.raises(DataError, match="a split has 1000000 scenes"):
+        _ = replace(SMALL, scenes=f"0:{TEST_SEEDS + 1}").generator_seeds
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"split": "test"}, "was collected with split 'train', not 'test'"),
+        ({"turn": 10.0}, "was collected with turn 15.0, not 10.0"),
+        ({"seed": 3}, "was collected with seed 0, not 3"),
+        ({"policy": "path"}, "was collected with policy 'explore', not 'path'"),
+    ],
+)
+def test_a_folder_keeps_to_one_plan(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    claim_folder(SMALL, tmp_path)
+    with pytest.raises(DataError, match=message):
+        claim_folder(replace(SMALL, **change), tmp_path)  # type: ignore[arg-type]
+
+
+def test_a_folder_of_other_trajectories_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "kitchen.parquet").touch()
+    with pytest.raises(DataError, match="did not write"):
+        claim_folder(SMALL, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scenes": "3:1"},
+        {"scenes": "5"},
+        {"scenes": "-1:4"},
+        {"size": "64"},
+        {"size": "0x64"},
+        {"policy": "fly"},
+        {"split": "val"},
+        {"seed": -1},
+        {"simulator": "minworld"},
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, change: dict[str, object]) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(PersistError) as caught:
+        run_collect(replace(SMALL, **change), out, 1, json=False)  # type: ignore[arg-type]
+    assert len(str(caught.value).splitlines()) == 1
+    assert str(next(iter(change.values()))) in str(caught.value)
+    assert not out.exists()
+
+
+def test_killed_runs_go_on_and_end_as_an_uninterrupted_one(tmp_path: Path) -> None:
+    make_world()
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert persist(COMMAND, whole).wait() == 0
+    for first_files in (0, 1, 3):
+        process = persist(COMMAND, killed)
+        while process.poll() is None and len(list(killed.glob("*.parquet"))) < first_files:
+            time.sleep(0.05)
+        time.sleep(0.05 * first_files)
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert persist(COMMAND, killed).wait() == 0
+    assert contents(killed) == contents(whole)
+
+
+def children(pid: int) -> list[int]:
+    listing = subprocess.run(["ps", "-o", "pid=,args=", "--ppid", str(pid)], capture_output=True, text=True)
+    workers = [line.split()[0] for line in listing.stdout.splitlines() if "spawn_main" in line]
+    return [int(worker) for worker in workers]
+
+
+def test_a_worker_that_dies_is_told_in_one_line(tmp_path: Path) -> None:
+    make_world()
+    process = persist(COMMAND.replace("0:4", "0:40"), tmp_path)
+    while process.poll() is None and not list(tmp_path.glob("*.parquet")):
+        time.sleep(0.05)
+    os.kill(children(process.pid)[0], signal.SIGKILL)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert told.strip().splitlines()[-1].startswith("error: a worker process died")
+    assert "Traceback" not in told
+
+
+def test_an_interrupt_ends_quietly_and_leaves_whole_files(tmp_path: Path) -> None:
+    make_world()
+    process = persist(COMMAND.replace("0:4", "0:40"), tmp_path)
+    while process.poll() is None and not list(tmp_path.glob("*.parquet")):
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in told
+    assert all(trajectory.length == 40 for trajectory in Store(tmp_path))
+    assert not list(tmp_path.glob(".partial-*"))

@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from persist_cli.registry import make_simulator
+from persist_cli.simulators.miniworld import MiniWorld
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.errors import DataError, RecipeError
+from persist_cli.world.geometry import camera_rays, project, unproject
+from persist_cli.world.observations import Frame
+
+from .conftest import make_world, put_somewhere
+
+FINGERPRINT = """
+import hashlib, sys
+from persist_cli.registry import make_simulator
+world = make_simulator("miniworld", {})
+world.open_scene(3)
+world.place((float(sys.argv[1]), float(sys.argv[2])), 0.3)
+frame = world.observe()
+print(hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest())
+"""
+OPEN = """
+import sys
+from persist_cli.registry import make_simulator
+from persist_cli.world.errors import PersistError
+if len(sys.argv) > 1:
+    sys.modules[sys.argv[1]] = None
+try:
+    make_simulator("miniworld", {})
+except PersistError as error:
+    print(error)
+"""
+
+
+def run_python(code: str, *arguments: str, **environment: str) -> str:
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def camera(world: MiniWorld, frame: Frame) -> Cameras:
+    intrinsics, pose = torch.from_numpy(world.info.intrinsics), torch.from_numpy(frame.world_from_camera)
+    return Cameras(pose[None], intrinsics[None], world.info.height, world.info.width)
+
+
+def depth_at(depth: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """Depth between pixels; 1/z is linear on a flat surface."""
+    grid = pixels / torch.tensor([depth.shape[1], depth.shape[0]]) * 2 - 1
+    inverse = (1 / depth.double().clamp_min(1e-3))[None, None]
+    sampled = torch.nn.functional.grid_sample(inverse, grid[None, None].double(), align_corners=False)
+    return 1 / sampled[0, 0, 0]
+
+
+def test_the_same_house_gives_the_same_pixels_in_another_process(world: MiniWorld) -> None:
+    frame, ((x, z), _) = world.observe(), world.agent
+    here = hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()
+    assert run_python(FINGERPRINT, repr(x), repr(z)) == here
+
+
+def test_another_house_gives_other_pixels(world: MiniWorld) -> None:
+    before = world.observe().rgb
+    world.open_scene(4)
+    put_somewhere(world)
+    assert np.abs(world.observe().rgb.astype(int) - before).mean() > 5
+
+
+def test_depth_of_the_floor_is_exact_to_a_tenth_of_a_millimetre(world: MiniWorld) -> None:
+    frame = world.observe()
+    points = unproject(torch.from_numpy(frame.depth)[None], camera(world, frame))[0]
+    floor = points[-12:, :, 1][points[-12:, :, 1] < 0.1]
+    assert floor.numel() > 100
+    assert float(floor.abs().median()) < 1e-4
+
+
+def test_depth_of_a_far_wall_is_exact_to_a_millimetre(world: MiniWorld) -> None:
+    room = max((room.ground for room in world.house.rooms), key=lambda ground: ground.width)
+    eye, forward = (room.low_x + 0.1, 2.6, room.center[1]), (1.0, 0.0, 0.0)
+    _, depth = world._renderer.render(eye, forward, 30.0)
+    assert depth[30:34, 28:36] == pytest.approx(room.high_x - eye[0], abs=1e-3)
+
+
+def test_two_views_agree_within_a_millimetre(world: MiniWorld) -> None:
+    errors = []
+    for seed in range(4):
+        put_somewhere(world, seed)
+        first = world.observe()
+        assert world.act("left")
+        second = world.observe()
+        points = unproject(torch.from_numpy(first.depth)[None], camera(world, first)).reshape(1, -1, 3)
+        pixels, depth = (value[0] for value in project(points, camera(world, second)))
+        inside = ((pixels > 1) & (pixels < 63)).all(-1) & (depth > 0)
+        errors.append((depth_at(torch.from_numpy(second.depth), pixels[inside]) - depth[inside]).abs())
+    median = float(torch.cat(errors).median())
+    print(f"median cross-view error {1000 * median:.3f} mm")  # noqa: T201
+    assert median < 1e-3
+
+
+def test_the_heading_is_the_optical_axis_and_left_is_left(world: MiniWorld) -> None:
+    pose = torch.from_numpy(world.observe().world_from_camera)
+    x, z = world.ahead(world.agent[1])
+    assert pose[:3, 2].tolist() == pytest.approx([x, 0.0, z])
+    assert pose[:3, 1].tolist() == pytest.approx([0.0, -1.0, 0.0])
+    assert float(torch.linalg.det(pose[:3, :3])) == pytest.approx(1.0)
+    world.act("left")
+    turned = torch.from_numpy(world.observe().world_from_camera)[:3, 2]
+    assert float(turned @ pose[:3, 0]) == pytest.approx(-math.sin(math.radians(15)))
+
+
+def test_the_field_of_view_is_that_of_the_intrinsics() -> None:
+    world = make_world(height=40, width=80, fov=90.0)
+    world.open_scene(3)
+    put_somewhere(world)
+    rays = camera_rays(camera(world, world.observe()))[0]
+    assert float(rays[0, 0, 1]) == pytest.approx(-39 / 40)
+    assert float(rays[0, -1, 0]) == pytest.approx(79 / 40)
+
+
+def test_the_sky_is_missing_depth(world: MiniWorld) -> None:
+    roofless = next(seed for seed in range(200) if any(not room.ceiling for room in make_house(world, seed)))
+    world.open_scene(roofless)
+    room = next(room for room in world.house.rooms if room.ceiling is None)
+    world._renderer.load(world.house, [])
+    (x, z), sky = room.ground.center, 25.0
+    _, depth = world._renderer.render((x, 1.2, z), (0.01, 1.0, 0.0), sky)
+    assert not depth.any()
+
+
+def make_house(world: MiniWorld, seed: int) -> tuple:  # type: ignore[type-arg]
+    world.open_scene(seed)
+    return world.house.rooms
+
+
+def test_recorded_poses_are_the_nominal_motion(world: MiniWorld) -> None:
+    random, info = np.random.default_rng(0), world.info
+    poses, done = [world.observe().world_from_camera], []
+    for _ in range(100):
+        action = str(random.choice(["forward", "backward", "left", "right", "stay"]))
+        if world.act(action):
+            done.append(action)
+            poses.append(world.observe().world_from_camera)
+    recorded = torch.from_numpy(np.stack(poses))
+    nominal = info.vocabulary.follow(recorded[0], done, torch.tensor(info.world_up, dtype=torch.float64))
+    assert float((nominal - recorded[1:]).abs().max()) < 1e-6
+
+
+def test_a_blocked_action_changes_nothing(world: MiniWorld) -> None:
+    for _ in range(100):
+        if not world.act("forward"):
+            break
+    before, agent = world.observe(), world.agent
+    assert not world.act("forward")
+    after = world.observe()
+    assert agent == world.agent
+    assert np.array_equal(before.rgb, after.rgb)
+    assert np.array_equal(before.world_from_camera, after.world_from_camera)
+
+
+def test_a_long_step_does_not_pass_through_walls() -> None:
+    world = make_world(step=5.0)
+    world.open_scene(3)
+    put_somewhere(world)
+    for _ in range(24):
+        (x, z), heading = world.agent
+        ahead_x, ahead_z = world.ahead(heading)
+        way = [(x + share * ahead_x, z + share * ahead_z) for share in np.linspace(0.0, 5.0, 200)]
+        moved = world.act("forward")
+        assert moved <= all(world.is_free(ground) for ground in way[::40])
+        world.place((x, z), heading)
+        world.act("left")
+
+
+def face_a_movable_thing(world: MiniWorld) -> None:
+    for seed in range(50):
+        world.open_scene(seed)
+        for thing in (thing for thing in world.house.things if thing.movable and thing.elevation == 0):
+            x, z = thing.ground[0] - thing.radius - 1.3, thing.ground[1]
+            if thing.shape == "box" and world.is_free((x, z)):
+                world.place((x, z), 0.0)
+                if world.act("toggle") and world.act("toggle") and world.act("pick_up"):
+                    world.open_scene(seed)
+                    world.place((x, z), 0.0)
+                    return
+    pytest.fail("no house has a movable box with free ground before it")
+
+
+def test_pick_up_and_drop_move_a_thing(world: MiniWorld) -> None:
+    face_a_movable_thing(world)
+    before = world.observe().rgb
+    assert not world.act("drop")
+    assert world.act("pick_up")
+    carried = world.observe().rgb
+    assert not world.act("pick_up")
+    assert world.act("drop")
+    assert not np.array_equal(before, carried)
+    assert not np.array_equal(carried, world.observe().rgb)
+
+
+def test_toggle_changes_a_thing_and_toggling_again_undoes_it(world: MiniWorld) -> None:
+    face_a_movable_thing(world)
+    before = world.observe().rgb
+    assert world.act("toggle")
+    toggled = world.observe().rgb
+    assert world.act("toggle")
+    assert not np.array_equal(before, toggled)
+    assert np.array_equal(before, world.observe().rgb)
+
+
+def test_a_place_inside_a_wall_is_refused(world: MiniWorld) -> None:
+    with pytest.raises(DataError, match=r"house 3: \(-9\.00, -9\.00\) is not free"):
+        world.place((-9.0, -9.0), 0.0)
+
+
+def test_wrong_settings_are_told_in_one_line() -> None:
+    with pytest.raises(RecipeError, match="did you mean 'fov'"):
+        make_simulator("miniworld", {"fow": 75})
+    with pytest.raises(RecipeError, match="fov 200"):
+        make_simulator("miniworld", {"fov": 200.0})
+
+
+def test_a_missing_driver_is_told_with_the_packages_to_install() -> None:
+    line = run_python(OPEN, __EGL_VENDOR_LIBRARY_DIRS="/nonexistent")
+    assert "EGL" in line
+    assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in line
+    assert len(line.splitlines()) == 1
+
+
+def test_a_missing_egl_library_is_told_with_the_packages_to_install() -> None:
+    assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in run_python(OPEN, "pyglet.libs.egl")
+
+
+def test_a_missing_miniworld_is_told_with_the_extra_to_install() -> None:
+    assert "pip install 'persist-cli[miniworld]'" in run_python(OPEN, "miniworld")

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from persist_cli.viewing.map import draw_map, ground_axes, paint
+from persist_cli.world.memory import MapPoints
+from tests.memory.views_of_room import walked, written
+from tests.rooms import UP
+
+RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+
+
+def points(*placed) -> MapPoints:
+    positions, colors = zip(*placed, strict=True)
+    return MapPoints(torch.tensor(positions, dtype=torch.float64), torch.tensor(colors, dtype=torch.uint8), 0.5)
+
+
+@pytest.mark.parametrize("up", [UP, (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, -0.8)])
+def test_the_map_is_seen_from_above_and_never_mirrored(up):
+    axes = ground_axes(up)
+    torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
+    assert torch.linalg.det(axes) > 0.99  # right, up in the picture, towards the viewer: right-handed
+    torch.testing.assert_close(axes[2], torch.tensor(up, dtype=torch.float64))
+
+
+def test_the_highest_point_under_the_ceiling_is_drawn():
+    seen = points(((0, 0.0, 0), RED), ((0, 1.0, 0), GREEN), ((0, 2.5, 0), BLUE))
+    image, _ = paint(seen, ground_axes(UP), 1.5)
+    assert {tuple(color) for color in image[image[..., 3] > 0][:, :3]} == {(0.0, 1.0, 0.0)}
+
+
+def test_a_place_without_a_point_is_left_open():
+    image, extent = paint(points(((0, 0, 0), RED), ((3, 0, 0), BLUE)), ground_axes(UP), None)
+    assert np.isclose(extent[0], -0.25)
+    assert (image[..., 3] == 0).mean() > 0.5
+    assert image[1, 1, 0] == 1.0
+    assert image[1, -3, 2] == 1.0
+
+
+def test_when_everything_is_over_the_cameras_all_of_it_is_drawn():
+    image, _ = paint(points(((0, 5.0, 0), RED)), ground_axes(UP), 1.0)
+    assert (image[..., 3] > 0).any()
+
+
+def test_a_map_with_several_paths_is_a_picture_in_true_scale(tmp_path):
+    observations = walked()
+    poses = observations.cameras.world_from_camera
+    memory = written("voxel", observations)
+    draw_map(memory.points(), UP, {"ground truth": poses, "rollout": poses[:3]}, tmp_path / "map.png")
+    picture = np.asarray(Image.open(tmp_path / "map.png").convert("RGB")).astype(int)
+    assert min(picture.shape[:2]) > 500
+    for color in ((0xD8, 0x1B, 0x60), (0x1E, 0x88, 0xE5)):
+        assert (np.abs(picture - color).sum(-1) < 12).sum() > 50
+
+
+@pytest.mark.parametrize("paths", [{}, [], [torch.eye(4)], {"still": torch.eye(4).expand(1, 4, 4)}])
+def test_an_empty_memory_and_a_short_path_still_give_a_picture(tmp_path, paths):
+    nothing = MapPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8))
+    paths = [path[None] for path in paths] if isinstance(paths, list) else paths
+    draw_map(nothing, UP, paths, tmp_path / "map.png")
+    assert Image.open(tmp_path / "map.png").size[0] > 100
+
+
+def test_the_same_map_is_the_same_picture(tmp_path):
+    memory = written("voxel", walked(2))
+    for name in ("a.png", "b.png"):
+        draw_map(memory.points(), UP, {}, tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
