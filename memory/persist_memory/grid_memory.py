@@ -182,6 +182,8 @@ class GridMemory(Memory):
         columns = self.grid.columns.items()
         expected = {name: (column.dtype, (None, column.width)[: 2 if column.width else 1]) for name, column in columns}
         check_tensors(tensors, {"cells": (torch.int32, (None, 3)), **expected}, where)
+        if "counts" in tensors and bool((tensors["counts"] < 1).any()):
+            raise CheckpointError(f"{where}: a cell without a pixel")
         cells = tensors["cells"].long()
         if not bool(((cells >= -LIMIT) & (cells < LIMIT)).all()):
             raise CheckpointError(f"{where}: a cell lies beyond ±{LIMIT} cells")

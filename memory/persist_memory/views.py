@@ -14,7 +14,7 @@ from persist_memory.sparse_grid import BLOCK, SparseGrid, unpack
 
 TOUCHING = 1e-6  # metres that a box must reach into a view: ties must not hang on the last bit
 MICRO = 1e6  # distances are compared in micrometres, for the same reason
-FIRST_LOOK = 4096  # cells examined before more are fetched
+FIRST_LOOK = 1024  # cells examined before more are fetched
 
 
 @dataclass(frozen=True)

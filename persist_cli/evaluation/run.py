@@ -21,6 +21,7 @@ from persist_cli.trajectories.store import Store
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 from persist_cli.viewing.sheet import write_sheet
 from persist_cli.world.backbone import Backbone, Sampling
+from persist_cli.world.errors import PersistError
 from persist_cli.world.files import write_json
 
 SHOWN = 3  # clips on the contact sheet
@@ -43,7 +44,11 @@ def run_eval(paths: Sequence[Path], data: Path, plan: EvalPlan, out: Path, json:
     checkpoints = [find_checkpoint(path) for path in paths]
     memories = [name.strip() for name in plan.memories.split(",") if name.strip()]
     rows = make_rows(checkpoints, memories, Sampling(plan.steps, plan.sampler))
+    if not memories:
+        raise PersistError("name at least one memory, as in --memories none,voxel")
     backbone = load_backbone(checkpoints[0])
+    if plan.sampler not in backbone.samplers:
+        raise PersistError(f"unknown sampler {plan.sampler!r}; this backbone has {', '.join(backbone.samplers)}")
     store = Store(data)
     for file in store:
         check_size(file.info, backbone.image_size, f"{data}#{file.name}")

@@ -19,7 +19,8 @@ T = TypeVar("T")
 
 GAPS = (64, 32, 16, 8, 4, 2, 1)  # frames between the two, the widest first
 MOST_TURN = 20.0  # degrees; more leaves too little in both views
-MOST_WALK = 0.3  # of the median depth; more hides too much
+MOST_WALK = 0.3  # of the median depth; more hides too much ...
+MOST_METRES = 0.75  # ... and no more than this, should the depth be in wrong units
 LEAST_TURN = 0.5  # degrees
 LEAST_WALK = 0.005  # metres
 
@@ -59,7 +60,7 @@ def spread(items: Sequence[T], count: int) -> list[T]:
 def _pairs_of(file: TrajectoryFile, frames: slice | None, count: int) -> list[FramePair]:
     first, end, _ = (frames or slice(None)).indices(len(file))
     poses = file.poses()[:end]
-    walk = MOST_WALK * _median_depth(file, (first + end) // 2)
+    walk = min(MOST_WALK * _median_depth(file, (first + end) // 2), MOST_METRES)
     starts = spread(range(first, end - 1), max(16, 4 * count))
     found = [(start, _partner(poses, start, walk)) for start in starts]
     return spread([FramePair(file, start, partner) for start, partner in found if partner is not None], count)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from persist_cli.world.errors import DataError
 from persist_cli.world.files import written_aside
 
 SMALLEST = 256  # pixels of the shorter side of a written image
@@ -64,3 +65,19 @@ def write_video(path: Path, video: UInt8[Tensor, "frame height width 3"], frames
         for image in frames[:, :height, :width].numpy():
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
         container.mux(stream.encode())
+
+
+def read_video(path: Path, height: int, width: int) -> UInt8[Tensor, "frame height width 3"]:
+    """Frames of a video file, reduced to a size by averaging.
+
+    Raises:
+        DataError: when it is missing or no video.
+    """
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            frames = [frame.reformat(width, height, format="rgb24").to_ndarray() for frame in container.decode(video=0)]
+    except (OSError, av.error.FFmpegError) as error:
+        raise DataError(f"{path}: cannot be read as a video ({error})") from error
+    return torch.from_numpy(np.stack(frames))

@@ -27,6 +27,15 @@ def persist(arguments: str, out: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, text=True, start_new_session=True, **pipes)  # type: ignore[call-overload,no-any-return]
 
 
+def persist_at_work(out: Path) -> subprocess.Popen[str]:
+    """A run of forty scenes that has finished its first."""
+    process = persist(COMMAND.replace("0:4", "0:40"), out)
+    while process.poll() is None and not list(out.glob("house-*.parquet")):
+        time.sleep(0.05)
+    assert process.poll() is None, process.communicate()
+    return process
+
+
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
@@ -120,7 +129,7 @@ def test_killed_runs_go_on_and_end_as_an_uninterrupted_one(tmp_path: Path) -> No
     assert persist(COMMAND, whole).wait() == 0
     for first_files in (0, 1, 3):
         process = persist(COMMAND, killed)
-        while process.poll() is None and len(list(killed.glob("*.parquet"))) < first_files:
+        while process.poll() is None and len(list(killed.glob("house-*.parquet"))) < first_files:
             time.sleep(0.05)
         time.sleep(0.05 * first_files)
         if process.poll() is None:
@@ -138,9 +147,7 @@ def children(pid: int) -> list[int]:
 
 def test_a_worker_that_dies_is_told_in_one_line(tmp_path: Path) -> None:
     make_world()
-    process = persist(COMMAND.replace("0:4", "0:40"), tmp_path)
-    while process.poll() is None and not list(tmp_path.glob("*.parquet")):
-        time.sleep(0.05)
+    process = persist_at_work(tmp_path)
     os.kill(children(process.pid)[0], signal.SIGKILL)
     _, told = process.communicate(timeout=60)
     assert process.returncode == 1
@@ -150,9 +157,7 @@ def test_a_worker_that_dies_is_told_in_one_line(tmp_path: Path) -> None:
 
 def test_an_interrupt_ends_quietly_and_leaves_whole_files(tmp_path: Path) -> None:
     make_world()
-    process = persist(COMMAND.replace("0:4", "0:40"), tmp_path)
-    while process.poll() is None and not list(tmp_path.glob("*.parquet")):
-        time.sleep(0.05)
+    process = persist_at_work(tmp_path)
     os.killpg(process.pid, signal.SIGINT)
     _, told = process.communicate(timeout=60)
     assert process.returncode == 130

@@ -92,7 +92,8 @@ class DinoV2(Encoder):
     def _model(self) -> Any:
         from transformers import Dinov2Model
 
-        return self._opened(Dinov2Model, use_safetensors=True, config=self._config).eval().requires_grad_(False)
+        options = {"use_safetensors": True, "config": self._config, "dtype": torch.float32}
+        return self._opened(Dinov2Model, **options).eval().requires_grad_(False)
 
     def _opened(self, kind: Any, **options: Any) -> Any:
         from safetensors import SafetensorError

@@ -1,0 +1,64 @@
+"""A micro CogVideoX and random clips for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from persist_backbones.cogvideox import CogVideoX
+from persist_cli.registry import make_backbone
+from persist_cli.world.backbone import Clips
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.tokens import MemoryTokens
+from tests.walking import MICRO, SIZE
+
+CHANNELS = 6
+
+
+def micro(**settings: Any) -> CogVideoX:
+    """A micro model with weights of seed 0."""
+    torch.manual_seed(0)
+    backbone = make_backbone("cogvideox", MICRO | settings)
+    assert isinstance(backbone, CogVideoX)
+    return backbone.eval()
+
+
+def with_adapter(backbone: CogVideoX, **settings: Any) -> CogVideoX:
+    """The model with a fresh adapter in use."""
+    torch.manual_seed(1)
+    backbone.add_adapter("voxel", CHANNELS, {"width": 16, "heads": 2, "dropout": 0.0} | settings)
+    return backbone
+
+
+def shaken(module: torch.nn.Module, scale: float = 0.1) -> None:
+    """Change every weight, as training would."""
+    draw = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.add_(torch.randn(parameter.shape, generator=draw) * scale)
+
+
+def random_tokens(batch: int, count: int, seed: int = 3) -> MemoryTokens:
+    """Tokens within a few metres."""
+    draw = torch.Generator().manual_seed(seed)
+    features = torch.randn(batch, count, CHANNELS, generator=draw)
+    positions = torch.randn(batch, count, 3, generator=draw, dtype=torch.float64) * 2
+    return MemoryTokens(features, positions, torch.ones(batch, count, dtype=torch.bool))
+
+
+def random_clips(batch: int = 2, tokens: MemoryTokens | None = None, interactions: Any = None) -> Clips:
+    """Noise images on a path that moves ahead."""
+    draw = torch.Generator().manual_seed(2)
+    poses = torch.eye(4, dtype=torch.float64).repeat(batch, 9, 1, 1)
+    poses[:, :, 2, 3] = torch.arange(9) * 0.25
+    focal = SIZE * 0.7
+    matrix = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]], dtype=torch.float64)
+    return Clips(
+        rgb=torch.randint(0, 256, (batch, 9, SIZE, SIZE, 3), generator=draw, dtype=torch.uint8),
+        depth=torch.rand(batch, 9, SIZE, SIZE, generator=draw) * 4 + 0.3,
+        cameras=Cameras(poses, matrix.expand(batch, 9, 3, 3), SIZE, SIZE),
+        interactions=interactions or [(None,) * 8] * batch,
+        tokens=tokens,
+        seeds=list(range(batch)),
+    )

@@ -1,0 +1,115 @@
+import dataclasses
+
+import pytest
+import torch
+
+from persist_backbones.conditioning import camera_latents
+from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
+from persist_backbones.diffusion import loss_weights
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import CheckpointError, DataError, PersistError
+from tests.backbones.micro import micro, random_clips, shaken
+
+
+def test_depth_survives_its_code_from_a_hand_to_a_hall():
+    depth = torch.tensor([0.1, 0.3, 1.0, 5.0, 20.0, 64.0])
+    assert torch.allclose(decode_depth(encode_depth(depth)), depth, rtol=1e-4)
+    assert decode_depth(encode_depth(torch.zeros(1))).item() == 0
+
+
+def test_filling_keeps_what_is_known_and_leaves_no_hole():
+    depth = torch.full((1, 13, 17), 3.0)
+    depth[:, 4:9, 3:12] = 0
+    filled = fill_missing(depth)
+    assert torch.allclose(filled, torch.full_like(depth, 3.0))
+    assert not fill_missing(torch.zeros(1, 4, 4)).any()
+
+
+def test_nine_frames_of_rays_become_three_latent_frames_of_24_channels():
+    assert camera_latents(random_clips(1).cameras, 4, 4, False).shape == (1, 3, 24, 8, 8)
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "dpm"])
+def test_a_clip_depends_on_its_seed_and_not_on_its_batch(sampler):
+    backbone, clips, sampling = micro(), random_clips(2), Sampling(3, sampler)
+    shaken(backbone)
+    rgb, depth = backbone.generate(clips, sampling)
+    again = backbone.generate(clips, sampling)
+    assert torch.equal(rgb, again[0])
+    assert torch.equal(depth, again[1])
+    second = dataclasses.replace(random_clips(2), rgb=clips.rgb[1:], depth=clips.depth[1:], seeds=[1])
+    second = dataclasses.replace(
+        second, cameras=dataclasses.replace(clips.cameras, world_from_camera=clips.cameras.world_from_camera[1:],
+                                            intrinsics=clips.cameras.intrinsics[1:]), interactions=[(None,) * 8]
+    )  # fmt: skip
+    alone = backbone.generate(second, sampling)
+    assert (alone[0][0].int() - rgb[1].int()).abs().max() <= 1
+    other = backbone.generate(dataclasses.replace(clips, seeds=[7, 8]), sampling)
+    assert not torch.equal(rgb, other[0])
+
+
+def test_a_clip_begins_with_the_given_frame():
+    backbone, clips = micro(), random_clips(1)
+    rgb, depth = backbone.generate(clips, Sampling(1))
+    assert torch.equal(rgb[:, 0], clips.rgb[:, 0])
+    assert torch.equal(depth[:, 0], clips.depth[:, 0])
+    assert rgb.shape == clips.rgb.shape
+
+
+def test_a_model_survives_saving_to_the_bit(tmp_path):
+    backbone, clips = micro(), random_clips(1)
+    shaken(backbone)
+    backbone.save_base(tmp_path)
+    other = micro()
+    other.load_base(tmp_path)
+    for one, two in zip(backbone.generate(clips, Sampling(2)), other.generate(clips, Sampling(2)), strict=True):
+        assert torch.equal(one, two)
+
+
+def test_interactions_change_nothing_at_first_and_something_once_learned():
+    backbone = micro()
+    shaken(backbone.transformer.base)
+    picked = random_clips(1, interactions=[(None, "pick_up", *[None] * 6)])
+    dropped = random_clips(1, interactions=[(None, "drop", *[None] * 6)])
+    assert torch.equal(backbone(picked, "1")["loss"], backbone(random_clips(1), "1")["loss"])
+    torch.nn.init.normal_(backbone.transformer.interactions.weight)
+    assert not torch.equal(backbone(picked, "1")["loss"], backbone(dropped, "1")["loss"])
+
+
+def test_an_unknown_interaction_sampler_or_window_is_one_line():
+    backbone = micro()
+    with pytest.raises(DataError, match="no interaction 'jump'; it has pick_up, drop, toggle"):
+        backbone(random_clips(1, interactions=[("jump",) * 8]), "1")
+    with pytest.raises(PersistError, match="unknown sampler 'euler'; known: ddim, dpm"):
+        backbone.generate(random_clips(1), Sampling(1, "euler"))
+    with pytest.raises(CheckpointError, match="larger than the clips"):
+        micro(codec_window=[9, 64, 64])(random_clips(1), "codec")
+
+
+def test_a_loss_is_drawn_from_the_seeds_alone():
+    backbone, clips = micro(), random_clips(2)
+    for stage in ("codec", "1"):
+        assert torch.equal(backbone(clips, stage)["loss"], backbone(clips, stage)["loss"])
+        other = dataclasses.replace(clips, seeds=[5, 6])
+        assert not torch.equal(backbone(clips, stage)["loss"], backbone(other, stage)["loss"])
+
+
+def test_min_snr_lowers_the_weight_of_clean_samples_and_never_exceeds_one():
+    scheduler = micro().scheduler
+    weights = loss_weights(scheduler, torch.tensor([0, 300, 999]), "min-snr", 5.0)
+    signal = scheduler.alphas_cumprod[torch.tensor([0, 300, 999])].double()
+    snr = signal / (1 - signal)
+    assert torch.allclose(weights.double(), snr.clamp_max(5.0) / (snr + 1), atol=1e-6)
+    assert loss_weights(scheduler, torch.tensor([0, 999]), "uniform", 5.0).tolist() == [1.0, 1.0]
+
+
+def test_the_codec_stage_measures_the_scale_of_its_latents():
+    backbone, clips = micro(), random_clips(2)
+    backbone.finish_stage("codec", [clips])
+    assert float(backbone.codec.encode(clips.rgb, clips.depth).std()) == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_printed_rays_are_another_model_input():
+    assert not torch.equal(
+        micro(rays="printed").camera_latents(random_clips(1)), micro().camera_latents(random_clips(1))
+    )

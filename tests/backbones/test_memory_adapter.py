@@ -1,0 +1,161 @@
+import dataclasses
+
+import pytest
+import torch
+
+from persist_backbones.memory_block import position_code
+from persist_cli.world.actions import rotation_about
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.errors import CheckpointError
+from persist_cli.world.tokens import MemoryTokens
+from tests.backbones.micro import CHANNELS, micro, random_clips, random_tokens, shaken, with_adapter
+
+QUICK = Sampling(steps=2)
+
+
+def padded(tokens: MemoryTokens, extra: int) -> MemoryTokens:
+    """The same tokens with rubbish behind the mask."""
+    batch = len(tokens.features)
+    return MemoryTokens(
+        torch.cat([tokens.features, torch.full((batch, extra, CHANNELS), 9.0)], 1),
+        torch.cat([tokens.positions, torch.full((batch, extra, 3), -7.0, dtype=torch.float64)], 1),
+        torch.cat([tokens.mask, torch.zeros(batch, extra, dtype=torch.bool)], 1),
+    )
+
+
+def velocity(backbone, clips, tokens):
+    """One prediction of the transformer."""
+    with torch.no_grad():
+        memory = backbone.prepare_memory(dataclasses.replace(clips, tokens=tokens))
+        latents = backbone.codec.encode(clips.rgb, clips.depth)
+        given = backbone.conditions(clips, torch.full((len(clips.seeds),), 500), memory)
+        return backbone.predict(latents, backbone.encode_first(clips), given)
+
+
+@pytest.mark.parametrize("count", [1, 30])
+def test_a_fresh_adapter_changes_not_one_bit_whatever_the_tokens(count):
+    backbone, clips = micro(), random_clips()
+    shaken(backbone.transformer)
+    bare = backbone.generate(clips, QUICK)
+    with_adapter(backbone)
+    for tokens in (None, random_tokens(2, count)):
+        remembered = backbone.generate(dataclasses.replace(clips, tokens=tokens), QUICK)
+        assert all(torch.equal(*pair) for pair in zip(bare, remembered, strict=True))
+
+
+def test_a_trained_adapter_uses_its_tokens():
+    backbone, clips = with_adapter(micro()), random_clips()
+    shaken(backbone)
+    assert not torch.allclose(
+        velocity(backbone, clips, random_tokens(2, 9)), velocity(backbone, clips, random_tokens(2, 9, 4))
+    )
+
+
+def test_padding_behind_the_mask_changes_nothing():
+    backbone, clips, tokens = with_adapter(micro()), random_clips(), random_tokens(2, 9)
+    shaken(backbone)
+    assert torch.allclose(velocity(backbone, clips, tokens), velocity(backbone, clips, padded(tokens, 20)), atol=1e-5)
+
+
+def test_a_batch_may_hold_a_sample_without_any_token():
+    backbone, clips = with_adapter(micro()), random_clips()
+    shaken(backbone)
+    some = random_tokens(2, 9)
+    mixed = dataclasses.replace(some, mask=some.mask & torch.tensor([[True], [False]]))
+    result = velocity(backbone, clips, mixed)
+    assert result.isfinite().all()
+    assert torch.allclose(result[1], velocity(backbone, clips, None)[1], atol=1e-5)
+    assert torch.allclose(result[0], velocity(backbone, clips, some)[0], atol=1e-5)
+
+
+def test_every_parameter_of_the_memory_blocks_has_a_gradient_within_two_steps():
+    backbone = with_adapter(micro())
+    shaken(backbone.transformer)
+    clips = random_clips(tokens=random_tokens(2, 9))
+    parameters = backbone.trained_parameters("2")
+    optimizer = torch.optim.AdamW(parameters.values(), lr=1e-2)
+    moved = dict.fromkeys(parameters, False)
+    for _ in range(2):
+        optimizer.zero_grad()
+        backbone(clips, "2")["loss"].backward()
+        moved = {name: moved[name] or bool(each.grad.any()) for name, each in parameters.items()}
+        optimizer.step()
+    # a softmax does not see a constant added to every key
+    assert [name for name, done in moved.items() if not done and not name.endswith("to_key.bias")] == []
+
+
+def test_stage_two_trains_the_adapter_and_nothing_else():
+    backbone = with_adapter(micro())
+    names = set(backbone.trained_parameters("2"))
+    assert names
+    assert all(name.startswith("adapters.voxel.") for name in names)
+    assert {name for name, each in backbone.named_parameters() if each.requires_grad} == names
+
+
+def test_moving_the_whole_world_changes_no_prediction():
+    backbone, clips, tokens = with_adapter(micro()), random_clips(), random_tokens(2, 9)
+    shaken(backbone)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3] = rotation_about(torch.tensor([0.6, 0.0, 0.8]), 1.1)
+    motion[:3, 3] = torch.tensor([40.0, -3.0, 12.0])
+    moved_cameras = Cameras(motion @ clips.cameras.world_from_camera, clips.cameras.intrinsics, 32, 32)
+    moved_tokens = dataclasses.replace(tokens, positions=tokens.positions @ motion[:3, :3].T + motion[:3, 3])
+    here = velocity(backbone, clips, tokens)
+    there = velocity(backbone, dataclasses.replace(clips, cameras=moved_cameras), moved_tokens)
+    assert torch.allclose(here, there, atol=1e-4)
+
+
+def test_absolute_positions_see_where_the_origin_is():
+    backbone, clips, tokens = with_adapter(micro(), positions="absolute"), random_clips(), random_tokens(2, 9)
+    shaken(backbone)
+    moved = dataclasses.replace(tokens, positions=tokens.positions + 1.0)
+    assert not torch.allclose(velocity(backbone, clips, tokens), velocity(backbone, clips, moved))
+
+
+def test_guidance_over_memory_of_weight_one_is_no_guidance_and_more_pushes_away_from_none():
+    backbone, clips = with_adapter(micro()), random_clips(tokens=random_tokens(2, 9))
+    shaken(backbone)
+    plain, strong = (backbone.generate(clips, Sampling(2, "ddim", weight))[1] for weight in (1.0, 3.0))
+    assert not torch.equal(plain, strong)
+    without = dataclasses.replace(clips, tokens=None)
+    assert torch.allclose(
+        backbone.generate(without, Sampling(2, "ddim", 3.0))[1], backbone.generate(without, QUICK)[1], atol=1e-3
+    )
+
+
+def test_blocks_stand_where_every_says():
+    assert set(with_adapter(micro(), every=2).adapter.blocks) == {"1"}
+    assert set(with_adapter(micro()).adapter.blocks) == {"0", "1"}
+
+
+def test_an_adapter_survives_saving_to_the_bit(tmp_path):
+    backbone = with_adapter(micro())
+    shaken(backbone.adapters)
+    backbone.save_adapter(tmp_path)
+    other = micro()
+    other.load_adapter("voxel", tmp_path)
+    assert all(
+        torch.equal(value, other.adapters.state_dict()[name]) for name, value in backbone.adapters.state_dict().items()
+    )
+
+
+def test_what_does_not_fit_is_one_line(tmp_path):
+    backbone = with_adapter(micro())
+    backbone.save_adapter(tmp_path)
+    (tmp_path / "adapter.safetensors").write_bytes(b"rubbish")
+    with pytest.raises(CheckpointError, match="not a whole safetensors file"):
+        backbone.load_adapter("voxel", tmp_path)
+    narrow = random_clips(tokens=MemoryTokens.stack([MemoryTokens.empty(3)] * 2))
+    with pytest.raises(CheckpointError, match="features of 3 channels"):
+        backbone.generate(narrow, QUICK)
+    with pytest.raises(CheckpointError, match="unknown adapter form 'splat'; known: cross"):
+        backbone.add_adapter("other", 3, {"form": "splat"})
+    with pytest.raises(CheckpointError, match="no memory adapter 'map2d'; there are: voxel"):
+        backbone.use_adapter("map2d")
+
+
+def test_the_position_code_tells_cells_apart_and_is_bounded():
+    code = position_code(torch.tensor([[0.0, 0, 0], [0.25, 0, 0], [60.0, 0, 0]]), 10)
+    assert code.abs().max() <= 1
+    assert torch.pdist(code).min() > 0.5

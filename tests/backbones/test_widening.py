@@ -1,0 +1,112 @@
+import pytest
+import torch
+from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
+
+from persist_backbones.parts import load_parts, make_parts, widen
+from persist_backbones.presets import CogVideoXSettings
+from persist_backbones.rotary import rotary_positions
+from persist_backbones.world_transformer import Conditions
+from persist_cli.registry import make_backbone
+from persist_cli.world.errors import CheckpointError
+from tests.walking import MICRO, SIZE
+
+KINDS = {
+    "learned-rotary (5b-I2V)": {"use_rotary_positional_embeddings": True, "use_learned_positional_embeddings": True},
+    "rotary": {"use_rotary_positional_embeddings": True},
+    "sinusoidal (2b)": {},
+    "text-to-video base": {"in_channels": 4},
+}
+
+
+def settings_of(kind: str) -> CogVideoXSettings:
+    sizes = {key: value for key, value in MICRO.items() if key not in {"transformer", "vae"}}
+    return CogVideoXSettings(
+        **sizes, transformer=MICRO["transformer"] | KINDS[kind], vae=MICRO["vae"] | {"latent_channels": 4}
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_widened_model_is_the_original_to_the_bit(kind):
+    torch.manual_seed(0)
+    settings = settings_of(kind)
+    parts = make_parts(settings)
+    base = parts.transformer
+    world = widen(parts, settings)
+    latents = torch.randn(2, 3, 4 * 4 + 24, 8, 8)
+    text, time = torch.randn(2, base.config.max_text_seq_length, 8), torch.tensor([3, 700])
+    rotary = rotary_positions(base.config, 3, torch.device("cpu"))
+    given = Conditions(text, time, torch.ones(2, 8, dtype=torch.long), torch.zeros(2, 48, 24), rotary)
+    with torch.no_grad():
+        plain = base(latents[:, :, : base.config.in_channels], text, time, image_rotary_emb=rotary).sample
+        widened = world(latents, given, None)
+    assert torch.equal(widened[:, :, :4], plain)
+    assert not widened[:, :, 4:].any()
+
+
+@pytest.fixture
+def plain_folder(tmp_path):
+    """A CogVideoX image-to-video directory as diffusers alone writes it."""
+    torch.manual_seed(0)
+    transformer = CogVideoXTransformer3DModel(
+        **MICRO["transformer"], sample_height=8, sample_width=8, sample_frames=9, max_text_seq_length=4
+    )
+    transformer.save_pretrained(tmp_path / "transformer")
+    blocks = {"down_block_types": ("CogVideoXDownBlock3D",) * 3, "up_block_types": ("CogVideoXUpBlock3D",) * 3}
+    AutoencoderKLCogVideoX(**MICRO["vae"], **blocks, layers_per_block=1).save_pretrained(tmp_path / "vae")
+    CogVideoXDDIMScheduler(prediction_type="v_prediction").save_pretrained(tmp_path / "scheduler")
+    return tmp_path
+
+
+def test_a_plain_diffusers_directory_gives_the_widened_model(plain_folder):
+    model = make_backbone("cogvideox", {"pretrained": str(plain_folder), "height": SIZE, "width": SIZE})
+    stored = load_parts(plain_folder).transformer.state_dict()
+    loaded = model.transformer.base.state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in stored.items())
+    assert not any(value.any() for name, value in model.transformer.named_parameters() if "base." not in name)
+
+
+def test_diffusers_loads_the_base_that_we_save(plain_folder, tmp_path):
+    model = make_backbone("cogvideox", {"pretrained": str(plain_folder), "height": SIZE, "width": SIZE})
+    model.save_base(tmp_path / "ours")
+    again = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "ours", subfolder="transformer")
+    assert all(
+        torch.equal(value, model.transformer.base.state_dict()[name]) for name, value in again.state_dict().items()
+    )
+
+
+@pytest.mark.parametrize("part", ["transformer", "vae", "scheduler"])
+def test_a_missing_or_truncated_part_is_one_line(plain_folder, part):
+    for file in (plain_folder / part).iterdir():
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(CheckpointError, match=rf"{part}: cannot be loaded") as error:
+        load_parts(plain_folder)
+    assert "\n" not in str(error.value)
+    for file in (plain_folder / part).iterdir():
+        file.unlink()
+    (plain_folder / part).rmdir()
+    with pytest.raises(CheckpointError, match=f"no {part}/ folder"):
+        load_parts(plain_folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [({"height": 30}, "multiple of 8"), ({"frames": 13}, r"8n \+ 1"), ({"frames": 1}, r"8n \+ 1"),
+     ({"codec_window": (5, 8, 8)}, "codec_window"), ({"transformer": {"patch_size_t": 2}}, "1.5"),
+     ({"transformer": {"in_channels": 6}}, "does not fit a VAE")],
+)  # fmt: skip
+def test_sizes_that_cannot_work_are_refused(change, cause):
+    with pytest.raises(CheckpointError, match=cause):
+        make_backbone("cogvideox", {"transformer": {"num_layers": 1}} | change)
+
+
+@pytest.mark.parametrize(
+    ("preset", "base", "new"), [("tiny", 9.88e6, 1.0e5), ("2b", 1.694e9, 7e5), ("5b", 5.570e9, 9e5)]
+)
+def test_the_presets_have_the_published_sizes(preset, base, new):
+    side = 64 if preset == "tiny" else 512
+    with torch.device("meta"):
+        model = make_backbone("cogvideox", {"preset": preset, "height": side, "width": side})
+    count = sum(each.numel() for each in model.transformer.base.parameters())
+    extra = sum(each.numel() for each in model.transformer.parameters()) - count
+    assert count == pytest.approx(base, rel=0.01)
+    assert 0 < extra < 1.1 * new

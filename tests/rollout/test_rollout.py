@@ -1,0 +1,128 @@
+import json
+import shutil
+
+import pytest
+import torch
+from PIL import Image
+
+from persist_cli.memorizing.memory_file import load_memory
+from persist_cli.registry import make_encoder, make_memory
+from persist_cli.rollout.world_model import WorldModel
+from persist_cli.trajectories.store import Store
+from persist_cli.trajectories.tum import quaternion
+from persist_cli.viewing.video import read_video
+from persist_cli.world.actions import rotation_about
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.memory import FrameOfReference
+from tests.training.test_finetune import codec, stage, stage1  # noqa: F401
+from tests.walking import SIZE
+
+
+@pytest.fixture
+def voxel(persist, walks, stage1, tmp_path_factory):  # noqa: F811
+    """A stage-2 run with a voxel memory."""
+    run = stage1.parent / "voxel"
+    if not run.exists():
+        assert persist(*stage("stage2-voxel", walks, run, f"base={stage1}")).code == 0
+    return run
+
+
+def roll(persist, run, walks, out, *options):
+    """Run ``persist rollout`` with two denoising steps."""
+    return persist("rollout", run, "--start", f"{walks}#0:2", "--out", out, "--steps", 2, *options)
+
+
+def test_a_rollout_leaves_videos_maps_poses_and_a_memory(persist, voxel, walks, tmp_path):
+    assert roll(persist, voxel, walks, tmp_path, "--actions", "left*4 forward*6").code == 0
+    names = {"rgb.mp4", "depth.mp4", "sheet.png", "map-after.png", "poses.txt", "memory.safetensors", "rollout.json"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert len(read_video(tmp_path / "rgb.mp4", SIZE, SIZE)) == 11
+    assert len([line for line in (tmp_path / "poses.txt").read_text().splitlines() if not line.startswith("#")]) == 11
+    assert Image.open(tmp_path / "map-after.png").width > 100
+    assert load_memory(tmp_path / "memory.safetensors").figures().cells > 0
+
+
+def test_a_rollout_is_the_same_for_the_same_seed_and_another_for_another(persist, voxel, walks, tmp_path):
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        assert roll(persist, voxel, walks, tmp_path / name, "--actions", "forward*9", "--seed", seed).code == 0
+    a, b, c = ((tmp_path / name / "rgb.mp4").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_following_a_trajectory_compares_with_what_is_really_there(persist, voxel, walks, tmp_path):
+    assert roll(persist, voxel, walks, tmp_path, "--follow", "--frames", 10).code == 0
+    figures = json.loads((tmp_path / "rollout.json").read_text())
+    assert len(figures["against_ground_truth"]["psnr"]) == 10
+    assert (tmp_path / "compare.mp4").is_file()
+
+
+def test_a_memory_file_is_read_and_kept_as_it_was_when_nothing_may_be_written(persist, voxel, walks, tmp_path):
+    memory = tmp_path / "m.safetensors"
+    assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
+    assert roll(persist, voxel, walks, tmp_path / "o", "--actions", "left", "--memory", memory, "--no-write").code == 0
+    before, after = load_memory(memory).tensors(), load_memory(tmp_path / "o/memory.safetensors").tensors()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    assert (tmp_path / "o/map-before.png").is_file()
+
+
+def test_without_an_adapter_it_is_plain_stage_one(persist, stage1, walks, tmp_path):  # noqa: F811
+    assert roll(persist, stage1, walks, tmp_path, "--actions", "left").code == 0
+    assert not (tmp_path / "memory.safetensors").exists()
+
+
+def test_what_cannot_be_rolled_out_is_one_line(persist, voxel, stage1, walks, tmp_path):  # noqa: F811
+    other, patches = tmp_path / "other.safetensors", tmp_path / "patches.safetensors"
+    assert persist("memorize", f"{walks}#1:0-4", "--out", other).code == 0
+    assert persist("memorize", f"{walks}#0:0-4", "--out", patches, "--set", "encoder.seed=5").code == 0
+    left = ("--actions", "left")
+    for run, options, cause in (
+        (voxel, (), "either --actions TEXT or --follow"),
+        (voxel, ("--actions", "lft"), "did you mean 'left'"),
+        (voxel, (*left, "--memory", tmp_path / "no.safetensors"), "no.safetensors"),
+        (voxel, (*left, "--memory", other), "its reference is 'room-1', wanted here is 'room-0'"),
+        (voxel, (*left, "--memory", patches), "its encoder settings"),
+        (stage1, (*left, "--memory", other), "no memory adapter that could read"),
+        (voxel, (*left, "--adapter", "map2d"), "no memory adapter 'map2d' in it; it has voxel"),
+        (voxel, (*left, "--sampler", "euler"), "unknown sampler 'euler'"),
+        (tmp_path / "gone", left, "no checkpoint there"),
+    ):
+        ended = roll(persist, run, walks, tmp_path / "o", *options)
+        assert (ended.code, cause in ended.err) == (1, True), ended.err
+        assert len(ended.err.strip().splitlines()) == 1
+    assert not (tmp_path / "o").exists()
+    ended = persist("rollout", voxel, "--start", f"{walks}#0:99", *left, "--out", tmp_path / "o")
+    assert (ended.code, "99" in ended.err) == (1, True)
+
+
+def test_a_run_that_moved_with_its_base_still_loads(persist, voxel, walks, tmp_path):
+    shutil.copytree(voxel.parent, tmp_path / "elsewhere")
+    assert roll(persist, tmp_path / "elsewhere/voxel", walks, tmp_path / "o", "--actions", "left").code == 0
+
+
+def test_the_loop_memorizes_what_it_imagines(walks):
+    from tests.backbones.micro import micro
+
+    trajectory = Store(walks)[0].read([0])
+    encoder = make_encoder("patches", {})
+    memory = make_memory("voxel", {}, encoder, FrameOfReference("room-0", trajectory.info.world_up))
+    backbone = micro()
+    backbone.add_adapter("voxel", encoder.channels, {"width": 16, "heads": 2})
+    model = WorldModel(backbone, memory, Sampling(1))
+    model.reset(trajectory.observations, trajectory.info)
+    cells = memory.figures().cells
+    seen = model.step(["left"] * 12)
+    assert len(seen) == 12
+    assert memory.figures().cells > cells
+    expected = trajectory.info.vocabulary.follow(
+        trajectory.observations.cameras.world_from_camera[0], ["left"] * 12, trajectory.world_up
+    )
+    assert torch.allclose(seen.cameras.world_from_camera, expected)
+
+
+def test_quaternions_rotate_as_their_matrices_do():
+    for angle in (0.0, 0.3, 2.0, 3.14159):
+        axis = torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
+        x, y, z, w = quaternion(rotation_about(axis, angle)).tolist()
+        expected = [*(axis * torch.sin(torch.tensor(angle / 2))).tolist(), float(torch.cos(torch.tensor(angle / 2)))]
+        assert [x, y, z, w] == pytest.approx(expected, abs=1e-6)

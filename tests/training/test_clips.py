@@ -1,0 +1,53 @@
+import pytest
+import torch
+
+from persist_cli.trajectories.clips import ClipDataset, ClipPlan, SharedBatches
+from persist_cli.world.errors import DataError
+from tests.walking import SIZE
+
+
+def plan(**changes) -> ClipPlan:
+    return ClipPlan(
+        **{"frames": 9, "strides": (1, 2), "context_frames": 5, "seed": 3, "image_size": (SIZE, SIZE)} | changes
+    )
+
+
+def test_sample_n_is_the_same_whoever_asks(walks):
+    one, two = ClipDataset(walks, plan())[11], ClipDataset(walks, plan())[11]
+    assert torch.equal(one.observations.rgb, two.observations.rgb)
+    assert torch.equal(one.context.depth, two.context.depth)
+    assert one.seed == two.seed
+    assert one.seed != ClipDataset(walks, plan(seed=4))[11].seed
+
+
+def test_the_context_ends_with_the_clips_first_frame_and_holds_no_later_one(walks):
+    clips = ClipDataset(walks, plan())
+    for number in range(20):
+        sample = clips[number]
+        assert 1 <= len(sample.context) <= 5
+        assert torch.equal(sample.context.rgb[-1], sample.observations.rgb[0])
+
+
+def test_interactions_of_skipped_frames_are_kept(walks):
+    clips = ClipDataset(walks, plan(strides=(2,)))
+    found = [clips[number].interactions for number in range(40)]
+    assert any("pick_up" in each for each in found)
+    assert all(len(each) == 8 for each in found)
+
+
+@pytest.mark.parametrize(("processes", "accumulation"), [(1, 1), (2, 1), (1, 4), (2, 2)])
+def test_processes_and_micro_batches_share_the_same_samples_of_each_step(processes, accumulation):
+    parts = [list(SharedBatches(3, 5, 8, accumulation, each, processes)) for each in range(processes)]
+    for step in (0, 1):
+        of_step = slice(step * accumulation, (step + 1) * accumulation)
+        numbers = sorted(number for part in parts for batch in part[of_step] for number in batch)
+        assert numbers == list(range((3 + step) * 8, (4 + step) * 8))
+
+
+def test_what_cannot_be_drawn_is_one_line(walks):
+    with pytest.raises(DataError, match="a clip needs 65 frames, the longest trajectory has 24"):
+        ClipDataset(walks, plan(frames=65))
+    with pytest.raises(DataError, match="images are 32x32, the model takes 64x64"):
+        ClipDataset(walks, plan(image_size=(64, 64)))
+    with pytest.raises(DataError, match="cannot be shared by 3 processes"):
+        SharedBatches(0, 1, 8, 1, 0, 3)

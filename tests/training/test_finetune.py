@@ -1,0 +1,179 @@
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_cli.checkpoints import find_checkpoint
+from persist_cli.world.files import read_tensors
+from tests.walking import MICRO_SETTINGS, SHORT
+
+PERSIST = [sys.executable, "-c", "from persist_cli.app import main; main()"]
+
+
+def stage(number: str, data: Path, out: Path, *changes: str) -> list[str]:
+    """Arguments of a short finetune run of the micro model."""
+    return ["finetune", f"tiny-{number}", "--data", str(data), "--out", str(out), *SHORT, *changes]
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    """Everything in the newest training state of a run."""
+    return read_tensors(max(run.glob("step-*")) / "training.safetensors")[0]
+
+
+def same(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> bool:
+    return set(one) == set(two) and all(torch.equal(one[name], two[name]) for name in one)
+
+
+@pytest.fixture(scope="module")
+def codec(walks, tmp_path_factory):
+    """A codec run of four steps."""
+    run = tmp_path_factory.mktemp("runs") / "codec"
+    subprocess.run([*PERSIST, *stage("codec", walks, run, *MICRO_SETTINGS)], check=True, capture_output=True)
+    return run
+
+
+@pytest.fixture(scope="module")
+def stage1(walks, codec):
+    """A stage-1 run of four steps on it."""
+    run = codec.parent / "stage1"
+    subprocess.run([*PERSIST, *stage("stage1", walks, run, f"base={codec}")], check=True, capture_output=True)
+    return run
+
+
+def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
+    assert {"recipe.yaml", "log.jsonl", "loss.png", "step-00000004"} == {path.name for path in codec.iterdir()}
+    rows = [json.loads(line) for line in (codec / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    assert rows[0]["learning_rate"] < rows[-1]["learning_rate"]
+
+
+@pytest.mark.parametrize("number", ["codec", "stage1", "stage2-voxel"])
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, codec, stage1, tmp_path, number):
+    base = {"codec": MICRO_SETTINGS, "stage1": [f"base={codec}"], "stage2-voxel": [f"base={stage1}"]}[number]
+    assert persist(*stage(number, walks, tmp_path / "whole", *base)).code == 0
+    assert persist(*stage(number, walks, tmp_path / "halves", *base, "training.steps=2")).code == 0
+    assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base)).code == 0
+    assert same(weights(tmp_path / "whole"), weights(tmp_path / "halves"))
+    assert (tmp_path / "whole/log.jsonl").read_text() == (tmp_path / "halves/log.jsonl").read_text()
+
+
+def test_stage_two_leaves_every_stage_one_weight_untouched_to_the_bit(persist, walks, stage1, tmp_path):
+    before = find_checkpoint(stage1).fingerprint
+    assert persist(*stage("stage2-voxel", walks, tmp_path / "voxel", f"base={stage1}")).code == 0
+    assert all(name.split("/")[-1].startswith(("adapters.", "torch")) for name in weights(tmp_path / "voxel"))
+    assert find_checkpoint(tmp_path / "voxel").fingerprint == before
+    assert find_checkpoint(stage1).fingerprint == before
+
+
+def test_micro_batches_give_the_gradient_of_the_whole_batch(persist, walks, codec, tmp_path):
+    base = [f"base={codec}", "training.batch=4"]
+    assert persist(*stage("stage1", walks, tmp_path / "one", *base)).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "two", *base, "training.accumulation=2")).code == 0
+    one, two = (
+        [json.loads(line)["loss"] for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
+        for name in ("one", "two")
+    )
+    assert one == pytest.approx(two, rel=1e-4)
+
+
+def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
+    changes = ["training.steps=40", "training.learning_rate=3e-3", "training.batch=4", f"base={codec}"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
+    losses = [json.loads(line)["loss"] for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    assert sum(losses[-10:]) < 0.9 * sum(losses[:10])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_run_killed_at_a_random_moment_goes_on_and_ends_like_one_that_was_not(walks, codec, tmp_path, seed):
+    base = [f"base={codec}", "training.checkpoint_every=1", "training.steps=6"]
+    arguments = [*PERSIST, *stage("stage1", walks, tmp_path / "killed", "--resume", *base)]
+    child = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list((tmp_path / "killed").glob("step-*")) and time.monotonic() < deadline and child.poll() is None:
+        time.sleep(0.02)
+    time.sleep(random.Random(seed).random() * 0.3)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    find_checkpoint(tmp_path / "killed")
+    subprocess.run(arguments, check=True, capture_output=True)
+    subprocess.run([*PERSIST, *stage("stage1", walks, tmp_path / "whole", *base)], check=True, capture_output=True)
+    assert same(weights(tmp_path / "killed"), weights(tmp_path / "whole"))
+    assert not list((tmp_path / "killed").glob(".partial-*"))
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(walks, codec, tmp_path):
+    arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=100000")
+    child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    deadline = time.monotonic() + 120
+    log = tmp_path / "run/log.jsonl"
+    while not (log.is_file() and log.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    child.send_signal(signal.SIGINT)
+    out, _ = child.communicate(timeout=60)
+    assert child.returncode == 130
+    assert "go on with --resume" in out
+    find_checkpoint(tmp_path / "run")
+
+
+def test_what_a_run_cannot_do_is_one_line(persist, walks, codec, stage1, tmp_path):
+    base = f"base={codec}"
+    for arguments, cause in (
+        (stage("stage1", walks, codec), "holds a run already"),
+        (
+            stage("codec", walks, codec, "--resume", *MICRO_SETTINGS, "training.learning_rate=1"),
+            "training.learning_rate changed",
+        ),
+        (stage("stage1", walks, tmp_path / "a", f"base={tmp_path}"), "no checkpoint there"),
+        (stage("stage1", tmp_path, tmp_path / "a", base), "no trajectory"),
+        (
+            stage("stage2-voxel", walks, tmp_path / "a", f"base={stage1}", "memory.encoder=patchs"),
+            "did you mean 'patches'",
+        ),
+        (stage("stage2-voxel", walks, tmp_path / "a", f"base={stage1}", "adapter.widht=3"), "did you mean 'width'"),
+        (stage("stage1", walks, tmp_path / "a", base, "backbone.name=cogvideo"), "is of backbone 'cogvideox'"),
+    ):
+        ended = persist(*arguments)
+        assert ended.code == 1
+        assert cause in ended.err
+        assert len(ended.err.strip().splitlines()) == 1
+    assert not list((tmp_path / "a").glob("step-*"))
+
+
+def test_a_damaged_checkpoint_or_another_base_is_one_line(persist, walks, codec, tmp_path):
+    run = tmp_path / "base"
+    assert persist(*stage("stage1", walks, run, f"base={codec}", "training.steps=1")).code == 0
+    assert persist(*stage("stage2-none", walks, tmp_path / "none", f"base={run}", "training.steps=1")).code == 0
+    assert persist(*stage("stage1", walks, run, "--resume", f"base={codec}", "training.steps=2")).code == 0
+    ended = persist("rollout", tmp_path / "none", "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
+    assert (ended.code, "another base" in ended.err) == (1, True)
+    model = next(run.glob("step-*")) / "model"
+    (model / "world.safetensors").write_bytes(b"0" * 20)
+    ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
+    assert (ended.code, "world.safetensors" in ended.err) == (1, True)
+    (model / "persist.json").write_text("{}")
+    ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
+    assert (ended.code, "not the card of a persist checkpoint" in ended.err) == (1, True)
+
+
+@pytest.mark.slow
+def test_two_processes_train_like_one(walks, codec, tmp_path):
+    changes = [f"base={codec}", "training.batch=4"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
+    subprocess.run([*PERSIST, *stage("stage1", walks, tmp_path / "one", *changes)], check=True, capture_output=True)
+    launch = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2", "--module"]
+    subprocess.run(
+        [*launch, "persist_cli", *stage("stage1", walks, tmp_path / "two", *changes)],
+        check=True, capture_output=True, env=environment,
+    )  # fmt: skip
+    one, two = (
+        [json.loads(line)["loss"] for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
+        for name in ("one", "two")
+    )
+    assert one == pytest.approx(two, rel=1e-4)

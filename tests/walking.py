@@ -1,0 +1,56 @@
+"""Walks through the furnished room by named actions, and the smallest model that takes their images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from persist_cli.trajectories.store import write_trajectory
+from persist_cli.world.actions import walking_actions
+from persist_cli.world.observations import Frame
+from tests.rooms import UP, Room, look
+
+SIZE = 32
+MICRO = {
+    "height": SIZE,
+    "width": SIZE,
+    "transformer": {
+        "num_layers": 2, "num_attention_heads": 2, "attention_head_dim": 32, "in_channels": 8, "out_channels": 4,
+        "time_embed_dim": 32, "text_embed_dim": 8,
+    },
+    "vae": {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4},
+}  # fmt: skip
+MICRO_SETTINGS = [
+    f"backbone.settings.height={SIZE}",
+    f"backbone.settings.width={SIZE}",
+    "backbone.settings.transformer={num_layers: 2, num_attention_heads: 2, attention_head_dim: 32, in_channels: 8, "
+    "out_channels: 4, time_embed_dim: 32, text_embed_dim: 8}",
+    "backbone.settings.vae={block_out_channels: [8, 8, 8], norm_num_groups: 4, latent_channels: 4}",
+    "backbone.settings.codec_window=null",
+]
+SHORT = ["training.steps=4", "training.batch=2", "training.workers=0", "training.warmup=2"]
+OUT = ("left", "left", "forward", "left", "left", "forward", "left", "left", "left", "forward", "left")
+
+
+def write_walks(folder: Path) -> Path:
+    """Two trajectories, out and back by the reversed actions, in rooms of two names."""
+    room, vocabulary = Room(SIZE, SIZE), walking_actions(0.2, 15.0)
+    out = list(OUT)
+    for number, start in enumerate((look((0.0, 1.3, 0.2), 0.0, 0.0), look((0.3, 1.3, -0.2), 90.0, 0.0))):
+        actions = [*out, "pick_up", *vocabulary.reversed(out)]
+        poses = [start, *vocabulary.follow(torch.from_numpy(start), actions, torch.tensor(UP).double()).numpy()]
+        names = [*actions, None]
+        frames: list[Frame] = [
+            room.see(pose, name, float(i)) for i, (pose, name) in enumerate(zip(poses, names, strict=True))
+        ]
+        info = replace(room.info, scene=f"room-{number}", vocabulary=vocabulary)
+        write_trajectory(folder / f"walk-{number}.parquet", info, frames)
+    return folder
+
+
+def smoothed(frames: int) -> np.ndarray:
+    """Poses of a slow turn to the left that never turns back."""
+    return np.stack([look((0.0, 1.3, 0.0), 6.0 * number, 0.0) for number in range(frames)])
