@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.walking import MICRO_SETTINGS, stage, train, write_walks
+
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 torch.set_num_threads(1)
 
@@ -44,6 +46,26 @@ def persist(capsys: pytest.CaptureFixture[str]) -> Persist:
 @pytest.fixture(scope="session")
 def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of two 32×32 walks of 24 frames through the furnished room, there and back, by named actions."""
-    from tests.walking import write_walks
-
     return write_walks(tmp_path_factory.mktemp("walks"))
+
+
+@pytest.fixture(scope="session")
+def codec(walks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A codec run of four steps of the micro model."""
+    run = tmp_path_factory.mktemp("runs") / "codec"
+    train(*stage("codec", walks, run, *MICRO_SETTINGS))
+    return run
+
+
+@pytest.fixture(scope="session")
+def stage1(walks: Path, codec: Path) -> Path:
+    """A stage-1 run of four steps on it."""
+    train(*stage("stage1", walks, codec.parent / "stage1", f"base={codec}"))
+    return codec.parent / "stage1"
+
+
+@pytest.fixture(scope="session")
+def voxel(walks: Path, stage1: Path) -> Path:
+    """A stage-2 run with a voxel memory on that."""
+    train(*stage("stage2-voxel", walks, stage1.parent / "voxel", f"base={stage1}"))
+    return stage1.parent / "voxel"

@@ -10,7 +10,7 @@ import pytest
 
 from persist_cli.registry import list_plugins, load_plugin
 from persist_cli.world.errors import PluginError
-from tests.training.test_finetune import codec, stage, stage1  # noqa: F401
+from tests.walking import stage
 
 LAST_FRAME = """
     import torch
@@ -48,7 +48,7 @@ def site(tmp_path, monkeypatch):
     return folder
 
 
-def test_a_third_partys_memory_of_ten_lines_works_in_every_command_by_name(persist, site, walks, stage1, tmp_path):  # noqa: F811
+def test_a_third_partys_memory_of_ten_lines_works_in_every_command_by_name(persist, site, walks, stage1, tmp_path):
     install(site, "persist-last", "persist.memories", "last = last_frame:LastFrame", LAST_FRAME)
     recipe = ("memory.name=last", f"base={stage1}")
     assert "persist-last" in persist("plugins").out

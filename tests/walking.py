@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +35,18 @@ MICRO_SETTINGS = [
 ]
 SHORT = ["training.steps=4", "training.batch=2", "training.workers=0", "training.warmup=2"]
 OUT = ("left", "left", "forward", "left", "left", "forward", "left", "left", "left", "forward", "left")
+
+PERSIST = [sys.executable, "-m", "persist_cli"]
+
+
+def stage(number: str, data: Path, out: Path, *changes: str) -> list[str]:
+    """Arguments of a short finetune run of the micro model."""
+    return ["finetune", f"tiny-{number}", "--data", str(data), "--out", str(out), *SHORT, *changes]
+
+
+def train(*arguments: str) -> None:
+    """Run ``persist`` in a process of its own."""
+    subprocess.run([*PERSIST, *arguments], check=True, capture_output=True)
 
 
 def write_walks(folder: Path) -> Path:

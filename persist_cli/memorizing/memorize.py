@@ -16,7 +16,7 @@ from persist_cli.registry import make_encoder, make_memory
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 from persist_cli.viewing.map import draw_map
 from persist_cli.world.errors import CheckpointError, RecipeError
-from persist_cli.world.files import ASIDE
+from persist_cli.world.files import remove_leftovers
 from persist_cli.world.memory import Memory
 
 
@@ -94,10 +94,10 @@ def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
 
 
 def _finish(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, extra: dict[str, Any]) -> None:
-    for leftover in out.parent.glob(f"{ASIDE}*-{out.stem}.*"):  # of a run that was killed
-        leftover.unlink(missing_ok=True)
-    memory.save(out)
     picture = out.with_suffix(".png")
+    for path in (out, picture):
+        remove_leftovers(path.parent, path.name)
+    memory.save(out)
     draw_map(memory.points(), memory.reference.world_up, paths, picture)
     figures = memory.figures()
     result = {

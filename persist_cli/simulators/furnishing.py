@@ -31,19 +31,19 @@ class MeshKind(NamedTuple):
 
 
 MESHES = (
-    MeshKind("barrel", 0.7, 1.0, 0.50, False),
+    MeshKind("barrel", 0.7, 1.0, 0.35, False),
     MeshKind("building", 0.9, 1.5, 0.64, False),
-    MeshKind("cone", 0.4, 0.8, 0.45, True),
-    MeshKind("duckie", 0.3, 0.7, 0.67, True),
-    MeshKind("medkit", 0.3, 0.45, 0.64, True),
-    MeshKind("office_chair", 0.9, 1.1, 0.43, False),
+    MeshKind("cone", 0.4, 0.8, 0.37, True),
+    MeshKind("duckie", 0.3, 0.7, 0.56, True),
+    MeshKind("medkit", 0.3, 0.45, 0.62, True),
+    MeshKind("office_chair", 0.9, 1.1, 0.34, False),
     MeshKind("office_desk", 0.75, 0.9, 0.59, False),
-    MeshKind("potion", 0.3, 0.5, 0.36, True),
-    MeshKind("tree", 1.2, 1.7, 0.66, False),
-    MeshKind("tree_pine", 1.4, 2.3, 0.41, False),
+    MeshKind("potion", 0.3, 0.5, 0.26, True),
+    MeshKind("tree", 1.2, 1.7, 0.61, False),
+    MeshKind("tree_pine", 1.4, 2.3, 0.25, False),
     MeshKind("key_red", 0.3, 0.35, 1.23, True),
     MeshKind("key_yellow", 0.3, 0.35, 1.23, True),
-    MeshKind("ball_blue", 0.4, 0.7, 0.71, True),
+    MeshKind("ball_blue", 0.4, 0.7, 0.51, True),
 )
 MESH_WEIGHTS = np.array([1.0] * (len(MESHES) - 1) + [0.3])  # a ball has 15,000 vertices
 

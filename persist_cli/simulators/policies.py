@@ -23,6 +23,7 @@ Walk = Generator[str, bool, None]
 Policy = Callable[[Simulator, np.random.Generator, int], Walk]
 
 SIGHT = 4.0  # metres that explore looks ahead
+OPEN_VIEW = 0.75  # metres ahead that explore likes to see: a wall before the nose shows nothing
 EFFORT = 3.0  # metres of new ground that explore gives for not turning right round
 PATCH = 0.5  # metres of the squares in which explore counts its visits
 NEAR_GOAL = 0.4  # metres at which a goal counts as reached
@@ -74,7 +75,8 @@ def _run(simulator: Simulator, most: int, visits: Counter[tuple[int, int]]) -> G
     for done in range(most):
         ground, heading = simulator.agent
         visits[_patch(ground)] += 1
-        if clear_distance(simulator, ground, heading, step, step) < step or not (yield "forward"):
+        view = step if done == 0 else step * math.ceil(OPEN_VIEW / step)
+        if clear_distance(simulator, ground, heading, view, step) < view or not (yield "forward"):
             return done
     return most
 
@@ -141,7 +143,8 @@ def _inviting_turn(simulator: Simulator, random: np.random.Generator, visits: Co
         seen = [visits[_patch((ground[0] + d * x, ground[1] + d * z))] for d in np.arange(step, length + 1e-9, PATCH)]
         novelty = sum(1 / (1 + count) ** 2 for count in seen) * PATCH
         effort = EFFORT * abs(turns) / max(most, 1)
-        scores.append(novelty + 0.25 * min(length, 2.0) - effort + float(random.gumbel(0, 0.25)) - (length < step) * 9)
+        dull = 9.0 * (length < step) + 1.0 * (length < OPEN_VIEW)
+        scores.append(novelty + 0.25 * min(length, 2.0) - effort - dull + float(random.gumbel(0, 0.25)))
     return options[int(np.argmax(scores))]
 
 

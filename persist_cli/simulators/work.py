@@ -64,7 +64,7 @@ def collect_scene(scene: int, path: Path) -> int:
         _running["simulator"] = make_simulator(tour.simulator, tour.settings)
     simulator: Simulator = _running["simulator"]
     frames = tour_frames(simulator, tour, scene)
-    note = {"split": tour.split, "policy": tour.policy, "seed": tour.seed, "scene_seed": scene}
+    note = {"split": tour.split, "policy": tour.policy, "seed": tour.seed}
     info = replace(simulator.info, source={**simulator.info.source, **note})
     return write_trajectory(path, info, frames)
 

@@ -13,7 +13,7 @@ from persist_cli.world.geometry import in_view, project, transform
 from persist_cli.world.observations import Observations
 
 NEAR = 1e-3  # metres in front of the camera
-MOST_POINTS = 2000  # of a pair; more change no figure
+MOST_POINTS = 1200  # of a pair; more change no figure by a tenth
 SAME_SURFACE = 1.2  # ratio of neighbouring depths above which an edge lies between them
 OCCLUDED = 0.05  # a point this part of its depth behind what frame j sees may be hidden by it
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -47,8 +48,15 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     from safetensors.torch import save_file
 
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with written_aside(path) as aside:
-        save_file(contiguous, aside, dict(metadata or {}))
+    # safetensors writes a nameless temporary file beside its target: a folder around both can be found after a kill
+    around = path.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{path.name}"
+    around.mkdir(parents=True)
+    try:
+        with written_aside(around / path.name) as aside:
+            save_file(contiguous, aside, dict(metadata or {}))
+        (around / path.name).replace(path)
+    finally:
+        shutil.rmtree(around, ignore_errors=True)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -82,8 +90,12 @@ def read_json(path: Path) -> Any:
         raise CheckpointError(f"{path}: not readable as JSON ({error})") from error
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Delete what a killed writer left aside in ``folder``."""
+def remove_leftovers(folder: Path, name: str = "") -> None:
+    """Delete what a killed writer left aside in ``folder``, of all files or of those of one ``name``."""
     for leftover in folder.glob(f"{ASIDE}*"):
-        if leftover.is_file():
+        if not leftover.name.endswith(name and f"-{name}"):
+            continue
+        if leftover.is_dir():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
             leftover.unlink(missing_ok=True)

@@ -8,8 +8,6 @@ from persist_cli.evaluation.revisits import find_revisits, recalled_part
 from persist_cli.trajectories.store import Store
 from persist_cli.world.errors import DataError
 from tests.rooms import Room
-from tests.rollout.test_rollout import voxel  # noqa: F401
-from tests.training.test_finetune import codec, stage, stage1  # noqa: F401
 from tests.walking import smoothed
 
 
@@ -59,7 +57,7 @@ def test_a_path_that_never_returns_has_no_clip_to_evaluate(tmp_path):
         find_revisits(Store(tmp_path), 9, 8)
 
 
-def test_eval_prints_a_table_and_leaves_figures_and_sheets(persist, voxel, stage1, walks, tmp_path):  # noqa: F811
+def test_eval_prints_a_table_and_leaves_figures_and_sheets(persist, voxel, stage1, walks, tmp_path):
     options = ["--data", walks, "--memories", "stage1,voxel", "--seeds", 2, "--steps", 2, "--out", tmp_path]
     ended = persist("eval", voxel, *options)
     assert ended.code == 0, ended.err
@@ -73,7 +71,7 @@ def test_eval_prints_a_table_and_leaves_figures_and_sheets(persist, voxel, stage
     assert (tmp_path / "clip-0.png").is_file()
 
 
-def test_eval_is_the_same_again_and_does_not_depend_on_the_batch(persist, voxel, walks, tmp_path):  # noqa: F811
+def test_eval_is_the_same_again_and_does_not_depend_on_the_batch(persist, voxel, walks, tmp_path):
     rows = []
     for name, batch in (("a", 2), ("b", 2), ("c", 1)):
         options = ["--memories", "voxel", "--seeds", 1, "--steps", 2, "--clips", 2, "--batch", batch]
@@ -83,7 +81,7 @@ def test_eval_is_the_same_again_and_does_not_depend_on_the_batch(persist, voxel,
     assert rows[0] == pytest.approx(rows[2], abs=0.05)
 
 
-def test_what_cannot_be_evaluated_is_one_line(persist, voxel, walks, tmp_path):  # noqa: F811
+def test_what_cannot_be_evaluated_is_one_line(persist, voxel, walks, tmp_path):
     for options, cause in (
         (
             ["--data", walks, "--memories", "snapshots"],

@@ -14,17 +14,7 @@ from persist_cli.viewing.video import read_video
 from persist_cli.world.actions import rotation_about
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.memory import FrameOfReference
-from tests.training.test_finetune import codec, stage, stage1  # noqa: F401
 from tests.walking import SIZE
-
-
-@pytest.fixture
-def voxel(persist, walks, stage1, tmp_path_factory):  # noqa: F811
-    """A stage-2 run with a voxel memory."""
-    run = stage1.parent / "voxel"
-    if not run.exists():
-        assert persist(*stage("stage2-voxel", walks, run, f"base={stage1}")).code == 0
-    return run
 
 
 def roll(persist, run, walks, out, *options):
@@ -66,12 +56,12 @@ def test_a_memory_file_is_read_and_kept_as_it_was_when_nothing_may_be_written(pe
     assert (tmp_path / "o/map-before.png").is_file()
 
 
-def test_without_an_adapter_it_is_plain_stage_one(persist, stage1, walks, tmp_path):  # noqa: F811
+def test_without_an_adapter_it_is_plain_stage_one(persist, stage1, walks, tmp_path):
     assert roll(persist, stage1, walks, tmp_path, "--actions", "left").code == 0
     assert not (tmp_path / "memory.safetensors").exists()
 
 
-def test_what_cannot_be_rolled_out_is_one_line(persist, voxel, stage1, walks, tmp_path):  # noqa: F811
+def test_what_cannot_be_rolled_out_is_one_line(persist, voxel, stage1, walks, tmp_path):
     other, patches = tmp_path / "other.safetensors", tmp_path / "patches.safetensors"
     assert persist("memorize", f"{walks}#1:0-4", "--out", other).code == 0
     assert persist("memorize", f"{walks}#0:0-4", "--out", patches, "--set", "encoder.seed=5").code == 0

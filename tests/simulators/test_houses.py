@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from persist_cli.simulators.building import build_house
+from persist_cli.simulators.furnishing import MESHES, MeshKind
 from persist_cli.simulators.houses import House, Rectangle, Thing, is_clear
+from persist_cli.simulators.meshes import read_mesh
 from persist_cli.simulators.panels import house_panels
+from persist_cli.simulators.rendering import assets
 
 SEEDS = range(60)
 RADIUS = 0.2
@@ -121,3 +124,11 @@ def test_walls_are_numbered_left_to_right_as_seen_from_inside() -> None:
     room = Rectangle(0.0, 0.0, 4.0, 3.0)
     assert room.wall(0) == ((0.0, 0.0), (4.0, 0.0))
     assert room.wall(1) == ((4.0, 0.0), (4.0, 3.0))
+
+
+@pytest.mark.parametrize("kind", MESHES, ids=lambda kind: kind.name)
+def test_meshes_stand_on_the_ground_within_the_circle_kept_for_them(kind: MeshKind) -> None:
+    mesh = read_mesh(assets() / "meshes" / f"{kind.name}.obj")
+    lowest = min(float(part.vertices[:, 1].min()) for part in mesh.parts)
+    assert lowest == pytest.approx(0.0, abs=1e-3 * mesh.height)
+    assert kind.aspect - 0.02 < mesh.radius / mesh.height <= kind.aspect

@@ -12,14 +12,7 @@ import torch
 
 from persist_cli.checkpoints import find_checkpoint
 from persist_cli.world.files import read_tensors
-from tests.walking import MICRO_SETTINGS, SHORT
-
-PERSIST = [sys.executable, "-c", "from persist_cli.app import main; main()"]
-
-
-def stage(number: str, data: Path, out: Path, *changes: str) -> list[str]:
-    """Arguments of a short finetune run of the micro model."""
-    return ["finetune", f"tiny-{number}", "--data", str(data), "--out", str(out), *SHORT, *changes]
+from tests.walking import MICRO_SETTINGS, PERSIST, stage, train
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -29,22 +22,6 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 def same(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> bool:
     return set(one) == set(two) and all(torch.equal(one[name], two[name]) for name in one)
-
-
-@pytest.fixture(scope="module")
-def codec(walks, tmp_path_factory):
-    """A codec run of four steps."""
-    run = tmp_path_factory.mktemp("runs") / "codec"
-    subprocess.run([*PERSIST, *stage("codec", walks, run, *MICRO_SETTINGS)], check=True, capture_output=True)
-    return run
-
-
-@pytest.fixture(scope="module")
-def stage1(walks, codec):
-    """A stage-1 run of four steps on it."""
-    run = codec.parent / "stage1"
-    subprocess.run([*PERSIST, *stage("stage1", walks, run, f"base={codec}")], check=True, capture_output=True)
-    return run
 
 
 def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
@@ -103,7 +80,7 @@ def test_a_run_killed_at_a_random_moment_goes_on_and_ends_like_one_that_was_not(
     child.wait()
     find_checkpoint(tmp_path / "killed")
     subprocess.run(arguments, check=True, capture_output=True)
-    subprocess.run([*PERSIST, *stage("stage1", walks, tmp_path / "whole", *base)], check=True, capture_output=True)
+    train(*stage("stage1", walks, tmp_path / "whole", *base))
     assert same(weights(tmp_path / "killed"), weights(tmp_path / "whole"))
     assert not list((tmp_path / "killed").glob(".partial-*"))
 
@@ -166,7 +143,7 @@ def test_a_damaged_checkpoint_or_another_base_is_one_line(persist, walks, codec,
 def test_two_processes_train_like_one(walks, codec, tmp_path):
     changes = [f"base={codec}", "training.batch=4"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
-    subprocess.run([*PERSIST, *stage("stage1", walks, tmp_path / "one", *changes)], check=True, capture_output=True)
+    train(*stage("stage1", walks, tmp_path / "one", *changes))
     launch = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2", "--module"]
     subprocess.run(
         [*launch, "persist_cli", *stage("stage1", walks, tmp_path / "two", *changes)],

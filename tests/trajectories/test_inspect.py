@@ -22,7 +22,7 @@ from tests.rooms import Room, look, walk
 from tests.trajectories import faults
 
 KITCHEN = Path(__file__).parents[3] / "shared/data/kitchen"
-PAIRS = 6
+PAIRS = 4
 
 FAULTS = [
     pytest.param(faults.inverted, 1.0, "the poses look inverted", id="inverted poses"),
