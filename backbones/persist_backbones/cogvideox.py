@@ -99,8 +99,9 @@ class CogVideoX(Backbone):
         """The codec's loss, or the velocity loss of RGB and depth latents (v-prediction)."""
         generators = generators_of(clips.seeds)
         if stage == "codec":
-            window = self.settings.codec_window or tuple(clips.depth.shape[1:])
-            rgb, depth = self.codec.windows(clips.rgb, clips.depth, window, generators)
+            rgb, depth = clips.rgb, clips.depth
+            if self.settings.codec_window:
+                rgb, depth = self.codec.windows(rgb, depth, self.settings.codec_window, generators)
             return self.codec.loss(rgb, depth, self.settings.kl_weight, generators)
         with torch.no_grad():
             latents, image = self.codec.encode(clips.rgb, clips.depth), self.encode_first(clips)

@@ -86,8 +86,8 @@ class CogVideoXSettings:
         weighting: of the v-prediction loss over noise levels, ``uniform`` or ``min-snr``.
         snr_gamma: of min-SNR.
         kl_weight: of the codec's latent prior.
-        codec_window: frames (1 or 8n + 1), height and width of the random windows that the codec is trained on; one of a
-            quarter of the pixels costs a quarter, and the codec, a convolution, does not mind.
+        codec_window: frames (1 or 8n + 1), height and width of the random windows that the codec is trained on; a
+            quarter of the pixels costs a quarter of the time.
         transformer: changes to the preset's transformer configuration.
         vae: changes to the preset's VAE configuration.
     """

@@ -67,7 +67,7 @@ def estimate_up(poses: np.ndarray[Any, Any]) -> tuple[float, float, float]:
 
     A hand-held camera pitches a lot and rolls little. The mean of the cameras' -y axes is taken, and what of it
     lies where the x axes spread by more than the usual roll is damped. On the kitchen of 7-Scenes this is 9° off
-    the normal of the work top, the plain mean 26°.
+    the normal of its horizontal surfaces, the plain mean 26°.
 
     Args:
         poses: world_from_camera ``[frame, 4, 4]``.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +21,9 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-OUT = Console()
+PIPED_WIDTH = 160  # columns of a table that goes into a file or pipe
+
+OUT = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
 PROGRESS = Console(stderr=True)
 
 

@@ -87,7 +87,7 @@ def test_what_cannot_be_evaluated_is_one_line(persist, voxel, walks, tmp_path):
             ["--data", walks, "--memories", "snapshots"],
             "no checkpoint has a memory adapter 'snapshots'; there are: voxel",
         ),
-        (["--data", tmp_path], "no trajectory"),
+        (["--data", tmp_path, "--memories", "voxel"], "no trajectory"),
         (["--data", walks, "--memories", ","], "name at least one memory"),
         (["--data", walks, "--memories", "voxel", "--sampler", "euler"], "unknown sampler 'euler'"),
     ):

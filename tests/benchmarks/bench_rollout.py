@@ -1,0 +1,108 @@
+"""How long a rollout takes with each memory: ``python tests/benchmarks/bench_rollout.py``; prints, asserts nothing.
+
+The tiny model and the adapters are fresh: what they imagine is noise, what it costs is not. Four DDIM steps a clip.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
+
+from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.recipe import MemoryChoice
+from persist_cli.registry import make_backbone
+from persist_cli.rollout.world_model import WorldModel
+from persist_cli.viewing.console import print_table
+from persist_cli.world.actions import walking_actions
+from persist_cli.world.backbone import Backbone, Sampling
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.observations import Observations, TrajectoryInfo
+from tests.benchmarks.timing import Times, alternate, say_conditions
+from tests.rooms import UP, Room, look
+
+NO_ADAPTER = "no adapter"
+MEMORIES = ("none", "voxel", "map2d", "snapshots")
+PARTS = ("recall", "denoise", "memorize")
+SIZE, STEPS, CLIPS, ROUNDS = 64, 4, 3, 4
+
+
+@dataclass
+class TimedWorldModel(WorldModel):
+    """A world model that knows how long its parts took."""
+
+    seconds: Counter[str] = field(default_factory=Counter)
+
+    def timed(self, part: str, *arguments: Any) -> Any:
+        """What the part of this name gives."""
+        start = time.perf_counter()
+        result = getattr(super(), part)(*arguments)
+        self.seconds[part] += time.perf_counter() - start
+        return result
+
+    def recall(self, *arguments: Any) -> Any:
+        return self.timed("recall", *arguments)
+
+    def denoise(self, *arguments: Any) -> Any:
+        return self.timed("denoise", *arguments)
+
+    def memorize(self, *arguments: Any) -> Any:
+        return self.timed("memorize", *arguments)
+
+
+def first_frame() -> tuple[Observations, TrajectoryInfo]:
+    """One view of the furnished room, whose agent walks."""
+    room, pose = Room(SIZE, SIZE), look((0.0, 1.4, 0.2), 0.0)
+    frame = room.see(pose)
+    cameras = Cameras(torch.from_numpy(pose)[None], torch.from_numpy(room.intrinsics)[None], SIZE, SIZE)
+    seen = Observations(torch.from_numpy(frame.rgb)[None], torch.from_numpy(frame.depth)[None], cameras)
+    info = room.info
+    return seen, TrajectoryInfo(info.scene, info.intrinsics, SIZE, SIZE, UP, walking_actions(0.2, 15.0))
+
+
+def make_world(backbone: Backbone, name: str, info: TrajectoryInfo) -> TimedWorldModel:
+    """The backbone with a memory of this name and a fresh adapter for it."""
+    memory = None
+    if name != NO_ADAPTER:
+        maker = MemoryMaker.of(MemoryChoice(name))
+        memory = maker.empty(info)
+        backbone.add_adapter(name, maker.encoder.channels, {})
+    return TimedWorldModel(backbone, memory, Sampling(STEPS))
+
+
+def roll(world: TimedWorldModel, name: str, start: Observations, info: TrajectoryInfo) -> None:
+    """A few clips from the start, the memory empty before."""
+    world.backbone.use_adapter(None if name == NO_ADAPTER else name)
+    if world.memory is not None:
+        world.memory.clear()
+    world.reset(start, info)
+    world.step(info.vocabulary.parse("left*2 forward*2 right*2 forward*2") * CLIPS)
+
+
+def rows(times: Times, worlds: dict[str, TimedWorldModel]) -> list[tuple[str, ...]]:
+    """Seconds a clip, relative to the memory ``none``, and its parts in milliseconds."""
+    found = []
+    for name, world in worlds.items():
+        parts = [f"{1e3 * world.seconds[part] / ((ROUNDS + 1) * CLIPS):.1f}" for part in PARTS]
+        found.append((name, f"{times.median(name) / CLIPS:.3f}", f"{times.ratio(name, 'none'):.2f}×", *parts))
+    return found
+
+
+if __name__ == "__main__":
+    torch.manual_seed(0)
+    start, info = first_frame()
+    backbone = make_backbone("cogvideox", {}).eval()
+    worlds = {name: make_world(backbone, name, info) for name in (NO_ADAPTER, *MEMORIES)}
+    works = {name: partial(roll, world, name, start, info) for name, world in worlds.items()}
+    say_conditions(f"rollouts of {CLIPS} clips, {STEPS} DDIM steps each, {SIZE}×{SIZE}")
+    columns = ["memory", "s a clip", "time to none", *(f"{part}, ms a clip" for part in PARTS)]
+    print_table("rollout of the tiny model", columns, rows(alternate(works, ROUNDS), worlds))

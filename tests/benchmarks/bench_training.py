@@ -1,0 +1,77 @@
+"""How fast the tiny model trains: ``python tests/benchmarks/bench_training.py``; prints a table, asserts nothing.
+
+Each recipe's own training step on a fixed batch: loss, backward, clipping, optimizer, average. How long the batch
+takes to make stands beside it: reading the clips, and building their memories.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import repeat
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from accelerate import Accelerator
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
+
+from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.registry import make_backbone, make_encoder
+from persist_cli.training.trainer import Trainer
+from persist_cli.trajectories.clips import ClipSample
+from persist_cli.viewing.console import print_table
+from persist_cli.world.backbone import Clips
+from tests.benchmarks.timing import Times, alternate, say_conditions, write_walks
+
+BATCH, ROUNDS = 4, 4
+MEMORIES = ("none", "voxel", "map2d", "snapshots")
+RECIPES = {"codec": "tiny-codec", "1": "tiny-stage1"} | {f"2, {name}": f"tiny-stage2-{name}" for name in MEMORIES}
+
+
+class FixedBatchTrainer(Trainer):
+    """The training loop on one batch over and over."""
+
+    def samples(self) -> list[ClipSample]:
+        """The first samples, read from the store."""
+        return [self.clips[number] for number in range(BATCH)]
+
+    def loader(self) -> Iterator[Clips]:
+        return repeat(self.to_batch(self.samples()))
+
+
+def make_trainer(name: str, data: Path) -> FixedBatchTrainer:
+    """A recipe's trainer with fresh weights."""
+    recipe = make_recipe(read_recipe(name), name)
+    backbone = make_backbone(recipe.backbone.name, recipe.backbone.settings)
+    if recipe.memory is not None:
+        channels = make_encoder(recipe.memory.encoder, recipe.memory.encoder_settings).channels
+        backbone.add_adapter(recipe.memory.name, channels, recipe.adapter)
+    return FixedBatchTrainer(recipe, backbone, data, Accelerator(cpu=True))
+
+
+def measure(data: Path) -> tuple[Times, Times, Times]:
+    """Steps, reading of samples, and making a batch of them, for each recipe."""
+    trainers = {stage: make_trainer(name, data) for stage, name in RECIPES.items()}
+    steps: dict[str, Callable[[], Any]] = {}
+    batches: dict[str, Callable[[], Any]] = {}
+    for stage, trainer in trainers.items():
+        steps[stage] = partial(next, trainer.steps())
+        batches[stage] = partial(trainer.to_batch, trainer.samples())
+    reads = {stage: trainer.samples for stage, trainer in trainers.items()}
+    return alternate(steps, ROUNDS), alternate(reads, ROUNDS), alternate(batches, ROUNDS)
+
+
+if __name__ == "__main__":
+    say_conditions(f"tiny model, 64×64, batches of {BATCH}")
+    with TemporaryDirectory() as folder:
+        steps, reads, batches = measure(write_walks(Path(folder), 64))
+    rows = []
+    for stage in RECIPES:
+        step, read, batch = (times.median(stage) / BATCH for times in (steps, reads, batches))
+        ratio = f"{steps.ratio(stage, '1'):.2f}×"
+        rows.append((stage, f"{1 / step:.1f}", ratio, *(f"{1e3 * part:.1f}" for part in (step, read, batch))))
+    columns = ["stage", "samples/s", "time to stage 1", "step, ms a sample", "reading, ms", "batch and memory, ms"]
+    print_table("training on the CPU", columns, rows)
