@@ -165,7 +165,8 @@ def rollout(
 
     persist rollout runs/voxel --start runs/houses#0:48 --actions "left*4 forward*6" --out runs/rollout
     """
-    from persist_cli.rollout.run import RolloutPlan, run_rollout
+    from persist_cli.rollout.run import run_rollout
+    from persist_cli.rollout.walk import RolloutPlan
 
     plan = RolloutPlan(
         start=start, actions=actions, follow=follow, frames=frames, memory=memory, adapter=adapter, write=write,

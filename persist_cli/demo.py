@@ -25,22 +25,22 @@ TRAINING = "training.checkpoint_minutes=60 training.workers=1"
 
 def demo_commands(out: Path) -> list[str]:
     """The command lines, in order, writing into ``out``."""
-    train, test, rollout = out / "train", out / "test", f"--start {out / 'test'}#0:{HALF} --follow --steps 20"
-    stage1 = f"base={out / 'stage1'} training.steps=40 training.batch=8 training.warmup=10 {TRAINING}"
+    train, test, rollout = out / "train", out / "test", f"--start {out / 'test'}#0:{HALF} --follow --steps 12"
+    stage1 = f"base={out / 'stage1'} training.steps=25 training.batch=8 training.warmup=5 {TRAINING}"
     return [
         f"collect miniworld --out {train} --scenes 0:24 --frames 64 --policy path",
         f"collect miniworld --out {test} --scenes 0:4 --frames {2 * HALF + 1} --policy there-and-back --split test",
         f"inspect {test}",
-        f"finetune tiny-codec --data {train} --out {out / 'codec'} --resume training.steps=200 training.batch=4 "
+        f"finetune tiny-codec --data {train} --out {out / 'codec'} --resume training.steps=120 training.batch=4 "
         + TRAINING,
         f"finetune tiny-stage1 --data {train} --out {out / 'stage1'} --resume base={out / 'codec'} "
-        f"training.steps=100 training.batch=8 training.warmup=20 training.learning_rate=1e-3 {TRAINING}",
+        f"training.steps=60 training.batch=8 training.warmup=10 training.learning_rate=1e-3 {TRAINING}",
         f"finetune tiny-stage2-none --data {train} --out {out / 'none'} --resume {stage1}",
         f"finetune tiny-stage2-voxel --data {train} --out {out / 'voxel'} --resume {stage1}",
         f"memorize {test}#0:0-{HALF + 1} --memory voxel --out {out / 'house.safetensors'}",
         f"rollout {out / 'voxel'} {rollout} --memory {out / 'house.safetensors'} --out {out / 'with-memory'}",
         f"rollout {out / 'none'} {rollout} --out {out / 'without-memory'}",
-        f"eval {out / 'none'} {out / 'voxel'} --data {test} --memories none,voxel --seeds 2 --steps 10 --clips 8 "
+        f"eval {out / 'none'} {out / 'voxel'} --data {test} --memories none,voxel --seeds 2 --steps 8 --clips 6 "
         f"--out {out / 'eval'}",
     ]
 

@@ -80,6 +80,7 @@ class TrainingSettings:
         checkpoint_every: steps between checkpoints.
         checkpoint_minutes: most minutes between checkpoints.
         workers: processes that read data.
+        threads: of torch on the CPU; 0 leaves torch's choice.
         tracker: ``none`` or ``tensorboard``.
     """
 
@@ -96,6 +97,7 @@ class TrainingSettings:
     checkpoint_every: int = 500
     checkpoint_minutes: float = 5.0
     workers: int = 1
+    threads: int = 0
     tracker: Literal["none", "tensorboard"] = "none"
 
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from persist_cli.trajectories.clips import interactions_of
 from persist_cli.trajectories.store import Store, TrajectoryFile
 from persist_cli.world.backbone import Interactions
 from persist_cli.world.errors import DataError
@@ -114,8 +115,6 @@ def visible(points: Float[Tensor, "point 3"], seen: Observations, frame: int) ->
 
 def read_revisit(revisit: Revisit, frames: int) -> RevisitClip:
     """The clip's frames and everything before."""
-    from persist_cli.rollout.world_model import interactions_of
-
     whole = revisit.file.read(slice(0, revisit.start + frames))
     clip = slice(revisit.start, revisit.start + frames)
     actions = whole.actions[clip][:-1]

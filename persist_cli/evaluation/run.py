@@ -12,10 +12,10 @@ from torch import Tensor
 
 from persist_cli import __version__
 from persist_cli.checkpoints import find_checkpoint, load_backbone
-from persist_cli.evaluation.metrics import METRICS
 from persist_cli.evaluation.revisits import LEAST_RECALLED, Revisit, RevisitClip, find_revisits, read_revisit
 from persist_cli.evaluation.rows import Row, make_rows, row_seeds
 from persist_cli.evaluation.scores import Scores, table_columns, table_row
+from persist_cli.metrics import METRICS
 from persist_cli.trajectories.clips import check_size
 from persist_cli.trajectories.store import Store
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say

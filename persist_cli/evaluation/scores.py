@@ -9,7 +9,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.evaluation.metrics import METRICS
+from persist_cli.metrics import METRICS
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
-from persist_cli.evaluation.metrics import METRICS
+from persist_cli.metrics import METRICS
+from persist_cli.rollout.walk import Rollout
 from persist_cli.trajectories.tum import write_poses
 from persist_cli.viewing.map import draw_map
 from persist_cli.viewing.sheet import write_sheet
@@ -16,9 +17,6 @@ from persist_cli.world.cameras import Cameras
 from persist_cli.world.files import write_json
 from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations
-
-if TYPE_CHECKING:
-    from persist_cli.rollout.run import Rollout
 
 
 def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[str, Any]:

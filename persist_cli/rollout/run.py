@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,74 +13,14 @@ from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, l
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.rollout.outputs import write_outputs
-from persist_cli.rollout.world_model import WorldModel, interactions_of
+from persist_cli.rollout.walk import Rollout, RolloutPlan, Walk, plan_walk
+from persist_cli.rollout.world_model import WorldModel
 from persist_cli.trajectories.clips import check_size
-from persist_cli.trajectories.reference import parse_reference
-from persist_cli.trajectories.store import TrajectoryFile
 from persist_cli.viewing.console import add_task, print_json, progress, say
-from persist_cli.world.actions import format_actions
-from persist_cli.world.backbone import Backbone, Interactions, Sampling
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.errors import CheckpointError, DataError, PersistError
+from persist_cli.world.backbone import Backbone, Sampling
+from persist_cli.world.errors import CheckpointError, PersistError
 from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations, TrajectoryInfo
-
-
-@dataclass(frozen=True)
-class RolloutPlan:
-    """The options of ``persist rollout``; see its help."""
-
-    start: str
-    actions: str | None
-    follow: bool
-    frames: int
-    memory: Path | None
-    adapter: str | None
-    write: bool
-    seed: int
-    steps: int
-    sampler: str
-    guidance: float
-
-
-@dataclass(frozen=True)
-class Walk:
-    """Where a rollout goes.
-
-    Args:
-        start: the first frame, observed.
-        cameras: of the frames to imagine.
-        interactions: one for each of them.
-        actions: in text form.
-        truth: what is really seen there, when the trajectory is followed.
-        info: of the trajectory.
-    """
-
-    start: Observations
-    cameras: Cameras
-    interactions: Interactions
-    actions: str
-    truth: Observations | None
-    info: TrajectoryInfo
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """What a rollout gave.
-
-    Args:
-        walk: where it went.
-        seen: the frames imagined.
-        before: the memory as it was, ``None`` without one.
-        memory: the memory as it is now.
-        seconds: that it took, without loading.
-    """
-
-    walk: Walk
-    seen: Observations
-    before: Memory | None
-    memory: Memory | None
-    seconds: float
 
 
 def run_rollout(path: Path, plan: RolloutPlan, out: Path, json: bool) -> None:
@@ -103,38 +42,6 @@ def run_rollout(path: Path, plan: RolloutPlan, out: Path, json: bool) -> None:
         print_json(figures)
     else:
         say(f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {walk.actions!r}; written to {out}")
-
-
-def plan_walk(plan: RolloutPlan) -> Walk:
-    """The start frame and the cameras to come, by actions or by the trajectory's own poses."""
-    reference = parse_reference(plan.start)
-    file = reference.single()
-    start = file.read([reference.frame])
-    if plan.follow:
-        return follow_trajectory(file, reference.frame, plan.frames)
-    names = file.info.vocabulary.parse(plan.actions or "")
-    camera = start.observations.cameras
-    poses = file.info.vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
-    cameras = Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
-    interactions = interactions_of(names, file.info.vocabulary)
-    return Walk(start.observations, cameras, interactions, format_actions(names), None, file.info)
-
-
-def follow_trajectory(file: TrajectoryFile, first: int, frames: int) -> Walk:
-    """The trajectory's own way from a frame on, with what is really seen there."""
-    last = min(len(file), first + 1 + frames) if frames else len(file)
-    if last - first < 2:
-        raise DataError(f"{file.name}: frame {first} is the last; there is nothing to follow")
-    span = file.read(slice(first, last))
-    names = tuple(name or "stay" for name in span.actions[:-1])
-    return Walk(
-        start=span.observations[:1],
-        cameras=span.observations.cameras[1:],
-        interactions=interactions_of(span.actions[:-1], file.info.vocabulary),
-        actions=format_actions(names),
-        truth=span.observations[1:],
-        info=file.info,
-    )
 
 
 def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:

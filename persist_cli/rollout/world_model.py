@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from persist_cli.world.actions import ActionVocabulary
+from persist_cli.trajectories.clips import interactions_of
 from persist_cli.world.backbone import Backbone, Clips, Interactions, Sampling
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import PersistError
@@ -94,11 +94,6 @@ class WorldModel:
         missing = self.backbone.frames_per_clip - 1 - len(cameras)
         parts = [self.now.cameras, cameras, *[cameras[-1:]] * missing]
         return Cameras.concatenate(parts)
-
-
-def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:
-    """What of the actions changes the world rather than the camera."""
-    return tuple(name if name is not None and vocabulary[name].interaction else None for name in actions)
 
 
 def clip_seed(seed: int, clip: int) -> int:

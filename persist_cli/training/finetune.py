@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,7 @@ from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError, RecipeError
 from persist_cli.world.files import write_text
 
-CHANGEABLE = {"steps", "checkpoint_every", "checkpoint_minutes", "workers", "tracker", "accumulation"}
+CHANGEABLE = {"steps", "checkpoint_every", "checkpoint_minutes", "workers", "threads", "tracker", "accumulation"}
 CODEC_BATCHES = 4  # batches that the scale of the codec's latents is measured on
 
 
@@ -36,10 +39,21 @@ def run_finetune(name: str, overrides: list[str], data: Path | None, out: Path |
         raise RecipeError(f"{name}: no data set; give --data DIR")
     run = out or Path("runs") / Path(name).stem
     check_run(run, recipe, resume)
-    with Stop() as stop:
+    with Stop() as stop, limited_threads(recipe.training.threads):
         finetune(recipe, run, stop)
     if stop.signal is not None:
         sys.exit(130 if stop.signal == signal.SIGINT else 0)
+
+
+@contextlib.contextmanager
+def limited_threads(threads: int) -> Iterator[None]:
+    """Torch with so many CPU threads, 0 for its own choice."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
@@ -58,6 +72,10 @@ def finetune(recipe: Recipe, run: Path, stop: Stop) -> None:
     """Train to the recipe's last step or to a signal, from the run's last checkpoint where there is one."""
     settings = recipe.training
     tracker = None if settings.tracker == "none" else settings.tracker
+    if tracker and importlib.util.find_spec(tracker) is None:
+        raise PersistError(
+            f"training.tracker={tracker} needs the package {tracker}: pip install 'persist-cli[{tracker}]'"
+        )
     accelerator = Accelerator(
         mixed_precision=settings.precision, log_with=tracker, project_dir=run, cpu=not torch.cuda.is_available()
     )

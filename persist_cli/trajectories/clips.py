@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from torch.utils.data import BatchSampler, Dataset
 
 from persist_cli.trajectories.store import Store
+from persist_cli.world.actions import ActionVocabulary
 from persist_cli.world.backbone import Interactions
 from persist_cli.world.errors import DataError
 from persist_cli.world.observations import Observations, Trajectory, TrajectoryInfo
@@ -138,6 +139,11 @@ def strided_interactions(span: Trajectory, stride: int) -> Interactions:
         done = [name for name in actions[first : first + stride] if name and span.info.vocabulary[name].interaction]
         names.append(done[0] if done else None)
     return tuple(names)
+
+
+def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:
+    """What of the actions changes the world rather than the camera."""
+    return tuple(name if name is not None and vocabulary[name].interaction else None for name in actions)
 
 
 def check_size(info: TrajectoryInfo, image_size: tuple[int, int], where: str) -> None:

@@ -23,9 +23,9 @@ from persist_cli.viewing.console import print_table
 from persist_cli.world.observations import Observations
 from tests.benchmarks.timing import Times, alternate, say_conditions, write_walks
 
-FRAMES, CLIPS = 9, 16  # frames a clip, clips a run
+FRAMES, CLIPS = 9, 8  # frames a clip, clips a run
 ALONE = "the same frames' PNGs alone"
-CONTEXT = "ClipDataset, with 48 earlier frames for a memory"
+CONTEXT = "ClipDataset, with up to 48 frames before"
 
 
 def images_of(observations: Observations) -> list[tuple[bytes, bytes]]:

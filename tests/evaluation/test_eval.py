@@ -3,8 +3,8 @@ import json
 import pytest
 import torch
 
-from persist_cli.evaluation.metrics import METRICS
 from persist_cli.evaluation.revisits import find_revisits, recalled_part
+from persist_cli.metrics import METRICS
 from persist_cli.trajectories.store import Store
 from persist_cli.world.errors import DataError
 from tests.rooms import Room

@@ -1,0 +1,105 @@
+"""Where a rollout goes and what comes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from persist_cli.trajectories.clips import interactions_of
+from persist_cli.trajectories.reference import parse_reference
+from persist_cli.trajectories.store import TrajectoryFile
+from persist_cli.world.actions import format_actions
+from persist_cli.world.backbone import Interactions
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.errors import DataError
+from persist_cli.world.memory import Memory
+from persist_cli.world.observations import Observations, TrajectoryInfo
+
+
+@dataclass(frozen=True)
+class RolloutPlan:
+    """The options of ``persist rollout``; see its help."""
+
+    start: str
+    actions: str | None
+    follow: bool
+    frames: int
+    memory: Path | None
+    adapter: str | None
+    write: bool
+    seed: int
+    steps: int
+    sampler: str
+    guidance: float
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Where a rollout goes.
+
+    Args:
+        start: the first frame, observed.
+        cameras: of the frames to imagine.
+        interactions: one for each of them.
+        actions: in text form.
+        truth: what is really seen there, when the trajectory is followed.
+        info: of the trajectory.
+    """
+
+    start: Observations
+    cameras: Cameras
+    interactions: Interactions
+    actions: str
+    truth: Observations | None
+    info: TrajectoryInfo
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout gave.
+
+    Args:
+        walk: where it went.
+        seen: the frames imagined.
+        before: the memory as it was, ``None`` without one.
+        memory: the memory as it is now.
+        seconds: that it took, without loading.
+    """
+
+    walk: Walk
+    seen: Observations
+    before: Memory | None
+    memory: Memory | None
+    seconds: float
+
+
+def plan_walk(plan: RolloutPlan) -> Walk:
+    """The start frame and the cameras to come, by actions or by the trajectory's own poses."""
+    reference = parse_reference(plan.start)
+    file = reference.single()
+    start = file.read([reference.frame])
+    if plan.follow:
+        return follow_trajectory(file, reference.frame, plan.frames)
+    names = file.info.vocabulary.parse(plan.actions or "")
+    camera = start.observations.cameras
+    poses = file.info.vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
+    cameras = Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
+    interactions = interactions_of(names, file.info.vocabulary)
+    return Walk(start.observations, cameras, interactions, format_actions(names), None, file.info)
+
+
+def follow_trajectory(file: TrajectoryFile, first: int, frames: int) -> Walk:
+    """The trajectory's own way from a frame on, with what is really seen there."""
+    last = min(len(file), first + 1 + frames) if frames else len(file)
+    if last - first < 2:
+        raise DataError(f"{file.name}: frame {first} is the last; there is nothing to follow")
+    span = file.read(slice(first, last))
+    names = tuple(name or "stay" for name in span.actions[:-1])
+    return Walk(
+        start=span.observations[:1],
+        cameras=span.observations.cameras[1:],
+        interactions=interactions_of(span.actions[:-1], file.info.vocabulary),
+        actions=format_actions(names),
+        truth=span.observations[1:],
+        info=file.info,
+    )
