@@ -4,34 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from persist_cli.recipe import MemoryChoice
-from persist_cli.registry import make_encoder, make_memory
+from persist_cli.registry import load_plugin, make_encoder
 from persist_cli.trajectories.clips import ClipSample
 from persist_cli.world.backbone import Clips
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.encoder import Encoder
 from persist_cli.world.memory import FrameOfReference, Memory
 from persist_cli.world.observations import TrajectoryInfo
+from persist_cli.world.settings import parse_settings
 from persist_cli.world.tokens import MemoryTokens
 
 
 @dataclass(frozen=True)
 class MemoryMaker:
-    """Makes empty memories of one choice that share one encoder."""
+    """Makes empty memories of one choice; plugin, settings and encoder are loaded once.
 
-    choice: MemoryChoice
+    Args:
+        kind: the memory's class.
+        settings: an instance of its settings type.
+        encoder: that all of them share.
+    """
+
+    kind: type[Memory]
+    settings: Any
     encoder: Encoder
 
     @staticmethod
     def of(choice: MemoryChoice) -> MemoryMaker:
-        """The maker of this choice, its encoder loaded once."""
-        return MemoryMaker(choice, make_encoder(choice.encoder, choice.encoder_settings))
+        """The maker of this choice."""
+        kind = load_plugin("memory", choice.name)
+        settings = parse_settings(kind.settings_type, choice.settings, f"memory {choice.name!r}")
+        return MemoryMaker(kind, settings, make_encoder(choice.encoder, choice.encoder_settings))
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """An empty memory in the frame of reference of a trajectory."""
-        reference = FrameOfReference(info.scene, info.world_up)
-        return make_memory(self.choice.name, self.choice.settings, self.encoder, reference)
+        return self.kind(self.settings, self.encoder, FrameOfReference(info.scene, info.world_up))
 
 
 def collate(samples: Sequence[ClipSample], maker: MemoryMaker | None, budget: int) -> Clips:

@@ -13,7 +13,7 @@ from persist_cli.trajectories.store import Store
 from persist_cli.world.actions import ActionVocabulary
 from persist_cli.world.backbone import Interactions
 from persist_cli.world.errors import DataError
-from persist_cli.world.observations import Observations, Trajectory, TrajectoryInfo
+from persist_cli.world.observations import Observations, TrajectoryInfo
 
 
 @dataclass(frozen=True)
@@ -79,13 +79,13 @@ class ClipDataset(Dataset[ClipSample]):
         steps = self.plan.frames - 1
         stride = int(random.choice([stride for stride in self.plan.strides if steps * stride < len(file)]))
         start = int(random.integers(len(file) - steps * stride))
-        span = file.read(slice(start, start + steps * stride + 1))
+        frames = slice(start, start + steps * stride + 1, stride)
         context = None
         if self.plan.context_frames:
             context = file.read(self._context_frames(start, random)).observations
         return ClipSample(
-            observations=span.observations[slice(None, None, stride)],
-            interactions=strided_interactions(span, stride),
+            observations=file.read(frames).observations,
+            interactions=strided_interactions(file.actions()[start : frames.stop - 1], stride, file.info.vocabulary),
             context=context,
             info=file.info,
             seed=int(random.integers(2**31)),
@@ -131,14 +131,11 @@ class SharedBatches(BatchSampler):
                 yield list(range(first, first + micro))
 
 
-def strided_interactions(span: Trajectory, stride: int) -> Interactions:
-    """For each step of ``stride`` frames the interaction that happened in it, if one did."""
-    names = []
-    actions = span.actions[:-1]
-    for first in range(0, len(actions), stride):
-        done = [name for name in actions[first : first + stride] if name and span.info.vocabulary[name].interaction]
-        names.append(done[0] if done else None)
-    return tuple(names)
+def strided_interactions(actions: Sequence[str | None], stride: int, vocabulary: ActionVocabulary) -> Interactions:
+    """For each step of ``stride`` frames the first interaction that happened in it, if one did."""
+    done = interactions_of(actions, vocabulary)
+    steps = (done[first : first + stride] for first in range(0, len(done), stride))
+    return tuple(next((name for name in step if name is not None), None) for step in steps)
 
 
 def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:
