@@ -16,7 +16,7 @@ from persist_cli.viewing.console import say
 from persist_cli.world.errors import PersistError
 
 WORDS = (
-    "This model has trained for a minute or two: its pictures are blurred and its figures say only that the whole "
+    "Each stage has trained for a minute or two, so the pictures are noise and the figures say only that the whole "
     "loop runs. Whether a memory helps is a question for hours of training, not for this demo."
 )
 HALF = 32  # frames from the start of the held-out path to where it turns back
@@ -26,12 +26,12 @@ TRAINING = "training.checkpoint_minutes=60 training.workers=1"
 def demo_commands(out: Path) -> list[str]:
     """The command lines, in order, writing into ``out``."""
     train, test, rollout = out / "train", out / "test", f"--start {out / 'test'}#0:{HALF} --follow --steps 12"
-    stage1 = f"base={out / 'stage1'} training.steps=25 training.batch=8 training.warmup=5 {TRAINING}"
+    stage1 = f"base={out / 'stage1'} training.steps=12 training.batch=8 training.warmup=4 {TRAINING}"
     return [
         f"collect miniworld --out {train} --scenes 0:24 --frames 64 --policy path",
         f"collect miniworld --out {test} --scenes 0:4 --frames {2 * HALF + 1} --policy there-and-back --split test",
         f"inspect {test}",
-        f"finetune tiny-codec --data {train} --out {out / 'codec'} --resume training.steps=120 training.batch=4 "
+        f"finetune tiny-codec --data {train} --out {out / 'codec'} --resume training.steps=140 training.batch=4 "
         + TRAINING,
         f"finetune tiny-stage1 --data {train} --out {out / 'stage1'} --resume base={out / 'codec'} "
         f"training.steps=60 training.batch=8 training.warmup=10 training.learning_rate=1e-3 {TRAINING}",
@@ -70,7 +70,7 @@ def gather(out: Path) -> None:
         rows.append((name.replace("-", " "), read_video(out / name / "rgb.mp4", truth.shape[1], truth.shape[2])))
     write_video(out / "rollout.mp4", beside([video for _, video in rows]))
     write_sheet(out / "sheet.png", rows, most=12)
-    shutil.copyfile(out / "with-memory" / "map-after.png", out / "map.png")
+    shutil.copyfile(out / "house.png", out / "map.png")
     shutil.copyfile(out / "eval" / "metrics.json", out / "metrics.json")
 
 
