@@ -43,7 +43,8 @@ class Codec(nn.Module):
     def images(
         self, rgb: UInt8[Tensor, "batch frame height width 3"], depth: Float[Tensor, "batch frame height width"]
     ) -> Float[Tensor, "stacked 3 frame height width"]:
-        """RGB clips, then depth clips, on the batch axis, in [-1, 1]."""
+        """RGB clips, then depth clips, on the batch axis, in [-1, 1], on the codec's device."""
+        rgb, depth = rgb.to(self.vae.device), depth.to(self.vae.device)
         color = rgb.permute(0, 4, 1, 2, 3).float() / 127.5 - 1
         filled = fill_missing(depth.float().flatten(0, 1)).unflatten(0, depth.shape[:2])
         grey = encode_depth(filled)[:, None].expand(-1, 3, -1, -1, -1)
