@@ -15,8 +15,9 @@ from accelerate import Accelerator
 from accelerate.utils import set_seed
 
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone, save_adapter, save_base, step_folders
+from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, parse_yaml_mapping, read_recipe, to_plain, to_yaml
-from persist_cli.registry import make_backbone, make_encoder
+from persist_cli.registry import make_backbone
 from persist_cli.training.log import StepLog
 from persist_cli.training.state import load_state, save_state
 from persist_cli.training.trainer import Stop, Trainer
@@ -81,9 +82,9 @@ def finetune(recipe: Recipe, run: Path, stop: Stop) -> None:
     )
     set_seed(settings.seed)
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
-    backbone = prepare_backbone(recipe, base)
-    trainer = Trainer(recipe, backbone, Path(recipe.data.path), accelerator)
-    notes = load_state(run, trainer.state)
+    maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
+    trainer = Trainer(recipe, prepare_backbone(recipe, base, maker), maker, accelerator)
+    load_state(run, trainer.state)
     if tracker:
         accelerator.init_trackers("persist")
     if accelerator.is_main_process:
@@ -93,7 +94,7 @@ def finetune(recipe: Recipe, run: Path, stop: Stop) -> None:
 
     def save() -> None:
         if accelerator.is_main_process:
-            save_run(run, trainer, base, notes)
+            save_run(run, trainer, base)
             log.draw(run / "loss.png")
         accelerator.wait_for_everyone()
 
@@ -106,7 +107,7 @@ def finetune(recipe: Recipe, run: Path, stop: Stop) -> None:
         report(recipe, run, trainer.state.step, stop)
 
 
-def prepare_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
+def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryMaker | None) -> Backbone:
     """The backbone to train: fresh or from the base, with a fresh adapter in stage 2."""
     settings = recipe.backbone.settings
     if base is None:
@@ -115,13 +116,12 @@ def prepare_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
         if base.backbone != recipe.backbone.name:
             raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {recipe.backbone.name!r}")
         backbone = load_backbone(base, settings)
-    if recipe.memory is not None:
-        encoder = make_encoder(recipe.memory.encoder, recipe.memory.encoder_settings)
-        backbone.add_adapter(recipe.memory.name, encoder.channels, recipe.adapter)
+    if recipe.memory is not None and maker is not None:
+        backbone.add_adapter(recipe.memory.name, maker.encoder.channels, recipe.adapter)
     return backbone
 
 
-def save_run(run: Path, trainer: Trainer, base: Checkpoint | None, notes: dict[str, Any]) -> None:
+def save_run(run: Path, trainer: Trainer, base: Checkpoint | None) -> None:
     """A checkpoint of the run, its model with averaged weights where they are kept."""
     state, recipe, backbone = trainer.state, trainer.recipe, trainer.backbone
 
@@ -143,7 +143,7 @@ def save_run(run: Path, trainer: Trainer, base: Checkpoint | None, notes: dict[s
             if state.average is not None:
                 state.average.restore(parameters)
 
-    save_state(run, state, save_model, notes)
+    save_state(run, state, save_model)
 
 
 def report(recipe: Recipe, run: Path, step: int, stop: Stop) -> None:

@@ -67,14 +67,13 @@ class TrainingState:
         torch.set_rng_state(tensors["random/torch"])
 
 
-def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], None], notes: dict[str, Any]) -> Path:
+def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], None]) -> Path:
     """Write a checkpoint aside, rename it to ``step-…`` and remove the older ones.
 
     Args:
         run: the run's folder.
         state: of the training.
         save_model: writes the model that others load into a folder.
-        notes: JSON values to keep beside it.
     """
     target = run / f"step-{state.step:08d}"
     aside = run / f".partial-{uuid.uuid4().hex[:8]}"
@@ -83,7 +82,7 @@ def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], Non
         save_model(aside / "model")
         write_tensors(aside / "training.safetensors", state.tensors())
         ema_steps = state.average.optimization_step if state.average else 0
-        write_json(aside / "training.json", {"step": state.step, "ema_steps": ema_steps} | notes)
+        write_json(aside / "training.json", {"step": state.step, "ema_steps": ema_steps})
         if target.exists():
             shutil.rmtree(target)
         aside.rename(target)
@@ -94,13 +93,13 @@ def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], Non
     return target
 
 
-def load_state(run: Path, state: TrainingState) -> dict[str, Any]:
-    """Restore the newest checkpoint of a run; returns its notes, empty when there is none."""
+def load_state(run: Path, state: TrainingState) -> None:
+    """Restore the newest checkpoint of a run, if there is one."""
     for leftover in run.glob(".partial-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     folders = step_folders(run)
     if not folders:
-        return {}
+        return
     notes: dict[str, Any] = read_json(folders[-1] / "training.json")
     path = folders[-1] / "training.safetensors"
     tensors, _ = read_tensors(path)
@@ -108,7 +107,6 @@ def load_state(run: Path, state: TrainingState) -> dict[str, Any]:
     state.step = int(notes["step"])
     if state.average is not None:
         state.average.optimization_step = int(notes["ema_steps"])
-    return notes
 
 
 def _take(tensors: dict[str, Tensor], name: str, like: Tensor, path: Path) -> Tensor:

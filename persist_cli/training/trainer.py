@@ -52,13 +52,13 @@ class Trainer:
     Args:
         recipe: the run.
         backbone: with the adapter to train in use, in stage 2.
-        data: data set folder.
+        maker: of the memories that the adapter reads, in stage 2.
         accelerator: one process or many.
     """
 
-    def __init__(self, recipe: Recipe, backbone: Backbone, data: Path, accelerator: Accelerator) -> None:
+    def __init__(self, recipe: Recipe, backbone: Backbone, maker: MemoryMaker | None, accelerator: Accelerator) -> None:
         self.recipe, self.backbone, self.accelerator = recipe, backbone, accelerator
-        self.maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
+        self.maker = maker
         plan = ClipPlan(
             frames=backbone.frames_per_clip,
             strides=recipe.data.strides,
@@ -66,7 +66,7 @@ class Trainer:
             seed=recipe.training.seed,
             image_size=backbone.image_size,
         )
-        self.clips = ClipDataset(data, plan)
+        self.clips = ClipDataset(Path(recipe.data.path), plan)
         parameters = backbone.trained_parameters(recipe.stage)
         settings = recipe.training
         optimizer = torch.optim.AdamW(

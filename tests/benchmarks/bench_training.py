@@ -18,8 +18,9 @@ from accelerate import Accelerator
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.registry import make_backbone, make_encoder
+from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
+from persist_cli.training.finetune import prepare_backbone
 from persist_cli.training.trainer import Trainer
 from persist_cli.trajectories.clips import ClipSample
 from persist_cli.viewing.console import print_table
@@ -44,12 +45,9 @@ class FixedBatchTrainer(Trainer):
 
 def make_trainer(name: str, data: Path) -> FixedBatchTrainer:
     """A recipe's trainer with fresh weights."""
-    recipe = make_recipe(read_recipe(name), name)
-    backbone = make_backbone(recipe.backbone.name, recipe.backbone.settings)
-    if recipe.memory is not None:
-        channels = make_encoder(recipe.memory.encoder, recipe.memory.encoder_settings).channels
-        backbone.add_adapter(recipe.memory.name, channels, recipe.adapter)
-    return FixedBatchTrainer(recipe, backbone, data, Accelerator(cpu=True))
+    recipe = make_recipe(apply_overrides(read_recipe(name), [f"data.path={data}"]), name)
+    maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
+    return FixedBatchTrainer(recipe, prepare_backbone(recipe, None, maker), maker, Accelerator(cpu=True))
 
 
 def measure(data: Path) -> tuple[Times, Times, Times]:
