@@ -1,8 +1,12 @@
+import shutil
+
 import pytest
 import torch
 
 from persist_cli.registry import make_encoder
 from persist_cli.world.errors import CheckpointError, RecipeError
+from persist_cli.world.files import write_json
+from persist_cli.world.weights import cached_weight
 from persist_memory.encoders.patches import EXACT, PatchesSettings, projection
 from tests.memory.views_of_room import walked
 
@@ -115,3 +119,40 @@ def test_dinov2_without_usable_weights_says_in_one_line_what_to_do(tiny_dino, tm
 def test_a_block_that_dinov2_does_not_have_is_refused(tiny_dino):
     with pytest.raises(CheckpointError, match="has 3 blocks, no block 9"):
         _ = make_encoder("dinov2", {"weights": str(tiny_dino), "layer": 9}).channels
+
+
+def test_dinov2_takes_fetched_weights_by_their_name(tiny_dino, tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    shutil.copytree(tiny_dino, tmp_path / "weights" / "dinov2-small")
+    rgb = walked(1).rgb
+    with pytest.raises(CheckpointError, match="'dinov2-small': not here: persist weights fetch dinov2-small"):
+        make_encoder("dinov2", {}).encode(rgb)
+    write_json(tmp_path / "weights" / "dinov2-small" / "weight.json", {"name": "dinov2-small"})
+    expected = make_encoder("dinov2", {"weights": str(tiny_dino)}).encode(rgb)
+    assert torch.equal(make_encoder("dinov2", {}).encode(rgb), expected)
+    with pytest.raises(CheckpointError, match="persist weights fetch dinov2-s-derived"):  # none stands in for another
+        make_encoder("dinov2", {"weights": "dinov2-s-derived"}).encode(rgb)
+
+
+def test_a_hub_id_is_opened_from_the_hubs_cache_or_refused_without_waiting(tmp_path, tiny_dino, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(CheckpointError, match="not in the hub's cache, and the hub: HF_HUB_OFFLINE is set"):
+        _ = make_encoder("dinov2", {"weights": "someone/dinov2-tiny"}).channels
+    obstacle = "http://127.0.0.1:9 does not answer"
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    with pytest.raises(CheckpointError, match=obstacle):
+        _ = make_encoder("dinov2", {"weights": "someone/dinov2-tiny"}).channels
+
+
+@pytest.mark.skipif(cached_weight("dinov2-s-derived") is None, reason="persist weights fetch dinov2-s-derived")
+def test_the_derived_dinov2_gives_block_8_and_sees_the_same_wall_from_elsewhere():
+    encoder = make_encoder("dinov2", {"weights": "dinov2-s-derived", "layer": 8})
+    rgb = walked(1).rgb[:, :42, :56].repeat(2, 1, 1, 1)
+    rgb[1] = rgb[0].roll(14, dims=1)  # by one patch
+    one, two = torch.nn.functional.normalize(encoder.encode(rgb), dim=-1)
+    assert one.shape == (3, 4, 384)
+    same, other = (one[:, :3] * two[:, 1:]).sum(-1).mean(), (one[:, :3] * two[:, :3]).sum(-1).mean()
+    assert same > other

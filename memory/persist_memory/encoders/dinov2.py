@@ -1,4 +1,4 @@
-"""DINOv2 patch features (PEWM, memory), from a local directory or the hub."""
+"""DINOv2 patch features (PEWM, memory), of fetched weights, a local directory or the hub."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from typing import Any
 import torch
 from jaxtyping import Float, UInt8
 from pydantic import PositiveInt
+from safetensors import SafetensorError
 from torch import Tensor
 
 from persist_cli.world.encoder import Encoder
 from persist_cli.world.errors import CheckpointError
+from persist_cli.world.hub import hub_obstacle, in_hub_cache
+from persist_cli.world.weights import cached_weight
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+_UNUSABLE = (OSError, ValueError, RuntimeError, SafetensorError)
 
 
 @dataclass(frozen=True)
@@ -25,16 +29,18 @@ class DinoV2Settings:
     """Which weights, and what is taken from them.
 
     Args:
-        weights: a directory that transformers wrote (``config.json`` and ``model.safetensors``), or a hub id.
+        weights: a directory that transformers wrote (``config.json`` and ``model.safetensors``); the name of weights
+            that ``persist weights fetch`` brought (``dinov2-small``, ``dinov2-base``, ``dinov2-s-derived``); or a hub
+            id, which is downloaded when it is not in the hub's cache. None of them stands in for another.
         size: pixels of the image's longer side when it is encoded; ``None`` keeps its own. Both sides are then
             rounded to whole patches.
         layer: the block whose output is taken, counted from 1; ``None`` for the last. The final layer norm
-            follows in either case.
+            follows in either case. DINOv2-S-derived was tuned for another task in its last blocks: take its block 8.
         batch: frames encoded at once. More is faster on a GPU, but then the last bits of a feature depend on
             the frames beside it, and a map on how its frames were grouped.
     """
 
-    weights: str = "facebook/dinov2-small"
+    weights: str = "dinov2-small"
     size: PositiveInt | None = None
     layer: PositiveInt | None = None
     batch: PositiveInt = 1
@@ -55,7 +61,7 @@ class DinoV2(Encoder):
         """Width of the model.
 
         Raises:
-            CheckpointError: when neither directory nor hub has its configuration.
+            CheckpointError: when its configuration is not to be had.
         """
         return int(self._config.hidden_size)
 
@@ -96,17 +102,36 @@ class DinoV2(Encoder):
         return self._opened(Dinov2Model, **options).eval().requires_grad_(False)
 
     def _opened(self, kind: Any, **options: Any) -> Any:
-        from safetensors import SafetensorError
-
-        weights = self.settings.weights
-        local = Path(weights).is_dir()
+        source, local = self._source
         try:
-            return kind.from_pretrained(weights, local_files_only=local, **options)
-        except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+            return kind.from_pretrained(source, local_files_only=local, **options)
+        except _UNUSABLE as error:
             cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            tried = "the directory" if local else "no such directory, and the hub"
-            hint = "download it once and set encoder.weights to its directory, or use the encoder 'patches'"
-            raise CheckpointError(f"DINOv2 weights {weights!r}: {tried} failed ({cause}); {hint}") from error
+            raise self._without(f"{source} failed ({cause})") from error
+
+    @cached_property
+    def _source(self) -> tuple[str, bool]:
+        """What to open, and whether it is here already."""
+        weights = self.settings.weights
+        if Path(weights).is_dir():
+            return weights, True
+        if "/" not in weights:
+            folder = cached_weight(weights)
+            if folder is None:
+                raise self._without(f"not here: persist weights fetch {weights}")
+            return str(folder), True
+        if weights.count("/") > 1:
+            raise self._without("no such directory")
+        if in_hub_cache(weights):
+            return weights, True
+        obstacle = hub_obstacle()
+        if obstacle:
+            raise self._without(f"no such directory, not in the hub's cache, and the hub: {obstacle}")
+        return weights, False
+
+    def _without(self, cause: str) -> CheckpointError:
+        hint = "set encoder.weights to a directory or to fetched weights (persist weights list), or take 'patches'"
+        return CheckpointError(f"DINOv2 weights {self.settings.weights!r}: {cause}; {hint}")
 
     def _rows_and_columns(self, height: int, width: int) -> tuple[int, int]:
         scale = (self.settings.size or max(height, width)) / max(height, width)

@@ -1,0 +1,1 @@
+"""Weights of encoders and metrics: what there is, where each can come from, and bringing it here verified."""

