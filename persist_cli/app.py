@@ -34,6 +34,11 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
+def names_in(text: str) -> tuple[str, ...]:
+    """The names of a list separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 def _show_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"persist {__version__}")
@@ -177,27 +182,92 @@ def rollout(
 
 @app.command("eval")
 def evaluate(
-    checkpoints: Annotated[list[Path], typer.Argument(metavar="CHECKPOINT...", help="Finetune runs or checkpoints.")],
-    data: Annotated[Path, typer.Option(help="Data set of held-out scenes.")],
-    memories: Annotated[str, typer.Option(help="Memories to compare, separated by commas.")] = "none,voxel",
-    seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
+    checkpoints: Annotated[
+        list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Finetune runs or checkpoints.")
+    ] = None,
+    data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
+    protocol: Annotated[str, typer.Option(help="revisit, return, long or unseen.")] = "revisit",
+    memories: Annotated[str, typer.Option(help="Memories to compare, the first as reference.")] = "none,voxel",
+    controls: Annotated[
+        str, typer.Option(help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy.")
+    ] = "copy,nearest,warp,codec,shuffled,emptied",
+    metrics: Annotated[str, typer.Option(help="Metrics separated by commas, or all.")] = "all",
+    frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
     clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
+    seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
     steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 50,
     sampler: Annotated[str, typer.Option(help="ddim or dpm.")] = "ddim",
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
-    out: Annotated[Path, typer.Option(help="Folder for metrics.json and the contact sheet.")] = Path("runs/eval"),
+    pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
+    out: Annotated[Path, typer.Option(help="Folder for metrics.json; a stopped run goes on.")] = Path("runs/eval"),
+    report: Annotated[Path | None, typer.Option(help="Folder for report.html, tables, curves, clips.")] = None,
+    compare: Annotated[
+        tuple[Path, Path] | None, typer.Option(metavar="A.json B.json", help="Compare two results instead.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Compare memories on clips that return to places seen before.
+    """Compare checkpoints, memories and controls on equal clips of held-out scenes.
 
-    persist eval runs/none runs/voxel --data runs/houses-test --memories none,voxel --seeds 3
+    persist eval runs/none runs/voxel --data runs/houses-test --memories none,voxel --report runs/report
+
+    persist eval --compare runs/a/metrics.json runs/b/metrics.json
     """
-    from persist_cli.evaluation.run import EvalPlan, run_eval
+    if compare is not None:
+        from persist_cli.reporting.compare import run_compare
+
+        run_compare(*compare, json, report)
+        return
+    if not checkpoints or not data:
+        raise PersistError("give at least one CHECKPOINT and --data DATA, or --compare A.json B.json")
+    from persist_cli.evaluation.command import run_eval
+    from persist_cli.evaluation.run import EvalPlan
 
     plan = EvalPlan(
-        memories=memories, seeds=seeds, clips=clips, steps=steps, sampler=sampler, batch=batch
+        data=tuple(data), protocol=protocol, memories=names_in(memories), controls=names_in(controls),
+        metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds, steps=steps, sampler=sampler, batch=batch,
+        noise=pose_noise,
     )  # fmt: skip
-    run_eval(checkpoints, data, plan, out, json)
+    run_eval(checkpoints, plan, out, report, json)
+
+
+weights_app = typer.Typer(no_args_is_help=True, help="Weights of encoders and metrics: what there is, fetch, path.")
+app.add_typer(weights_app, name="weights")
+
+
+@weights_app.command("list")
+def weights_list(json: JsonOption = False) -> None:
+    """List every weight with its use, licence, size and sources, and whether it is here."""
+    from persist_cli.weights.command import show_weights
+
+    show_weights(json)
+
+
+@weights_app.command("fetch")
+def weights_fetch(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Weights; `persist weights list` lists them.")],
+    source: Annotated[
+        Path | None, typer.Option("--from", help="Directory to look into first; else $PERSIST_WEIGHTS.")
+    ] = None,
+    offline: Annotated[bool, typer.Option("--offline", help="Never ask the network.")] = False,
+) -> None:
+    """Bring weights into the cache, verified and as safetensors: from a directory, the hub, or a pinned archive.
+
+    persist weights fetch lpips-alex i3d-kinetics-400
+    """
+    from persist_cli.weights.fetch import run_fetch
+
+    run_fetch(names, source, offline)
+
+
+@weights_app.command("path")
+def weights_path(name: Annotated[str, typer.Argument(help="A fetched weight.")]) -> None:
+    """Print the folder of a fetched weight, and nothing else.
+
+    ls $(persist weights path lpips-alex)
+    """
+    from persist_cli.weights.command import show_path
+
+    show_path(name)
 
 
 @app.command()

@@ -41,7 +41,7 @@ def demo_commands(out: Path) -> list[str]:
         f"rollout {out / 'voxel'} {rollout} --memory {out / 'house.safetensors'} --out {out / 'with-memory'}",
         f"rollout {out / 'none'} {rollout} --out {out / 'without-memory'}",
         f"eval {out / 'none'} {out / 'voxel'} --data {test} --memories none,voxel --seeds 2 --steps 8 --clips 6 "
-        f"--out {out / 'eval'}",
+        f"--metrics psnr,ssim,lpips-alex,absrel --out {out / 'eval'} --report {out / 'report'}",
     ]
 
 
@@ -55,7 +55,7 @@ def run_demo(out: Path) -> None:
     gather(out)
     say(f"\nDone in {(time.monotonic() - began) / 60:.1f} minutes. {WORDS}")
     say(f"Look at {out / 'rollout.mp4'} (ground truth, with memory, without), {out / 'sheet.png'}, {out / 'map.png'}")
-    say(f"and {out / 'metrics.json'}.")
+    say(f"and {out / 'report' / 'report.html'}.")
 
 
 def gather(out: Path) -> None:

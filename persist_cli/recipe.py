@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -13,7 +12,7 @@ from typing import Any, Literal
 import yaml
 
 from persist_cli.world.backbone import Stage
-from persist_cli.world.errors import RecipeError
+from persist_cli.world.errors import RecipeError, hint
 from persist_cli.world.settings import parse_settings
 
 
@@ -146,9 +145,7 @@ def read_recipe(name: str) -> dict[str, Any]:
     elif name in recipe_names():
         text = (resources.files("persist_recipes") / f"{name}.yaml").read_text(encoding="utf-8")
     else:
-        close = difflib.get_close_matches(name, recipe_names(), n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(recipe_names())}"
-        raise RecipeError(f"unknown recipe {name!r}; {hint} (a file of your own ends in .yaml)")
+        raise RecipeError(f"unknown recipe {name!r}; {hint(name, recipe_names())} (a file of your own ends in .yaml)")
     return parse_yaml_mapping(text, name)
 
 

@@ -6,14 +6,13 @@ that names plugin, package, version, target and cause.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections import defaultdict
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.world.errors import PluginError
+from persist_cli.world.errors import PluginError, hint
 
 if TYPE_CHECKING:
     from persist_cli.world.backbone import Backbone
@@ -71,9 +70,7 @@ def load_plugin(kind: str, name: str) -> type[Any]:
     for plugin in list_plugins(kind):
         named[plugin.name].append(plugin)
     if name not in named:
-        close = difflib.get_close_matches(name, named, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"installed: {', '.join(sorted(named)) or 'none'}"
-        raise PluginError(f"unknown {kind} {name!r}; {hint}")
+        raise PluginError(f"unknown {kind} {name!r}; {hint(name, sorted(named), 'installed')}")
     if len(named[name]) > 1:
         packages = " and ".join(plugin.package for plugin in named[name])
         raise PluginError(f"{kind} {name!r} is claimed by {packages}; uninstall one of them")

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-COMMANDS = ("collect", "import", "inspect", "finetune", "memorize", "rollout", "eval", "plugins", "recipes")
+COMMANDS = ("collect", "import", "inspect", "finetune", "memorize", "rollout", "eval", "weights", "plugins", "recipes")
 
 
 def test_help_imports_no_torch():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -47,6 +48,14 @@ def stage(number: str, data: Path, out: Path, *changes: str) -> list[str]:
 def train(*arguments: str) -> None:
     """Run ``persist`` in a process of its own."""
     subprocess.run([*PERSIST, *arguments], check=True, capture_output=True)
+
+
+def together(*arguments: str) -> None:
+    """Run ``persist`` as two processes with gloo; ``--multi_gpu`` is accelerate's word for several on one machine."""
+    launch = ["--multi_gpu", "--num_machines", "1", "--num_processes", "2", "--mixed_precision", "no"]
+    command = [sys.executable, "-m", "accelerate.commands.launch", *launch, "--dynamo_backend", "no", "--module"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
+    subprocess.run([*command, "persist_cli", *arguments], check=True, capture_output=True, env=environment)
 
 
 def write_walks(folder: Path) -> Path:

@@ -1,1 +1,1 @@
-"""Comparison of memories on clips that return to places seen before."""
+"""``persist eval``: checkpoints, memories and controls on equal clips, with metrics that say what they measure."""

@@ -1,143 +1,199 @@
-"""``persist eval``: memories compared on clips that return to places seen before."""
+"""``persist eval``: rows of checkpoints, memories and controls, measured on the clips of a protocol."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from persist_cli import __version__
-from persist_cli.checkpoints import find_checkpoint, load_backbone
-from persist_cli.evaluation.revisits import LEAST_RECALLED, Revisit, RevisitClip, find_revisits, read_revisit
-from persist_cli.evaluation.rows import Row, make_rows, row_seeds
-from persist_cli.evaluation.scores import Scores, table_columns, table_row
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone
+from persist_cli.evaluation.cases import Case, CaseFrames, read_case
+from persist_cli.evaluation.journal import Journal, Unit
+from persist_cli.evaluation.measuring import VIDEO, Measurer, choose_metrics, make_setup
+from persist_cli.evaluation.processes import Processes
+from persist_cli.evaluation.protocols import PROTOCOLS, Protocol
+from persist_cli.evaluation.protocols.protocol import Selected
+from persist_cli.evaluation.provenance import checkpoint_json, metric_json, training_scenes
+from persist_cli.evaluation.results import TRUTH
+from persist_cli.evaluation.rows.choice import RowChoice, check_choice, make_rows
+from persist_cli.evaluation.rows.row import Row
 from persist_cli.metrics import METRICS
+from persist_cli.rollout.world_model import clip_seed
 from persist_cli.trajectories.clips import check_size
 from persist_cli.trajectories.store import Store
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
-from persist_cli.viewing.sheet import write_sheet
+from persist_cli.viewing.console import add_task, progress, say
 from persist_cli.world.backbone import Backbone, Sampling
-from persist_cli.world.errors import PersistError
-from persist_cli.world.files import write_json
+from persist_cli.world.errors import PersistError, hint
 
-SHOWN = 3  # clips on the contact sheet
+SHOWN = 3  # clips whose videos are kept of every row, for the contact sheets
 
 
 @dataclass(frozen=True)
 class EvalPlan:
     """The options of ``persist eval``; see its help."""
 
-    memories: str
-    seeds: int
+    data: tuple[Path, ...]
+    protocol: str
+    memories: tuple[str, ...]
+    controls: tuple[str, ...]
+    metrics: tuple[str, ...]
+    frames: int
     clips: int
+    seeds: int
     steps: int
     sampler: str
     batch: int
+    noise: tuple[float, float]
+
+    @property
+    def choice(self) -> RowChoice:
+        """Which rows."""
+        return RowChoice(self.memories, self.controls, Sampling(self.steps, self.sampler), self.noise)
 
 
-def run_eval(paths: Sequence[Path], data: Path, plan: EvalPlan, out: Path, json: bool) -> None:
-    """Compare rows and leave a table, ``metrics.json`` and a contact sheet; see ``persist eval --help``."""
+@dataclass(frozen=True)
+class Evaluation:
+    """An evaluation that was checked and is ready to be measured.
+
+    Args:
+        plan: the options.
+        checkpoints: in the order given.
+        protocol: which clips.
+        cases: the clips.
+        rows: of the table.
+        measurer: of the metrics.
+        journal: that keeps what was measured.
+    """
+
+    plan: EvalPlan
+    checkpoints: Sequence[Checkpoint]
+    protocol: Protocol
+    cases: Sequence[Case]
+    rows: Sequence[Row]
+    measurer: Measurer
+    journal: Journal
+
+    @property
+    def batches(self) -> int:
+        """Batches of every row and seed."""
+        return -(-len(self.cases) // self.plan.batch)
+
+    def batch(self, number: int) -> Sequence[Case]:
+        """The cases of a batch."""
+        return self.cases[number * self.plan.batch : (number + 1) * self.plan.batch]
+
+    def seeds(self, row: Row) -> int:
+        """How many sampling seeds a row has."""
+        return self.plan.seeds if row.random else 1
+
+    def units(self, number: int) -> Iterator[Unit]:
+        """Every batch of a row."""
+        for seed in range(self.seeds(self.rows[number])):
+            for batch in range(self.batches):
+                yield Unit(number, seed, batch)
+
+
+def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Processes) -> tuple[Evaluation, Backbone]:
+    """Check everything that can be checked before anything is measured, and find the clips.
+
+    Raises:
+        PersistError: one line for whatever does not fit.
+    """
     checkpoints = [find_checkpoint(path) for path in paths]
-    memories = [name.strip() for name in plan.memories.split(",") if name.strip()]
-    rows = make_rows(checkpoints, memories, Sampling(plan.steps, plan.sampler))
-    if not memories:
-        raise PersistError("name at least one memory, as in --memories none,voxel")
+    check_choice(plan.choice)
+    if plan.protocol not in PROTOCOLS:
+        raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
+    protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
     backbone = load_backbone(checkpoints[0])
     if plan.sampler not in backbone.samplers:
         raise PersistError(f"unknown sampler {plan.sampler!r}; this backbone has {', '.join(backbone.samplers)}")
-    store = Store(data)
-    for file in store:
-        check_size(file.info, backbone.image_size, f"{data}#{file.name}")
-    revisits = find_revisits(store, backbone.frames_per_clip, plan.clips)
-    scores, shown = score_rows(rows, revisits, plan, backbone)
-    report = describe(paths, data, plan, revisits, scores)
-    write_json(out / "metrics.json", report)
-    for number, clip in enumerate(shown):
-        write_sheet(out / f"clip-{number}.png", clip)
-    if json:
-        print_json(report)
-    else:
-        show(report, scores, out)
+    make_rows(checkpoints, plan.choice, protocol, ())  # what is wrong with rows is told before clips are sought
+    for folder in plan.data:
+        for file in Store(folder):
+            check_size(file.info, backbone.image_size, f"{folder}#{file.name}")
+    clip = backbone.frames_per_clip - 1
+    asked = Selected(plan.data, plan.frames, plan.clips, clip, training_scenes(checkpoints))
+    journal, cases = Journal(out), None
+    if processes.main:
+        cases = found_cases(journal, what_is_measured(plan, checkpoints, metrics), protocol, asked)
+    processes.wait()
+    cases = cases or journal.cases() or []
+    rows = make_rows(checkpoints, plan.choice, protocol, cases)
+    measurer = Measurer.of(metrics, make_setup(cases))
+    return Evaluation(plan, checkpoints, protocol, cases, rows, measurer, journal), backbone
 
 
-def score_rows(
-    rows: Sequence[Row], revisits: Sequence[Revisit], plan: EvalPlan, backbone: Backbone
-) -> tuple[list[Scores], list[list[tuple[str, Tensor]]]]:
-    """Scores of every row, and the labelled videos of the first clips for the contact sheets."""
-    loaded = rows[0].base.fingerprint
-    shown = [
-        [("ground truth", read_revisit(each, backbone.frames_per_clip).observations.rgb)] for each in revisits[:SHOWN]
+def found_cases(journal: Journal, plan: dict[str, Any], protocol: Protocol, asked: Selected) -> list[Case]:
+    """The clips, from the journal where it goes on."""
+    journal.check(plan)
+    cases = journal.cases()
+    if cases is None:
+        say(f"finding clips for the protocol {protocol.name!r} in {', '.join(map(str, asked.folders))}")
+        cases = protocol.find(asked)
+        journal.begin(plan, cases)
+    return cases
+
+
+def what_is_measured(plan: EvalPlan, checkpoints: Sequence[Checkpoint], metrics: Any) -> dict[str, Any]:
+    """All that changes a figure, JSON values: the same evaluation goes on where it stopped."""
+    options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
+    models = [checkpoint_json(each) for each in checkpoints]
+    values = options | {"checkpoints": models, "metric definitions": metric_json(metrics)}
+    return dict(json.loads(json.dumps(values)))  # as a file gives it back
+
+
+def measure_rows(run: Evaluation, backbone: Backbone, processes: Processes) -> None:
+    """Measure every batch that the journal does not have, this process its share."""
+    todo = [
+        [unit for unit in run.units(number) if processes.mine(unit.batch) and not run.journal.has(unit)]
+        for number in range(len(run.rows))
     ]
-    scores = []
+    loaded = run.checkpoints[0].fingerprint
     with progress() as bar:
-        total = sum(len(revisits) * (plan.seeds if row.random else 1) for row in rows)
-        task = add_task(bar, "eval", total, "clip")
-        for row in rows:
+        bar.disable = not processes.main
+        task = add_task(bar, "eval", sum(len(run.batch(unit.batch)) for units in todo for unit in units), "clip")
+        measure_truth(run, processes)
+        for row, units in zip(run.rows, todo, strict=True):
+            if not units:
+                continue
             if row.base.fingerprint != loaded:
                 backbone, loaded = load_backbone(row.base), row.base.fingerprint
             row.prepare(backbone)
             bar.update(task, note=row.name)
-            by_seed = []
-            for seed in range(plan.seeds if row.random else 1):
-                parts = []
-                for first, videos, values in score_batches(row, backbone, revisits, seed, plan.batch):
-                    parts.append(values)
-                    bar.advance(task, len(videos))
-                    for number in range(first, min(first + len(videos), SHOWN)) if seed == 0 else ():
-                        shown[number].append((row.name, videos[number - first].cpu()))
-                by_seed.append(torch.cat(parts))
-            values = torch.stack(by_seed)
-            scores.append(Scores(row.name, {name: values[..., column] for column, name in enumerate(METRICS)}))
-    return scores, shown
+            for unit in units:
+                measure_unit(run, row, backbone, unit)
+                bar.advance(task, len(run.batch(unit.batch)))
+    processes.wait()
 
 
-def score_batches(
-    row: Row, backbone: Backbone, revisits: Sequence[Revisit], seed: int, batch: int
-) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Number of the first clip, videos and figures ``[clip, frame, metric]`` of each batch."""
-    for first in range(0, len(revisits), batch):
-        clips = [read_revisit(each, backbone.frames_per_clip) for each in revisits[first : first + batch]]
-        rgb, depth = row.frames(backbone, clips, row_seeds(seed, first, len(clips)))
-        yield first, rgb, torch.stack([measure(*each) for each in zip(rgb, depth, clips, strict=True)])
+def measure_truth(run: Evaluation, processes: Processes) -> None:
+    """Keep the features of the true videos, which sets of videos are compared with."""
+    for batch in range(run.batches):
+        unit = Unit(TRUTH, 0, batch)
+        if run.measurer.by_set and processes.mine(batch) and not run.journal.has(unit):
+            run.journal.write(unit, run.measurer.true_features(run.batch(batch)))
 
 
-def measure(rgb: Tensor, depth: Tensor, clip: RevisitClip) -> Tensor:
-    """Figures ``[frame, metric]`` of one clip, the given first frame left out."""
-    truth = clip.observations
-    return torch.stack(
-        [each.measure(rgb[1:].cpu(), depth[1:].cpu(), truth.rgb[1:], truth.depth[1:]) for each in METRICS.values()],
-        dim=-1,
-    )
+def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> None:
+    """Measure one batch and keep it, with the videos of the clips to be shown."""
+    clips = [read_case(case) for case in run.batch(unit.batch)]
+    rgb, depth = predict(run, row, backbone, unit, clips)
+    kept = run.measurer.measure(rgb, depth, clips, f"row {row.name!r}")
+    shown = max(0, SHOWN - unit.batch * run.plan.batch) if unit.seed == 0 else 0
+    if shown:
+        kept[VIDEO] = rgb[:shown].cpu()
+    run.journal.write(unit, kept)
 
 
-def describe(
-    paths: Sequence[Path], data: Path, plan: EvalPlan, revisits: Sequence[Revisit], scores: Sequence[Scores]
-) -> dict[str, Any]:
-    """The figures with all that is needed to measure them again, JSON values."""
-    return {
-        "persist": __version__,
-        "torch": torch.__version__,
-        "checkpoints": [{"path": str(path), "fingerprint": find_checkpoint(path).fingerprint} for path in paths],
-        "data": str(data),
-        "plan": vars(plan),
-        "protocol": f"revisit: at least {LEAST_RECALLED:.0%} of the last view seen only by frames before the clip",
-        "clips": [{"trajectory": each.file.name, "start": each.start, "recalled": each.recalled} for each in revisits],
-        "metrics": {name: {"better": each.better, "definition": each.definition} for name, each in METRICS.items()},
-        "rows": {each.name: each.to_json() for each in scores},
-    }
-
-
-def show(report: dict[str, Any], scores: Sequence[Scores], out: Path) -> None:
-    """The table, with what it says."""
-    clips = report["clips"]
-    recalled = sum(each["recalled"] for each in clips) / len(clips)
-    title = f"{len(clips)} clips, {report['plan']['seeds']} seeds, {report['plan']['steps']} steps"
-    print_table(title, table_columns(list(METRICS)), [table_row(each) for each in scores])
-    say(f"clips recall {recalled:.0%} of their last view on average; mean ± standard deviation over seeds")
-    for metric in METRICS.values():
-        say(f"{metric.title}: {metric.definition}")
-    say(f"written to {out}")
+def predict(
+    run: Evaluation, row: Row, backbone: Backbone, unit: Unit, clips: Sequence[CaseFrames]
+) -> tuple[Tensor, Tensor]:
+    """The row's videos of a batch; the noise of a clip is the same for every row, so that rows are paired."""
+    first = unit.batch * run.plan.batch
+    with torch.no_grad():
+        return row.videos(backbone, clips, [clip_seed(unit.seed, first + number) for number in range(len(clips))])

@@ -1,82 +1,57 @@
-"""Metrics: each a small named thing that says what it measures."""
+"""Metrics of a frame's colours, without a network."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import ClassVar
-
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
 
-class Metric(ABC):
-    """A figure for each frame.
-
-    ``definition`` is printed beside every figure; ``better`` says which way is good.
-    """
-
-    title: ClassVar[str]
-    definition: ClassVar[str]
-    better: ClassVar[str]
-
-    @abstractmethod
-    def measure(
-        self,
-        rgb: UInt8[Tensor, "frame height width 3"],
-        depth: Float[Tensor, "frame height width"],
-        true_rgb: UInt8[Tensor, "frame height width 3"],
-        true_depth: Float[Tensor, "frame height width"],
-    ) -> Float[Tensor, " frame"]:
-        """The figure of each frame, float64; NaN where it is not defined."""
+WINDOW = 11  # pixels
 
 
-class Psnr(Metric):
+class Psnr(FrameMetric):
     """Peak signal-to-noise ratio of RGB."""
 
+    name = "psnr"
     title = "PSNR"
-    definition = "dB, 8-bit RGB over the whole frame, averaged over frames (torchmetrics)"
     better = "higher"
+    definition = "dB, 8-bit RGB over the whole frame (torchmetrics); an exact copy counts as 100"
 
-    def measure(self, rgb: Tensor, depth: Tensor, true_rgb: Tensor, true_depth: Tensor) -> Float[Tensor, " frame"]:
+    def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
         """dB of each frame; an exact copy counts as 100 dB, so that means stay finite."""
         from torchmetrics.functional.image import peak_signal_noise_ratio
 
         ratios = peak_signal_noise_ratio(
-            rgb.double(), true_rgb.double(), data_range=255.0, dim=(1, 2, 3), reduction="none"
+            prediction.rgb.double(), prediction.truth.rgb.double(), data_range=255.0, dim=(1, 2, 3), reduction="none"
         )
         return torch.as_tensor(ratios).double().clamp_max(100.0)
 
 
-class Ssim(Metric):
+class Ssim(FrameMetric):
     """Structural similarity of RGB."""
 
+    name = "ssim"
     title = "SSIM"
-    definition = "Gaussian window 11, sigma 1.5, RGB in [0, 1] (torchmetrics)"
     better = "higher"
+    definition = (
+        "Gaussian window of 11 px, sigma 1.5, each of R, G, B in [0, 1], edges reflected, mean over the whole frame "
+        "(torchmetrics, float32)"
+    )
 
-    def measure(self, rgb: Tensor, depth: Tensor, true_rgb: Tensor, true_depth: Tensor) -> Float[Tensor, " frame"]:
-        """Similarity of each frame, at most 1."""
+    def obstacle(self, setup: Setup) -> str | None:
+        """The window must fit."""
+        if min(setup.height, setup.width) < WINDOW:
+            return f"images of {setup.width}×{setup.height} are smaller than the window of {WINDOW} px"
+        return None
+
+    def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
+        """Similarity of each frame, at most 1; frames one by one, whose last bits would depend on their neighbours."""
         from torchmetrics.functional.image import structural_similarity_index_measure
 
-        images = (part.permute(0, 3, 1, 2).double() / 255 for part in (rgb, true_rgb))
-        return torch.as_tensor(
-            structural_similarity_index_measure(*images, data_range=1.0, reduction="none")
-        ).double().reshape(len(rgb))  # fmt: skip
-
-
-class AbsRel(Metric):
-    """Relative error of depth."""
-
-    title = "AbsRel"
-    definition = "mean |z - z*| / z* over pixels with true depth z*, no alignment of scale"
-    better = "lower"
-
-    def measure(self, rgb: Tensor, depth: Tensor, true_rgb: Tensor, true_depth: Tensor) -> Float[Tensor, " frame"]:
-        """Error of each frame; a pixel without generated depth counts as z = 0, NaN without any true depth."""
-        known = true_depth > 0
-        error = (depth.double() - true_depth.double()).abs() / true_depth.double().clamp_min(1e-6)
-        return (error * known).sum((1, 2)) / known.sum((1, 2))
-
-
-METRICS: dict[str, Metric] = {"psnr": Psnr(), "ssim": Ssim(), "absrel": AbsRel()}
+        images = [part.permute(0, 3, 1, 2).float() / 255 for part in (prediction.rgb, prediction.truth.rgb)]
+        frames = zip(*(part.split(1) for part in images), strict=True)
+        return torch.stack(
+            [torch.as_tensor(structural_similarity_index_measure(*pair, data_range=1.0)).double() for pair in frames]
+        )

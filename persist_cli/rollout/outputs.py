@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from persist_cli.metrics import METRICS
+from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
 from persist_cli.rollout.walk import Rollout
 from persist_cli.trajectories.tum import write_poses
 from persist_cli.viewing.map import draw_map
@@ -40,9 +41,15 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
 
 
 def compare(seen: Observations, truth: Observations) -> dict[str, list[float]]:
-    """Every metric for each frame."""
+    """Every metric of single frames that can be measured here, for each frame."""
+    frames, height, width = truth.depth.shape
+    setup = Setup(1, frames, height, width, depth=bool((truth.depth > 0).any()), returns=False)
+    prediction = Prediction(seen.rgb, seen.depth, truth, torch.full((frames,), -1))
+    prediction.check("rollout")
     return {
-        name: metric.measure(seen.rgb, seen.depth, truth.rgb, truth.depth).tolist() for name, metric in METRICS.items()
+        name: metric.measure(prediction).tolist()
+        for name, metric in METRICS.items()
+        if isinstance(metric, FrameMetric) and metric.obstacle(setup) is None
     }
 
 

@@ -30,7 +30,7 @@ def write_sheet(
         columns: labels above the frames.
         most: frames a row.
     """
-    font = ImageFont.load_default(13)
+    font = label_font()
     margin = GAP + max(int(font.getlength(label)) for label, _ in rows) + GAP
     widths = [_cells(video, most) for _, video in rows]
     across = max(len(cells) * (cells[0].width + GAP) for cells in widths)
@@ -47,6 +47,13 @@ def write_sheet(
                 draw.text((left, 2), columns[column], fill="black", font=font)
     with written_aside(path) as aside:
         sheet.save(aside, format="PNG")
+
+
+def label_font() -> ImageFont.FreeTypeFont:
+    """The font of labels in pictures; it has Greek letters and signs, which Pillow's own lacks."""
+    import matplotlib
+
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", 12)
 
 
 def _cells(video: Tensor, most: int) -> list[Image.Image]:

@@ -15,6 +15,7 @@ from persist_cli.world.errors import DataError
 from persist_cli.world.files import written_aside
 
 SMALLEST = 256  # pixels of the shorter side of a written image
+STRIP = 20  # pixels of the strip with a video's name
 
 
 def color_depth(
@@ -45,6 +46,24 @@ def beside(
             parts.append(torch.full((*video.shape[:2], gap, 3), 255, dtype=torch.uint8))
         parts.append(video)
     return torch.cat(parts, dim=2)
+
+
+def below(videos: Sequence[UInt8[Tensor, "frame height width 3"]], gap: int = 2) -> UInt8[Tensor, "frame all width 3"]:
+    """Videos of one length and width one below the other with a white gap."""
+    turned = beside([video.transpose(1, 2) for video in videos], gap)
+    return turned.transpose(1, 2).contiguous()
+
+
+def labelled(video: UInt8[Tensor, "frame height width 3"], label: str) -> UInt8[Tensor, "frame taller width 3"]:
+    """A video under a white strip with its name."""
+    from PIL import Image, ImageDraw
+
+    from persist_cli.viewing.sheet import label_font
+
+    strip = Image.new("RGB", (video.shape[2], STRIP), "white")
+    ImageDraw.Draw(strip).text((4, 2), label, fill="black", font=label_font())
+    pixels = torch.from_numpy(np.array(strip)).expand(len(video), -1, -1, -1)
+    return torch.cat([pixels, video], dim=1)
 
 
 def enlarge(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame height width 3"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.world.errors import DataError
+from persist_cli.world.errors import DataError, hint
 
 FREE = "free"  # a motion that no named action describes; the poses say what it was
 STAY = "stay"
@@ -49,10 +48,7 @@ class ActionVocabulary:
         for action in self.actions:
             if action.name == name:
                 return action
-        known = [action.name for action in self.actions]
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
-        raise DataError(f"unknown action {name!r}; {hint}")
+        raise DataError(f"unknown action {name!r}; {hint(name, (action.name for action in self.actions))}")
 
     def parse(self, text: str) -> tuple[str, ...]:
         """Action names of the text form ``"forward*4 left*2"``."""

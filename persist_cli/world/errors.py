@@ -1,5 +1,15 @@
 """The one error family: whatever a user can cause ends in one line and exit code 1."""
 
+import difflib
+from collections.abc import Iterable
+
+
+def hint(name: str, known: Iterable[str], otherwise: str = "known") -> str:
+    """What was meant by an unknown name, or else which names there are."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"{otherwise}: {', '.join(names) or 'none'}"
+
 
 class PersistError(Exception):
     """Something the user can mend; its message is one line that says what is wrong and what to do."""

@@ -58,6 +58,16 @@ def project(
     return image[..., :2] / safe[..., None], depth
 
 
+def pose_differences(
+    first: Float[Tensor, "*pose 4 4"], second: Float[Tensor, "*pose 4 4"]
+) -> tuple[Float[Tensor, "*pose"], Float[Tensor, "*pose"]]:
+    """Metres between the origins of poses, and degrees of the turn from one to the other."""
+    metres = (first[..., :3, 3] - second[..., :3, 3]).norm(dim=-1)
+    relative = first[..., :3, :3].transpose(-1, -2) @ second[..., :3, :3]
+    cosine = (relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return metres, torch.rad2deg(cosine.clamp(-1, 1).acos())
+
+
 def plucker(cameras: Cameras, printed: bool = False) -> Float[Tensor, "*batch height width 6"]:
     """Plücker embedding (o × d, d) of every pixel's ray, d = R K⁻¹ (u, v, 1)ᵀ (PEWM, camera condition).
 

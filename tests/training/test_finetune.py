@@ -1,9 +1,7 @@
 import json
-import os
 import random
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import torch
 
 from persist_cli.checkpoints import find_checkpoint
 from persist_cli.world.files import read_tensors
-from tests.walking import MICRO_SETTINGS, PERSIST, stage, train
+from tests.walking import MICRO_SETTINGS, PERSIST, stage, together, train
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -143,13 +141,8 @@ def test_a_damaged_checkpoint_or_another_base_is_one_line(persist, walks, codec,
 @pytest.mark.slow
 def test_two_processes_train_like_one(walks, codec, tmp_path):
     changes = [f"base={codec}", "training.batch=4"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
     train(*stage("stage1", walks, tmp_path / "one", *changes))
-    launch = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2", "--module"]
-    subprocess.run(
-        [*launch, "persist_cli", *stage("stage1", walks, tmp_path / "two", *changes)],
-        check=True, capture_output=True, env=environment,
-    )  # fmt: skip
+    together(*stage("stage1", walks, tmp_path / "two", *changes))
     one, two = (
         [json.loads(line)["loss"] for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
         for name in ("one", "two")

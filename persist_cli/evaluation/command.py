@@ -1,0 +1,107 @@
+"""What ``persist eval`` does from its options to its table, results and report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from persist_cli.evaluation.cases import cases_json, data_files
+from persist_cli.evaluation.columns import column_json, make_columns
+from persist_cli.evaluation.pictures import make_pictures
+from persist_cli.evaluation.processes import Processes
+from persist_cli.evaluation.provenance import checkpoint_json, command, environment, metric_json
+from persist_cli.evaluation.results import RowResults, Table
+from persist_cli.evaluation.run import EvalPlan, Evaluation, measure_rows, prepare
+from persist_cli.reporting.report import write_report
+from persist_cli.reporting.text import print_tables
+from persist_cli.viewing.console import print_json, say
+from persist_cli.world.files import write_json
+
+RESULTS = "metrics.json"
+
+
+def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | None, json: bool) -> None:
+    """Measure rows and leave ``metrics.json``, and a report where one is asked for; see ``persist eval --help``."""
+    processes = Processes()
+    run, backbone = prepare(paths, plan, out, processes)
+    measure_rows(run, backbone, processes)
+    if not processes.main:
+        return
+    results = describe(run, processes.count)
+    write_json(out / RESULTS, results)
+    if report is not None:
+        write_report(results, make_pictures(run, results), report)
+    if json:
+        print_json(results)
+        return
+    print_tables(results)
+    say(motion_line(results["measured"]["clips"]))
+    say(f"written to {out / RESULTS}" + (f" and {report / 'report.html'}" if report else ""))
+
+
+def motion_line(clips: Sequence[dict[str, Any]]) -> str:
+    """How much the clips move and how much of what they look at was seen before: a frozen video scores well on some."""
+    way, away, turned = (
+        sum(clip[key] for clip in clips) / len(clips) for key in ("path_metres", "farthest_metres", "turned_degrees")
+    )
+    shares = [share for clip in clips for share in clip["seen_before"][1:] if share is not None]
+    seen = f"; {sum(shares) / len(shares):.0%} of what they look at was seen before" if shares else ""
+    return f"{len(clips)} clips, on average {way:.1f} m long, {away:.1f} m away, {turned:.0f}° of turns{seen}"
+
+
+def describe(run: Evaluation, processes: int) -> dict[str, Any]:
+    """The results with all that is needed to measure them again, JSON values."""
+    info = run.cases[0].file.info
+    protocol = {
+        "name": run.protocol.name,
+        "title": run.protocol.title,
+        "definition": run.protocol.definition,
+        "frames": run.cases[0].frames,
+        "options": {},
+    }
+    return {
+        "format": "persist-evaluation",
+        "version": 1,
+        "measured": {
+            "protocol": protocol,
+            "data": data_files(run.cases),
+            "image_size": [info.height, info.width],
+            "clips": cases_json(run.cases),
+            "metrics": metric_json(run.measurer.metrics),
+        },
+        "sampling": {
+            "steps": run.plan.steps,
+            "sampler": run.plan.sampler,
+            "seeds": list(range(run.plan.seeds)),
+            "batch": run.plan.batch,
+        },
+        "environment": environment(processes),
+        "command": command(),
+        "checkpoints": [checkpoint_json(each) for each in run.checkpoints],
+        "columns": column_json(make_columns(run.measurer.metrics, run.protocol)),
+        "tables": tables(run),
+        "first_row": run.rows[0].name,
+    }
+
+
+def tables(run: Evaluation) -> list[dict[str, Any]]:
+    """One table of all clips, or one for each data set where the protocol says so."""
+    columns = make_columns(run.measurer.metrics, run.protocol)
+    rows = [RowResults(row, number, run.seeds(row), run.batches) for number, row in enumerate(run.rows)]
+    return [
+        Table(name, clips, run.cases, run.measurer, columns, run.journal).to_json(rows)
+        for name, clips in domains(run).items()
+    ]
+
+
+def domains(run: Evaluation) -> dict[str, list[int]]:
+    """Numbers of the clips of each table."""
+    if not run.protocol.domains:
+        return {"all": list(range(len(run.cases)))}
+    found: dict[str, list[int]] = {}
+    for number, case in enumerate(run.cases):
+        source = case.file.info.source
+        origin = source.get("simulator") or source.get("format") or "unknown origin"
+        found.setdefault(f"{case.data} ({origin})", []).append(number)
+    return found

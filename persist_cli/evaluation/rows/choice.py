@@ -1,0 +1,123 @@
+"""From names to rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from persist_cli.checkpoints import Checkpoint
+from persist_cli.evaluation.cases import Case
+from persist_cli.evaluation.protocols import Protocol
+from persist_cli.evaluation.rows.controls import Codec, Copy, Nearest, Truth, Warp
+from persist_cli.evaluation.rows.model import ModelRow, Remembering
+from persist_cli.evaluation.rows.recalls import Emptied, Faithful, NoisyPoses, Oracle, Recall, Shuffled
+from persist_cli.evaluation.rows.row import Row
+from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import CheckpointError, PersistError, hint
+
+PLAIN = "stage1"  # the row of the base without any adapter
+FORGETFUL = "none"  # the memory that never reads a token, which no disturbance can reach
+CONTROLS: dict[str, Callable[[str, Checkpoint, Protocol], Row]] = {
+    "copy": lambda name, base, protocol: Copy(name, base),
+    "nearest": lambda name, base, protocol: Nearest(name, base, protocol.writes),
+    "warp": lambda name, base, protocol: Warp(name, base, protocol.writes),
+    "codec": lambda name, base, protocol: Codec(name, base),
+    "truth": lambda name, base, protocol: Truth(name, base),
+}
+TITLES = {
+    "copy": "copy of the first frame",
+    "nearest": "nearest earlier frame",
+    "warp": "geometric warp",
+    "codec": "codec reconstruction",
+    "truth": "ground truth",
+}
+RECALLS = ("shuffled", "emptied", "oracle", "noisy")
+
+
+@dataclass(frozen=True)
+class RowChoice:
+    """Which rows.
+
+    Args:
+        memories: names of adapters, or ``stage1``.
+        controls: names of ``CONTROLS`` and ``RECALLS``.
+        sampling: how clips are drawn.
+        noise: centimetres and degrees of the control ``noisy``.
+    """
+
+    memories: Sequence[str]
+    controls: Sequence[str]
+    sampling: Sampling
+    noise: tuple[float, float] = (5.0, 2.0)
+
+
+def check_choice(choice: RowChoice) -> None:
+    """Raise ``PersistError`` for an unknown control, and when no memory is named."""
+    if not choice.memories:
+        raise PersistError("name at least one memory, as in --memories none,voxel")
+    known = [*CONTROLS, *RECALLS]
+    for name in choice.controls:
+        if name not in known:
+            raise PersistError(f"unknown control {name!r}; {hint(name, known)}")
+    if min(choice.noise) < 0:
+        raise PersistError(f"the pose noise {choice.noise[0]:g} cm, {choice.noise[1]:g}° must not be negative")
+
+
+def make_rows(
+    checkpoints: Sequence[Checkpoint], choice: RowChoice, protocol: Protocol, cases: Sequence[Case]
+) -> list[Row]:
+    """A row for each memory and checkpoint that has it, these with a disturbed memory, then the controls.
+
+    Raises:
+        CheckpointError: when no checkpoint has a memory.
+    """
+    plain = [row for memory in choice.memories for row in model_rows(checkpoints, memory, choice, protocol)]
+    disturbed = [
+        disturbed_row(row, recall)
+        for row in plain
+        if row.adapter not in (None, FORGETFUL)
+        for recall in recalls(choice, cases)
+    ]
+    bases = list({each.fingerprint: each for each in checkpoints}.values())
+    named = [name for name in CONTROLS if name in (*choice.controls, *protocol.guards)]
+    controls = []
+    for name in named:
+        for base in bases if name == "codec" else bases[:1]:
+            suffix = f" ({base.name})" if name == "codec" and len(bases) > 1 else ""
+            controls.append(CONTROLS[name](TITLES[name] + suffix, base, protocol))
+    return [*plain, *disturbed, *controls]
+
+
+def model_rows(checkpoints: Sequence[Checkpoint], memory: str, choice: RowChoice, protocol: Protocol) -> list[ModelRow]:
+    """A row for each checkpoint that has the memory."""
+    owners = [each for each in checkpoints if memory == PLAIN or memory in each.adapters]
+    if memory == PLAIN:
+        owners = list({each.fingerprint: each for each in owners}.values())
+    if not owners:
+        known = sorted({name for each in checkpoints for name in each.adapters})
+        raise CheckpointError(f"no checkpoint has a memory adapter {memory!r}; there are: {', '.join(known) or 'none'}")
+    rows = []
+    for owner in owners:
+        adapter = None if memory == PLAIN else memory
+        maker = MemoryMaker.of(owner.memory_choice(memory)) if adapter else None
+        name = memory if len(owners) == 1 else f"{memory} ({owner.name})"
+        rows.append(ModelRow(name, owner, adapter, choice.sampling, Remembering(maker, Faithful(), protocol.writes)))
+    return rows
+
+
+def disturbed_row(row: ModelRow, recall: Recall) -> ModelRow:
+    """The same row with another memory."""
+    remembering = Remembering(row.remembering.maker, recall, row.remembering.writes)
+    return ModelRow(f"{row.name}, {recall.name}", row.checkpoint, row.adapter, row.sampling, remembering)
+
+
+def recalls(choice: RowChoice, cases: Sequence[Case]) -> list[Recall]:
+    """The memory controls asked for, in a fixed order."""
+    made: dict[str, Callable[[], Recall]] = {
+        "shuffled": lambda: Shuffled(cases),
+        "emptied": Emptied,
+        "oracle": Oracle,
+        "noisy": lambda: NoisyPoses(*choice.noise),
+    }
+    return [made[name]() for name in RECALLS if name in choice.controls]

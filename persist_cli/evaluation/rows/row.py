@@ -1,0 +1,52 @@
+"""The abstract row."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from persist_cli.checkpoints import Checkpoint
+from persist_cli.evaluation.cases import CaseFrames
+from persist_cli.world.backbone import Backbone
+
+Kind = Literal["model", "control", "memory control"]
+
+
+class Row(ABC):
+    """What one line of the table gives for a clip.
+
+    ``random`` says whether another sampling seed gives another result.
+
+    Args:
+        name: in the table.
+        base: the checkpoint whose backbone it needs.
+    """
+
+    kind: Kind = "control"
+    random: ClassVar[bool] = False
+
+    def __init__(self, name: str, base: Checkpoint) -> None:
+        self.name, self.base = name, base
+
+    @property
+    @abstractmethod
+    def definition(self) -> str:
+        """What the row shows, in a few words."""
+
+    def prepare(self, backbone: Backbone) -> None:
+        """Make the backbone ready for this row."""
+        backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+
+    @abstractmethod
+    def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """RGB uint8 ``[clip, frame, height, width, 3]`` and depth in metres of every frame, the given one first.
+
+        Args:
+            backbone: prepared for this row.
+            clips: all of one number of frames.
+            seeds: of the sampling noise, one for each clip.
+        """

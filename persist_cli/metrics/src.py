@@ -1,0 +1,150 @@
+"""SRC, scene revisit consistency: whether a place looks on return as it did when first generated."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
+from persist_cli.metrics.networks import exact_inference, missing_weights, network_device
+from persist_cli.metrics.returns import farthest, returns
+from persist_cli.world.encoder import Encoder
+from persist_cli.world.weights import cached_weight
+
+SIZE = 224  # pixels of the longer side
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """An encoder whose features are compared.
+
+    Args:
+        weights: their name in the cache.
+        title: printed.
+        layer: block whose output is taken, ``None`` for the last.
+    """
+
+    weights: str
+    title: str
+    layer: int | None
+
+
+BACKBONES = (
+    Backbone("dinov2-small", "DINOv2-S, block 12", None),
+    Backbone("dinov2-s-derived", "DINOv2-S-derived, block 8", 8),  # its last blocks look tuned for something else
+)
+
+
+class Likeness(FrameMetric):
+    """Likeness of two generated frames for each frame that returns to an earlier pose."""
+
+    pairing: ClassVar[str]
+
+    @abstractmethod
+    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
+        """For each frame that returns the two frames that are compared."""
+
+    @property
+    def definition(self) -> str:
+        """Encoder, layer, pooling, pairing and average."""
+        return (
+            f"100 × cosine similarity of {chosen_backbone().title} with the final layer norm, mean of patch tokens, "
+            f"longer side resized to {SIZE} px (bicubic, antialiased), {self.pairing}"
+        )
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """Those of the encoder that is used: the first that is cached."""
+        return (chosen_backbone().weights,)
+
+    def obstacle(self, setup: Setup) -> str | None:
+        """It needs clips that return, and an encoder."""
+        if not setup.returns:
+            return "no clip returns to a pose it had before"
+        return missing_weights(*(each.weights for each in BACKBONES))
+
+    def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
+        """Similarity at each frame that returns, at most 100; NaN at the others."""
+        figures = torch.full((len(prediction.rgb),), math.nan, dtype=torch.float64)
+        features = _encoded(prediction.rgb)
+        for frame, (one, other) in self.pairs(prediction).items():
+            figures[frame] = 100 * (features.of(one) @ features.of(other)).clamp_max(1.0)
+        return figures
+
+
+class Src(Likeness):
+    """Likeness of a generated frame to the generated frame of the first visit."""
+
+    name = "src"
+    title = "SRC"
+    better = "higher"
+    pairing = "each frame that returns to an earlier pose against what the video shows at its first visit there"
+
+    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
+        """The first visit and the frame itself."""
+        return {frame: (first, frame) for frame, first in returns(prediction.first_visits)}
+
+
+class SrcAway(Likeness):
+    """The motion guard of SRC: likeness of the first visit to the farthest frame before the return."""
+
+    name = "src-away"
+    title = "SRC away"
+    better = None
+    pairing = (
+        "at each frame that returns, the generated frame of the first visit against that frame in between whose true "
+        "camera is farthest from it (metres + radians), so that a frozen video has 100"
+    )
+
+    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
+        """The first visit and the farthest frame in between."""
+        cameras = prediction.truth.cameras
+        return {frame: (first, farthest(cameras, first, frame)) for frame, first in returns(prediction.first_visits)}
+
+
+def chosen_backbone() -> Backbone:
+    """The first whose weights are cached, else the first."""
+    return next((each for each in BACKBONES if cached_weight(each.weights)), BACKBONES[0])
+
+
+class VideoFeatures:
+    """Features of a video's frames, each encoded once, when first asked for.
+
+    Args:
+        rgb: the video.
+    """
+
+    def __init__(self, rgb: UInt8[Tensor, "frame height width 3"]) -> None:
+        self.rgb = rgb
+        self.found: dict[int, Float[Tensor, " channel"]] = {}
+
+    def of(self, frame: int) -> Float[Tensor, " channel"]:
+        """Mean patch features of unit length, float64 on the CPU."""
+        if frame not in self.found:
+            backbone = chosen_backbone()
+            with exact_inference():
+                encoder = _encoder(str(cached_weight(backbone.weights)), backbone.layer, network_device())
+                grid = encoder.encode(self.rgb[frame : frame + 1])
+                features = torch.nn.functional.normalize(grid.flatten(1, 2).double().mean(1), dim=-1)
+            self.found[frame] = features[0].cpu()
+        return self.found[frame]
+
+
+@lru_cache(maxsize=1)
+def _encoded(rgb: Tensor) -> VideoFeatures:
+    """Those of the last video, so that both metrics share them."""
+    return VideoFeatures(rgb)
+
+
+@lru_cache(maxsize=2)
+def _encoder(weights: str, layer: int | None, device: torch.device) -> Encoder:
+    from persist_cli.registry import make_encoder
+
+    return make_encoder("dinov2", {"weights": weights, "size": SIZE, "layer": layer}).to(device)

@@ -1,0 +1,237 @@
+"""The results of ``persist eval`` as its JSON holds them, checked."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+
+from persist_cli.world.errors import DataError
+
+FORMAT = "persist-evaluation"
+VERSION = 1
+FILE = "results.json"  # in a report's folder
+FILES = (FILE, "metrics.json")  # that one, or the one in the folder of ``persist eval --out``
+Kind = Literal["model", "control", "memory control"]
+
+
+def _defined(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Figure = Annotated[float | None, BeforeValidator(_defined)]
+
+
+class Part(BaseModel):
+    """A part of the results; keys that are not known here are kept out, so that later minor additions still read."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Protocol(Part):
+    """Which clips were asked of the model, and how."""
+
+    name: str
+    title: str = ""
+    definition: str = ""
+    frames: int
+    options: dict[str, Any] = {}
+
+
+class DataSet(Part):
+    """A data set with the hash of each trajectory that was used."""
+
+    path: str
+    trajectories: dict[str, str]
+
+
+class Clip(Part):
+    """One measured clip; ``data`` is the number of its data set, ``seen_before`` a share for each frame."""
+
+    data: int
+    trajectory: str
+    scene: str | int | None = None
+    start: int
+    frames: int
+    seen_before: list[Figure] = []
+    path_metres: Figure = None
+    farthest_metres: Figure = None
+    turned_degrees: Figure = None
+
+
+class MetricFacts(Part):
+    """What a metric is, with the hash of each weight it used."""
+
+    title: str
+    better: str | None = None
+    definition: str
+    weights: dict[str, str] = {}
+
+
+class Measured(Part):
+    """Everything that two runs must share to be comparable."""
+
+    protocol: Protocol
+    data: list[DataSet]
+    image_size: tuple[int, int]
+    clips: list[Clip]
+    metrics: dict[str, MetricFacts]
+
+
+class Column(Part):
+    """A column of the table: a metric over all frames, the last one, or the returns."""
+
+    metric: str
+    title: str
+    better: str | None = None
+    definition: str = ""
+    frames: str = "all"
+
+
+class Difference(Part):
+    """Paired difference to the first row with its 95 % interval."""
+
+    mean: Figure
+    low: Figure = None
+    high: Figure = None
+
+    @property
+    def clear(self) -> bool:
+        """Whether the interval is known and leaves zero out."""
+        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
+
+
+class Cell(Part):
+    """A figure with its spread, or why there is none."""
+
+    na: str | None = None
+    mean: Figure = None
+    std: Figure = None
+    low: Figure = None
+    high: Figure = None
+    count: int | None = None
+    per_clip: list[Figure] | None = None
+    difference: Difference | None = None
+
+
+class Bin(Part):
+    """Frames whose view was seen before to a share from ``low`` to ``high``."""
+
+    low: float
+    high: float
+    mean: Figure
+    count: int
+
+
+class Curve(Part):
+    """A metric frame by frame, the last value at the clip's last frame, and by the seen-before share of the view."""
+
+    per_frame: list[Figure] = []
+    by_seen_before: list[Bin] = []
+
+
+class Row(Part):
+    """A row of the table."""
+
+    kind: Kind
+    definition: str = ""
+    checkpoint: str | None = None
+    memory: str | None = None
+    columns: dict[str, Cell]
+    curves: dict[str, Curve] = {}
+
+
+class Table(Part):
+    """A table over some of the clips."""
+
+    name: str
+    clips: list[int]
+    rows: dict[str, Row]
+
+
+class CheckpointFacts(Part):
+    """A checkpoint by what is in it."""
+
+    name: str
+    path: str = ""
+    fingerprint: str = ""
+    recipe_sha256: str | None = None
+    adapters: dict[str, str] = {}
+
+
+class Sampling(Part):
+    """How clips were drawn from the models."""
+
+    steps: int | None = None
+    sampler: str | None = None
+    seeds: list[int] = []
+    batch: int | None = None
+
+
+class Evaluation(Part):
+    """All results of one ``persist eval``."""
+
+    measured: Measured
+    sampling: Sampling
+    environment: dict[str, Any] = {}
+    command: list[str] = []
+    checkpoints: list[CheckpointFacts] = []
+    columns: dict[str, Column]
+    tables: list[Table]
+    first_row: str | None = None
+
+
+def read_results(path: Path) -> Evaluation:
+    """Results from a JSON file, or from the folder of an evaluation or a report.
+
+    Raises:
+        DataError: one line when it is missing, not JSON, not results, or of another version.
+    """
+    file = path
+    if path.is_dir():
+        file = next((path / name for name in FILES if (path / name).is_file()), path / FILE)
+    try:
+        value = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError(f"{file}: no such file; `persist eval` writes it") from error
+    except (ValueError, OSError, RecursionError) as error:
+        raise DataError(f"{file}: not readable as JSON ({str(error).splitlines()[0]})") from error
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        raise DataError(f"{file}: not the results of `persist eval` (no format {FORMAT!r} in it)")
+    if value.get("version") != VERSION:
+        raise DataError(f"{file}: results of version {value.get('version')!r}; this persist reads version {VERSION}")
+    return check_results(value, str(file))
+
+
+def check_results(value: Mapping[str, Any], where: str) -> Evaluation:
+    """Results from JSON values; ``DataError`` names ``where`` and the first key that does not fit."""
+    try:
+        results = Evaluation.model_validate(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise DataError(f"{where}: results are damaged: {key}: {first['msg']}") from error
+    for table in results.tables:
+        if not all(0 <= number < len(results.measured.clips) for number in table.clips):
+            raise DataError(f"{where}: results are damaged: table {table.name!r} names clips that are not there")
+        for name, row in table.rows.items():
+            for column, cell in row.columns.items():
+                if cell.per_clip is not None and len(cell.per_clip) != len(table.clips):
+                    raise DataError(
+                        f"{where}: results are damaged: {table.name}, {name}, {column} has {len(cell.per_clip)} "
+                        f"figures for {len(table.clips)} clips"
+                    )
+    return results
+
+
+def plain(value: Any) -> Any:
+    """JSON values without NaN and infinity, which JSON does not have: they become null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    return _defined(value)

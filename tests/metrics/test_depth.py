@@ -1,0 +1,62 @@
+import math
+
+import pytest
+import torch
+
+from persist_cli.metrics import METRICS
+from tests.metrics.predictions import noise, prediction, setup, still
+
+PERFECT = {"absrel": 0.0, "rmse": 0.0, "delta1": 1.0, "drift": 0.0}
+
+
+def measured(name, depth, true_depth):
+    rgb, _ = noise(0)
+    return METRICS[name].measure(prediction(rgb, depth, still(rgb, true_depth))).tolist()
+
+
+@pytest.mark.parametrize("name", ["absrel", "rmse", "delta1"])
+def test_true_depth_is_perfect(name):
+    _, depth = noise(0)
+    assert measured(name, depth, depth) == [PERFECT[name]] * 2
+
+
+def test_depth_a_tenth_too_far_has_these_errors():
+    flat = torch.full((2, 32, 32), 2.0)
+    assert measured("absrel", flat * 1.1, flat) == pytest.approx([0.1, 0.1], rel=1e-5)
+    assert measured("rmse", flat * 1.1, flat) == pytest.approx([0.2, 0.2], rel=1e-5)
+
+
+@pytest.mark.parametrize(("factor", "share"), [(1.24, 1.0), (1.26, 0.0), (1 / 1.24, 1.0), (1 / 1.26, 0.0)])
+def test_delta_counts_pixels_within_a_quarter_in_either_direction(factor, share):
+    _, depth = noise(0)
+    assert measured("delta1", depth * factor, depth) == [share] * 2
+
+
+def test_rmse_weighs_large_errors_more():
+    flat = torch.full((2, 32, 32), 2.0)
+    halves = flat.clone()
+    halves[:, :16] += 0.4
+    assert measured("rmse", halves, flat) == pytest.approx([math.sqrt(0.08)] * 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", PERFECT)
+def test_missing_true_depth_is_left_out(name):
+    _, depth = noise(0)
+    holes = depth.clone()
+    holes[:, :16] = 0
+    assert measured(name, depth, holes) == pytest.approx([PERFECT[name]] * 2, abs=0.05)
+    assert all(map(math.isnan, measured(name, depth, torch.zeros_like(depth))))
+
+
+@pytest.mark.parametrize(("name", "figure"), [("absrel", 0.5), ("rmse", math.sqrt(2)), ("delta1", 0.5), ("drift", 1.0)])
+def test_missing_generated_depth_counts_as_an_error(name, figure):
+    flat = torch.full((2, 32, 32), 2.0)
+    holes = flat.clone()
+    holes[:, :16] = 0
+    assert measured(name, holes, flat) == pytest.approx([figure] * 2, abs=0.03)
+
+
+@pytest.mark.parametrize("name", PERFECT)
+def test_data_without_depth_is_not_measured(name):
+    assert METRICS[name].obstacle(setup(depth=False)) == "the data has no depth"
+    assert METRICS[name].obstacle(setup()) is None

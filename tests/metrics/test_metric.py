@@ -1,0 +1,69 @@
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from persist_cli.metrics import METRICS
+from persist_cli.metrics.metric import FrameMetric, SetMetric
+from persist_cli.rollout.outputs import compare
+from persist_cli.world.errors import DataError
+from tests.metrics.predictions import noise, prediction, setup, still, there_and_back
+
+
+def test_every_metric_is_there_by_its_name_and_says_what_it_is():
+    columns = "psnr ssim lpips-alex lpips-vgg dreamsim fvd src src-away absrel rmse delta1 drift"
+    assert " ".join(METRICS) == columns
+    for name, metric in METRICS.items():
+        assert metric.name == name
+        assert metric.better in ("higher", "lower") or name == "src-away"
+        assert isinstance(metric, FrameMetric | SetMetric)
+        assert metric.title
+        assert len(metric.definition) > 20
+        assert "\n" not in metric.definition
+
+
+def test_what_needs_weights_names_the_command_that_brings_them(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    for name, metric in METRICS.items():
+        obstacle = metric.obstacle(setup())
+        assert bool(obstacle) == bool(metric.weights), name
+        assert obstacle is None or f"persist weights fetch {metric.weights[0]}" in obstacle
+
+
+def test_importing_the_metrics_imports_no_network_and_no_heavy_library():
+    heavy = ("transformers", "torchmetrics", "scipy", "diffusers", "persist_memory", "persist_cli.registry")
+    code = f"import sys, persist_cli.metrics; print([name for name in {heavy} if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout == "[]\n"
+
+
+def test_a_video_that_does_not_match_the_truth_is_one_line():
+    rgb, depth = noise(0)
+    whole = prediction(rgb, depth, still(rgb, depth))
+    whole.check("clip 3")
+    hole = depth.clone()
+    hole[1, 2, 3] = float("nan")
+    for changes, cause in (
+        ({"rgb": rgb[:, :16]}, r"generated RGB \[2, 16, 32, 3\] .* true RGB \[2, 32, 32, 3\]"),
+        ({"rgb": rgb[:1], "depth": depth[:1]}, r"generated RGB \[1, 32, 32, 3\]"),
+        ({"depth": depth[:, :, :8]}, r"depth \[2, 32, 8\], true"),
+        ({"rgb": rgb / 255}, "generated RGB is torch.float32, wanted uint8"),
+        ({"depth": hole}, "generated depth is not finite"),
+        ({"depth": depth / 0}, "generated depth is not finite"),
+        ({"first_visits": torch.tensor([-1])}, "for each of 2"),
+        ({"first_visits": torch.tensor([-1, 1])}, "must name an earlier frame"),
+    ):
+        with pytest.raises(DataError, match=f"^clip 3: .*{cause}") as error:
+            replace(whole, **changes).check("clip 3")
+        assert "\n" not in str(error.value)
+
+
+def test_a_rollout_is_compared_by_what_can_be_measured_of_single_frames(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    truth = there_and_back().truth
+    figures = compare(replace(truth, depth=truth.depth * 1.1), truth)
+    assert list(figures) == ["psnr", "ssim", "absrel", "rmse", "delta1", "drift"]
+    assert figures["psnr"] == [100.0] * 7
+    assert figures["absrel"] == pytest.approx([0.1] * 7, rel=1e-5)
+    assert "drift" not in compare(truth, replace(truth, depth=torch.zeros_like(truth.depth)))

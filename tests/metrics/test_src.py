@@ -1,0 +1,86 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from persist_cli.metrics import METRICS
+from persist_cli.metrics.returns import farthest
+from persist_cli.metrics.src import BACKBONES
+from persist_cli.world.files import write_json
+from persist_cli.world.weights import cached_weight
+from tests.metrics.predictions import setup, there_and_back
+
+SRC, AWAY = METRICS["src"], METRICS["src-away"]
+any_encoder = pytest.mark.skipif(
+    not any(cached_weight(each.weights) for each in BACKBONES), reason="no weights of an encoder for SRC"
+)
+
+
+def cache_tiny(folder):
+    """A random DINOv2 of nine blocks as a cached weight."""
+    from transformers import Dinov2Config, Dinov2Model
+
+    torch.manual_seed(0)
+    sizes = {"hidden_size": 24, "num_hidden_layers": 9, "num_attention_heads": 2, "mlp_ratio": 2}
+    Dinov2Model(Dinov2Config(image_size=56, patch_size=14, **sizes)).save_pretrained(folder)
+    write_json(folder / "weight.json", {})
+
+
+@pytest.fixture(params=[each.weights for each in BACKBONES])
+def encoder(request, tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    cache_tiny(tmp_path / "weights" / request.param)
+
+
+def test_the_truth_has_100_at_returns_and_no_figure_elsewhere(encoder):
+    figures = SRC.measure(there_and_back())
+    assert figures[:4].isnan().all()
+    assert figures[4:].tolist() == pytest.approx([100.0] * 3)
+    assert figures[4:].max() <= 100
+
+
+def test_a_place_that_looks_otherwise_on_return_has_less(encoder):
+    clip = there_and_back()
+    changed = clip.rgb.clone()
+    changed[5] = 255 - changed[5]
+    figures = SRC.measure(replace(clip, rgb=changed))
+    assert figures[5] < figures[4] == pytest.approx(100)
+
+
+def test_the_guard_of_a_frozen_video_is_100_and_that_of_the_truth_less(encoder):
+    clip = there_and_back()
+    frozen = replace(clip, rgb=clip.rgb[:1].expand_as(clip.rgb))
+    assert AWAY.measure(frozen)[4:].tolist() == SRC.measure(frozen)[4:].tolist() == pytest.approx([100.0] * 3)
+    assert (AWAY.measure(clip)[4:] < SRC.measure(clip)[4:]).all()
+
+
+def test_a_frame_counts_the_same_alone_and_among_others_to_the_bit(encoder):
+    clip = there_and_back()
+    alone = replace(clip, first_visits=torch.tensor([-1, -1, -1, -1, 2, -1, -1]))
+    changed = replace(alone, rgb=clip.rgb.flip(0).clone())
+    assert SRC.measure(replace(changed, first_visits=clip.first_visits))[4] == SRC.measure(changed)[4]
+
+
+@any_encoder
+def test_real_features_tell_the_way_there_from_the_place():
+    clip = there_and_back()
+    assert (AWAY.measure(clip)[4:] < 97).all()
+    assert (SRC.measure(clip)[4:] > 99.99).all()
+
+
+def test_the_definition_says_which_weights_are_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    assert SRC.obstacle(setup()) == (
+        "weights dinov2-small or dinov2-s-derived are not here: persist weights fetch dinov2-small"
+    )
+    assert SRC.obstacle(setup(returns=False)) == "no clip returns to a pose it had before"
+    write_json(tmp_path / "weights/dinov2-s-derived/weight.json", {})
+    assert SRC.obstacle(setup()) is None
+    assert "DINOv2-S-derived, block 8" in SRC.definition
+    assert SRC.weights == ("dinov2-s-derived",)
+    write_json(tmp_path / "weights/dinov2-small/weight.json", {})
+    assert "DINOv2-S, block 12" in SRC.definition
+
+
+def test_the_guard_compares_with_the_farthest_camera():
+    assert farthest(there_and_back().truth.cameras, 0, 6) == 3
