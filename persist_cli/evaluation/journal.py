@@ -89,9 +89,9 @@ class Journal:
         return torch.cat(found) if found else None
 
 
-def different(one: dict[str, Any], other: dict[str, Any]) -> str:
-    """The first thing that two plans differ in."""
-    for key in sorted({*one, *other}):
-        if one.get(key) != other.get(key):
-            return f"{key}: {one.get(key)}, now {other.get(key)}"
-    return "unknown difference"
+def different(one: Any, other: Any, where: str = "") -> str:
+    """The first thing that two plans differ in, with both values."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        key = next(key for key in sorted({*one, *other}) if one.get(key) != other.get(key))
+        return different(one.get(key), other.get(key), f"{where} {key}".strip())
+    return f"{where}: {one}, now {other}"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.progress import Progress
 from torch import Tensor
 
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone
@@ -156,8 +157,8 @@ def measure_rows(run: Evaluation, backbone: Backbone, processes: Processes) -> N
     loaded = run.checkpoints[0].fingerprint
     with progress() as bar:
         bar.disable = not processes.main
+        measure_truth(run, processes, bar)
         task = add_task(bar, "eval", sum(len(run.batch(unit.batch)) for units in todo for unit in units), "clip")
-        measure_truth(run, processes)
         for row, units in zip(run.rows, todo, strict=True):
             if not units:
                 continue
@@ -171,12 +172,15 @@ def measure_rows(run: Evaluation, backbone: Backbone, processes: Processes) -> N
     processes.wait()
 
 
-def measure_truth(run: Evaluation, processes: Processes) -> None:
+def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
     """Keep the features of the true videos, which sets of videos are compared with."""
-    for batch in range(run.batches):
-        unit = Unit(TRUTH, 0, batch)
-        if run.measurer.by_set and processes.mine(batch) and not run.journal.has(unit):
-            run.journal.write(unit, run.measurer.true_features(run.batch(batch)))
+    units = [Unit(TRUTH, 0, batch) for batch in range(run.batches) if processes.mine(batch)]
+    todo = [unit for unit in units if run.measurer.by_set and not run.journal.has(unit)]
+    if todo:
+        task = add_task(bar, "true videos", sum(len(run.batch(unit.batch)) for unit in todo), "clip")
+    for unit in todo:
+        run.journal.write(unit, run.measurer.true_features(run.batch(unit.batch)))
+        bar.advance(task, len(run.batch(unit.batch)))
 
 
 def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> None:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from persist_cli.checkpoints import Checkpoint
 from persist_cli.evaluation.cases import CaseFrames
 from persist_cli.evaluation.rows.row import Row
-from persist_cli.evaluation.rows.warp import warp
+from persist_cli.evaluation.rows.warp import Surface, warp
 from persist_cli.evaluation.seen import held_frames
 from persist_cli.rollout.world_model import Question, batch_of
 from persist_cli.world.backbone import Backbone
+from persist_cli.world.cameras import Cameras
 from persist_cli.world.geometry import pose_differences
 from persist_cli.world.observations import Observations
+
+Shower = Callable[[Cameras, Tensor], tuple[Tensor, Tensor]]
 
 
 class Copy(Row):
@@ -80,24 +84,28 @@ class Memoryless(Row):
 
     def video(self, clip: CaseFrames, length: int) -> tuple[Tensor, Tensor]:
         """One clip; ``length`` frames are predicted at once."""
-        rgb, depth = clip.observations.rgb.clone(), clip.observations.depth.clone()
+        truth = clip.observations
+        rgb, depth = truth.rgb.clone(), truth.depth.clone()
+        earlier = truth if clip.context is None else Observations.concatenate([clip.context, truth])
+        show = self.shower(earlier)
         for frame in range(1, len(rgb)):
-            rgb[frame], depth[frame] = self.frame(self.held(clip, frame, length), clip.observations[frame : frame + 1])
+            held = self.held(clip, frame, length)
+            distances = pose_distances(earlier.cameras, truth.cameras[frame]).where(held, torch.inf)
+            rgb[frame], depth[frame] = show(truth.cameras[frame : frame + 1], distances)
         return rgb, depth
 
-    def held(self, clip: CaseFrames, frame: int, length: int) -> Observations:
-        """The true frames known when a frame is predicted: the memory's and the given one."""
+    def held(self, clip: CaseFrames, frame: int, length: int) -> Bool[Tensor, " earlier"]:
+        """Which of the context's and the clip's frames are known when a frame is predicted: never those to come."""
         case = clip.case
         numbers = held_frames(case.start, case.context, frame, length, self.writes)
-        written = clip.observations[: max(1, sum(number >= case.start for number in numbers))]
-        before = case.start if case.context > case.start else case.context
-        if clip.context is None or not before:
-            return written
-        return Observations.concatenate([clip.context[:before], written])
+        known = torch.zeros(case.context + case.frames, dtype=torch.bool)
+        known[[*range(case.context), case.context]] = True  # the clip's given first frame follows the context
+        known[[case.context + number - case.start for number in numbers if number >= case.start]] = True
+        return known
 
-    def frame(self, held: Observations, asked: Observations) -> tuple[Tensor, Tensor]:
-        """RGB and depth of the asked view."""
-        raise NotImplementedError
+    @abstractmethod
+    def shower(self, earlier: Observations) -> Shower:
+        """What makes RGB and depth of a view from the frames whose distance from it is finite."""
 
 
 class Nearest(Memoryless):
@@ -105,10 +113,14 @@ class Nearest(Memoryless):
 
     definition = "the true earlier frame whose pose is nearest (metres + radians) among those the memory holds by then"
 
-    def frame(self, held: Observations, asked: Observations) -> tuple[Tensor, Tensor]:
+    def shower(self, earlier: Observations) -> Shower:
         """The nearest frame as it is."""
-        nearest = int(pose_distances(held, asked).argmin())
-        return held.rgb[nearest], held.depth[nearest]
+
+        def show(camera: Cameras, distances: Tensor) -> tuple[Tensor, Tensor]:
+            nearest = int(distances.argmin())
+            return earlier.rgb[nearest], earlier.depth[nearest]
+
+        return show
 
 
 class Warp(Memoryless):
@@ -119,16 +131,16 @@ class Warp(Memoryless):
         "colours from the nearest pose that shows the surface, holes filled from the nearest pixel"
     )
 
-    def frame(self, held: Observations, asked: Observations) -> tuple[Tensor, Tensor]:
-        """The warped view, colours from the frame of the nearest pose that shows the surface."""
-        return warp(held[pose_distances(held, asked).argsort(descending=True)], asked.cameras)
+    def shower(self, earlier: Observations) -> Shower:
+        """The warped view."""
+        return partial(warp, Surface.of(earlier))
 
 
-def pose_distances(held: Observations, asked: Observations) -> Float[Tensor, " frame"]:
-    """Metres plus radians from every held pose to the asked one."""
-    poses = held.cameras.world_from_camera
-    metres, degrees = pose_differences(poses, asked.cameras.world_from_camera.expand_as(poses))
-    return metres + degrees * (math.pi / 180)
+def pose_distances(cameras: Cameras, asked: Cameras) -> Float[Tensor, " frame"]:
+    """Metres plus radians from every camera to the one asked for."""
+    poses = cameras.world_from_camera
+    metres, degrees = pose_differences(poses, asked.world_from_camera.expand_as(poses))
+    return metres + torch.deg2rad(degrees)
 
 
 def part_of(truth: Observations, first: int, length: int) -> Question:

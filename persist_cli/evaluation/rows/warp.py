@@ -2,62 +2,88 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.geometry import project, unproject
+from persist_cli.world.cameras import Cameras, invert_rigid
+from persist_cli.world.geometry import unproject
 from persist_cli.world.observations import Observations
 
-SAME = 0.05  # relative depth within which two frames show the same surface
+SAME = 0.05  # relative depth within which two points show the same surface
 CRACK = 1.1  # a pixel this much deeper than most of its neighbours shows through a gap between points
 
 
-def warp(held: Observations, camera: Cameras) -> tuple[UInt8[Tensor, "height width 3"], Float[Tensor, "height width"]]:
-    """What posed RGB-D frames show from another camera, the nearest surface first, holes filled from the nearest pixel.
+@dataclass(frozen=True)
+class Surface:
+    """The coloured points that posed RGB-D frames have seen.
 
     Args:
-        held: the earlier frames; where several show the nearest surface, the last of them gives the colour.
+        points: world metres, float64.
+        colors: of each point.
+        frames: number of the frame that each comes from.
+    """
+
+    points: Float[Tensor, "point 3"]
+    colors: UInt8[Tensor, "point 3"]
+    frames: Int64[Tensor, " point"]
+
+    @staticmethod
+    def of(seen: Observations) -> Surface:
+        """Every pixel that has depth."""
+        known = seen.depth > 0
+        numbers = torch.arange(len(seen))[:, None, None].expand_as(known)
+        return Surface(unproject(seen.depth, seen.cameras)[known], seen.rgb[known], numbers[known])
+
+
+def warp(
+    seen: Surface, camera: Cameras, ranks: Float[Tensor, " frame"]
+) -> tuple[UInt8[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+    """What the points show from another camera, the nearest surface first, holes filled from the nearest pixel.
+
+    Args:
+        seen: the earlier frames' points.
         camera: the asked view.
+        ranks: of every earlier frame; where several show the nearest surface, the lowest gives the colour, and an
+            infinite one does not take part.
 
     Returns:
         RGB, and depth in metres of the surfaces shown. Black and 0 when nothing falls into the view.
     """
     height, width = camera.height, camera.width
-    splats = [splat(held[number : number + 1], camera) for number in range(len(held))]
-    nearest = torch.full((height * width,), torch.inf, dtype=torch.float64)
-    for cells, distances, _ in splats:
-        nearest[cells] = torch.minimum(nearest[cells], distances)
-    depth, rgb = nearest.clone(), torch.zeros(height * width, 3, dtype=torch.uint8)
-    for cells, distances, colors in splats:
-        shown = distances <= nearest[cells] * (1 + SAME)
-        depth[cells[shown]], rgb[cells[shown]] = distances[shown], colors[shown]
-    return filled(rgb.reshape(height, width, 3), without_cracks(depth.reshape(height, width)))
+    points, cells, depth = in_image(seen, camera, ranks.isfinite())
+    nearest = torch.full((height * width,), torch.inf, dtype=torch.float64).scatter_reduce(0, cells, depth, "amin")
+    front = depth <= nearest[cells] * (1 + SAME)
+    points, cells, depth = points[front], cells[front], depth[front]
+    order = torch.argsort(depth, stable=True, descending=True)
+    order = order[torch.argsort(ranks[seen.frames[points[order]]], stable=True, descending=True)]
+    shown, rgb = torch.full_like(nearest, torch.inf), torch.zeros(height * width, 3, dtype=torch.uint8)
+    last = last_of_each(cells[order], height * width)
+    taken = order[last[last >= 0]]
+    shown[cells[taken]], rgb[cells[taken]] = depth[taken], seen.colors[points[taken]]
+    return filled(rgb.reshape(height, width, 3), without_cracks(shown.reshape(height, width)))
 
 
-def splat(seen: Observations, camera: Cameras) -> tuple[Int64[Tensor, " cell"], Float[Tensor, " cell"], Tensor]:
-    """Pixels of the asked view that one frame's points fall on, with the nearest one's depth and colour."""
-    known = seen.depth[0] > 0
-    points = unproject(seen.depth[0], seen.cameras[0])[known]
-    pixels, distances = project(points, camera[0])
-    columns, rows = pixels.nan_to_num(-1).floor().clamp(-1, 1e6).long().unbind(-1)
-    inside = (distances > 0) & (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width)
-    cells = (rows * camera.width + columns)[inside]
-    distances, colors = distances[inside], seen.rgb[0][known][inside]
-    order = torch.argsort(distances, stable=True)
-    cells, distances, colors = cells[order], distances[order], colors[order]
-    first = first_of_each(cells)
-    return cells[first], distances[first], colors[first]
+def in_image(
+    seen: Surface, camera: Cameras, known: Bool[Tensor, " frame"]
+) -> tuple[Int64[Tensor, " shown"], Int64[Tensor, " shown"], Float[Tensor, " shown"]]:
+    """Numbers of the points that fall into the image, the pixel of each counted along rows, and its planar depth."""
+    camera_from_world = invert_rigid(camera.world_from_camera[0])
+    local = seen.points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    image = local @ camera.intrinsics[0].double().T
+    depth = local[:, 2]
+    columns, rows = (image[:, :2] / depth[:, None]).nan_to_num(-1, -1, -1).floor().clamp(-1, 1e6).long().unbind(-1)
+    inside = (depth > 0) & (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width)
+    points = (inside & known[seen.frames]).nonzero()[:, 0]
+    return points, (rows * camera.width + columns)[points], depth[points]
 
 
-def first_of_each(values: Int64[Tensor, " value"]) -> Int64[Tensor, " kind"]:
-    """Where each distinct value stands first."""
-    order = torch.argsort(values, stable=True)
-    ordered = values[order]
-    fresh = torch.ones_like(ordered, dtype=torch.bool)
-    fresh[1:] = ordered[1:] != ordered[:-1]
-    return order[fresh]
+def last_of_each(cells: Int64[Tensor, " place"], count: int) -> Int64[Tensor, " cell"]:
+    """The last place of every cell in a list, -1 for those that are not in it."""
+    places = torch.arange(len(cells))
+    return torch.full((count,), -1, dtype=torch.long).scatter_reduce(0, cells, places, "amax")
 
 
 def without_cracks(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
