@@ -31,7 +31,7 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
     results = describe(run, processes.count)
     write_json(out / RESULTS, results)
     if report is not None:
-        write_report(results, make_pictures(run, results), report)
+        write_report(results, make_pictures(run, domains(run)), report)
     if json:
         print_json(results)
         return

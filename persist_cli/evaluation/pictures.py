@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.checkpoints import load_backbone
-from persist_cli.evaluation.cases import CaseFrames, read_case
+from persist_cli.evaluation.cases import read_case
 from persist_cli.evaluation.journal import Unit
-from persist_cli.evaluation.measuring import VIDEO
+from persist_cli.evaluation.measuring import FIGURES, VIDEO
 from persist_cli.evaluation.run import SHOWN, Evaluation, predict
-from persist_cli.metrics import METRICS
+from persist_cli.metrics.metric import Metric
 from persist_cli.reporting.pictures import ClipPicture, Pictures, RowPictures, Sheet
 from persist_cli.viewing.console import add_task, progress
 from persist_cli.world.backbone import Backbone
 
 
-def make_pictures(run: Evaluation, results: dict[str, Any]) -> Pictures:
-    """All pictures of an evaluation; the clips that are picked are predicted again, in the batch they were in."""
-    return Pictures(rows=tuple(row_pictures(run, results["tables"])), sheets=tuple(sheets(run)))
+def make_pictures(run: Evaluation, domains: dict[str, list[int]]) -> Pictures:
+    """All pictures of an evaluation.
+
+    Args:
+        run: that was measured.
+        domains: numbers of the clips of each table.
+    """
+    return Pictures(rows=tuple(row_pictures(run, domains)), sheets=tuple(sheets(run)))
 
 
 def sheets(run: Evaluation) -> list[Sheet]:
@@ -36,60 +40,59 @@ def sheets(run: Evaluation) -> list[Sheet]:
     return found
 
 
-def row_pictures(run: Evaluation, tables: Sequence[dict[str, Any]]) -> list[RowPictures]:
-    """Best, median and worst clip of every row in every table."""
-    metric = picking_metric(run)
+def row_pictures(run: Evaluation, domains: dict[str, list[int]]) -> list[RowPictures]:
+    """Best, median and worst clip of every row in every table, at the first seed.
+
+    They are predicted again, one by one and from the noise they had, because keeping every video would take more room
+    than anybody has; the last bits may differ from what was measured in a batch.
+    """
+    metric = next(iter(run.measurer.by_frame.values()), None)
     if metric is None:
         return []
-    picks = [
-        (table["name"], row, pick_clips(table, run.rows[row].name, metric))
-        for row in range(len(run.rows))
-        for table in tables
-    ]
     found, backbone, loaded = [], None, ""
     with progress() as bar:
-        task = add_task(bar, "pictures", len(picks), "row")
-        for table, row, clips in picks:
-            if backbone is None or run.rows[row].base.fingerprint != loaded:
-                backbone, loaded = load_backbone(run.rows[row].base), run.rows[row].base.fingerprint
-            run.rows[row].prepare(backbone)
-            shown = [clip_picture(run, backbone, row, clip, metric) for clip in clips]
-            found.append(RowPictures(table, run.rows[row].name, *shown))
+        task = add_task(bar, "pictures", len(run.rows), "row")
+        for number, row in enumerate(run.rows):
+            if backbone is None or row.base.fingerprint != loaded:
+                backbone, loaded = load_backbone(row.base), row.base.fingerprint
+            row.prepare(backbone)
+            figures = first_figures(run, number)
+            for name, clips in domains.items():
+                shown = []
+                for clip in pick_clips(figures, clips, metric):
+                    caption = f"{metric.title} {float(figures[clip]):.2f}"
+                    shown.append(clip_picture(run, backbone, (number, clip), caption))
+                found.append(RowPictures(name, row.name, *shown))
             bar.advance(task)
     return found
 
 
-def picking_metric(run: Evaluation) -> str | None:
-    """The metric that says which clip is best: the first that was measured for each frame."""
-    return next(iter(run.measurer.by_frame), None)
+def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
+    """The first metric's mean over the predicted frames of each clip, at the first seed."""
+    figures = run.journal.gather(row, 0, run.batches, FIGURES)
+    assert figures is not None  # every batch of a measured row has them
+    return figures[:, 1:, 0].nanmean(dim=1)
 
 
-def pick_clips(table: dict[str, Any], row: str, metric: str) -> list[int]:
-    """Numbers of the best, the median and the worst clip, over seeds."""
-    figures = table["rows"][row]["columns"][metric].get("per_clip") or [None] * len(table["clips"])
-    sign = -1.0 if METRICS[metric].better == "higher" else 1.0
-    known = [(sign * value, clip) for value, clip in zip(figures, table["clips"], strict=True) if value is not None]
-    ordered = [clip for _, clip in sorted(known)] or list(table["clips"])
+def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Metric) -> list[int]:
+    """Numbers of the best, the median and the worst of some clips."""
+    sign = -1.0 if metric.better == "higher" else 1.0
+    known = [clip for clip in clips if figures[clip].isfinite()] or list(clips)
+    ordered = sorted(known, key=lambda clip: sign * float(figures[clip]))
     return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
 
 
-def clip_picture(run: Evaluation, backbone: Backbone, row: int, clip: int, metric: str) -> ClipPicture:
-    """One clip at the first seed, as it was measured."""
-    batch, place = divmod(clip, run.plan.batch)
-    clips = [read_case(case) for case in run.batch(batch)]
-    rgb, depth = predict(run, run.rows[row], backbone, Unit(row, 0, batch), clips)
-    truth, generated, metres = clips[place].observations, rgb[place].cpu(), depth[place].cpu()
+def clip_picture(run: Evaluation, backbone: Backbone, where: tuple[int, int], caption: str) -> ClipPicture:
+    """What a row predicts for a clip, by their numbers, at the first seed."""
+    row, clip = where
+    frames = read_case(run.cases[clip])
+    rgb, depth = predict(run.rows[row], backbone, [frames], 0, clip)
+    truth = frames.observations
     return ClipPicture(
         clip=clip,
-        figure=f"{METRICS[metric].title} {mean_of(run, generated, metres, clips[place])}",
-        generated=generated,
+        figure=caption,
+        generated=rgb[0].cpu(),
         truth=truth.rgb,
-        depth=metres,
+        depth=depth[0].cpu(),
         true_depth=truth.depth if bool((truth.depth > 0).any()) else None,
     )
-
-
-def mean_of(run: Evaluation, rgb: Tensor, depth: Tensor, clip: CaseFrames) -> str:
-    """The picking metric's mean over the predicted frames, as text."""
-    figures = run.measurer.figures(rgb, depth, clip, "picture")[1:, 0]
-    return f"{float(torch.nanmean(figures)):.2f}"

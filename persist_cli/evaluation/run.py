@@ -186,7 +186,7 @@ def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
 def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> None:
     """Measure one batch and keep it, with the videos of the clips to be shown."""
     clips = [read_case(case) for case in run.batch(unit.batch)]
-    rgb, depth = predict(run, row, backbone, unit, clips)
+    rgb, depth = predict(row, backbone, clips, unit.seed, unit.batch * run.plan.batch)
     kept = run.measurer.measure(rgb, depth, clips, f"row {row.name!r}")
     shown = max(0, SHOWN - unit.batch * run.plan.batch) if unit.seed == 0 else 0
     if shown:
@@ -194,10 +194,15 @@ def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> N
     run.journal.write(unit, kept)
 
 
-def predict(
-    run: Evaluation, row: Row, backbone: Backbone, unit: Unit, clips: Sequence[CaseFrames]
-) -> tuple[Tensor, Tensor]:
-    """The row's videos of a batch; the noise of a clip is the same for every row, so that rows are paired."""
-    first = unit.batch * run.plan.batch
+def predict(row: Row, backbone: Backbone, clips: Sequence[CaseFrames], seed: int, first: int) -> tuple[Tensor, Tensor]:
+    """The row's videos of consecutive clips; a clip's noise is the same for every row, so that rows are paired.
+
+    Args:
+        row: prepared.
+        backbone: of the row.
+        clips: to predict.
+        seed: of the sampling.
+        first: number of the first clip.
+    """
     with torch.no_grad():
-        return row.videos(backbone, clips, [clip_seed(unit.seed, first + number) for number in range(len(clips))])
+        return row.videos(backbone, clips, [clip_seed(seed, first + number) for number in range(len(clips))])
