@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from persist_cli.trajectories.store import write_trajectory
+from persist_cli.trajectories.store import Store, write_trajectory
 from persist_cli.world.actions import walking_actions
 from persist_cli.world.observations import Frame
 from tests.rooms import UP, Room, look
@@ -71,6 +71,17 @@ def write_walks(folder: Path) -> Path:
         ]
         info = replace(room.info, scene=f"room-{number}", vocabulary=vocabulary)
         write_trajectory(folder / f"walk-{number}.parquet", info, frames)
+    return folder
+
+
+def without_depth(walks: Path, folder: Path) -> Path:
+    """The same walks seen by a camera that gives no depth."""
+    for file in Store(walks):
+        whole = file.read()
+        steps = zip(whole.observations.rgb, whole.observations.cameras.world_from_camera, whole.actions, strict=True)
+        nothing = np.zeros((SIZE, SIZE), np.float32)
+        frames = [Frame(rgb.numpy(), nothing, pose.numpy(), name) for rgb, pose, name in steps]
+        write_trajectory(folder / file.path.name, file.info, frames)
     return folder
 
 

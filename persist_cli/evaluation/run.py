@@ -105,7 +105,7 @@ def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Process
     Raises:
         PersistError: one line for whatever does not fit.
     """
-    checkpoints = [find_checkpoint(path) for path in paths]
+    checkpoints = list({each.folder.resolve(): each for each in map(find_checkpoint, paths)}.values())
     check_choice(plan.choice)
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
@@ -121,23 +121,19 @@ def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Process
     asked = Selected(plan.data, plan.frames, plan.clips, clip, training_scenes(checkpoints))
     journal, cases = Journal(out), None
     if processes.main:
-        cases = found_cases(journal, what_is_measured(plan, checkpoints, metrics), protocol, asked)
+        identity = what_is_measured(plan, checkpoints, metrics)
+        journal.check(identity)
+        cases = journal.cases()
+        if cases is None:
+            say(f"finding clips for the protocol {protocol.name!r} in {', '.join(map(str, asked.folders))}")
+            cases = protocol.find(asked)
+            make_rows(checkpoints, plan.choice, protocol, cases)  # controls may not suit the clips
+            journal.begin(identity, cases)
     processes.wait()
     cases = cases or journal.cases() or []
     rows = make_rows(checkpoints, plan.choice, protocol, cases)
     measurer = Measurer.of(metrics, make_setup(cases))
     return Evaluation(plan, checkpoints, protocol, cases, rows, measurer, journal), backbone
-
-
-def found_cases(journal: Journal, plan: dict[str, Any], protocol: Protocol, asked: Selected) -> list[Case]:
-    """The clips, from the journal where it goes on."""
-    journal.check(plan)
-    cases = journal.cases()
-    if cases is None:
-        say(f"finding clips for the protocol {protocol.name!r} in {', '.join(map(str, asked.folders))}")
-        cases = protocol.find(asked)
-        journal.begin(plan, cases)
-    return cases
 
 
 def what_is_measured(plan: EvalPlan, checkpoints: Sequence[Checkpoint], metrics: Any) -> dict[str, Any]:

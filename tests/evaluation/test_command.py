@@ -7,7 +7,7 @@ import time
 import pytest
 
 from persist_cli.world.files import read_json, write_json
-from tests.walking import PERSIST, together
+from tests.walking import PERSIST, together, without_depth
 
 QUICK = ["--memories", "stage1,voxel", "--metrics", "psnr,absrel", "--seeds", 2, "--steps", 2]
 
@@ -104,6 +104,19 @@ def test_another_evaluation_in_the_folder_is_refused(persist, whole, voxel, walk
     assert "holds another evaluation (batch: 1, now 2); choose another --out" in ended.err
 
 
+def test_checkpoints_of_one_name_are_told_apart_by_their_folders(persist, voxel, stage1, walks, tmp_path):
+    shutil.copytree(stage1, tmp_path / "stage1")
+    shutil.copytree(voxel, tmp_path / "voxel")
+    options = ["--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1, "--controls", "codec"]
+    ended = persist("eval", voxel, tmp_path / "voxel", voxel, "--data", walks, *options, "--out", tmp_path / "o")
+    assert ended.code == 0, ended.err
+    rows = figures(tmp_path / "o")[0]["rows"]
+    assert len(rows) == 3
+    assert [name.startswith("voxel (/") for name in rows] == [True, True, False]
+    one, two = (rows[name]["columns"]["psnr"]["per_clip"] for name in list(rows)[:2])
+    assert one == two
+
+
 def test_a_metric_that_cannot_be_measured_says_why_and_the_others_are(persist, voxel, walks, tmp_path):
     options = ["--memories", "stage1", "--metrics", "psnr,fvd,src", "--seeds", 1, "--steps", 2, "--controls", "copy"]
     ended = persist("eval", voxel, "--data", walks, *options, "--out", tmp_path)
@@ -161,3 +174,17 @@ def test_eval_wants_a_checkpoint_and_data_that_are_there(persist, voxel, walks, 
     assert "give at least one CHECKPOINT and --data" in persist("eval", voxel).err
     assert "give at least one CHECKPOINT and --data" in persist("eval", "--data", walks).err
     assert "no trajectory" in persist("eval", voxel, "--data", tmp_path, "--memories", "voxel").err
+
+
+def test_data_without_depth_is_measured_where_depth_is_not_needed(persist, voxel, walks, tmp_path):
+    data, command = without_depth(walks, tmp_path / "data"), ["--memories", "voxel", "--seeds", 1, "--steps", 1]
+    common = ["--protocol", "return", *command, "--metrics", "psnr,absrel", "--out", tmp_path / "o"]
+    refused = persist("eval", voxel, "--data", data, *common)
+    assert "the control 'warp' needs depth" in refused.err
+    assert not (tmp_path / "o").exists()
+    ended = persist("eval", voxel, "--data", data, *common, "--controls", "copy")
+    assert ended.code == 0, ended.err
+    rows = figures(tmp_path / "o")[0]["rows"]
+    assert set(rows) == {"voxel", "copy of the first frame", "ground truth"}
+    assert rows["voxel"]["columns"]["absrel"] == {"na": "the data has no depth"}
+    assert rows["ground truth"]["columns"]["psnr-return"]["mean"] == 100.0

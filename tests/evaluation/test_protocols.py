@@ -13,7 +13,7 @@ from persist_cli.trajectories.store import Store, write_trajectory
 from persist_cli.world.errors import DataError
 from persist_cli.world.geometry import pose_differences
 from tests.rooms import Room, look
-from tests.walking import smoothed
+from tests.walking import smoothed, without_depth
 
 
 def asked(folder, frames=0, most=8, clip=8, scenes=()):
@@ -92,13 +92,7 @@ def test_unseen_refuses_what_was_trained_on(walks, tmp_path):
 
 
 def test_data_without_depth_says_which_protocols_remain(walks, tmp_path):
-    for file in Store(walks):
-        whole = file.read()
-        frames = [
-            replace(Room(32, 32).see(pose.numpy(), name), depth=np.zeros((32, 32), np.float32))
-            for pose, name in zip(whole.observations.cameras.world_from_camera, whole.actions, strict=True)
-        ]
-        write_trajectory(tmp_path / file.path.name, file.info, frames)
+    without_depth(walks, tmp_path)
     with pytest.raises(DataError, match=r"no frame has depth.*--protocol return or long"):
         PROTOCOLS["revisit"].find(asked(tmp_path))
     case = PROTOCOLS["return"].find(asked(tmp_path))[0]

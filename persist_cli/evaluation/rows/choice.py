@@ -14,7 +14,7 @@ from persist_cli.evaluation.rows.recalls import Emptied, Faithful, NoisyPoses, O
 from persist_cli.evaluation.rows.row import Row
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.world.backbone import Sampling
-from persist_cli.world.errors import CheckpointError, PersistError, hint
+from persist_cli.world.errors import CheckpointError, DataError, PersistError, hint
 
 PLAIN = "stage1"  # the row of the base without any adapter
 FORGETFUL = "none"  # the memory that never reads a token, which no disturbance can reach
@@ -71,6 +71,7 @@ def make_rows(
 
     Raises:
         CheckpointError: when no checkpoint has a memory.
+        DataError: when the clips do not allow a control.
     """
     plain = [row for memory in choice.memories for row in model_rows(checkpoints, memory, choice, protocol)]
     disturbed = [
@@ -80,11 +81,13 @@ def make_rows(
         for recall in recalls(choice, cases)
     ]
     bases = list({each.fingerprint: each for each in checkpoints}.values())
+    if "warp" in choice.controls and cases and all(share is None for case in cases for share in case.seen_before):
+        raise DataError("the control 'warp' needs depth, which the data does not have; leave it out of --controls")
     named = [name for name in CONTROLS if name in (*choice.controls, *protocol.guards)]
     controls = []
     for name in named:
-        for base in bases if name == "codec" else bases[:1]:
-            suffix = f" ({base.name})" if name == "codec" and len(bases) > 1 else ""
+        for base, label in zip(bases, labels(bases), strict=True) if name == "codec" else [(bases[0], "")]:
+            suffix = f" ({label})" if name == "codec" and len(bases) > 1 else ""
             controls.append(CONTROLS[name](TITLES[name] + suffix, base, protocol))
     return [*plain, *disturbed, *controls]
 
@@ -98,12 +101,18 @@ def model_rows(checkpoints: Sequence[Checkpoint], memory: str, choice: RowChoice
         known = sorted({name for each in checkpoints for name in each.adapters})
         raise CheckpointError(f"no checkpoint has a memory adapter {memory!r}; there are: {', '.join(known) or 'none'}")
     rows = []
-    for owner in owners:
+    for owner, label in zip(owners, labels(owners), strict=True):
         adapter = None if memory == PLAIN else memory
         maker = MemoryMaker.of(owner.memory_choice(memory)) if adapter else None
-        name = memory if len(owners) == 1 else f"{memory} ({owner.name})"
+        name = memory if len(owners) == 1 else f"{memory} ({label})"
         rows.append(ModelRow(name, owner, adapter, choice.sampling, Remembering(maker, Faithful(), protocol.writes)))
     return rows
+
+
+def labels(checkpoints: Sequence[Checkpoint]) -> list[str]:
+    """The checkpoints' names, or their folders where two share a name."""
+    names = [each.name for each in checkpoints]
+    return [each.name if names.count(each.name) == 1 else str(each.folder) for each in checkpoints]
 
 
 def disturbed_row(row: ModelRow, recall: Recall) -> ModelRow:
