@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -20,6 +20,8 @@ from rich.progress import (
 )
 from rich.table import Table
 from rich.text import Text
+
+Item = TypeVar("Item")
 
 PIPED_WIDTH = 160  # columns of a table that goes into a file or pipe
 
@@ -54,6 +56,15 @@ def progress() -> Progress:
 def add_task(bar: Progress, description: str, total: int, unit: str, note: str = "") -> TaskID:
     """A task that counts ``unit`` up to ``total``; ``bar.update(task, note=…)`` changes its note."""
     return bar.add_task(description, total=total, unit=unit, note=note)
+
+
+def watched(items: Sequence[Item], description: str, unit: str) -> Iterator[Item]:
+    """The items one after the other, with a progress bar that counts those that are done."""
+    with progress() as bar:
+        task = add_task(bar, description, len(items), unit)
+        for item in items:
+            yield item
+            bar.advance(task)
 
 
 def print_json(value: Any) -> None:

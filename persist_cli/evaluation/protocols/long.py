@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from persist_cli.evaluation.cases import Case
 from persist_cli.evaluation.protocols.protocol import Protocol, Selected, names, trajectories
+from persist_cli.viewing.console import watched
 from persist_cli.world.errors import DataError
 
 LEAST = 112  # frames to predict, as in the paper
@@ -36,5 +37,5 @@ class Long(Protocol):
             )
         return [
             self.case(file, file.read(slice(0, start + frames)).observations, (start, frames, 0), asked)
-            for file, start in places[: asked.most]
+            for file, start in watched(places[: asked.most], "seen before", "clip")
         ]

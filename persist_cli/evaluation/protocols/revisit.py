@@ -6,6 +6,7 @@ from persist_cli.evaluation.cases import Case
 from persist_cli.evaluation.protocols.protocol import Protocol, Selected, names, require_depth, trajectories
 from persist_cli.evaluation.seen import GRID, recalled_share
 from persist_cli.trajectories.store import TrajectoryFile
+from persist_cli.viewing.console import watched
 from persist_cli.world.errors import DataError
 
 LEAST_RECALLED = 0.3  # share of the last view seen earlier and not from the clip's first frame
@@ -26,7 +27,8 @@ class Revisit(Protocol):
     def find(self, asked: Selected) -> list[Case]:
         """The clips with the most to recall, taking turns over trajectories, disjoint within each."""
         frames = asked.frames or asked.clip + 1
-        ranked = [self.rank(file, frames) for file in trajectories(asked.folders)]
+        files = watched(trajectories(asked.folders), "what returns", "trajectory")
+        ranked = [self.rank(file, frames) for file in files]
         turns = range(max(map(len, ranked), default=0))
         chosen = [(row[turn], number) for turn in turns for number, row in enumerate(ranked) if turn < len(row)]
         if not chosen:
@@ -40,7 +42,7 @@ class Revisit(Protocol):
         """The cases of (start, number of the trajectory), each trajectory read once."""
         files = trajectories(asked.folders)
         found: dict[tuple[int, int], Case] = {}
-        for number in dict.fromkeys(number for _, number in chosen):
+        for number in watched(list(dict.fromkeys(number for _, number in chosen)), "seen before", "trajectory"):
             seen = files[number].read().observations
             for start in (start for start, owner in chosen if owner == number):
                 found[start, number] = self.case(files[number], seen, (start, frames, start + 1), asked)

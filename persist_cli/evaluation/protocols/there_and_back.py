@@ -10,6 +10,7 @@ from torch import Tensor
 from persist_cli.evaluation.cases import Case
 from persist_cli.evaluation.protocols.protocol import Protocol, Selected, names, trajectories
 from persist_cli.trajectories.store import TrajectoryFile
+from persist_cli.viewing.console import watched
 from persist_cli.world.errors import DataError
 from persist_cli.world.geometry import pose_differences
 
@@ -36,11 +37,12 @@ class ThereAndBack(Protocol):
     def find(self, asked: Selected) -> list[Case]:
         """One clip of each trajectory that turns round and comes back far enough, all of one length."""
         poses = {file.path: file.poses() for file in trajectories(asked.folders)}
-        turns = {file.path: turning_point(poses[file.path]) for file in trajectories(asked.folders)}
+        files = watched(trajectories(asked.folders), "turning points", "trajectory")
+        turns = {file.path: turning_point(poses[file.path]) for file in files}
         lengths = [length for _, length in turns.values() if length >= FEWEST]
         frames = asked.frames or min(FRAMES, sorted(lengths)[len(lengths) // 2] if lengths else FRAMES)
         cases: list[Case] = []
-        for file in trajectories(asked.folders):
+        for file in watched(trajectories(asked.folders), "seen before", "trajectory"):
             twice, length = turns[file.path]
             if length < max(frames, FEWEST) or len(cases) == asked.most:
                 continue
