@@ -117,14 +117,20 @@ def finetune(
     data: Annotated[Path | None, typer.Option(help="Data set folder.")] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on from the run's last checkpoint.")] = False,
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder for latents and memory tokens; set data.clips_per_trajectory too.")
+    ] = None,
+    cache_gigabytes: Annotated[float, typer.Option(min=0, help="Most that the cache may hold.")] = 20,
 ) -> None:
     """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
 
     persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
     """
+    from persist_cli.training.cache import CachePlace
     from persist_cli.training.finetune import run_finetune
 
-    run_finetune(recipe, overrides or [], data, out, resume)
+    place = None if cache is None else CachePlace(cache, cache_gigabytes)
+    run_finetune(recipe, overrides or [], data, out, resume, place)
 
 
 @app.command()

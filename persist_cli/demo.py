@@ -41,7 +41,8 @@ def demo_commands(out: Path) -> list[str]:
         f"rollout {out / 'voxel'} {rollout} --memory {out / 'house.safetensors'} --out {out / 'with-memory'}",
         f"rollout {out / 'none'} {rollout} --out {out / 'without-memory'}",
         f"eval {out / 'none'} {out / 'voxel'} --data {test} --memories none,voxel --seeds 2 --steps 8 --clips 6 "
-        f"--metrics psnr,ssim,lpips-alex,absrel --out {out / 'eval'} --report {out / 'report'}",
+        f"--metrics psnr,ssim,lpips-alex,absrel --controls copy,nearest,warp,codec "
+        f"--out {out / 'eval'} --report {out / 'report'}",
     ]
 
 

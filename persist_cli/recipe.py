@@ -54,11 +54,14 @@ class DataSettings:
         path: data set folder; ``--data`` sets it.
         strides: every n-th frame; one of these is drawn for each clip.
         context_frames: most earlier frames that a clip's memory is made of (stage 2).
+        clips_per_trajectory: how many fixed clips, with fixed contexts, each trajectory offers, so that clips come
+            again and can be cached; 0 draws from all that there are.
     """
 
     path: str = ""
     strides: tuple[int, ...] = (1, 2, 3)
     context_frames: int = 48
+    clips_per_trajectory: int = 0
 
 
 @dataclass(frozen=True)
@@ -208,6 +211,8 @@ def _inconsistencies(recipe: Recipe) -> list[str]:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
     if not recipe.data.strides or min(recipe.data.strides) < 1:
         problems.append("data.strides must be whole numbers of at least 1")
+    if recipe.data.clips_per_trajectory < 0:
+        problems.append(f"data.clips_per_trajectory must be at least 0, not {recipe.data.clips_per_trajectory}")
     if training.batch % max(1, training.accumulation):
         problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
     return problems

@@ -1,23 +1,22 @@
-"""Memory adapters: how tokens reach the video, one class a form.
+"""Memory adapters: how tokens reach the video, one class a form (see ``forms``).
 
-``cross`` is the paper's. ``FORMS`` is the seam for others: a form prepares the batch's tokens once and changes the
-hidden states after the blocks where it stands.
+A form prepares the batch's tokens once and changes the hidden states before or after the blocks where it stands.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.memory_block import MemoryBlock, position_code
-from persist_cli.world.cameras import Cameras, invert_rigid
+from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.geometry import transform
 from persist_cli.world.tokens import MemoryTokens
 
 
@@ -26,55 +25,82 @@ class AdapterSettings:
     """A memory adapter.
 
     Args:
-        form: how tokens reach the video; ``cross`` is the paper's cross-attention.
-        every: a memory block stands after every n-th transformer block.
-        width: channels of the tokens inside the blocks.
-        heads: attention heads.
-        ff_factor: hidden width of the feed-forward over the video's.
-        frequencies: of the position code, for each axis.
-        positions: ``relative`` to the first camera of the clip, or ``absolute`` as in the paper.
+        form: how tokens reach the video: ``cross``, the paper's cross-attention to positions in metres;
+            ``projected``, the same to positions in each latent frame's own cameras; ``canvas``, tokens drawn into
+            each view and added.
+        every: a memory block stands after every n-th transformer block; ``canvas`` is added before every n-th, the
+            first included.
+        width: channels of the tokens inside the blocks, or of the canvas at a video token.
+        heads: attention heads (``cross`` and ``projected``).
+        ff_factor: hidden width of the feed-forward over the video's (``cross`` and ``projected``).
+        frequencies: of the position code, for each axis (``cross`` and ``projected``).
+        positions: ``relative`` to the first camera of the clip, or ``absolute`` as in the paper (``cross`` alone).
+        canvas_channels: features of a token as drawn (``canvas``).
+        token_size: edge in metres of what a token stands for (``canvas``); 0 draws points.
+        splat_pixels: most latent pixels along the edge of a drawn token, odd (``canvas``); 1 draws points.
         token_budget: most tokens read for a clip.
         dropout: part of the training samples that see no memory, for guidance over memory.
     """
 
     form: str = "cross"
-    every: int = 1
-    width: int = 128
-    heads: int = 4
+    every: PositiveInt = 1
+    width: PositiveInt = 128
+    heads: PositiveInt = 4
     ff_factor: float = 2.0
-    frequencies: int = 10
+    frequencies: PositiveInt = 10
     positions: Literal["relative", "absolute"] = "relative"
+    canvas_channels: PositiveInt = 32
+    token_size: NonNegativeFloat = 0.25
+    splat_pixels: PositiveInt = 5
     token_budget: int = 256
     dropout: float = 0.1
 
 
 @dataclass(frozen=True)
 class VideoShape:
-    """What an adapter must know of the transformer.
+    """What an adapter must know of the video model.
 
     Args:
         channels: of the hidden states.
         camera_channels: of the camera embedding at each token.
         time_channels: of the time embedding.
         layers: transformer blocks.
+        patch: latent pixels along the edge of a video token.
+        spatial: compression of the codec in height and width.
+        temporal: compression of the codec in time.
     """
 
     channels: int
     camera_channels: int
     time_channels: int
     layers: int
+    patch: int
+    spatial: int
+    temporal: int
 
 
 @dataclass(frozen=True)
 class PreparedMemory:
-    """Tokens of a batch, embedded once for all blocks and denoising steps."""
+    """Memory of a batch, embedded once for all blocks and denoising steps.
 
-    tokens: Float[Tensor, "batch token width"]
-    mask: Bool[Tensor, "batch token"]
+    Args:
+        tokens: what the form's blocks take.
+        mask: what of it there is; nothing behind it changes the video.
+        places: position code of each video token, for forms whose queries have one.
+    """
+
+    tokens: Float[Tensor, "batch *group token width"]
+    mask: Bool[Tensor, "batch *group token"]
+    places: Float[Tensor, "video_token code"] | None = None
+
+    def only(self, kept: Bool[Tensor, " batch"]) -> PreparedMemory:
+        """The same batch in which all other samples see no memory."""
+        kept = kept.reshape(-1, *[1] * (self.mask.ndim - 1))
+        return dataclasses.replace(self, mask=self.mask & kept)
 
     def emptied(self) -> PreparedMemory:
         """The same batch with every token behind the mask."""
-        return PreparedMemory(self.tokens, torch.zeros_like(self.mask))
+        return dataclasses.replace(self, mask=torch.zeros_like(self.mask))
 
 
 class Adapter(nn.Module, ABC):
@@ -83,70 +109,31 @@ class Adapter(nn.Module, ABC):
     Args:
         channels: of the memory's features.
         settings: sizes.
-        video: the transformer it stands in.
+        video: the model it stands in.
     """
 
     def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
         super().__init__()
         self.channels = channels
         self.settings = settings
+        self.video = video
 
     @abstractmethod
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
         """Embed the tokens of a batch for the clip that the cameras look at."""
 
-    @abstractmethod
-    def after_block(
-        self, layer: int, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
-    ) -> Float[Tensor, "batch token channel"]:
-        """The hidden states after transformer block ``layer``."""
-
-
-class CrossAdapter(Adapter):
-    """The paper's form: features with a position code, cross-attended after transformer blocks."""
-
-    def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
-        super().__init__(channels, settings, video)
-        self.embed = nn.Linear(channels + 6 * settings.frequencies, settings.width)
-        self.blocks = nn.ModuleDict(
-            {
-                str(layer): MemoryBlock(
-                    video.channels, video.camera_channels, settings.width, settings.heads, settings.ff_factor,
-                    video.time_channels,
-                )
-                for layer in range(settings.every - 1, video.layers, settings.every)
-            }
-        )  # fmt: skip
-
-    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
-        """Concatenate the position code to the features and project them."""
-        positions = tokens.positions
-        if self.settings.positions == "relative":
-            first_from_world = invert_rigid(cameras.world_from_camera[:, 0].double())
-            positions = transform(first_from_world, positions)
-        code = position_code(positions, self.settings.frequencies)
-        hidden = self.embed(torch.cat([tokens.features, code], dim=-1))
-        return PreparedMemory(hidden * tokens.mask[..., None], tokens.mask)
+    def before_block(self, layer: int, video: Tensor, memory: PreparedMemory) -> Tensor:
+        """The hidden states ``[batch, token, channel]`` before transformer block ``layer``; unchanged by default."""
+        return video
 
     def after_block(
         self, layer: int, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
-        """The memory block of this layer, where one stands."""
-        if str(layer) not in self.blocks:
-            return video
-        block: MemoryBlock = self.blocks[str(layer)]  # type: ignore[assignment]
-        return block(video, memory.tokens, memory.mask, camera, time)  # type: ignore[no-any-return]
+        """The hidden states after transformer block ``layer``; unchanged by default."""
+        return video
 
 
-FORMS: dict[str, type[Adapter]] = {"cross": CrossAdapter}
-
-
-def make_adapter(channels: int, settings: AdapterSettings, video: VideoShape) -> Adapter:
-    """A fresh adapter of the form that the settings name.
-
-    Raises:
-        CheckpointError: for an unknown form.
-    """
-    if settings.form not in FORMS:
-        raise CheckpointError(f"unknown adapter form {settings.form!r}; known: {', '.join(FORMS)}")
-    return FORMS[settings.form](channels, settings, video)
+def refuse_absolute(settings: AdapterSettings) -> None:
+    """Raise ``CheckpointError`` when a form that places tokens by cameras alone is asked for absolute positions."""
+    if settings.positions == "absolute":
+        raise CheckpointError(f"adapter form {settings.form!r} has no absolute positions; only 'cross' has")

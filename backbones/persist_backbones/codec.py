@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+
 import torch
 from diffusers import AutoencoderKLCogVideoX
 from jaxtyping import Float, UInt8
@@ -39,6 +42,15 @@ class Codec(nn.Module):
     def temporal(self) -> int:
         """Compression in time."""
         return int(self.vae.config.temporal_compression_ratio)
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the VAE's weights and configuration: what ``encode`` depends on besides the clips."""
+        config = {name: value for name, value in self.vae.config.items() if not name.startswith("_")}
+        digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
+        for name, tensor in sorted(self.vae.state_dict().items()):
+            digest.update(f"{name} {tensor.dtype}".encode())
+            digest.update(tensor.cpu().reshape(-1).view(torch.uint8).numpy())
+        return digest.hexdigest()
 
     def images(
         self, rgb: UInt8[Tensor, "batch frame height width 3"], depth: Float[Tensor, "batch frame height width"]

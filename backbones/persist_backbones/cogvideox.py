@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, make_adapter
+from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
 from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
 from persist_backbones.diffusion import SAMPLERS, denoise, draw_timesteps, generators_of, loss_weights, noise_like
+from persist_backbones.forms import make_adapter
 from persist_backbones.parts import (
     DiffusersParts,
     check_fit,
@@ -81,6 +82,20 @@ class CogVideoX(Backbone):
         return None if self.adapter_name is None else self.adapters[self.adapter_name]  # type: ignore[return-value]
 
     @property
+    def video_shape(self) -> VideoShape:
+        """What an adapter must know of the model."""
+        config = self.transformer.base.config
+        return VideoShape(
+            channels=config.num_attention_heads * config.attention_head_dim,
+            camera_channels=self.transformer.camera_channels,
+            time_channels=config.time_embed_dim,
+            layers=config.num_layers,
+            patch=config.patch_size,
+            spatial=self.codec.spatial,
+            temporal=self.codec.temporal,
+        )
+
+    @property
     def token_budget(self) -> int:
         """Tokens that the adapter in use asks for; none without one."""
         return self.adapter.settings.token_budget if self.adapter else 0
@@ -103,8 +118,8 @@ class CogVideoX(Backbone):
             if self.settings.codec_window:
                 rgb, depth = self.codec.windows(rgb, depth, self.settings.codec_window, generators)
             return self.codec.loss(rgb, depth, self.settings.kl_weight, generators)
-        with torch.no_grad():
-            latents, image = self.codec.encode(clips.rgb, clips.depth), self.encode_first(clips)
+        kept = self.encode(clips) if clips.latents is None else clips.latents
+        latents, image = kept[:, :-1], self.image_condition(kept[:, -1:])
         timesteps = draw_timesteps(self.scheduler, generators).to(latents.device)
         noise = noise_like(latents, generators)
         target = self.scheduler.get_velocity(latents, noise, timesteps)
@@ -115,6 +130,16 @@ class CogVideoX(Backbone):
         error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
         color, depth = error.chunk(2, dim=2)
         return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+
+    def encoding(self, stage: Stage) -> str | None:
+        """The frozen codec's fingerprint; ``None`` in its own stage."""
+        return None if stage == "codec" else self.codec.fingerprint()
+
+    @torch.no_grad()
+    def encode(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
+        """Latents of the clips, and behind them one frame more: the latents of the first image alone."""
+        whole, first = (self.codec.encode(clips.rgb[:, :end], clips.depth[:, :end]) for end in (None, 1))
+        return torch.cat([whole, first], dim=1)
 
     @torch.no_grad()
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
@@ -144,8 +169,11 @@ class CogVideoX(Backbone):
         return self.codec.decode(self.codec.encode(clips.rgb, clips.depth))
 
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
-        """Latents of the first frame alone, followed by zeros: the image condition, scaled like all latents."""
-        first = self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1])
+        """The image condition of the clips' first frames."""
+        return self.image_condition(self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1]))
+
+    def image_condition(self, first: Float[Tensor, "batch 1 channel height width"]) -> Tensor:
+        """Latents of the first frame alone, followed by zeros, scaled like all latents."""
         later = (self.settings.frames - 1) // self.codec.temporal
         return torch.cat([first, first.new_zeros(first.shape[0], later, *first.shape[2:])], dim=1)
 
@@ -168,8 +196,7 @@ class CogVideoX(Backbone):
         if memory is None or self.adapter is None or self.adapter.settings.dropout == 0:
             return memory
         draws = torch.cat([torch.rand(1, generator=each) for each in generators])
-        kept = (draws >= self.adapter.settings.dropout).to(memory.mask.device)
-        return dataclasses.replace(memory, mask=memory.mask & kept[:, None])
+        return memory.only((draws >= self.adapter.settings.dropout).to(memory.mask.device))
 
     def conditions(self, clips: Clips, timesteps: Tensor, memory: PreparedMemory | None) -> Conditions:
         """Prompt, interactions, cameras and memory of a batch."""
@@ -209,7 +236,7 @@ class CogVideoX(Backbone):
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter and use it."""
         parsed = parse_settings(AdapterSettings, settings, f"adapter {name!r}")
-        self.adapters[name] = make_adapter(channels, parsed, self.transformer.shape).to(self.prompt.device)
+        self.adapters[name] = make_adapter(channels, parsed, self.video_shape).to(self.prompt.device)
         self.adapter_name = name
 
     def use_adapter(self, name: str | None) -> None:

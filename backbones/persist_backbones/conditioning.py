@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from persist_cli.world.backbone import Interactions
@@ -35,8 +35,15 @@ def camera_latents(
     local = Cameras(first @ cameras.world_from_camera.double(), cameras.intrinsics, cameras.height, cameras.width)
     rays = plucker(local, printed).permute(0, 1, 4, 2, 3).float()
     pooled = F.avg_pool2d(rays.flatten(0, 1), spatial).unflatten(0, rays.shape[:2])
-    padded = torch.cat([pooled[:, :1].expand(-1, temporal - 1, -1, -1, -1), pooled], dim=1)
-    folded: Tensor = padded.unflatten(1, (-1, temporal)).flatten(2, 3)
+    return fold_frames(pooled, temporal)
+
+
+def fold_frames(
+    frames: Shaped[Tensor, "batch frame channel *rest"], temporal: int
+) -> Shaped[Tensor, "batch latent_frame folded *rest"]:
+    """Frames folded into channels, the first one alone in the first latent frame and repeated to fill its channels."""
+    first = frames[:, :1].expand(-1, temporal - 1, *frames.shape[2:])
+    folded: Tensor = torch.cat([first, frames], dim=1).unflatten(1, (-1, temporal)).flatten(2, 3)
     return folded
 
 

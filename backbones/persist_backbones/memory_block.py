@@ -24,10 +24,19 @@ class Modulation(NamedTuple):
     memory_gate: Tensor
 
 
-def position_code(positions: Float[Tensor, "*batch 3"], frequencies: int) -> Float[Tensor, "*batch code"]:
-    """3D sinusoidal code: sine and cosine of each coordinate (metres) at geometric wavelengths, 6 × frequencies."""
+def position_code(
+    positions: Float[Tensor, "*batch axis"], frequencies: int, shortest: float = SHORTEST, longest: float = LONGEST
+) -> Float[Tensor, "*batch code"]:
+    """Sinusoidal code: sine and cosine of each coordinate at geometric wavelengths, axes × 2 × frequencies.
+
+    Args:
+        positions: coordinates, by default in metres.
+        frequencies: for each axis.
+        shortest: wavelength, in the unit of the coordinates.
+        longest: wavelength.
+    """
     steps = torch.linspace(0, 1, frequencies, dtype=torch.float64, device=positions.device)
-    rates = 2 * math.pi / (SHORTEST * (LONGEST / SHORTEST) ** steps)
+    rates = 2 * math.pi / (shortest * (longest / shortest) ** steps)
     angles = positions.double()[..., None] * rates
     return torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2).float()
 

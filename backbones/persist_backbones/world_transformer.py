@@ -15,7 +15,7 @@ from diffusers import CogVideoXTransformer3DModel
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapter import Adapter, PreparedMemory
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class WorldTransformer(nn.Module):
         self.extra_in = nn.Conv2d(in_channels - config.in_channels, inner, patch, stride=patch, bias=False)
         self.extra_out = nn.Linear(inner, patch * patch * (out_channels - config.out_channels))
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
-        self.shape = VideoShape(inner, camera_channels, config.time_embed_dim, config.num_layers)
+        self.camera_channels = camera_channels
         for module in (self.extra_in, self.extra_out, self.interactions):
             for parameter in module.parameters():
                 nn.init.zeros_(parameter)
@@ -78,6 +78,8 @@ class WorldTransformer(nn.Module):
         time = self.embed_time(given, latents.dtype)
         text, video = self.embed_patches(latents, given.text.to(latents.dtype))
         for layer, block in enumerate(self.base.transformer_blocks):
+            if adapter is not None and given.memory is not None:
+                video = adapter.before_block(layer, video, given.memory)
             video, text = self.run_block(block, video, text, time, given.rotary)
             if adapter is not None and given.memory is not None:
                 video = adapter.after_block(layer, video, given.memory, given.camera, time)

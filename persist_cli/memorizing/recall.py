@@ -45,12 +45,22 @@ class MemoryMaker:
 
 
 def collate(samples: Sequence[ClipSample], maker: MemoryMaker | None, budget: int) -> Clips:
-    """A batch of clips; with a maker, each with the tokens that a memory of its context gives its cameras."""
+    """A batch of clips; with a maker, each with the tokens that a memory of its context gives its cameras.
+
+    Latents and tokens that samples bring along are taken; either all samples bring latents or none.
+    """
     import torch
 
     tokens = None
     if maker is not None:
-        tokens = MemoryTokens.stack([recall(sample, maker, budget) for sample in samples])
+        known = [sample.tokens for sample in samples]
+        tokens = MemoryTokens.stack(
+            [
+                recall(sample, maker, budget) if each is None else each
+                for sample, each in zip(samples, known, strict=True)
+            ]
+        )
+    latents = [sample.latents for sample in samples if sample.latents is not None]
     first = samples[0].observations.cameras
     return Clips(
         rgb=torch.stack([sample.observations.rgb for sample in samples]),
@@ -64,6 +74,7 @@ def collate(samples: Sequence[ClipSample], maker: MemoryMaker | None, budget: in
         interactions=[sample.interactions for sample in samples],
         tokens=tokens,
         seeds=[sample.seed for sample in samples],
+        latents=torch.stack(latents) if latents else None,
     )
 
 

@@ -18,7 +18,8 @@ from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone, 
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, parse_yaml_mapping, read_recipe, to_plain, to_yaml
 from persist_cli.registry import make_backbone
-from persist_cli.training.log import StepLog
+from persist_cli.training.cache import Cache, CachePlace
+from persist_cli.training.log import SpeedLog, StepLog
 from persist_cli.training.state import load_state, save_state
 from persist_cli.training.trainer import Stop, Trainer
 from persist_cli.viewing.console import say
@@ -30,7 +31,9 @@ CHANGEABLE = {"steps", "checkpoint_every", "checkpoint_minutes", "workers", "thr
 CODEC_BATCHES = 4  # batches that the scale of the codec's latents is measured on
 
 
-def run_finetune(name: str, overrides: list[str], data: Path | None, out: Path | None, resume: bool) -> None:
+def run_finetune(
+    name: str, overrides: list[str], data: Path | None, out: Path | None, resume: bool, place: CachePlace | None = None
+) -> None:
     """Train a stage and leave a run folder; see ``persist finetune --help``."""
     values = apply_overrides(read_recipe(name), overrides)
     if data is not None:
@@ -40,10 +43,23 @@ def run_finetune(name: str, overrides: list[str], data: Path | None, out: Path |
         raise RecipeError(f"{name}: no data set; give --data DIR")
     run = out or Path("runs") / Path(name).stem
     check_run(run, recipe, resume)
+    if place is not None:
+        check_cacheable(recipe)
     with Stop() as stop, limited_threads(recipe.training.threads):
-        finetune(recipe, run, stop)
+        finetune(recipe, run, stop, place)
     if stop.signal is not None:
         sys.exit(130 if stop.signal == signal.SIGINT else 0)
+
+
+def check_cacheable(recipe: Recipe) -> None:
+    """Raise a one-line error when a cache would never be read."""
+    if recipe.stage == "codec":
+        raise RecipeError("--cache: stage codec trains the codec, so it keeps no latents; leave it out")
+    if not recipe.data.clips_per_trajectory:
+        raise RecipeError(
+            "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
+            "data.clips_per_trajectory=32, or leave --cache out"
+        )
 
 
 @contextlib.contextmanager
@@ -63,13 +79,14 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
         return
     if not resume:
         raise PersistError(f"{run}: holds a run already; go on with --resume or choose another --out")
-    before = parse_yaml_mapping((run / "recipe.yaml").read_text(encoding="utf-8"), str(run / "recipe.yaml"))
+    values = parse_yaml_mapping((run / "recipe.yaml").read_text(encoding="utf-8"), str(run / "recipe.yaml"))
+    before = to_plain(make_recipe(values, str(run / "recipe.yaml")))  # with what settings that are new stand for
     changed = [key for key in _differences(before, to_plain(recipe), "") if key.split(".")[-1] not in CHANGEABLE]
     if changed:
         raise RecipeError(f"{run}: cannot resume with another recipe; {', '.join(changed)} changed")
 
 
-def finetune(recipe: Recipe, run: Path, stop: Stop) -> None:
+def finetune(recipe: Recipe, run: Path, stop: Stop, place: CachePlace | None = None) -> None:
     """Train to the recipe's last step or to a signal, from the run's last checkpoint where there is one."""
     settings = recipe.training
     tracker = None if settings.tracker == "none" else settings.tracker
@@ -83,17 +100,21 @@ def finetune(recipe: Recipe, run: Path, stop: Stop) -> None:
     set_seed(settings.seed)
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
     maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
-    trainer = Trainer(recipe, prepare_backbone(recipe, base, maker), maker, accelerator)
+    cache = None if place is None else Cache(place)
+    trainer = Trainer(recipe, prepare_backbone(recipe, base, maker), maker, accelerator, cache)
     load_state(run, trainer.state)
     if tracker:
         accelerator.init_trackers("persist")
     if accelerator.is_main_process:
         run.mkdir(parents=True, exist_ok=True)
         write_text(run / "recipe.yaml", to_yaml(recipe))
-    log = StepLog(run / "log.jsonl", trainer.state.step)
+    with accelerator.main_process_first():  # it makes the folder
+        log = StepLog(run / "log.jsonl", trainer.state.step)
+    speed = SpeedLog(run / "speed.jsonl", trainer.state.step, settings.batch)
 
     def save() -> None:
         if accelerator.is_main_process:
+            speed.add(trainer.state.step, trainer.keeper.figures() if trainer.keeper else {})
             save_run(run, trainer, base)
             log.draw(run / "loss.png")
         accelerator.wait_for_everyone()
@@ -104,7 +125,7 @@ def finetune(recipe: Recipe, run: Path, stop: Stop) -> None:
         save()
     accelerator.end_training()
     if accelerator.is_main_process:
-        report(recipe, run, trainer.state.step, stop)
+        report(recipe, run, trainer.state.step, stop, speed.rate())
 
 
 def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryMaker | None) -> Backbone:
@@ -146,12 +167,13 @@ def save_run(run: Path, trainer: Trainer, base: Checkpoint | None) -> None:
     save_state(run, state, save_model)
 
 
-def report(recipe: Recipe, run: Path, step: int, stop: Stop) -> None:
-    """One line about how the run ended."""
+def report(recipe: Recipe, run: Path, step: int, stop: Stop, rate: float) -> None:
+    """One line about how the run ended and how fast it went."""
     if stop.signal is not None:
-        say(f"stopped at step {step} of {recipe.training.steps}; go on with --resume")
+        say(f"stopped at step {step} of {recipe.training.steps} ({rate:.3g} samples/s); go on with --resume")
     else:
-        say(f"stage {recipe.stage} trained {step} steps of {recipe.training.batch} samples; checkpoint in {run}")
+        done = f"trained {step} steps of {recipe.training.batch} samples ({rate:.3g} samples/s)"
+        say(f"stage {recipe.stage} {done}; checkpoint in {run}")
 
 
 def _differences(before: Any, now: Any, key: str) -> list[str]:

@@ -1,8 +1,9 @@
-"""What a run writes down: a line of JSON a step, and the loss as a picture."""
+"""What a run writes down: a line of JSON a step, the loss as a picture, and how fast it went."""
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -34,6 +35,35 @@ class StepLog:
 
         if self.rows:
             draw_curve([row["step"] for row in self.rows], [row["loss"] for row in self.rows], path)
+
+
+class SpeedLog:
+    """``speed.jsonl`` of a run: a line for each checkpoint with samples a second since the one before.
+
+    Args:
+        path: of the file; lines are appended.
+        step: the step to go on from.
+        batch: samples a step, over all processes.
+    """
+
+    def __init__(self, path: Path, step: int, batch: int) -> None:
+        self.path, self.step, self.batch = path, step, batch
+        self.since = time.monotonic()
+        self.samples, self.seconds = 0, 0.0
+
+    def add(self, step: int, figures: Mapping[str, float]) -> None:
+        """Append the speed up to a step, of everything that it took, and other figures."""
+        now = time.monotonic()
+        samples, seconds = (step - self.step) * self.batch, now - self.since
+        self.samples, self.seconds = self.samples + samples, self.seconds + seconds
+        self.step, self.since = step, now
+        row = {"step": step, "seconds": round(seconds, 3), "samples_per_second": round(samples / seconds, 3)}
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row | dict(figures)) + "\n")
+
+    def rate(self) -> float:
+        """Samples a second of all lines that this process wrote."""
+        return self.samples / self.seconds if self.seconds else 0.0
 
 
 def _parse(line: str) -> dict[str, float] | None:

@@ -14,10 +14,12 @@ from typing import Any
 import torch
 from accelerate import Accelerator
 from diffusers.training_utils import EMAModel
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.memorizing.recall import MemoryMaker, collate
 from persist_cli.recipe import Recipe
+from persist_cli.training.cache import Cache
+from persist_cli.training.keeping import Dependencies, Keeper, KeptClips
 from persist_cli.training.log import StepLog
 from persist_cli.training.state import TrainingState
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan, ClipSample, SharedBatches
@@ -54,19 +56,20 @@ class Trainer:
         backbone: with the adapter to train in use, in stage 2.
         maker: of the memories that the adapter reads, in stage 2.
         accelerator: one process or many.
+        cache: of latents and tokens, for clips that come again.
     """
 
-    def __init__(self, recipe: Recipe, backbone: Backbone, maker: MemoryMaker | None, accelerator: Accelerator) -> None:
+    def __init__(
+        self,
+        recipe: Recipe,
+        backbone: Backbone,
+        maker: MemoryMaker | None,
+        accelerator: Accelerator,
+        cache: Cache | None = None,
+    ) -> None:
         self.recipe, self.backbone, self.accelerator = recipe, backbone, accelerator
         self.maker = maker
-        plan = ClipPlan(
-            frames=backbone.frames_per_clip,
-            strides=recipe.data.strides,
-            context_frames=recipe.data.context_frames if self.maker else 0,
-            seed=recipe.training.seed,
-            image_size=backbone.image_size,
-        )
-        self.clips = ClipDataset(Path(recipe.data.path), plan)
+        self.clips = self.clip_source(cache)
         parameters = backbone.trained_parameters(recipe.stage)
         settings = recipe.training
         optimizer = torch.optim.AdamW(
@@ -77,6 +80,23 @@ class Trainer:
         if average is not None:
             average.to(accelerator.device)
         self.state = TrainingState(parameters, optimizer, average)
+        self.keeper = Keeper.of(recipe, backbone, maker, accelerator, cache)
+
+    def clip_source(self, cache: Cache | None) -> Dataset[ClipSample]:
+        """The recipe's clips, with what a cache has of them."""
+        recipe, backbone = self.recipe, self.backbone
+        plan = ClipPlan(
+            frames=backbone.frames_per_clip,
+            strides=recipe.data.strides,
+            context_frames=recipe.data.context_frames if self.maker else 0,
+            seed=recipe.training.seed,
+            image_size=backbone.image_size,
+            clips_per_trajectory=recipe.data.clips_per_trajectory,
+        )
+        clips = ClipDataset(Path(recipe.data.path), plan)
+        if cache is None:
+            return clips
+        return KeptClips(clips, cache, Dependencies.of(recipe, backbone, self.maker, self.accelerator.device))
 
     def loader(self) -> Iterator[Clips]:
         """Batches of this process from the state's step to the last."""
@@ -98,6 +118,8 @@ class Trainer:
     def to_batch(self, samples: list[ClipSample]) -> Clips:
         """Samples as a batch with memory tokens, on the training device."""
         device = self.accelerator.device
+        if self.keeper is not None:
+            samples = [self.keeper.complete(sample) for sample in samples]
         clips = collate(samples, self.maker, self.backbone.token_budget)
         return Clips(
             rgb=clips.rgb.to(device),
@@ -106,6 +128,7 @@ class Trainer:
             interactions=clips.interactions,
             tokens=clips.tokens,
             seeds=clips.seeds,
+            latents=None if clips.latents is None else clips.latents.to(device),
         )
 
     def learning_rate(self, step: int) -> float:

@@ -7,13 +7,34 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset
 
-from persist_cli.trajectories.store import Store
+from persist_cli.trajectories.store import Store, TrajectoryFile
 from persist_cli.world.actions import ActionVocabulary
 from persist_cli.world.backbone import Interactions
+from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import DataError
 from persist_cli.world.observations import Observations, TrajectoryInfo
+from persist_cli.world.tokens import MemoryTokens
+
+
+@dataclass(frozen=True)
+class ClipChoice:
+    """Which frames a sample is made of, nothing of them read yet.
+
+    Args:
+        file: the trajectory.
+        frames: numbers of the clip's frames.
+        context: numbers of the context's frames; none when no context is asked for.
+        seed: for everything random about the sample.
+    """
+
+    file: TrajectoryFile
+    frames: range
+    context: tuple[int, ...]
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -21,11 +42,14 @@ class ClipSample:
     """One clip with what came before it.
 
     Args:
-        observations: the clip's frames.
+        observations: the clip's frames; no images where ``latents`` stand for them, the cameras always.
         interactions: what the agent did to the world in each step of the clip.
         context: earlier frames of the same trajectory, the clip's first one included; ``None`` when not asked for.
         info: of the trajectory.
         seed: for everything random about the sample.
+        latents: what ``Backbone.encode`` gives of this clip alone, without a batch axis, where it is known.
+        tokens: what a memory of the context says to the clip's cameras, where it is known.
+        keys: names of the latents and of the tokens in a cache, if there is one.
     """
 
     observations: Observations
@@ -33,6 +57,9 @@ class ClipSample:
     context: Observations | None
     info: TrajectoryInfo
     seed: int
+    latents: Tensor | None = None
+    tokens: MemoryTokens | None = None
+    keys: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -45,6 +72,7 @@ class ClipPlan:
         context_frames: most earlier frames to give along; 0 gives none.
         seed: of the draws.
         image_size: height and width that the frames must have.
+        clips_per_trajectory: how many fixed clips each trajectory offers; 0 draws from all there are.
     """
 
     frames: int
@@ -52,6 +80,7 @@ class ClipPlan:
     context_frames: int
     seed: int
     image_size: tuple[int, int]
+    clips_per_trajectory: int = 0
 
 
 class ClipDataset(Dataset[ClipSample]):
@@ -74,22 +103,47 @@ class ClipDataset(Dataset[ClipSample]):
             check_size(file.info, plan.image_size, f"{folder}#{file.name}")
 
     def __getitem__(self, number: int) -> ClipSample:
+        return self.read(self.choose(number))
+
+    def choose(self, number: int) -> ClipChoice:
+        """The frames of sample ``number``."""
         random = np.random.default_rng((self.plan.seed, number))
-        file = self.files[int(random.integers(len(self.files)))]
+        place = int(random.integers(len(self.files)))
+        file = self.files[place]
+        if not self.plan.clips_per_trajectory:
+            frames, context = self._draw(file, random)
+            return ClipChoice(file, frames, context, int(random.integers(2**31)))
+        clip = int(random.integers(self.plan.clips_per_trajectory))
+        # plus one: numpy reads missing numbers as zeros, and (seed, place) is a sample's own
+        frames, context = self._draw(file, np.random.default_rng((self.plan.seed, place, clip + 1)))
+        return ClipChoice(file, frames, context, int(random.integers(2**31)))
+
+    def read(self, choice: ClipChoice, images: bool = True, context: bool = True) -> ClipSample:
+        """The sample of this choice.
+
+        Args:
+            choice: which frames.
+            images: false leaves the clip's images unread and gives its cameras only.
+            context: false leaves the context unread.
+        """
+        file, frames = choice.file, choice.frames
+        actions = file.actions()[frames[0] : frames[-1]]
+        wanted = choice.context if context else ()
+        return ClipSample(
+            observations=file.read(list(frames)).observations if images else unseen(file, frames),
+            interactions=strided_interactions(actions, frames.step, file.info.vocabulary),
+            context=file.read(wanted).observations if wanted else None,
+            info=file.info,
+            seed=choice.seed,
+        )
+
+    def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:
+        """Frames of a random clip and of its context."""
         steps = self.plan.frames - 1
         stride = int(random.choice([stride for stride in self.plan.strides if steps * stride < len(file)]))
         start = int(random.integers(len(file) - steps * stride))
-        frames = slice(start, start + steps * stride + 1, stride)
-        context = None
-        if self.plan.context_frames:
-            context = file.read(self._context_frames(start, random)).observations
-        return ClipSample(
-            observations=file.read(frames).observations,
-            interactions=strided_interactions(file.actions()[start : frames.stop - 1], stride, file.info.vocabulary),
-            context=context,
-            info=file.info,
-            seed=int(random.integers(2**31)),
-        )
+        frames = range(start, start + steps * stride + 1, stride)
+        return frames, tuple(self._context_frames(start, random)) if self.plan.context_frames else ()
 
     def _context_frames(self, start: int, random: np.random.Generator) -> list[int]:
         """The clip's first frame and a random choice of those before it, in order."""
@@ -136,6 +190,14 @@ def strided_interactions(actions: Sequence[str | None], stride: int, vocabulary:
     done = interactions_of(actions, vocabulary)
     steps = (done[first : first + stride] for first in range(0, len(done), stride))
     return tuple(next((name for name in step if name is not None), None) for step in steps)
+
+
+def unseen(file: TrajectoryFile, frames: Sequence[int]) -> Observations:
+    """The cameras of some frames, without their images: rgb and depth have no frames."""
+    height, width = file.info.height, file.info.width
+    intrinsics = torch.from_numpy(file.info.intrinsics).expand(len(frames), 3, 3).clone()
+    cameras = Cameras(file.poses()[list(frames)], intrinsics, height, width)
+    return Observations(torch.zeros(0, height, width, 3, dtype=torch.uint8), torch.zeros(0, height, width), cameras)
 
 
 def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:

@@ -32,6 +32,8 @@ class Clips:
         interactions: for each sample, what the agent did to the world between the frames.
         tokens: memory tokens of the batch, ``None`` without a memory.
         seeds: one for each sample; everything random about it is drawn from this.
+        latents: what ``Backbone.encode`` gave of these clips, if it was asked before; rgb and depth may then have no
+            frames.
     """
 
     rgb: UInt8[Tensor, "batch frame height width 3"]
@@ -40,6 +42,7 @@ class Clips:
     interactions: Sequence[Interactions]
     tokens: MemoryTokens | None
     seeds: Sequence[int]
+    latents: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,14 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
         """Scalars of one training step; ``"loss"`` is minimised, the others are logged."""
+
+    def encoding(self, stage: Stage) -> str | None:
+        """A fingerprint of what ``encode`` depends on besides the clips; ``None``: a stage trains what encodes."""
+        return None
+
+    def encode(self, clips: Clips) -> Tensor:
+        """What of the clips can be kept between steps, batch axis first; ``forward`` takes it as ``Clips.latents``."""
+        raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """Last act of a stage: measure on some clips what training cannot learn; nothing by default."""

@@ -3,6 +3,7 @@ import dataclasses
 import pytest
 import torch
 
+from persist_backbones.forms import FORMS
 from persist_backbones.memory_block import position_code
 from persist_cli.world.actions import rotation_about
 from persist_cli.world.backbone import Sampling
@@ -12,14 +13,16 @@ from persist_cli.world.tokens import MemoryTokens
 from tests.backbones.micro import CHANNELS, micro, random_clips, random_tokens, shaken, with_adapter
 
 QUICK = Sampling(steps=2)
+every_form = pytest.mark.parametrize("form", FORMS)
 
 
 def padded(tokens: MemoryTokens, extra: int) -> MemoryTokens:
-    """The same tokens with rubbish behind the mask."""
+    """The same tokens with rubbish behind the mask, in view and nearer than they are."""
     batch = len(tokens.features)
+    near = torch.tensor([0.1, 0.1, 0.6], dtype=torch.float64).expand(batch, extra, 3)
     return MemoryTokens(
         torch.cat([tokens.features, torch.full((batch, extra, CHANNELS), 9.0)], 1),
-        torch.cat([tokens.positions, torch.full((batch, extra, 3), -7.0, dtype=torch.float64)], 1),
+        torch.cat([tokens.positions, near], 1),
         torch.cat([tokens.mask, torch.zeros(batch, extra, dtype=torch.bool)], 1),
     )
 
@@ -33,33 +36,37 @@ def velocity(backbone, clips, tokens):
         return backbone.predict(latents, backbone.encode_first(clips), given)
 
 
+@every_form
 @pytest.mark.parametrize("count", [1, 30])
-def test_a_fresh_adapter_changes_not_one_bit_whatever_the_tokens(count):
+def test_a_fresh_adapter_changes_not_one_bit_whatever_the_tokens(form, count):
     backbone, clips = micro(), random_clips()
     shaken(backbone.transformer)
     bare = backbone.generate(clips, QUICK)
-    with_adapter(backbone)
+    with_adapter(backbone, form=form)
     for tokens in (None, random_tokens(2, count)):
         remembered = backbone.generate(dataclasses.replace(clips, tokens=tokens), QUICK)
         assert all(torch.equal(*pair) for pair in zip(bare, remembered, strict=True))
 
 
-def test_a_trained_adapter_uses_its_tokens():
-    backbone, clips = with_adapter(micro()), random_clips()
+@every_form
+def test_a_trained_adapter_uses_its_tokens(form):
+    backbone, clips = with_adapter(micro(), form=form), random_clips()
     shaken(backbone)
     assert not torch.allclose(
         velocity(backbone, clips, random_tokens(2, 9)), velocity(backbone, clips, random_tokens(2, 9, 4))
     )
 
 
-def test_padding_behind_the_mask_changes_nothing():
-    backbone, clips, tokens = with_adapter(micro()), random_clips(), random_tokens(2, 9)
+@every_form
+def test_padding_behind_the_mask_changes_nothing(form):
+    backbone, clips, tokens = with_adapter(micro(), form=form), random_clips(), random_tokens(2, 9)
     shaken(backbone)
     assert torch.allclose(velocity(backbone, clips, tokens), velocity(backbone, clips, padded(tokens, 20)), atol=1e-5)
 
 
-def test_a_batch_may_hold_a_sample_without_any_token():
-    backbone, clips = with_adapter(micro()), random_clips()
+@every_form
+def test_a_batch_may_hold_a_sample_without_any_token(form):
+    backbone, clips = with_adapter(micro(), form=form), random_clips()
     shaken(backbone)
     some = random_tokens(2, 9)
     mixed = dataclasses.replace(some, mask=some.mask & torch.tensor([[True], [False]]))
@@ -69,8 +76,9 @@ def test_a_batch_may_hold_a_sample_without_any_token():
     assert torch.allclose(result[0], velocity(backbone, clips, some)[0], atol=1e-5)
 
 
-def test_every_parameter_of_the_memory_blocks_has_a_gradient_within_two_steps():
-    backbone = with_adapter(micro())
+@every_form
+def test_every_parameter_of_an_adapter_has_a_gradient_within_two_steps(form):
+    backbone = with_adapter(micro(), form=form)
     shaken(backbone.transformer)
     clips = random_clips(tokens=random_tokens(2, 9))
     parameters = backbone.trained_parameters("2")
@@ -85,16 +93,18 @@ def test_every_parameter_of_the_memory_blocks_has_a_gradient_within_two_steps():
     assert [name for name, done in moved.items() if not done and not name.endswith("to_key.bias")] == []
 
 
-def test_stage_two_trains_the_adapter_and_nothing_else():
-    backbone = with_adapter(micro())
+@every_form
+def test_stage_two_trains_the_adapter_and_nothing_else(form):
+    backbone = with_adapter(micro(), form=form)
     names = set(backbone.trained_parameters("2"))
     assert names
     assert all(name.startswith("adapters.voxel.") for name in names)
     assert {name for name, each in backbone.named_parameters() if each.requires_grad} == names
 
 
-def test_moving_the_whole_world_changes_no_prediction():
-    backbone, clips, tokens = with_adapter(micro()), random_clips(), random_tokens(2, 9)
+@every_form
+def test_moving_the_whole_world_changes_no_prediction(form):
+    backbone, clips, tokens = with_adapter(micro(), form=form), random_clips(), random_tokens(2, 9)
     shaken(backbone)
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3] = rotation_about(torch.tensor([0.6, 0.0, 0.8]), 1.1)
@@ -113,8 +123,9 @@ def test_absolute_positions_see_where_the_origin_is():
     assert not torch.allclose(velocity(backbone, clips, tokens), velocity(backbone, clips, moved))
 
 
-def test_guidance_over_memory_of_weight_one_is_no_guidance_and_more_pushes_away_from_none():
-    backbone, clips = with_adapter(micro()), random_clips(tokens=random_tokens(2, 9))
+@every_form
+def test_guidance_over_memory_of_weight_one_is_no_guidance_and_more_pushes_away_from_none(form):
+    backbone, clips = with_adapter(micro(), form=form), random_clips(tokens=random_tokens(2, 9))
     shaken(backbone)
     plain, strong = (backbone.generate(clips, Sampling(2, "ddim", weight))[1] for weight in (1.0, 3.0))
     assert not torch.equal(plain, strong)
@@ -127,10 +138,14 @@ def test_guidance_over_memory_of_weight_one_is_no_guidance_and_more_pushes_away_
 def test_blocks_stand_where_every_says():
     assert set(with_adapter(micro(), every=2).adapter.blocks) == {"1"}
     assert set(with_adapter(micro()).adapter.blocks) == {"0", "1"}
+    assert set(with_adapter(micro(), form="projected", every=2).adapter.blocks) == {"1"}
+    assert set(with_adapter(micro(), form="canvas", every=2).adapter.outs) == {"0"}
+    assert set(with_adapter(micro(), form="canvas").adapter.outs) == {"0", "1"}
 
 
-def test_an_adapter_survives_saving_to_the_bit(tmp_path):
-    backbone = with_adapter(micro())
+@every_form
+def test_an_adapter_survives_saving_to_the_bit(form, tmp_path):
+    backbone = with_adapter(micro(), form=form)
     shaken(backbone.adapters)
     backbone.save_adapter(tmp_path)
     other = micro()
@@ -149,8 +164,12 @@ def test_what_does_not_fit_is_one_line(tmp_path):
     narrow = random_clips(tokens=MemoryTokens.stack([MemoryTokens.empty(3)] * 2))
     with pytest.raises(CheckpointError, match="features of 3 channels"):
         backbone.generate(narrow, QUICK)
-    with pytest.raises(CheckpointError, match="unknown adapter form 'splat'; known: cross"):
+    with pytest.raises(CheckpointError, match="unknown adapter form 'splat'; known: cross, projected, canvas"):
         backbone.add_adapter("other", 3, {"form": "splat"})
+    with pytest.raises(CheckpointError, match="form 'canvas' has no absolute positions"):
+        backbone.add_adapter("other", 3, {"form": "canvas", "positions": "absolute"})
+    with pytest.raises(CheckpointError, match="splat_pixels must be odd, not 4"):
+        backbone.add_adapter("other", 3, {"form": "canvas", "splat_pixels": 4})
     with pytest.raises(CheckpointError, match="no memory adapter 'map2d'; there are: voxel"):
         backbone.use_adapter("map2d")
 

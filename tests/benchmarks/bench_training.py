@@ -1,7 +1,8 @@
 """How fast the tiny model trains: ``python tests/benchmarks/bench_training.py``; prints a table, asserts nothing.
 
 Each recipe's own training step on a fixed batch: loss, backward, clipping, optimizer, average. How long the batch
-takes to make stands beside it: reading the clips, and building their memories.
+takes to make stands beside it: reading the clips, and building their memories. The stages that a cache serves stand
+there a second time, with all clips of the batch in it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
+from persist_cli.training.cache import Cache, CachePlace
 from persist_cli.training.finetune import prepare_backbone
 from persist_cli.training.trainer import Trainer
 from persist_cli.trajectories.clips import ClipSample
@@ -29,7 +31,13 @@ from tests.benchmarks.timing import Times, alternate, say_conditions, write_walk
 
 BATCH, ROUNDS = 4, 4
 MEMORIES = ("none", "voxel", "map2d", "snapshots")
-RECIPES = {"codec": "tiny-codec", "1": "tiny-stage1"} | {f"2, {name}": f"tiny-stage2-{name}" for name in MEMORIES}
+FORMS = ("projected", "canvas")  # the recipes' own is cross
+RECIPES = (
+    {"codec": "tiny-codec", "1": "tiny-stage1"}
+    | {f"2, {name}": f"tiny-stage2-{name}" for name in MEMORIES}
+    | {f"2, voxel, {form}": f"tiny-stage2-voxel adapter.form={form}" for form in FORMS}
+)
+CACHED = {"1, cached": "tiny-stage1", "2, voxel, cached": "tiny-stage2-voxel"}
 
 
 class FixedBatchTrainer(Trainer):
@@ -43,16 +51,24 @@ class FixedBatchTrainer(Trainer):
         return repeat(self.to_batch(self.samples()))
 
 
-def make_trainer(name: str, data: Path) -> FixedBatchTrainer:
-    """A recipe's trainer with fresh weights."""
-    recipe = make_recipe(apply_overrides(read_recipe(name), [f"data.path={data}"]), name)
+def make_trainer(words: str, data: Path, cache: Cache | None = None) -> FixedBatchTrainer:
+    """The trainer of a recipe and changes to it, with fresh weights; with a cache, its batch's clips are in it."""
+    name, *changes = words.split()
+    given = [f"data.path={data}", f"data.clips_per_trajectory={0 if cache is None else 8}", *changes]
+    recipe = make_recipe(apply_overrides(read_recipe(name), given), name)
     maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
-    return FixedBatchTrainer(recipe, prepare_backbone(recipe, None, maker), maker, Accelerator(cpu=True))
+    backbone = prepare_backbone(recipe, None, maker)
+    trainer = FixedBatchTrainer(recipe, backbone, maker, Accelerator(cpu=True), cache)
+    if cache is not None:
+        trainer.to_batch(trainer.samples())
+    return trainer
 
 
 def measure(data: Path) -> tuple[Times, Times, Times]:
     """Steps, reading of samples, and making a batch of them, for each recipe."""
     trainers = {stage: make_trainer(name, data) for stage, name in RECIPES.items()}
+    cache = Cache(CachePlace(data / "cache", 1))
+    trainers |= {stage: make_trainer(name, data, cache) for stage, name in CACHED.items()}
     steps: dict[str, Callable[[], Any]] = {}
     batches: dict[str, Callable[[], Any]] = {}
     for stage, trainer in trainers.items():
@@ -67,9 +83,17 @@ if __name__ == "__main__":
     with TemporaryDirectory() as folder:
         steps, reads, batches = measure(write_walks(Path(folder), 64))
     rows = []
-    for stage in RECIPES:
+    for stage in RECIPES | CACHED:
         step, read, batch = (times.median(stage) / BATCH for times in (steps, reads, batches))
-        ratio = f"{steps.ratio(stage, '1'):.2f}×"
-        rows.append((stage, f"{1 / step:.1f}", ratio, *(f"{1e3 * part:.1f}" for part in (step, read, batch))))
-    columns = ["stage", "samples/s", "time to stage 1", "step, ms a sample", "reading, ms", "batch and memory, ms"]
+        ratios = [f"{steps.ratio(stage, to):.2f}×" for to in ("1", "2, voxel")]
+        rows.append((stage, f"{1 / step:.1f}", *ratios, *(f"{1e3 * part:.1f}" for part in (step, read, batch))))
+    columns = [
+        "stage",
+        "samples/s",
+        "time to stage 1",
+        "to voxel, cross",
+        "step, ms a sample",
+        "reading, ms",
+        "batch and memory, ms",
+    ]
     print_table("training on the CPU", columns, rows)

@@ -35,6 +35,19 @@ def test_interactions_of_skipped_frames_are_kept(walks):
     assert all(len(each) == 8 for each in found)
 
 
+def test_few_clips_a_trajectory_come_again_with_their_context_and_with_new_noise(walks):
+    clips = ClipDataset(walks, plan(clips_per_trajectory=2))
+    drawn = [clips.choose(number) for number in range(60)]
+    assert len({(str(each.file.path), each.frames, each.context) for each in drawn}) == 2 * len(clips.files)
+    assert len({each.seed for each in drawn}) == 60
+
+
+def test_the_few_clips_are_the_same_with_and_without_context(walks):
+    one, two = (ClipDataset(walks, plan(clips_per_trajectory=5, context_frames=frames)) for frames in (0, 5))
+    for number in range(20):
+        assert one.choose(number).frames == two.choose(number).frames
+
+
 @pytest.mark.parametrize(("processes", "accumulation"), [(1, 1), (2, 1), (1, 4), (2, 2)])
 def test_processes_and_micro_batches_share_the_same_samples_of_each_step(processes, accumulation):
     parts = [list(SharedBatches(3, 5, 8, accumulation, each, processes)) for each in range(processes)]

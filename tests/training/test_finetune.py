@@ -23,7 +23,9 @@ def same(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> bool:
 
 
 def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
-    assert {"recipe.yaml", "log.jsonl", "loss.png", "step-00000004"} == {path.name for path in codec.iterdir()}
+    left = {"recipe.yaml", "log.jsonl", "loss.png", "speed.jsonl", "step-00000004"}
+    assert {path.name for path in codec.iterdir()} == left
+    assert json.loads((codec / "speed.jsonl").read_text())["samples_per_second"] > 0
     rows = [json.loads(line) for line in (codec / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
     assert rows[0]["learning_rate"] < rows[-1]["learning_rate"]
@@ -38,6 +40,13 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, co
     assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base)).code == 0
     assert same(weights(tmp_path / "whole"), weights(tmp_path / "halves"))
     assert (tmp_path / "whole/log.jsonl").read_text() == (tmp_path / "halves/log.jsonl").read_text()
+
+
+def test_a_run_of_a_version_without_a_setting_resumes(persist, walks, codec, tmp_path):
+    assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=1")).code == 0
+    recipe = tmp_path / "run/recipe.yaml"
+    recipe.write_text(recipe.read_text().replace("  clips_per_trajectory: 0\n", ""))
+    assert persist(*stage("stage1", walks, tmp_path / "run", "--resume", f"base={codec}")).code == 0
 
 
 def test_stage_two_leaves_every_stage_one_weight_untouched_to_the_bit(persist, walks, stage1, tmp_path):

@@ -32,7 +32,8 @@ def test_overrides_reach_nested_settings():
     ("overrides", "cause"),
     [(["training.stpes=3"], "did you mean 'training.steps'"), (["training.steps=0"], "at least 1"),
      (["training.steps=soon"], "training.steps"), (["steps"], "KEY=VALUE"), (["stage=2"], "stage 2 needs a memory"),
-     (["data.strides=[0]"], "data.strides"), (["training.precision=fp8"], "training.precision"),
+     (["data.strides=[0]"], "data.strides"), (["data.clips_per_trajectory=-1"], "at least 0"),
+     (["training.precision=fp8"], "training.precision"),
      (["training.batch=5", "training.accumulation=2"], "multiple of accumulation"),
      (["a=[1"], "cannot read the value")],
 )  # fmt: skip

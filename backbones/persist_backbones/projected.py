@@ -1,0 +1,90 @@
+"""``projected``: the paper's memory block, told where in each latent frame's own cameras a token lies."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape, refuse_absolute
+from persist_backbones.conditioning import fold_frames
+from persist_backbones.cross import memory_blocks
+from persist_backbones.memory_block import MemoryBlock, position_code
+from persist_cli.world.cameras import Cameras
+from persist_cli.world.geometry import pixel_centers, project
+from persist_cli.world.tokens import MemoryTokens
+
+SHORTEST, LONGEST = 1 / 16, 2.0  # wavelengths in images; twice an image tells both sides of it and a margin apart
+MARGIN = 0.25  # of the image: a token's cell reaches into view before its middle does
+NEAR = 0.05  # metres
+OCTAVES = 8.0  # 6 cm to 16 m, the depths of rooms, span one unit of log z as the image spans one of u and v
+
+
+class ProjectedAdapter(Adapter):
+    """Each latent frame attends to the tokens at their projection (u, v, log z) into its own cameras.
+
+    A latent frame that folds four frames sees the projections into all four, concatenated as the camera latents are:
+    at large turns a token that one of the four sees lies outside the others, and a mean or the last camera would
+    tell nothing of it. A frame that does not see the token gives zeros and a zero flag; a latent frame none of whose
+    frames sees it does not attend to it, so that the softmax is shared by what can be in the picture. Queries carry
+    the code of the video token's own (u, v), at the same wavelengths.
+    """
+
+    def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
+        super().__init__(channels, settings, video)
+        refuse_absolute(settings)
+        code = video.temporal * (6 * settings.frequencies + 1)
+        self.embed = nn.Linear(channels, settings.width)
+        self.place = nn.Linear(code, settings.width, bias=False)
+        self.blocks = memory_blocks(settings, video, video.camera_channels + 4 * settings.frequencies)
+
+    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
+        """Features and position codes projected and summed, for each latent frame."""
+        temporal, dtype = self.video.temporal, self.embed.weight.dtype
+        places, seen = image_places(tokens, cameras)
+        code = torch.cat([self.code(places) * seen[..., None], seen[..., None].float()], dim=-1)
+        folded = fold_frames(code.transpose(2, 3), temporal).transpose(2, 3)
+        mask = fold_frames(seen[:, :, None], temporal).any(dim=2)
+        hidden = self.embed(tokens.features.to(dtype))[:, None] + self.place(folded.to(dtype))
+        return PreparedMemory(hidden * mask[..., None], mask, self.query_places(cameras).to(dtype))
+
+    def after_block(
+        self, layer: int, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
+    ) -> Float[Tensor, "batch token channel"]:
+        """The memory block of this layer, where one stands, on each latent frame by itself."""
+        if str(layer) not in self.blocks or memory.places is None:
+            return video
+        block: MemoryBlock = self.blocks[str(layer)]  # type: ignore[assignment]
+        frames = memory.mask.shape[1]
+        places = memory.places.expand(len(video) * frames, -1, -1)
+        split, views = (part.unflatten(1, (frames, -1)).flatten(0, 1) for part in (video, camera))
+        query = torch.cat([views.to(places.dtype), places], dim=-1)
+        instants = time.repeat_interleave(frames, dim=0)
+        changed: Tensor = block(split, memory.tokens.flatten(0, 1), memory.mask.flatten(0, 1), query, instants)
+        joined: Tensor = changed.unflatten(0, (-1, frames)).flatten(1, 2)
+        return joined
+
+    def code(self, places: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch code"]:
+        """Sines and cosines of places in the image."""
+        return position_code(places, self.settings.frequencies, SHORTEST, LONGEST)
+
+    def query_places(self, cameras: Cameras) -> Float[Tensor, "video_token code"]:
+        """The code of (u, v) at the middle of each video token of a latent frame."""
+        edge = self.video.spatial * self.video.patch
+        rows, columns = cameras.height // edge, cameras.width // edge
+        middles = pixel_centers(rows, columns, cameras.world_from_camera.device)
+        return self.code(middles.flatten(0, 1) / middles.new_tensor([columns, rows]))
+
+
+def image_places(
+    tokens: MemoryTokens, cameras: Cameras
+) -> tuple[Float[Tensor, "batch frame token 3"], Bool[Tensor, "batch frame token"]]:
+    """Where each frame has each token: (u, v) in images, log₂ z over ``OCTAVES``; and whether it sees it at all."""
+    frames = cameras.world_from_camera.shape[1]
+    pixels, depth = project(tokens.positions[:, None].expand(-1, frames, -1, -1), cameras)
+    image = pixels / pixels.new_tensor([cameras.width, cameras.height])
+    inside = ((image > -MARGIN) & (image < 1 + MARGIN)).all(dim=-1)
+    seen = inside & (depth > NEAR) & tokens.mask[:, None]
+    logs = depth.clamp_min(NEAR).log2() / OCTAVES
+    places = torch.cat([image, logs[..., None]], dim=-1)
+    return torch.where(seen[..., None], places, torch.zeros_like(places)), seen

@@ -1,0 +1,142 @@
+import dataclasses
+
+import pytest
+import torch
+
+from persist_backbones.forms import FORMS
+from persist_backbones.projected import image_places
+from persist_cli.world.tokens import MemoryTokens
+from tests.backbones.micro import CHANNELS, micro, random_clips, random_tokens, shaken, with_adapter
+from tests.backbones.test_memory_adapter import velocity
+
+every_form = pytest.mark.parametrize("form", FORMS)
+told_by_cameras = pytest.mark.parametrize("form", ["projected", "canvas"])
+
+
+def trained(form, **settings):
+    """A micro model with an adapter whose weights are no longer fresh."""
+    backbone = with_adapter(micro(), form=form, **settings)
+    shaken(backbone)
+    return backbone
+
+
+def token_at(*position):
+    """One token, the same in two samples."""
+    place = torch.tensor(position, dtype=torch.float64).expand(2, 1, 3)
+    return MemoryTokens(torch.full((2, 1, CHANNELS), 0.7), place, torch.ones(2, 1, dtype=torch.bool))
+
+
+@every_form
+def test_the_order_of_tokens_changes_nothing(form):
+    backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    shuffled = MemoryTokens(tokens.features[:, order], tokens.positions[:, order], tokens.mask[:, order])
+    assert torch.allclose(velocity(backbone, clips, tokens), velocity(backbone, clips, shuffled), atol=1e-5)
+
+
+@every_form
+def test_equal_tokens_at_one_place_do_not_depend_on_their_order(form):
+    backbone, clips, twice = trained(form), random_clips(), random_tokens(2, 8)
+    twice.positions[:, 4:] = twice.positions[:, :4]
+    turned = dataclasses.replace(twice, features=twice.features.roll(4, dims=1))
+    assert torch.allclose(velocity(backbone, clips, twice), velocity(backbone, clips, turned), atol=1e-5)
+
+
+@every_form
+def test_a_sample_does_not_see_the_memory_of_another(form):
+    backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
+    changed = dataclasses.replace(tokens, features=tokens.features * torch.tensor([1.0, 2.0])[:, None, None])
+    before, after = velocity(backbone, clips, tokens), velocity(backbone, clips, changed)
+    assert torch.allclose(before[0], after[0], atol=1e-5)
+    assert not torch.allclose(before[1], after[1], atol=1e-5)
+
+
+@every_form
+def test_a_dropped_memory_is_no_memory(form):
+    backbone, clips = trained(form, dropout=1.0), random_clips(tokens=random_tokens(2, 40))
+    without = dataclasses.replace(clips, tokens=None)
+    with torch.no_grad():
+        assert torch.allclose(backbone(clips, "2")["loss"], backbone(without, "2")["loss"], atol=1e-6)
+
+
+@every_form
+def test_an_emptied_memory_is_an_empty_one(form):
+    backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
+    memory = backbone.prepare_memory(dataclasses.replace(clips, tokens=tokens))
+    kept = memory.only(torch.tensor([True, False]))
+    assert not memory.emptied().mask.any()
+    assert torch.equal(kept.mask[0], memory.mask[0])
+    assert not kept.mask[1].any()
+
+
+@every_form
+def test_gradients_are_the_same_with_checkpointing(form):
+    backbone, clips = trained(form), random_clips(tokens=random_tokens(2, 40))
+    parameters = backbone.trained_parameters("2")
+    backbone(clips, "2")["loss"].backward()
+    plain = {name: each.grad.clone() for name, each in parameters.items()}
+    backbone.zero_grad()
+    backbone.transformer.base.enable_gradient_checkpointing()
+    backbone.train()
+    backbone(clips, "2")["loss"].backward()
+    assert all(torch.allclose(each.grad, plain[name], atol=1e-6) for name, each in parameters.items())
+
+
+@every_form
+def test_training_in_bfloat16_follows_training_in_float32(form):
+    backbone, clips = trained(form), random_clips(tokens=random_tokens(2, 40))
+    exact = backbone(clips, "2")["loss"].item()
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = backbone(clips, "2")["loss"]
+    loss.backward()
+    assert loss.item() == pytest.approx(exact, rel=0.05)
+    assert all(
+        each.grad.isfinite().all() for each in backbone.trained_parameters("2").values() if each.grad is not None
+    )
+
+
+@every_form
+def test_an_adapter_kept_in_bfloat16_takes_the_same_tokens(form):
+    backbone, clips, tokens = trained(form).to(torch.bfloat16), random_clips(), random_tokens(2, 40)
+    memory = backbone.adapter.prepare(tokens, clips.cameras)
+    video, time = torch.zeros(2, 48, 64, dtype=torch.bfloat16), torch.zeros(2, 32, dtype=torch.bfloat16)
+    before = backbone.adapter.before_block(0, video, memory)
+    after = backbone.adapter.after_block(0, before, memory, torch.zeros(2, 48, 24), time)
+    assert after.dtype == torch.bfloat16
+    assert after.isfinite().all()
+    assert after.any()
+
+
+@told_by_cameras
+@pytest.mark.parametrize("place", [(0.0, 0.0, -1.0), (9.0, 0.0, 3.0), (0.0, -9.0, 3.0)])
+def test_what_no_camera_of_the_clip_sees_changes_nothing(form, place):
+    backbone, clips = trained(form), random_clips()
+    assert torch.equal(velocity(backbone, clips, token_at(*place)), velocity(backbone, clips, None))
+    assert not torch.allclose(velocity(backbone, clips, token_at(0.0, 0.0, 3.0)), velocity(backbone, clips, None))
+
+
+def test_projected_frames_attend_to_what_they_see_themselves():
+    # the cameras move 2 m ahead: past the token, which the first latent frames see and the last does not
+    adapter = with_adapter(micro(), form="projected").adapter
+    memory = adapter.prepare(token_at(0.0, 0.0, 1.0), random_clips().cameras)
+    assert memory.mask[:, :, 0].tolist() == [[True, True, False]] * 2
+
+
+def test_a_projected_token_has_the_code_of_the_video_token_on_its_ray():
+    adapter = with_adapter(micro(), form="projected").adapter
+    cameras = random_clips().cameras
+    pixel = torch.tensor([20.0, 12.0, 1.0], dtype=torch.float64)  # the middle of video token (1, 2) of 4 × 4
+    ray = torch.linalg.inv(cameras.intrinsics[0, 0]) @ pixel
+    places, seen = image_places(token_at(*(3 * ray).tolist()), cameras)
+    assert seen[:, 0].all()
+    assert torch.allclose(adapter.code(places[0, 0, 0, :2]), adapter.query_places(cameras)[1 * 4 + 2], atol=1e-5)
+
+
+@pytest.mark.parametrize("tokens", [None, token_at(0.0, 0.0, -1.0)], ids=["none", "behind"])
+def test_a_canvas_on_which_nothing_falls_is_stage_one_to_the_bit_even_once_trained(tokens):
+    backbone, clips = micro(), random_clips()
+    shaken(backbone)
+    bare = velocity(backbone, clips, None)
+    with_adapter(backbone, form="canvas")
+    shaken(backbone.adapters)
+    assert torch.equal(velocity(backbone, clips, tokens), bare)

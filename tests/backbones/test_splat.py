@@ -1,0 +1,103 @@
+import pytest
+import torch
+
+from persist_backbones.canvas import patchify
+from persist_backbones.splat import place, splat
+from persist_cli.world.actions import rotation_about
+from persist_cli.world.cameras import Cameras
+from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
+
+SIDE, FOCAL = 8, 5.6
+
+
+def views(frames: int = 1) -> Cameras:
+    """Cameras at the origin that look along z."""
+    matrix = torch.tensor([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).expand(1, frames, 4, 4).clone()
+    return Cameras(poses, matrix.expand(1, frames, 3, 3), SIDE, SIDE)
+
+
+def on_ray(column: float, row: float, depth: float) -> list[float]:
+    """The point at this depth that falls on the middle of a pixel."""
+    return [(column + 0.5 - SIDE / 2) / FOCAL * depth, (row + 0.5 - SIDE / 2) / FOCAL * depth, depth]
+
+
+def drawn(points, features, cameras=None, size=0.0, most=1):
+    """The first view's canvas: features, coverage, log depth."""
+    cameras = cameras or views()
+    positions = torch.tensor(points, dtype=torch.float64)[None]
+    splats = place(positions, torch.ones(1, len(points), dtype=torch.bool), cameras, size, most)
+    values = torch.tensor(features, dtype=torch.float32)[None, :, None]
+    return splat(values, splats, (1, cameras.world_from_camera.shape[1], SIDE, SIDE))[0, 0]
+
+
+@pytest.mark.parametrize(("column", "row"), [(0, 0), (5, 2), (7, 7), (3, 6)])
+def test_a_token_on_a_ray_lands_on_its_pixel_and_nowhere_else(column, row):
+    value, coverage, logs = drawn([on_ray(column, row, 3.0)], [7.0])
+    assert coverage.nonzero().tolist() == [[row, column]]
+    assert value[row, column] == 7
+    assert logs[row, column] == pytest.approx(torch.tensor(3.0).log().item())
+    assert value.count_nonzero() == logs.count_nonzero() == 1
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_nearer_token_hides_a_farther_one(order):
+    points, features = [on_ray(4, 4, 2.0), on_ray(4, 4, 3.0), on_ray(1, 1, 3.0)], [1.0, 2.0, 3.0]
+    value = drawn(points[::order], features[::order])[0]
+    assert (value[4, 4], value[1, 1]) == (1, 3)
+
+
+@pytest.mark.parametrize("point", [[0.0, 0.0, -2.0], [0.0, 0.0, 0.0], [9.0, 0.0, 2.0], [0.0, -9.0, 2.0]])
+def test_what_is_behind_the_camera_or_out_of_view_does_not_appear(point):
+    assert not drawn([point], [1.0], size=0.25, most=5).any()
+
+
+def test_tokens_as_near_as_each_other_are_averaged():
+    assert drawn([on_ray(4, 4, 2.0)] * 3, [1.0, 2.0, 6.0])[0, 4, 4] == 3
+
+
+def test_a_token_is_as_large_as_it_appears():
+    # a square of 1 m seen from 2 m at a focal length of 5.6 px is 2.8 px wide: it covers the middles of 3 × 3 pixels
+    near = drawn([on_ray(4, 3, 2.0)], [1.0], size=1.0, most=7)[1]
+    assert near.nonzero().tolist() == [[row, column] for row in (2, 3, 4) for column in (3, 4, 5)]
+    assert drawn([on_ray(4, 3, 20.0)], [1.0], size=1.0, most=7)[1].sum() == 1
+    assert drawn([on_ray(4, 3, 0.5)], [1.0], size=1.0, most=3)[1].sum() == 9
+
+
+def test_a_token_outside_the_image_reaches_into_it():
+    assert drawn([on_ray(-1, 3, 2.0)], [1.0], size=1.0, most=5)[1].nonzero().tolist() == [[2, 0], [3, 0], [4, 0]]
+
+
+def test_a_wall_of_cells_seen_face_on_is_the_same_picture_however_the_world_is_turned():
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, :3], motion[:3, 3] = rotation_about(torch.tensor([0.6, 0.0, 0.8]), 1.1), torch.tensor([40.0, -3, 12])
+    cells = torch.tensor([[x * 0.25, y * 0.25, 2.0] for x in range(-4, 5) for y in range(-4, 5)], dtype=torch.float64)
+    moved = cells @ motion[:3, :3].T + motion[:3, 3]
+    camera = views()
+    turned = Cameras(motion @ camera.world_from_camera, camera.intrinsics, SIDE, SIDE)
+    features = [float(number) for number in range(len(cells))]
+    here = drawn(cells.tolist(), features, camera, 0.25, 3)
+    assert torch.allclose(here, drawn(moved.tolist(), features, turned, 0.25, 3), atol=1e-4)
+
+
+def test_every_frame_has_its_own_view():
+    camera = views(2)
+    camera.world_from_camera[0, 1, 2, 3] = 2.5  # past the token
+    splats = place(torch.tensor([[[0.1, 0.1, 2.0]]]).double(), torch.ones(1, 1, dtype=torch.bool), camera, 0.25, 3)
+    canvas = splat(torch.ones(1, 1, 1), splats, (1, 2, SIDE, SIDE))
+    assert canvas[0, 0, 1].any()
+    assert not canvas[0, 1].any()
+
+
+def test_patches_are_in_the_order_of_the_video_tokens():
+    latents = torch.zeros(1, 3, 2, SIDE, SIDE)
+    latents[0, 1, :, 5, 2] = 1.0  # latent frame 1, row 2 and column 1 of 4 × 4 video tokens
+    assert patchify(latents, 2).any(-1).nonzero().tolist() == [[0, 16 + 2 * 4 + 1]]
+
+
+def test_the_mask_of_a_canvas_is_where_tokens_fell():
+    adapter, clips, tokens = with_adapter(micro(), form="canvas").adapter, random_clips(), random_tokens(2, 5)
+    memory = adapter.prepare(tokens, clips.cameras)
+    assert memory.mask.shape == memory.tokens.shape[:2] == (2, 3 * 4 * 4)
+    assert memory.tokens[~memory.mask].count_nonzero() == 0
+    assert memory.tokens[memory.mask].any(-1).all()
