@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from persist_cli.recipe import MemoryChoice
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_json, write_json
+from persist_cli.world.files import file_sha256, read_json, write_json
 from persist_cli.world.settings import parse_settings
 
 if TYPE_CHECKING:
@@ -143,8 +143,7 @@ def fingerprint(folder: Path) -> str:
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.safetensors")):
         digest.update(str(path.relative_to(folder)).encode())
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+        digest.update(bytes.fromhex(file_sha256(path)))
     return digest.hexdigest()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor
 from persist_cli.trajectories.clips import interactions_of
 from persist_cli.trajectories.store import SUFFIX, TrajectoryFile
 from persist_cli.world.backbone import Interactions
+from persist_cli.world.files import file_sha256
 from persist_cli.world.geometry import pose_differences
 from persist_cli.world.observations import Observations, TrajectoryInfo
 
@@ -121,8 +121,7 @@ def data_files(cases: Sequence[Case]) -> list[dict[str, Any]]:
     for case in cases:
         hashes = used.setdefault(case.data, {})
         if case.trajectory not in hashes:
-            with case.file.path.open("rb") as file:
-                hashes[case.trajectory] = hashlib.file_digest(file, "sha256").hexdigest()
+            hashes[case.trajectory] = file_sha256(case.file.path)
     return [{"path": path, "trajectories": dict(sorted(hashes.items()))} for path, hashes in used.items()]
 
 

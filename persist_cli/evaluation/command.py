@@ -24,14 +24,14 @@ RESULTS = "metrics.json"
 def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | None, json: bool) -> None:
     """Measure rows and leave ``metrics.json``, and a report where one is asked for; see ``persist eval --help``."""
     processes = Processes()
-    run, backbone = prepare(paths, plan, out, processes)
-    measure_rows(run, backbone, processes)
+    run, backbones = prepare(paths, plan, out, processes)
+    measure_rows(run, backbones, processes)
     if not processes.main:
         return
     results = describe(run, processes.count)
     write_json(out / RESULTS, results)
     if report is not None:
-        write_report(results, make_pictures(run, domains(run)), report)
+        write_report(results, make_pictures(run, domains(run), backbones), report)
     if json:
         print_json(results)
         return
@@ -88,7 +88,7 @@ def describe(run: Evaluation, processes: int) -> dict[str, Any]:
 def tables(run: Evaluation) -> list[dict[str, Any]]:
     """One table of all clips, or one for each data set where the protocol says so."""
     columns = make_columns(run.measurer.metrics, run.protocol)
-    rows = [RowResults(row, number, run.seeds(row), run.batches) for number, row in enumerate(run.rows)]
+    rows = [RowResults(row, number, run.seeds(row), run.batches, run.journal) for number, row in enumerate(run.rows)]
     return [
         Table(name, clips, run.cases, run.measurer, columns, run.journal).to_json(rows)
         for name, clips in domains(run).items()

@@ -82,11 +82,9 @@ class Journal:
         """What ``write`` kept."""
         return read_tensors(self.folder / unit.file)[0]
 
-    def gather(self, row: int, seed: int, batches: int, name: str) -> Tensor | None:
-        """A tensor of every clip of a row at a seed; ``None`` where it is not kept."""
-        parts = [self.read(Unit(row, seed, batch)).get(name) for batch in range(batches)]
-        found = [part for part in parts if part is not None]
-        return torch.cat(found) if found else None
+    def gather(self, row: int, seed: int, batches: int, name: str) -> Tensor:
+        """A tensor of every clip of a measured row at a seed."""
+        return torch.cat([self.read(Unit(row, seed, batch))[name] for batch in range(batches)])
 
 
 def different(one: Any, other: Any, where: str = "") -> str:

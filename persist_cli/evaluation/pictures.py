@@ -7,25 +7,25 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.checkpoints import load_backbone
 from persist_cli.evaluation.cases import read_case
 from persist_cli.evaluation.journal import Unit
 from persist_cli.evaluation.measuring import FIGURES, VIDEO
-from persist_cli.evaluation.run import SHOWN, Evaluation, predict
+from persist_cli.evaluation.run import SHOWN, Backbones, Evaluation, predict
 from persist_cli.metrics.metric import Metric
 from persist_cli.reporting.pictures import ClipPicture, Pictures, RowPictures, Sheet
 from persist_cli.viewing.console import add_task, progress
 from persist_cli.world.backbone import Backbone
 
 
-def make_pictures(run: Evaluation, domains: dict[str, list[int]]) -> Pictures:
+def make_pictures(run: Evaluation, domains: dict[str, list[int]], backbones: Backbones) -> Pictures:
     """All pictures of an evaluation.
 
     Args:
         run: that was measured.
         domains: numbers of the clips of each table.
+        backbones: that the rows were measured with.
     """
-    return Pictures(rows=tuple(row_pictures(run, domains)), sheets=tuple(sheets(run)))
+    return Pictures(rows=tuple(row_pictures(run, domains, backbones)), sheets=tuple(sheets(run)))
 
 
 def sheets(run: Evaluation) -> list[Sheet]:
@@ -40,7 +40,7 @@ def sheets(run: Evaluation) -> list[Sheet]:
     return found
 
 
-def row_pictures(run: Evaluation, domains: dict[str, list[int]]) -> list[RowPictures]:
+def row_pictures(run: Evaluation, domains: dict[str, list[int]], backbones: Backbones) -> list[RowPictures]:
     """Best, median and worst clip of every row in every table, at the first seed.
 
     They are predicted again, one by one and from the noise they had, because keeping every video would take more room
@@ -49,13 +49,11 @@ def row_pictures(run: Evaluation, domains: dict[str, list[int]]) -> list[RowPict
     metric = next(iter(run.measurer.by_frame.values()), None)
     if metric is None:
         return []
-    found, backbone, loaded = [], None, ""
+    found = []
     with progress() as bar:
         task = add_task(bar, "pictures", len(run.rows), "row")
         for number, row in enumerate(run.rows):
-            if backbone is None or row.base.fingerprint != loaded:
-                backbone, loaded = load_backbone(row.base), row.base.fingerprint
-            row.prepare(backbone)
+            backbone = backbones.ready(row)
             figures = first_figures(run, number)
             for name, clips in domains.items():
                 shown = []
@@ -69,9 +67,7 @@ def row_pictures(run: Evaluation, domains: dict[str, list[int]]) -> list[RowPict
 
 def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
     """The first metric's mean over the predicted frames of each clip, at the first seed."""
-    figures = run.journal.gather(row, 0, run.batches, FIGURES)
-    assert figures is not None  # every batch of a measured row has them
-    return figures[:, 1:, 0].nanmean(dim=1)
+    return run.journal.gather(row, 0, run.batches, FIGURES)[:, 1:, 0].nanmean(dim=1)
 
 
 def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Metric) -> list[int]:

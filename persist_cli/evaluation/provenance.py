@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from persist_cli.checkpoints import Checkpoint
 from persist_cli.metrics.metric import Metric
 from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.trajectories.store import Store
-from persist_cli.world.files import read_json
+from persist_cli.world.files import file_sha256, read_json
 from persist_cli.world.weights import cached_weight
 
 PACKAGES = ("accelerate", "diffusers", "numpy", "safetensors", "scipy", "torch", "torchmetrics", "transformers")
@@ -45,12 +44,12 @@ def command() -> list[str]:
 def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
     """A checkpoint with the hashes of its base, recipe and adapters, JSON values."""
     recipe = recipe_path(checkpoint.folder)
-    adapters = {name: file_hash(folder / "adapter.safetensors") for name, folder in checkpoint.adapters.items()}
+    adapters = {name: file_sha256(folder / "adapter.safetensors") for name, folder in checkpoint.adapters.items()}
     return {
         "name": checkpoint.name,
         "path": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
-        "recipe_sha256": file_hash(recipe) if recipe else None,
+        "recipe_sha256": file_sha256(recipe) if recipe else None,
         "adapters": adapters,
     }
 
@@ -86,9 +85,3 @@ def weight_hashes(names: Sequence[str]) -> dict[str, str]:
     """SHA-256 of the converted weights that are there."""
     found = {name: cached_weight(name) for name in names}
     return {name: str(read_json(folder / "weight.json")["sha256"]) for name, folder in found.items() if folder}
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -32,25 +32,23 @@ class RowResults:
         number: in the journal.
         seeds: how many.
         batches: how many a seed.
+        journal: that holds them.
     """
 
     row: Row
     number: int
     seeds: int
     batches: int
+    journal: Journal
 
-    def figures(self, journal: Journal) -> Tensor:
-        """Every figure, ``[seed, clip, frame, metric]``."""
-        return torch.stack([self._gather(journal, seed, FIGURES) for seed in range(self.seeds)])
+    @cached_property
+    def figures(self) -> Tensor:
+        """Every figure, ``[seed, clip, frame, metric]``; read once for all tables and curves."""
+        return self.gather(FIGURES)
 
-    def features(self, journal: Journal, metric: str) -> Tensor:
-        """Features of every video, ``[seed, clip, channel]``."""
-        return torch.stack([self._gather(journal, seed, f"features/{metric}") for seed in range(self.seeds)])
-
-    def _gather(self, journal: Journal, seed: int, name: str) -> Tensor:
-        found = journal.gather(self.number, seed, self.batches, name)
-        assert found is not None  # every batch of a finished row has it
-        return found
+    def gather(self, name: str) -> Tensor:
+        """A tensor of every seed and clip."""
+        return torch.stack([self.journal.gather(self.number, seed, self.batches, name) for seed in range(self.seeds)])
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ class Table:
 
     def figures(self, each: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""
-        values = each.figures(self.journal)[:, list(self.clips)]
+        values = each.figures[:, list(self.clips)]
         found = {}
         for column in self.columns:
             if column.metric in self.measurer.by_frame:
@@ -121,7 +119,7 @@ class Table:
 
     def set_figure(self, metric: str, each: RowResults) -> Figure:
         """The distance of the row's videos from the true ones."""
-        generated = each.features(self.journal, metric)[:, list(self.clips)]
+        generated = each.gather(f"features/{metric}")[:, list(self.clips)]
         truth = self.true_features[metric]
         measured = self.measurer.by_set[metric]
 
@@ -136,11 +134,11 @@ class Table:
         """Features of the true videos of this domain."""
         batches = len(list(self.journal.folder.glob(f"row-{TRUTH:03d}-*")))
         found = {name: self.journal.gather(TRUTH, 0, batches, f"features/{name}") for name in self.measurer.by_set}
-        return {name: features[list(self.clips)] for name, features in found.items() if features is not None}
+        return {name: features[list(self.clips)] for name, features in found.items()}
 
     def curves(self, each: RowResults) -> dict[str, Any]:
         """Each metric against frame number and against the share of the view seen before."""
-        values = each.figures(self.journal)[:, list(self.clips), 1:].numpy()
+        values = each.figures[:, list(self.clips), 1:].numpy()
         shares = np.array([self.cases[clip].seen_before[1:] for clip in self.clips], dtype=np.float64)
         curves = {}
         for place, (name, metric) in enumerate(self.measurer.by_frame.items()):

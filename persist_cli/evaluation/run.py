@@ -99,7 +99,26 @@ class Evaluation:
                 yield Unit(number, seed, batch)
 
 
-def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Processes) -> tuple[Evaluation, Backbone]:
+class Backbones:
+    """The backbone of one base at a time, loaded when a row needs another.
+
+    Args:
+        backbone: loaded already.
+        base: the checkpoint that it is of.
+    """
+
+    def __init__(self, backbone: Backbone, base: Checkpoint) -> None:
+        self.backbone, self.loaded = backbone, base.fingerprint
+
+    def ready(self, row: Row) -> Backbone:
+        """The backbone, prepared for this row."""
+        if row.base.fingerprint != self.loaded:
+            self.backbone, self.loaded = load_backbone(row.base), row.base.fingerprint
+        row.prepare(self.backbone)
+        return self.backbone
+
+
+def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Processes) -> tuple[Evaluation, Backbones]:
     """Check everything that can be checked before anything is measured, and find the clips.
 
     Raises:
@@ -133,7 +152,7 @@ def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Process
     cases = cases or journal.cases() or []
     rows = make_rows(checkpoints, plan.choice, protocol, cases)
     measurer = Measurer.of(metrics, make_setup(cases))
-    return Evaluation(plan, checkpoints, protocol, cases, rows, measurer, journal), backbone
+    return Evaluation(plan, checkpoints, protocol, cases, rows, measurer, journal), Backbones(backbone, checkpoints[0])
 
 
 def what_is_measured(plan: EvalPlan, checkpoints: Sequence[Checkpoint], metrics: Any) -> dict[str, Any]:
@@ -144,13 +163,12 @@ def what_is_measured(plan: EvalPlan, checkpoints: Sequence[Checkpoint], metrics:
     return dict(json.loads(json.dumps(values)))  # as a file gives it back
 
 
-def measure_rows(run: Evaluation, backbone: Backbone, processes: Processes) -> None:
+def measure_rows(run: Evaluation, backbones: Backbones, processes: Processes) -> None:
     """Measure every batch that the journal does not have, this process its share."""
     todo = [
         [unit for unit in run.units(number) if processes.mine(unit.batch) and not run.journal.has(unit)]
         for number in range(len(run.rows))
     ]
-    loaded = run.checkpoints[0].fingerprint
     with progress() as bar:
         bar.disable = not processes.main
         measure_truth(run, processes, bar)
@@ -158,9 +176,7 @@ def measure_rows(run: Evaluation, backbone: Backbone, processes: Processes) -> N
         for row, units in zip(run.rows, todo, strict=True):
             if not units:
                 continue
-            if row.base.fingerprint != loaded:
-                backbone, loaded = load_backbone(row.base), row.base.fingerprint
-            row.prepare(backbone)
+            backbone = backbones.ready(row)
             bar.update(task, note=row.name)
             for unit in units:
                 measure_unit(run, row, backbone, unit)

@@ -23,6 +23,7 @@ from persist_cli.recipe import Recipe
 from persist_cli.training.cache import Cache, name_of
 from persist_cli.trajectories.clips import ClipChoice, ClipDataset, ClipSample
 from persist_cli.world.backbone import Backbone
+from persist_cli.world.files import file_sha256
 from persist_cli.world.observations import Observations
 from persist_cli.world.tokens import MemoryTokens
 
@@ -95,8 +96,7 @@ class KeptClips(Dataset[ClipSample]):
     def trajectory(self, path: Path) -> str:
         """SHA-256 of a trajectory's file, computed once."""
         if path not in self.hashes:
-            with path.open("rb") as file:
-                self.hashes[path] = hashlib.file_digest(file, "sha256").hexdigest()
+            self.hashes[path] = file_sha256(path)
         return self.hashes[path]
 
 

@@ -13,7 +13,7 @@ from typing import IO, Final
 
 from persist_cli.weights.catalog import Archive, Weight
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import written_aside
+from persist_cli.world.files import file_sha256, written_aside
 
 CHUNK: Final = 1 << 20
 BROKEN: Final = (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, KeyError, NotImplementedError, OSError)
@@ -55,12 +55,6 @@ def check_original(weight: Weight, what: str, size: int, sha256: str) -> None:
         raise CheckpointError(f"{what}: refused, {many}{min(size, weight.size)} bytes, {weight.name} has {weight.size}")
     if weight.sha256 is not None and sha256 != weight.sha256:
         raise CheckpointError(f"{what}: refused, its SHA-256 is {sha256}, that of {weight.name} is {weight.sha256}")
-
-
-def file_sha256(path: Path) -> str:
-    """SHA-256 of a file in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextlib.contextmanager

@@ -11,12 +11,12 @@ from pathlib import Path
 from torch import Tensor
 
 from persist_cli import __version__
-from persist_cli.weights.archives import check_file, file_sha256, unpack_original
+from persist_cli.weights.archives import check_file, unpack_original
 from persist_cli.weights.catalog import Weight
 from persist_cli.weights.conversion import CONFIGS, CONVERSIONS
 from persist_cli.weights.directory import Found
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_tensors, write_json, write_tensors
+from persist_cli.world.files import file_sha256, read_tensors, write_json, write_tensors
 
 MODEL = "model.safetensors"
 

