@@ -4,14 +4,58 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 
 import torch
+import torch.nn.functional as F
 from diffusers import AutoencoderKLCogVideoX
+from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
+from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
+from persist_backbones.still import apart, code_frames_alone, together
 from persist_cli.world.errors import CheckpointError
+
+CALM = -6.0  # log variance of fresh latents: noise that does not drown what has not been learnt yet
+
+
+def calm(vae: AutoencoderKLCogVideoX) -> None:
+    """Begin a fresh VAE with residual blocks that are the identity and latents with little noise.
+
+    Measured on houses at 64×64 after 150 steps: 22.8 dB instead of 20.1 with diffusers' own beginning.
+    """
+    with torch.no_grad():
+        vae.encoder.conv_out.conv.bias[vae.config.latent_channels :] = CALM
+        for module in vae.modules():
+            if isinstance(module, CogVideoXResnetBlock3D):
+                module.conv2.conv.weight.zero_()
+                module.conv2.conv.bias.zero_()
+
+
+def pixel_patch(vae: AutoencoderKLCogVideoX) -> int:
+    """Edge of the square of pixels that is folded into the VAE's input channels, 1 for CogVideoX's own."""
+    return math.isqrt(vae.config.in_channels // 3)
+
+
+def spatial_compression(vae: AutoencoderKLCogVideoX) -> int:
+    """Pixels along the edge of a latent pixel."""
+    return pixel_patch(vae) * int(2 ** (len(vae.config.block_out_channels) - 1))
+
+
+def fold_pixels(
+    videos: Float[Tensor, "batch channel frame height width"], patch: int
+) -> Float[Tensor, "batch folded frame rows columns"]:
+    """Squares of pixels folded into channels."""
+    return F.pixel_unshuffle(videos.transpose(1, 2), patch).transpose(1, 2)
+
+
+def unfold_pixels(
+    videos: Float[Tensor, "batch folded frame rows columns"], patch: int
+) -> Float[Tensor, "batch channel frame height width"]:
+    """The pixels that ``fold_pixels`` folded."""
+    return F.pixel_shuffle(videos.transpose(1, 2), patch).transpose(1, 2)
 
 
 class Codec(nn.Module):
@@ -20,6 +64,9 @@ class Codec(nn.Module):
     Depth goes through the same VAE as a grey image of its code (see ``depth_code``). Latents are the posterior's
     mean, times the scaling factor: in training, in the image condition and in sampling alike.
 
+    A VAE that does not compress time (``temporal_compression_ratio`` 1) codes every frame alone. One of 3 p² input
+    channels sees p×p pixels folded into channels, which costs a small codec far less than convolutions at full size.
+
     Args:
         vae: diffusers' autoencoder.
     """
@@ -27,6 +74,8 @@ class Codec(nn.Module):
     def __init__(self, vae: AutoencoderKLCogVideoX) -> None:
         super().__init__()
         self.vae = vae
+        if self.frames_alone:
+            code_frames_alone(vae)
 
     @property
     def channels(self) -> int:
@@ -36,12 +85,17 @@ class Codec(nn.Module):
     @property
     def spatial(self) -> int:
         """Compression in height and width."""
-        return int(2 ** (len(self.vae.config.block_out_channels) - 1))
+        return spatial_compression(self.vae)
 
     @property
     def temporal(self) -> int:
         """Compression in time."""
         return int(self.vae.config.temporal_compression_ratio)
+
+    @property
+    def frames_alone(self) -> bool:
+        """Whether the latents of a frame depend on that frame only."""
+        return self.temporal == 1
 
     def fingerprint(self) -> str:
         """SHA-256 of the VAE's weights and configuration: what ``encode`` depends on besides the clips."""
@@ -64,27 +118,44 @@ class Codec(nn.Module):
 
     def encode(self, rgb: Tensor, depth: Tensor) -> Float[Tensor, "batch frame channel height width"]:
         """Scaled latents of RGB and depth, concatenated on channels."""
-        mean: Tensor = self.vae.encode(self.images(rgb, depth)).latent_dist.mode()
+        mean: Tensor = self.posterior(self.images(rgb, depth)).mode()
         color, grey = (mean * self.vae.config.scaling_factor).transpose(1, 2).chunk(2)
         return torch.cat([color, grey], dim=2)
 
     def decode(self, latents: Float[Tensor, "batch frame channel height width"]) -> tuple[Tensor, Tensor]:
         """RGB uint8 ``[batch, frame, height, width, 3]`` and depth in metres of latents that ``encode`` gave."""
         stacked = torch.cat(latents.chunk(2, dim=2)).transpose(1, 2) / self.vae.config.scaling_factor
-        color, grey = self.vae.decode(stacked).sample.float().chunk(2)
+        color, grey = self.images_of(stacked).float().chunk(2)
         rgb = ((color.permute(0, 2, 3, 4, 1) + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
         return rgb, decode_depth(grey.mean(dim=1))
+
+    def posterior(self, images: Float[Tensor, "stacked 3 frame height width"]) -> DiagonalGaussianDistribution:
+        """Distribution of the unscaled latents ``[stacked, channel, latent_frame, rows, columns]``."""
+        folded = fold_pixels(images, pixel_patch(self.vae))
+        if not self.frames_alone:
+            return self.vae.encode(folded).latent_dist
+        found = self.vae.encode(apart(folded)).latent_dist
+        return DiagonalGaussianDistribution(together(found.parameters, images.shape[2]))
+
+    def images_of(
+        self, latents: Float[Tensor, "stacked channel latent_frame rows columns"]
+    ) -> Float[Tensor, "stacked 3 frame height width"]:
+        """The images of unscaled latents."""
+        if self.frames_alone:
+            folded = together(self.vae.decode(apart(latents)).sample, latents.shape[2])
+        else:
+            folded = self.vae.decode(latents).sample
+        return unfold_pixels(folded, pixel_patch(self.vae))
 
     def loss(
         self, rgb: Tensor, depth: Tensor, kl_weight: float, generators: list[torch.Generator]
     ) -> dict[str, Tensor]:
         """Reconstruction error (mean absolute plus squared) and prior of a batch of clips."""
         images = self.images(rgb, depth)
-        posterior = self.vae.encode(images).latent_dist
+        posterior = self.posterior(images)
         shape = posterior.mean.shape[1:]
         noise = torch.stack([torch.randn(2, *shape, generator=each) for each in generators], dim=1).flatten(0, 1)
-        sample = posterior.mean + posterior.std * noise.to(posterior.mean)
-        decoded = self.vae.decode(sample).sample
+        decoded = self.images_of(posterior.mean + posterior.std * noise.to(posterior.mean))
         error = (decoded.float() - images).abs()
         reconstruction = error.mean() + error.square().mean()
         prior = posterior.kl().mean()

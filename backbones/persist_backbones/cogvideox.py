@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
 from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
-from persist_backbones.diffusion import SAMPLERS, denoise, draw_timesteps, generators_of, loss_weights, noise_like
+from persist_backbones.diffusion import draw_timesteps, generators_of, noise_like
 from persist_backbones.forms import make_adapter
+from persist_backbones.objective import loss_weights, predicted_target, squared_error
 from persist_backbones.parts import (
     DiffusersParts,
     check_fit,
@@ -28,6 +29,7 @@ from persist_backbones.parts import (
 )
 from persist_backbones.presets import CogVideoXSettings
 from persist_backbones.rotary import rotary_positions
+from persist_backbones.samplers import SAMPLERS, denoise
 from persist_backbones.world_transformer import Conditions
 from persist_cli.world.backbone import Backbone, Clips, Sampling, Stage
 from persist_cli.world.errors import CheckpointError
@@ -73,7 +75,7 @@ class CogVideoX(Backbone):
 
     @property
     def samplers(self) -> tuple[str, ...]:
-        """DDIM and DPM of diffusers."""
+        """Those of diffusers that keep to the noise levels of training."""
         return tuple(SAMPLERS)
 
     @property
@@ -111,7 +113,7 @@ class CogVideoX(Backbone):
         return {name: each for name, each in self.named_parameters() if each.requires_grad}
 
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
-        """The codec's loss, or the velocity loss of RGB and depth latents (v-prediction)."""
+        """The codec's loss, or that of denoising RGB and depth latents."""
         generators = generators_of(clips.seeds)
         if stage == "codec":
             rgb, depth = clips.rgb, clips.depth
@@ -122,23 +124,27 @@ class CogVideoX(Backbone):
         latents, image = kept[:, :-1], self.image_condition(kept[:, -1:])
         timesteps = draw_timesteps(self.scheduler, generators).to(latents.device)
         noise = noise_like(latents, generators)
-        target = self.scheduler.get_velocity(latents, noise, timesteps)
+        target = predicted_target(self.scheduler, latents, noise, timesteps)
         noisy = self.scheduler.add_noise(latents, noise, timesteps)
         memory = self.drop_memory(self.prepare_memory(clips), generators)
         predicted = self.predict(noisy, image, self.conditions(clips, timesteps, memory))
         weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
-        error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
-        color, depth = error.chunk(2, dim=2)
-        return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+        return squared_error(predicted, target, weights, self.settings.depth)
 
     def encoding(self, stage: Stage) -> str | None:
         """The frozen codec's fingerprint; ``None`` in its own stage."""
         return None if stage == "codec" else self.codec.fingerprint()
 
+    @property
+    def frames_alone(self) -> bool:
+        """The codec's."""
+        return self.codec.frames_alone
+
     @torch.no_grad()
     def encode(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Latents of the clips, and behind them one frame more: the latents of the first image alone."""
-        whole, first = (self.codec.encode(clips.rgb[:, :end], clips.depth[:, :end]) for end in (None, 1))
+        whole = self.codec.encode(clips.rgb, clips.depth)
+        first = whole[:, :1] if self.frames_alone else self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1])
         return torch.cat([whole, first], dim=1)
 
     @torch.no_grad()
@@ -160,6 +166,8 @@ class CogVideoX(Backbone):
         noise = noise_like(image, generators)
         latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
         rgb, depth = self.codec.decode(latents)
+        if not self.settings.depth:
+            depth = torch.zeros_like(depth)
         rgb[:, 0], depth[:, 0] = first.rgb[:, 0], first.depth[:, 0]
         return rgb, depth
 
@@ -218,9 +226,11 @@ class CogVideoX(Backbone):
         return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed)
 
     def predict(self, noisy: Tensor, image: Tensor, given: Conditions) -> Tensor:
-        """Velocities: channels are noisy RGB, RGB image, noisy depth, depth image, camera, the originals first."""
+        """What the objective asks for; channels are noisy RGB, RGB image, noisy depth, depth image and camera."""
         color, depth = noisy.chunk(2, dim=2)
         color_image, depth_image = image.chunk(2, dim=2)
+        if not self.settings.depth:
+            depth, depth_image = torch.zeros_like(depth), torch.zeros_like(depth_image)
         latents = torch.cat([color, color_image, depth, depth_image, given.camera.to(noisy.dtype)], dim=2)
         patch = self.transformer.base.config.patch_size
         given = dataclasses.replace(given, camera=camera_tokens(given.camera, patch))

@@ -22,8 +22,9 @@ def camera_latents(
 ) -> Float[Tensor, "batch latent_frame channel height width"]:
     """Plücker rays relative to each clip's first camera, at the VAE's compression.
 
-    Mean-pooled in space; in time frames are folded into channels (unpixelshuffle). As for the VAE, the first frame
-    stands alone in the first latent frame, here repeated to fill its channels: 9×512×512×6 → 3×64×64×24.
+    Mean-pooled in space, which for rays is the ray through the middle; in time frames are folded into channels
+    (unpixelshuffle). As for the VAE, the first frame stands alone in the first latent frame, here repeated to fill
+    its channels: 9×512×512×6 → 3×64×64×24.
 
     Args:
         cameras: ``[batch, frame]``, 4n + 1 frames.
@@ -33,9 +34,8 @@ def camera_latents(
     """
     first = invert_rigid(cameras.world_from_camera[:, :1].double())
     local = Cameras(first @ cameras.world_from_camera.double(), cameras.intrinsics, cameras.height, cameras.width)
-    rays = plucker(local, printed).permute(0, 1, 4, 2, 3).float()
-    pooled = F.avg_pool2d(rays.flatten(0, 1), spatial).unflatten(0, rays.shape[:2])
-    return fold_frames(pooled, temporal)
+    rays = plucker(local.resized(local.height // spatial, local.width // spatial), printed)
+    return fold_frames(rays.permute(0, 1, 4, 2, 3).float(), temporal)
 
 
 def fold_frames(

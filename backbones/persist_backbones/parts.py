@@ -10,6 +10,7 @@ import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
 from torch import Tensor, nn
 
+from persist_backbones.codec import calm, spatial_compression
 from persist_backbones.conditioning import RAY_CHANNELS
 from persist_backbones.presets import PRESETS, CogVideoXSettings
 from persist_backbones.world_transformer import WorldTransformer
@@ -38,14 +39,21 @@ def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
     vae = AutoencoderKLCogVideoX(
         **(preset["vae"] | {"sample_height": settings.height, "sample_width": settings.width} | settings.vae)
     )
-    spatial = 2 ** (len(vae.config.block_out_channels) - 1)
+    calm(vae)
+    spatial = spatial_compression(vae)
     size = {
         "sample_height": settings.height // spatial,
         "sample_width": settings.width // spatial,
         "sample_frames": settings.frames,
     }
     transformer = CogVideoXTransformer3DModel(**(preset["transformer"] | size | settings.transformer))
-    return DiffusersParts(transformer, vae, CogVideoXDDIMScheduler(**preset["scheduler"]))
+    return DiffusersParts(transformer, vae, make_scheduler(settings))
+
+
+def make_scheduler(settings: CogVideoXSettings) -> CogVideoXDDIMScheduler:
+    """The noise levels of the settings' preset, for what the settings predict."""
+    preset = PRESETS[settings.preset]["scheduler"]
+    return CogVideoXDDIMScheduler(**(preset | {"prediction_type": settings.prediction}))
 
 
 def load_parts(folder: Path) -> DiffusersParts:
@@ -75,7 +83,7 @@ def _load_part(folder: Path, name: str) -> Any:
 def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
     """Raise ``CheckpointError`` when the parts do not work together at the settings' size."""
     config, vae = parts.transformer.config, parts.vae.config
-    spatial = 2 ** (len(vae.block_out_channels) - 1)
+    spatial = spatial_compression(parts.vae)
     temporal = int(vae.temporal_compression_ratio)
     unit = spatial * config.patch_size
     if config.patch_size_t is not None or config.ofs_embed_dim:
@@ -112,7 +120,7 @@ def save_world(transformer: WorldTransformer, prompt: Tensor, folder: Path) -> N
 
 
 def load_world(transformer: WorldTransformer, folder: Path) -> Tensor:
-    """Take what ``save_world`` wrote; returns the prompt's embedding."""
+    """Take what ``save_world`` wrote, in whatever precision; returns the prompt's embedding in the transformer's."""
     path = folder / "world.safetensors"
     tensors, _ = read_tensors(path)
     prompt = tensors.pop("prompt", None)
@@ -120,11 +128,14 @@ def load_world(transformer: WorldTransformer, folder: Path) -> Tensor:
         raise CheckpointError(f"{path}: no prompt embedding in it")
     own = {name for name in transformer.state_dict() if not name.startswith("base.")}
     load_exactly(transformer, tensors, own, path)
-    return prompt
+    return prompt.to(next(transformer.parameters()).dtype)
 
 
 def load_exactly(module: nn.Module, tensors: dict[str, Tensor], names: set[str], path: Path) -> None:
-    """Load tensors under exactly these names and shapes, or raise a one-line ``CheckpointError``."""
+    """Load tensors under exactly these names and shapes, or raise a one-line ``CheckpointError``.
+
+    The module keeps its precision, whatever the file's.
+    """
     state = module.state_dict()
     different = sorted(names ^ set(tensors))
     different += sorted(name for name in names & set(tensors) if state[name].shape != tensors[name].shape)
@@ -132,5 +143,6 @@ def load_exactly(module: nn.Module, tensors: dict[str, Tensor], names: set[str],
         raise CheckpointError(
             f"{path}: does not fit this model; {len(different)} tensors differ, first {different[0]!r}"
         )
+    cast = {name: value.to(state[name].dtype) for name, value in tensors.items()}
     with torch.no_grad():
-        module.load_state_dict(tensors, strict=False, assign=any(state[name].is_meta for name in names))
+        module.load_state_dict(cast, strict=False, assign=any(state[name].is_meta for name in names))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from persist_backbones.objective import Prediction, Weighting
+
 VAE_8X = {
     "down_block_types": ("CogVideoXDownBlock3D",) * 4,
     "up_block_types": ("CogVideoXUpBlock3D",) * 4,
@@ -83,7 +85,10 @@ class CogVideoXSettings:
         frames: frames a clip, 8n + 1.
         interactions: actions that change the world; each gets an embedding for each step of a clip.
         rays: ``correct`` Plücker directions, or as the paper ``printed`` them, with the translation added.
-        weighting: of the v-prediction loss over noise levels, ``uniform`` or ``min-snr``.
+        depth: false holds depth at zero in the input and leaves it out of the loss: a model of RGB alone with as many
+            parameters, whose clips have no depth (0) after the given frame.
+        prediction: ``v_prediction`` as CogVideoX, or ``sample``, the clean latents; a preset's only.
+        weighting: of errors over noise levels: ``uniform``, ``min-snr`` or ``min-snr-plus-one`` (see ``objective``).
         snr_gamma: of min-SNR.
         kl_weight: of the codec's latent prior.
         codec_window: frames (1 or 8n + 1), height and width of the random windows that the codec is trained on; a
@@ -99,7 +104,9 @@ class CogVideoXSettings:
     frames: int = 9
     interactions: tuple[str, ...] = ("pick_up", "drop", "toggle")
     rays: Literal["correct", "printed"] = "correct"
-    weighting: Literal["uniform", "min-snr"] = "uniform"
+    depth: bool = True
+    prediction: Prediction = "v_prediction"
+    weighting: Weighting = "uniform"
     snr_gamma: float = 5.0
     kl_weight: float = 1e-6
     codec_window: tuple[int, int, int] | None = None

@@ -105,6 +105,14 @@ class Backbone(nn.Module, ABC):
         """What of the clips can be kept between steps, batch axis first; ``forward`` takes it as ``Clips.latents``."""
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
+    @property
+    def frames_alone(self) -> bool:
+        """Whether ``encode`` gives one row a frame, and one more that repeats the first's, each of its frame alone.
+
+        The latents of a whole trajectory then serve all clips of it.
+        """
+        return False
+
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """Last act of a stage: measure on some clips what training cannot learn; nothing by default."""
 

@@ -5,7 +5,7 @@ import torch
 
 from persist_backbones.conditioning import camera_latents
 from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
-from persist_backbones.diffusion import loss_weights
+from persist_backbones.objective import loss_weights
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import CheckpointError, DataError, PersistError
 from tests.backbones.micro import micro, random_clips, shaken
@@ -100,7 +100,8 @@ def test_min_snr_lowers_the_weight_of_clean_samples_and_never_exceeds_one():
     signal = scheduler.alphas_cumprod[torch.tensor([0, 300, 999])].double()
     snr = signal / (1 - signal)
     assert torch.allclose(weights.double(), snr.clamp_max(5.0) / (snr + 1), atol=1e-6)
-    assert loss_weights(scheduler, torch.tensor([0, 999]), "uniform", 5.0).tolist() == [1.0, 1.0]
+    assert loss_weights(scheduler, torch.tensor([0, 999]), "uniform", 5.0).tolist() == pytest.approx([1.0, 1.0])
+    assert float(loss_weights(scheduler, torch.tensor([999]), "min-snr-plus-one", 5.0)) == pytest.approx(1.0)
 
 
 def test_the_codec_stage_measures_the_scale_of_its_latents():

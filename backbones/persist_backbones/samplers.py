@@ -1,0 +1,85 @@
+"""Samplers: diffusers' CogVideoX schedulers, and its multistep solvers for few steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from diffusers import (
+    CogVideoXDDIMScheduler,
+    CogVideoXDPMScheduler,
+    DPMSolverMultistepScheduler,
+    UniPCMultistepScheduler,
+)
+from torch import Tensor
+
+from persist_cli.world.errors import PersistError
+
+COGVIDEOX: dict[str, Any] = {"ddim": CogVideoXDDIMScheduler, "dpm": CogVideoXDPMScheduler}
+MULTISTEP: dict[str, Any] = {"unipc": UniPCMultistepScheduler, "dpm++": DPMSolverMultistepScheduler}
+SAMPLERS = COGVIDEOX | MULTISTEP
+Denoiser = Callable[[Tensor, Tensor], Tensor]
+
+
+def denoise(
+    predict: Denoiser, latents: Tensor, config: Any, sampler: str, steps: int, generators: list[torch.Generator]
+) -> Tensor:
+    """Latents after ``steps`` denoising steps from noise: the last clean prediction.
+
+    Args:
+        predict: of (latents, timesteps) what the configuration's ``prediction_type`` says.
+        latents: pure noise.
+        config: configuration of the CogVideoX scheduler that the model was trained with.
+        sampler: a key of ``SAMPLERS``.
+        steps: denoising steps, each one call of ``predict``.
+        generators: one a sample, for samplers that add noise.
+
+    Raises:
+        PersistError: for an unknown sampler, and for more steps than the training has noise levels.
+    """
+    schedule = make_schedule(config, sampler, steps)
+    before: tuple[Tensor | None, Tensor | None] = (None, None)  # the last clean prediction and its time step
+    for timestep in schedule.timesteps:
+        predicted = predict(latents, timestep.expand(len(latents)).to(latents.device))
+        if sampler == "dpm":
+            latents, *clean = schedule.step(
+                predicted, before[0], timestep, before[1], latents, generator=generators, return_dict=False
+            )
+            before = (clean[0], timestep)
+        else:
+            latents, *clean = schedule.step(predicted, timestep, latents, return_dict=False)
+    return clean[0] if clean else latents  # CogVideoX's leave noise when steps do not divide the training's levels
+
+
+def make_schedule(config: Any, sampler: str, steps: int) -> Any:
+    """The sampler's scheduler with so many timesteps, each at the noise level that training gives it.
+
+    Raises:
+        PersistError: for an unknown sampler, and for more steps than the training has noise levels.
+    """
+    if sampler not in SAMPLERS:
+        raise PersistError(f"unknown sampler {sampler!r}; known: {', '.join(SAMPLERS)}")
+    trained = CogVideoXDDIMScheduler.from_config(config)
+    if not 1 <= steps <= trained.config.num_train_timesteps:
+        raise PersistError(f"{steps} denoising steps; it must be 1 to {trained.config.num_train_timesteps}")
+    schedule = COGVIDEOX[sampler].from_config(config) if sampler in COGVIDEOX else multistep(sampler, trained)
+    schedule.set_timesteps(steps)
+    schedule.timesteps = schedule.timesteps[:steps]  # rounding gives some numbers, as 61, one timestep more: -1
+    if sampler in MULTISTEP:
+        schedule.sigmas = torch.cat([schedule.sigmas[:steps], torch.zeros(1)])
+    return schedule
+
+
+def multistep(sampler: str, trained: CogVideoXDDIMScheduler) -> Any:
+    """A scheduler of ``MULTISTEP`` with CogVideoX's noise levels, whose shift of the SNR it does not know itself."""
+    signal = trained.alphas_cumprod.double()
+    betas = 1 - signal / torch.cat([signal.new_ones(1), signal[:-1]])
+    return MULTISTEP[sampler](
+        num_train_timesteps=len(betas),
+        trained_betas=betas.tolist(),
+        prediction_type=trained.config.prediction_type,
+        timestep_spacing=trained.config.timestep_spacing,
+        steps_offset=trained.config.steps_offset,
+        rescale_betas_zero_snr=bool(signal[-1] == 0),  # nothing is left to rescale, but the last SNR must not be zero
+    )

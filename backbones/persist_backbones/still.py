@@ -1,0 +1,49 @@
+"""CogVideoX's VAE for frames that are coded alone, each as a video of one frame, at the price of an image VAE.
+
+A causal convolution repeats the first frame into the past, so on a single frame all its taps in time see the same
+image: it is a plain 2D convolution with the sum of the taps. That is a third of the arithmetic, with diffusers'
+weights and layout.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from diffusers import AutoencoderKLCogVideoX
+from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXCausalConv3d
+from jaxtyping import Float
+from torch import Tensor
+
+
+class StillConv(CogVideoXCausalConv3d):  # type: ignore[misc]
+    """diffusers' causal convolution, as a 2D convolution where the video is one frame."""
+
+    def forward(self, inputs: Tensor, conv_cache: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """The convolved video, and what a next piece of it would need: nothing after a single frame."""
+        if inputs.shape[2] != 1 or self.pad_mode == "replicate":
+            result: tuple[Tensor, Tensor | None] = super().forward(inputs, conv_cache)
+            return result
+        conv = self.conv
+        padding = (self.height_pad, self.width_pad)
+        out = F.conv2d(inputs[:, :, 0], conv.weight.sum(2), conv.bias, conv.stride[1:], padding, conv.dilation[1:])
+        return out[:, :, None], None
+
+
+def code_frames_alone(vae: AutoencoderKLCogVideoX) -> None:
+    """Make a VAE fast for videos of one frame; its parameters and their names stay as they are."""
+    for module in vae.modules():
+        if type(module) is CogVideoXCausalConv3d:
+            module.__class__ = StillConv
+
+
+def apart(videos: Float[Tensor, "batch channel frame height width"]) -> Float[Tensor, "image channel 1 height width"]:
+    """Every frame as a video of its own."""
+    return videos.transpose(1, 2).flatten(0, 1)[:, :, None]
+
+
+def together(
+    images: Float[Tensor, "image channel 1 height width"], frames: int
+) -> Float[Tensor, "batch channel frame height width"]:
+    """The videos that ``apart`` took apart, whatever became of channels and sizes."""
+    videos: Tensor = torch.movedim(images[:, :, 0].unflatten(0, (-1, frames)), 1, 2)
+    return videos

@@ -1,0 +1,162 @@
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from persist_backbones.diffusion import generators_of, noise_like
+from persist_backbones.presets import PRESETS
+from persist_backbones.samplers import MULTISTEP, SAMPLERS, denoise, make_schedule
+from persist_cli.world.errors import PersistError
+
+TINY, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3
+CONFIGS = pytest.mark.parametrize("config", [TINY, SHIFTED], ids=["shift 1", "shift 3"])
+EVERY = pytest.mark.parametrize("sampler", SAMPLERS)
+STEPS = pytest.mark.parametrize("steps", [1, 2, 4, 7, 10, 50, 61])
+# Where training knows no signal the multistep schedulers assume a share of 2⁻¹², and so leave that much of the noise;
+# the rest is float32.
+TOLERANCE = 5 * 2**-12  # noise of the tests stays below 5
+SHAPE = (3, 4, 2, 2)
+
+
+def levels(config: dict, timesteps: Tensor) -> tuple[Tensor, Tensor]:
+    """Shares of signal and noise in training, for each sample."""
+    signal = make_schedule(config, "ddim", 1).alphas_cumprod[timesteps].float()[:, None, None, None, None]
+    return signal.sqrt(), (1 - signal).sqrt()
+
+
+def knowing(clean: Tensor, config: dict) -> Callable[[Tensor, Tensor], Tensor]:
+    """A denoiser that knows the clean latents: its velocity is α ε − σ x₀ with the noise that it must have been."""
+
+    def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
+        alpha, sigma = levels(config, timesteps)
+        return alpha * (latents - alpha * clean) / sigma - sigma * clean
+
+    return predict
+
+
+def expecting(spread: float, config: dict) -> Callable[[Tensor, Tensor], Tensor]:
+    """The best denoiser of Gaussian latents of this standard deviation."""
+
+    def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
+        alpha, sigma = levels(config, timesteps)
+        variance = alpha.square() * spread**2 + sigma.square()
+        return alpha * sigma * (1 - spread**2) / variance * latents
+
+    return predict
+
+
+def drawn(seeds: list[int]) -> tuple[Tensor, list[torch.Generator]]:
+    generators = generators_of(seeds)
+    return noise_like(torch.zeros(len(seeds), *SHAPE), generators), generators
+
+
+@CONFIGS
+@EVERY
+@STEPS
+def test_a_denoiser_that_knows_the_clean_latents_is_asked_once_a_step_and_brings_them_back(config, sampler, steps):
+    clean, asked = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4)), []
+    knows = knowing(clean, config)
+
+    def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
+        asked.append(timesteps)
+        return knows(latents, timesteps)
+
+    noise, generators = drawn([0, 1])
+    assert noise.abs().max() < 5
+    found = denoise(predict, noise, config, sampler, steps, generators)
+    assert torch.allclose(found, clean, rtol=0, atol=TOLERANCE)
+    assert len(asked) == steps
+    assert {int(each) for part in asked for each in part} <= set(range(1000))
+
+
+@EVERY
+@pytest.mark.parametrize("steps", [4, 7, 50, 61])
+def test_a_model_that_predicts_clean_latents_is_sampled_alike(sampler, steps):
+    clean = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4))
+    noise, generators = drawn([0, 1])
+    config = TINY | {"prediction_type": "sample"}
+    assert torch.allclose(denoise(lambda *_: clean, noise, config, sampler, steps, generators), clean, atol=1e-6)
+
+
+@CONFIGS
+@EVERY
+@pytest.mark.parametrize("steps", [4, 7, 50, 61])
+def test_the_last_step_leaves_no_noise(config, sampler, steps):
+    cleaned = []
+    schedule = make_schedule(config, "ddim", 1)
+
+    def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
+        alpha, sigma = levels(config, timesteps)
+        velocity = torch.sin(3 * latents) + schedule.alphas_cumprod[timesteps[0]].float() * 0.3
+        cleaned.append(alpha * latents - sigma * velocity)
+        return velocity
+
+    noise, generators = drawn([0, 1])
+    found = denoise(predict, noise, config, sampler, steps, generators)
+    assert torch.allclose(found, cleaned[-1], rtol=0, atol=TOLERANCE)
+
+
+@EVERY
+@pytest.mark.parametrize("steps", [1, 4, 10])
+def test_a_sample_depends_on_its_seed_and_not_on_its_batch(sampler, steps):
+    def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
+        return torch.sin(3 * latents)
+
+    def denoised(seeds: list[int]) -> Tensor:
+        noise, generators = drawn(seeds)
+        return denoise(predict, noise, TINY, sampler, steps, generators)
+
+    together, alone, other = denoised([3, 4, 5]), denoised([4]), denoised([6])
+    assert torch.allclose(together[1], alone[0], atol=1e-6)
+    assert (alone - other).abs().max() > 0.1
+
+
+@CONFIGS
+@pytest.mark.parametrize("sampler", MULTISTEP)
+@pytest.mark.parametrize("steps", [10, 50, 1000])
+def test_a_multistep_sampler_has_the_noise_levels_of_training(config, sampler, steps):
+    trained, schedule = make_schedule(config, "ddim", steps), make_schedule(config, sampler, steps)
+    signal = trained.alphas_cumprod
+    assert torch.allclose(schedule.alphas_cumprod[:-1].double(), signal[:-1], rtol=1e-5, atol=0)
+    assert schedule.alphas_cumprod[-1] == 2**-24
+    assert torch.equal(schedule.timesteps, trained.timesteps)
+    sigmas = ((1 - signal) / signal).sqrt()[trained.timesteps[1:]]
+    assert torch.allclose(schedule.sigmas[1:-1].double(), sigmas, rtol=1e-4, atol=0)
+    assert schedule.sigmas[-1] == 0
+
+
+@pytest.mark.parametrize("sampler", MULTISTEP)
+def test_a_schedule_without_zero_terminal_snr_stays_so(sampler):
+    config = SHIFTED | {"rescale_betas_zero_snr": False}
+    trained, schedule = make_schedule(config, "ddim", 10), make_schedule(config, sampler, 10)
+    assert torch.allclose(schedule.alphas_cumprod.double(), trained.alphas_cumprod, rtol=1e-5, atol=0)
+
+
+@CONFIGS
+@pytest.mark.parametrize("steps", [6, 10, 20])
+def test_multistep_samplers_stay_nearer_to_the_flow_than_ddim(config, steps):
+    errors = {sampler: distance_from_flow(0.4, config, sampler, steps) for sampler in ("ddim", *MULTISTEP)}
+    assert all(errors[sampler] < errors["ddim"] / 2 for sampler in MULTISTEP), errors
+
+
+def distance_from_flow(spread: float, config: dict, sampler: str, steps: int) -> float:
+    """Of the latents before the last step; Gaussian latents flow from pure noise along √(α² spread² + σ²) · noise."""
+    expects, distances = expecting(spread, config), []
+    noise, generators = drawn([0, 1])
+
+    def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
+        alpha, sigma = levels(config, timesteps)
+        distances.append(float((latents - (alpha.square() * spread**2 + sigma.square()).sqrt() * noise).std()))
+        return expects(latents, timesteps)
+
+    denoise(predict, noise, config, sampler, steps, generators)
+    return distances[-1]
+
+
+def test_an_unknown_sampler_or_number_of_steps_is_one_line():
+    with pytest.raises(PersistError, match=r"^unknown sampler 'euler'; known: ddim, dpm, unipc, dpm\+\+$"):
+        make_schedule(TINY, "euler", 4)
+    for steps in (0, 1001):
+        with pytest.raises(PersistError, match=f"^{steps} denoising steps; it must be 1 to 1000$"):
+            make_schedule(TINY, "unipc", steps)
