@@ -32,12 +32,13 @@ class AdapterSettings:
             first included.
         width: channels of the tokens inside the blocks, or of the canvas at a video token.
         heads: attention heads (``cross`` and ``projected``).
-        ff_factor: hidden width of the feed-forward over the video's (``cross`` and ``projected``).
+        ff_factor: hidden width of the feed-forward over the video's; 0 leaves it out (``canvas`` alone).
         frequencies: of the position code, for each axis (``cross`` and ``projected``).
         positions: ``relative`` to the first camera of the clip, or ``absolute`` as in the paper (``cross`` alone).
         canvas_channels: features of a token as drawn (``canvas``).
+        canvas_scale: pixels of the canvas along the edge of a latent pixel (``canvas``).
         token_size: edge in metres of what a token stands for (``canvas``); 0 draws points.
-        splat_pixels: most latent pixels along the edge of a drawn token, odd (``canvas``); 1 draws points.
+        splat_pixels: most canvas pixels along the edge of a drawn token, odd (``canvas``); 1 draws points.
         token_budget: most tokens read for a clip.
         dropout: part of the training samples that see no memory, for guidance over memory.
     """
@@ -50,6 +51,7 @@ class AdapterSettings:
     frequencies: PositiveInt = 10
     positions: Literal["relative", "absolute"] = "relative"
     canvas_channels: PositiveInt = 32
+    canvas_scale: PositiveInt = 1
     token_size: NonNegativeFloat = 0.25
     splat_pixels: PositiveInt = 5
     token_budget: int = 256

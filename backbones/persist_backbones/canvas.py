@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape, refuse_absolute
@@ -14,12 +15,46 @@ from persist_cli.world.errors import CheckpointError
 from persist_cli.world.tokens import MemoryTokens
 
 
+class CanvasBlock(nn.Module):
+    """Adds to each video token what the canvas shows there, linearly and by a feed-forward of both.
+
+    Args:
+        channels: of the video's hidden states.
+        width: of the canvas.
+        ff_factor: hidden width of the feed-forward over the video's; 0 leaves it out.
+    """
+
+    def __init__(self, channels: int, width: int, ff_factor: float) -> None:
+        super().__init__()
+        hidden = int(channels * ff_factor)
+        self.out = nn.Linear(width, channels, bias=False)
+        self.norm = nn.LayerNorm(channels, elementwise_affine=False)
+        self.up = nn.Linear(channels + width, hidden, bias=False) if hidden else None
+        self.down = nn.Linear(hidden, channels, bias=False) if hidden else None
+        for layer in (self.out, self.down):
+            if layer is not None:
+                nn.init.zeros_(layer.weight)
+
+    def forward(
+        self,
+        video: Float[Tensor, "batch token channel"],
+        canvas: Float[Tensor, "batch token width"],
+        mask: Bool[Tensor, "batch token"],
+    ) -> Float[Tensor, "batch token channel"]:
+        """The video with the canvas added where the mask is true, unchanged elsewhere."""
+        added: Tensor = self.out(canvas)
+        if self.up is not None and self.down is not None:
+            both = torch.cat([self.norm(video), canvas.to(video.dtype)], dim=-1)
+            added = added + self.down(F.gelu(self.up(both), approximate="tanh"))
+        return video + (added * mask[..., None]).to(video.dtype)
+
+
 class CanvasAdapter(Adapter):
     """Tokens splatted with a z-buffer into the view of each frame, embedded like patches and added.
 
-    The views have the latents' size; frames are folded into channels as the camera latents are. Nothing after the
-    drawing has a bias and every activation keeps zero, so a video token on whose pixels no memory token falls is
-    that of stage 1 to the bit, before and after training alike.
+    The views have the latents' size times ``canvas_scale``; frames are folded into channels as the camera latents
+    are. Nothing after the drawing has a bias and every activation keeps zero, so a video token on whose pixels no
+    memory token falls is that of stage 1 to the bit, before and after training alike.
     """
 
     def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
@@ -28,26 +63,23 @@ class CanvasAdapter(Adapter):
         if settings.splat_pixels % 2 == 0:
             raise CheckpointError(f"splat_pixels must be odd, not {settings.splat_pixels}")
         drawn = settings.canvas_channels
-        self.embed = nn.Sequential(nn.Linear(channels, drawn), nn.LayerNorm(drawn))
-        self.patches = nn.Linear((drawn + 2) * video.temporal * video.patch**2, settings.width, bias=False)
-        self.outs = nn.ModuleDict(
-            {
-                str(layer): nn.Linear(settings.width, video.channels, bias=False)
-                for layer in range(0, video.layers, settings.every)
-            }
+        self.embed = nn.Linear(channels, drawn)
+        self.patch = video.patch * settings.canvas_scale
+        self.patches = nn.Linear((drawn + 2) * video.temporal * self.patch**2, settings.width, bias=False)
+        layers = range(0, video.layers, settings.every)
+        self.blocks = nn.ModuleDict(
+            {str(layer): CanvasBlock(video.channels, settings.width, settings.ff_factor) for layer in layers}
         )
-        for parameter in self.outs.parameters():
-            nn.init.zeros_(parameter)
 
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
         """Draw the tokens, fold frames, and embed the patch of each video token; the mask says where one fell."""
-        patches = patchify(fold_frames(self.draw(tokens, cameras), self.video.temporal), self.video.patch)
+        patches = patchify(fold_frames(self.draw(tokens, cameras), self.video.temporal), self.patch)
         return PreparedMemory(F.gelu(self.patches(patches)), patches.detach().ne(0).any(dim=-1))
 
     def draw(self, tokens: MemoryTokens, cameras: Cameras) -> Float[Tensor, "batch frame channel height width"]:
         """What each frame's camera sees of the memory: embedded features, coverage and log depth."""
-        spatial = self.video.spatial
-        views = cameras.resized(cameras.height // spatial, cameras.width // spatial)
+        height, width = (side // self.video.spatial for side in (cameras.height, cameras.width))
+        views = cameras.resized(height * self.settings.canvas_scale, width * self.settings.canvas_scale)
         splats = place(tokens.positions, tokens.mask, views, self.settings.token_size, self.settings.splat_pixels)
         batch, frames = tokens.mask.shape[0], views.world_from_camera.shape[1]
         features = self.embed(tokens.features.to(self.patches.weight.dtype))
@@ -55,10 +87,10 @@ class CanvasAdapter(Adapter):
 
     def before_block(self, layer: int, video: Tensor, memory: PreparedMemory) -> Tensor:
         """The canvas added before this layer, where it is."""
-        if str(layer) not in self.outs:
+        if str(layer) not in self.blocks:
             return video
-        added: Tensor = self.outs[str(layer)](memory.tokens * memory.mask[..., None])
-        return video + added.to(video.dtype)
+        changed: Tensor = self.blocks[str(layer)](video, memory.tokens, memory.mask)
+        return changed
 
 
 def patchify(

@@ -81,12 +81,33 @@ def place(
     middle, depth = middles[sample, frame, token], depth[sample, frame, token]
     focal = views.intrinsics.double().diagonal(dim1=-2, dim2=-1)[sample, frame, :2]
     half = 0.5 * token_size * focal / depth[:, None]
-    line = torch.arange(-reach, reach + 1, device=depth.device)
+    spans = (half.amax(-1) + 0.5 + SNAP).floor().clamp(max=reach).long()  # pixels reached on each side
+    parts = []
+    for span in range(reach + 1):
+        alike = (spans == span).nonzero()[:, 0]
+        pixel, number = _squares(middle[alike], half[alike], span, (views.height, views.width))
+        entry = alike[number]
+        parts.append(((sample * frames + frame)[entry] * (views.height * views.width) + pixel, entry))
+    pixel, entry = (torch.cat(each) for each in zip(*parts, strict=True))
+    return Splats(pixel, (sample * positions.shape[1] + token)[entry], depth[entry])
+
+
+def _squares(
+    middle: Float[Tensor, "entry 2"], half: Float[Tensor, "entry 2"], reach: int, size: tuple[int, int]
+) -> tuple[Int[Tensor, " splat"], Int[Tensor, " splat"]]:
+    """Pixels, counted along rows, whose middle a square covers, and that of its own middle; and whose they are.
+
+    Args:
+        middle: column and row of each square.
+        half: of its edges, in columns and rows.
+        reach: pixels that any of them reaches on each side.
+        size: height and width of the image.
+    """
+    line = torch.arange(-reach, reach + 1, device=middle.device)
     steps = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).flatten(0, 1)
     corner = (middle + SNAP).floor()[:, None] + steps  # column and row of each pixel that the square may cover
     covered = ((corner + 0.5 - middle[:, None]).abs() + SNAP <= half[:, None]).all(-1) | (steps == 0).all(-1)
-    inside = ((corner >= 0) & (corner < size)).all(-1)
+    inside = ((corner >= 0) & (corner < corner.new_tensor([size[1], size[0]]))).all(-1)
     entry, number = (covered & inside).nonzero(as_tuple=True)
     column, row = corner[entry, number].long().unbind(-1)
-    pixel = ((sample * frames + frame)[entry] * views.height + row) * views.width + column
-    return Splats(pixel, (sample * positions.shape[1] + token)[entry], depth[entry])
+    return row * size[1] + column, entry

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from pydantic import PositiveFloat
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from persist_cli.world.cameras import Cameras
@@ -21,15 +21,17 @@ class Map2DSettings(GridSettings):
 
     Args:
         cell: metres along the two axes of the ground.
+        eye_height: metres from the ground to the camera; tokens lie that far below the first camera that asks.
     """
 
     cell: tuple[PositiveFloat, PositiveFloat] = (0.25, 0.25)
+    eye_height: NonNegativeFloat = 0.0
 
 
 class Map2D(GridMemory):
     """Features pooled over all heights into cells of the ground plane.
 
-    It knows no height: tokens stand at the height of the first camera that asks.
+    It knows no height: tokens stand at the height of the first camera that asks, or on the ground below it.
     """
 
     settings_type = Map2DSettings
@@ -45,9 +47,9 @@ class Map2D(GridMemory):
         return horizontal_views(cameras, self.lattice)
 
     def heights(self, positions: Float[Tensor, "token 3"], cameras: Cameras) -> Float[Tensor, " token"]:
-        """That of the first camera."""
+        """That of the first camera, less the eye height."""
         up = self.lattice.grid_from_world[1].to(positions.device)
-        return (cameras.centers[0].double() @ up).expand(len(positions))
+        return (cameras.centers[0].double() @ up - self.settings.eye_height).expand(len(positions))
 
 
 def ground_basis(world_up: tuple[float, float, float]) -> Float[Tensor, "3 3"]:

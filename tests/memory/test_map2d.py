@@ -30,6 +30,13 @@ def test_tokens_stand_at_the_height_of_the_first_asking_camera():
     torch.testing.assert_close(tokens.positions[:, 1], observations.cameras.centers[2, 1].expand(100))
 
 
+def test_tokens_lie_on_the_ground_where_the_eye_height_is_known():
+    observations = walked()
+    tokens = written("map2d", observations, eye_height=1.2).read(observations.cameras[2:], 100)
+    ground = observations.cameras.centers[2, 1] - 1.2
+    torch.testing.assert_close(tokens.positions[:, 1], ground.expand(100))
+
+
 def test_a_camera_that_looks_straight_down_sees_all_around():
     memory = written("map2d", walked(12))
     down = observe([look((0.0, 1.4, 0.0), 0.0, -89.0)]).cameras
