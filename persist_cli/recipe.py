@@ -74,6 +74,7 @@ class TrainingSettings:
         accumulation: micro-batches that a step is split into.
         learning_rate: of AdamW, after the warm-up.
         warmup: steps of linear warm-up.
+        cooldown: steps at the end over which the learning rate falls linearly to zero.
         weight_decay: of AdamW.
         clip: largest gradient norm.
         ema: decay of the averaged weights that are kept; 0 keeps the last ones.
@@ -91,6 +92,7 @@ class TrainingSettings:
     accumulation: int = 1
     learning_rate: float = 1e-4
     warmup: int = 50
+    cooldown: int = 0
     weight_decay: float = 1e-4
     clip: float = 1.0
     ema: float = 0.999

@@ -27,7 +27,16 @@ from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError, RecipeError
 from persist_cli.world.files import write_text
 
-CHANGEABLE = {"steps", "checkpoint_every", "checkpoint_minutes", "workers", "threads", "tracker", "accumulation"}
+CHANGEABLE = {
+    "steps",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "workers",
+    "threads",
+    "tracker",
+    "accumulation",
+    "cooldown",
+}
 CODEC_BATCHES = 4  # batches that the scale of the codec's latents is measured on
 
 
@@ -43,19 +52,17 @@ def run_finetune(
         raise RecipeError(f"{name}: no data set; give --data DIR")
     run = out or Path("runs") / Path(name).stem
     check_run(run, recipe, resume)
-    if place is not None:
-        check_cacheable(recipe)
+    if place is not None and recipe.stage == "codec":
+        raise RecipeError("--cache: stage codec trains the codec, so it keeps no latents; leave it out")
     with Stop() as stop, limited_threads(recipe.training.threads):
         finetune(recipe, run, stop, place)
     if stop.signal is not None:
         sys.exit(130 if stop.signal == signal.SIGINT else 0)
 
 
-def check_cacheable(recipe: Recipe) -> None:
+def check_cacheable(recipe: Recipe, backbone: Backbone) -> None:
     """Raise a one-line error when a cache would never be read."""
-    if recipe.stage == "codec":
-        raise RecipeError("--cache: stage codec trains the codec, so it keeps no latents; leave it out")
-    if not recipe.data.clips_per_trajectory:
+    if not recipe.data.clips_per_trajectory and (recipe.stage == "2" or not backbone.frames_alone):
         raise RecipeError(
             "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
             "data.clips_per_trajectory=32, or leave --cache out"
@@ -100,8 +107,11 @@ def finetune(recipe: Recipe, run: Path, stop: Stop, place: CachePlace | None = N
     set_seed(settings.seed)
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
     maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
+    backbone = prepare_backbone(recipe, base, maker)
+    if place is not None:
+        check_cacheable(recipe, backbone)
     cache = None if place is None else Cache(place)
-    trainer = Trainer(recipe, prepare_backbone(recipe, base, maker), maker, accelerator, cache)
+    trainer = Trainer(recipe, backbone, maker, accelerator, cache)
     load_state(run, trainer.state)
     if tracker:
         accelerator.init_trackers("persist")

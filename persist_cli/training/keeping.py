@@ -1,7 +1,9 @@
 """Clips that come again: what was made of one of them once is taken from the cache, what is missing is made and kept.
 
 Everything is made of one clip alone, never of a batch, so that it does not depend on which clips stand beside it: a
-step of cached clips equals one of clips that are encoded on the spot.
+step of cached clips equals one of clips that are encoded on the spot. Where a codec codes every frame alone, latents
+are kept of whole trajectories instead and serve every clip that can be cut from them, at any stride; such a step equals
+one without a cache up to the rounding of larger batches.
 """
 
 from __future__ import annotations
@@ -61,6 +63,11 @@ class Dependencies:
         return Dependencies(latents, made_by | memory)
 
 
+def rows_of(latents: Tensor, choice: ClipChoice, whole: bool) -> Tensor:
+    """The clip's latents, its first frame's repeated at the end, of those of its ``whole`` trajectory or its own."""
+    return latents[[*choice.frames, choice.frames[0]]] if whole else latents
+
+
 class KeptClips(Dataset[ClipSample]):
     """Clips with the latents and tokens that a cache has of them; of those, no image is read.
 
@@ -68,10 +75,11 @@ class KeptClips(Dataset[ClipSample]):
         clips: the clips.
         cache: where latents and tokens are.
         given: what they depend on besides the clip.
+        whole: whether latents are those of whole trajectories.
     """
 
-    def __init__(self, clips: ClipDataset, cache: Cache, given: Dependencies) -> None:
-        self.clips, self.cache, self.given = clips, cache, given
+    def __init__(self, clips: ClipDataset, cache: Cache, given: Dependencies, whole: bool = False) -> None:
+        self.clips, self.cache, self.given, self.whole = clips, cache, given, whole
         self.hashes: dict[Path, str] = {}
 
     def __getitem__(self, number: int) -> ClipSample:
@@ -82,7 +90,7 @@ class KeptClips(Dataset[ClipSample]):
         sample = self.clips.read(choice, images=latents is None, context=tokens is None)
         return replace(
             sample,
-            latents=None if latents is None else latents["latents"],
+            latents=None if latents is None else rows_of(latents["latents"], choice, self.whole),
             tokens=None if tokens is None else MemoryTokens(**tokens),
             keys=keys,
         )
@@ -90,7 +98,7 @@ class KeptClips(Dataset[ClipSample]):
     def keys(self, choice: ClipChoice) -> tuple[str, str]:
         """Names of the clip's latents and of its tokens."""
         clip = {"trajectory": self.trajectory(choice.file.path), "frames": list(choice.frames)}
-        latents = name_of(clip | self.given.latents)
+        latents = name_of((clip | {"frames": "all"} if self.whole else clip) | self.given.latents)
         return latents, name_of(clip | {"context": list(choice.context)} | (self.given.tokens or {}))
 
     def trajectory(self, path: Path) -> str:
@@ -120,8 +128,9 @@ class Keeper:
     def of(
         recipe: Recipe, backbone: Backbone, maker: MemoryMaker | None, accelerator: Accelerator, cache: Cache | None
     ) -> Keeper | None:
-        """The keeper of a run; ``None`` when no clip comes again or its stage trains what encodes."""
-        if not recipe.data.clips_per_trajectory or backbone.encoding(recipe.stage) is None:
+        """The keeper of a run; ``None`` when nothing comes again or its stage trains what encodes."""
+        again = recipe.data.clips_per_trajectory or (cache is not None and backbone.frames_alone)
+        if not again or backbone.encoding(recipe.stage) is None:
             return None
         return Keeper(backbone, maker, accelerator, cache)
 
@@ -146,11 +155,16 @@ class Keeper:
         """The clip's latents, found or made."""
         if sample.latents is not None:
             return sample.latents
+        choice = sample.choice
+        whole = self.backbone.frames_alone and self.cache is not None and choice is not None
+        if whole and choice is not None:
+            sample = replace(sample, observations=choice.file.read().observations)
         with torch.no_grad(), self.accelerator.autocast():
             latents = self.backbone.encode(collate([sample], None, 0))[0].cpu()
+        latents = latents[:-1] if whole else latents
         if self.cache is not None and sample.keys is not None:
             self.cache.put(sample.keys[0], {"latents": latents})
-        return latents
+        return rows_of(latents, choice, whole) if choice is not None else latents
 
     def tokens(self, sample: ClipSample) -> MemoryTokens | None:
         """What a memory of the clip's context says, found or made."""

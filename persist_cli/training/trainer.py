@@ -96,7 +96,8 @@ class Trainer:
         clips = ClipDataset(Path(recipe.data.path), plan)
         if cache is None:
             return clips
-        return KeptClips(clips, cache, Dependencies.of(recipe, backbone, self.maker, self.accelerator.device))
+        given = Dependencies.of(recipe, backbone, self.maker, self.accelerator.device)
+        return KeptClips(clips, cache, given, whole=backbone.frames_alone)
 
     def loader(self) -> Iterator[Clips]:
         """Batches of this process from the state's step to the last."""
@@ -132,9 +133,11 @@ class Trainer:
         )
 
     def learning_rate(self, step: int) -> float:
-        """Linear warm-up to the recipe's rate."""
+        """The recipe's rate after a linear warm-up, until a linear cool-down to zero."""
         settings = self.recipe.training
-        return settings.learning_rate * min(1.0, (step + 1) / max(1, settings.warmup))
+        rising = (step + 1) / max(1, settings.warmup)
+        falling = (settings.steps - step) / (settings.cooldown + 1)
+        return settings.learning_rate * min(1.0, rising, falling)
 
     def steps(self) -> Iterator[dict[str, float]]:
         """Train; after each optimizer step its logged values."""

@@ -50,6 +50,7 @@ class ClipSample:
         latents: what ``Backbone.encode`` gives of this clip alone, without a batch axis, where it is known.
         tokens: what a memory of the context says to the clip's cameras, where it is known.
         keys: names of the latents and of the tokens in a cache, if there is one.
+        choice: which frames it is made of, for those who keep more than this clip.
     """
 
     observations: Observations
@@ -60,6 +61,7 @@ class ClipSample:
     latents: Tensor | None = None
     tokens: MemoryTokens | None = None
     keys: tuple[str, str] | None = None
+    choice: ClipChoice | None = None
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,7 @@ class ClipDataset(Dataset[ClipSample]):
             context=file.read(wanted).observations if wanted else None,
             info=file.info,
             seed=choice.seed,
+            choice=choice,
         )
 
     def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:

@@ -202,23 +202,28 @@ class TrajectoryFile:
 class Store:
     """A data set: the trajectories of one folder, in the order of their names.
 
+    A folder that holds no trajectory but data sets stands for all of them together.
+
     Args:
         folder: what a killed writer left aside in it is ignored.
 
     Raises:
-        DataError: when the folder is missing or holds no trajectory.
+        DataError: when the folder is missing, holds no trajectory, or two of one name.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder)
         if not self.folder.is_dir():
             raise DataError(f"{self.folder}: no such data set folder")
-        found = sorted(path for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(ASIDE))
+        found = _trajectories(self.folder, f"*{SUFFIX}") or _trajectories(self.folder, f"*/*{SUFFIX}")
         if not found:
             raise DataError(
                 f"{self.folder}: no trajectory in it (*{SUFFIX}); `persist collect` or `import` writes some"
             )
         self._files = {file.name: file for file in map(TrajectoryFile, found)}
+        for path in found:
+            if self._files[path.stem].path != path:
+                raise DataError(f"{path}: {self._files[path.stem].path} has the same name")
         self.names = list(self._files)
 
     def __len__(self) -> int:
@@ -239,6 +244,12 @@ class Store:
                 f"{self.folder}: has {len(self)} trajectories (0-{len(self) - 1}), there is no number {key}"
             )
         return self._files[self.names[key]]
+
+
+def _trajectories(folder: Path, pattern: str) -> list[Path]:
+    """Files that match, in the order of their names, without those that a writer left aside."""
+    found = [path for path in folder.glob(pattern) if not path.name.startswith(ASIDE)]
+    return sorted(found, key=lambda path: (path.name, path))
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from persist_cli.training.cache import Cache, CachePlace, name_of
 from persist_cli.training.keeping import Dependencies, KeptClips
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan
 from persist_cli.world.files import read_tensors
-from tests.walking import SIZE, stage, together, train
+from tests.walking import MICRO_SETTINGS, SIZE, stage, together, train
 
 FEW = "data.clips_per_trajectory=3"
 
@@ -41,6 +41,22 @@ def test_cached_steps_equal_uncached_ones_to_the_bit(persist, walks, stage1, tmp
         assert same(tmp_path / "without", tmp_path / name)
     assert found(tmp_path / "without") == 0
     assert found(tmp_path / "cold") < found(tmp_path / "warm") == 1
+
+
+STILL = "backbone.settings.vae={block_out_channels: [8, 8, 8], norm_num_groups: 4, latent_channels: 4, "
+ALONE = ["base=null", *MICRO_SETTINGS, STILL + "temporal_compression_ratio: 1}"]
+
+
+def test_where_frames_are_coded_alone_the_latents_of_a_trajectory_serve_all_its_clips(persist, walks, tmp_path):
+    cache = ["--cache", tmp_path / "cache"]
+    assert persist(*stage("stage1", walks, tmp_path / "without", *ALONE, "data.strides=[1]")).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "cold", *ALONE, "data.strides=[1]", *cache)).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "other", *ALONE, "data.strides=[2]", *cache)).code == 0
+    assert len(entries(tmp_path / "cache")) == 2  # trajectories
+    assert found(tmp_path / "other") == 1
+    logs = [(tmp_path / run / "log.jsonl").read_text().splitlines() for run in ("without", "cold")]
+    for one, two in zip(*logs, strict=True):
+        assert json.loads(one)["loss"] == pytest.approx(json.loads(two)["loss"], rel=1e-4)
 
 
 @pytest.mark.slow

@@ -91,6 +91,16 @@ def test_a_store_lists_its_trajectories_by_name_and_number(tmp_path: Path) -> No
     assert store[1] is store["b"]
 
 
+def test_a_folder_of_data_sets_is_all_of_them_together(tmp_path: Path) -> None:
+    for name in ("z/a", "y/b", "z/c"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write_trajectory(tmp_path / f"{name}.parquet", INFO, make_frames(2))
+    assert Store(tmp_path).names == ["a", "b", "c"]
+    write_trajectory(tmp_path / "y" / "a.parquet", INFO, make_frames(2))
+    with pytest.raises(DataError, match=r"a\.parquet has the same name"):
+        Store(tmp_path)
+
+
 @pytest.mark.parametrize("frames", [slice(0, 21), [20], [-1], [], slice(4, 4)])
 def test_frames_outside_a_trajectory_are_named(path: Path, frames: slice | list[int]) -> None:
     with pytest.raises(DataError, match=r"one\.parquet: (has 20 frames|no frames asked for)"):
