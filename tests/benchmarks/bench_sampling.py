@@ -1,0 +1,257 @@
+"""Quality against seconds for each sampler and number of steps, and what each memory costs beside none.
+
+    python tests/benchmarks/bench_sampling.py --checkpoint runs/none runs/voxel --data runs/test --out runs/sampling
+
+Prints two tables, asserts nothing; ``--out`` keeps them as ``sampling.json`` and the curve as ``sampling.png``. The
+clips are those of ``persist eval --protocol revisit``, one at a time as in a rollout, and all settings take turns on
+each. Without a checkpoint a tiny model of random weights stands in: its seconds say something, its quality nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
+
+from persist_cli.checkpoints import find_checkpoint, load_backbone, save_adapter, save_base
+from persist_cli.evaluation.cases import Case, CaseFrames, read_case
+from persist_cli.evaluation.measuring import Measurer, choose_metrics, make_setup
+from persist_cli.evaluation.protocols import PROTOCOLS
+from persist_cli.evaluation.protocols.protocol import Selected
+from persist_cli.evaluation.provenance import checkpoint_json, environment, metric_json
+from persist_cli.evaluation.rows.choice import FORGETFUL, PLAIN, RowChoice, make_rows
+from persist_cli.evaluation.rows.model import ModelRow
+from persist_cli.evaluation.run import Backbones
+from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.metrics import METRICS
+from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.registry import make_backbone
+from persist_cli.rollout.world_model import WorldModel, clip_seed, imagine_together
+from persist_cli.viewing.console import print_table, say, watched
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import write_json, written_aside
+from persist_cli.world.observations import Observations
+from tests.benchmarks.timing import Times, say_conditions, write_walks
+
+PROTOCOL = PROTOCOLS["revisit"]
+FIGURES = ("psnr", "lpips-alex")
+STAND_IN = ("none", "voxel")  # memories of the model of random weights
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What is measured.
+
+    Args:
+        rows: one for each adapter of the checkpoints, and one without.
+        row: whose clips are sampled in every way.
+        samplings: the ways; times are told as ratios to the first.
+        cases: the clips.
+        measurer: of their quality.
+        backbones: that make them.
+    """
+
+    rows: Sequence[ModelRow]
+    row: ModelRow
+    samplings: Sequence[Sampling]
+    cases: Sequence[Case]
+    measurer: Measurer
+    backbones: Backbones
+
+    def start(self, row: ModelRow, number: int) -> tuple[WorldModel, CaseFrames]:
+        """The row's world model at the beginning of a clip, its memory filled, and the clip."""
+        backbone, clip = self.backbones.ready(row), read_case(self.cases[number])
+        return row.start(backbone, clip, clip_seed(0, number)), clip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parse(arguments)
+    say_conditions("one clip at a time, all settings taking turns on each")
+    with TemporaryDirectory() as folder:
+        if not options.checkpoint:
+            stand_in(Path(folder), options)
+        bench = make_bench(options)
+        samplers, memories = compare_samplers(bench), compare_memories(bench)
+    show(bench, samplers, memories)
+    if options.out:
+        options.out.mkdir(parents=True, exist_ok=True)
+        results = {"samplers": samplers, "memories": memories} | conditions(bench)
+        write_json(options.out / "sampling.json", results)
+        draw(samplers, bench.measurer, options.out / "sampling.png")
+        say(f"written to {options.out / 'sampling.json'} and {options.out / 'sampling.png'}")
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", type=Path, nargs="+", default=[], help="finetune runs or checkpoints")
+    parser.add_argument("--data", type=Path, nargs="+", default=[], help="data sets of held-out scenes")
+    parser.add_argument("--clips", type=int, default=16, help="most clips")
+    parser.add_argument("--adapter", help="memory that the samplers are compared with; voxel when there is one")
+    parser.add_argument("--samplers", default="", help="separated by commas; all, ddim first, when not given")
+    parser.add_argument("--steps", default="50,20,10,4", help="separated by commas")
+    parser.add_argument("--out", type=Path, help="folder for sampling.json and sampling.png")
+    options = parser.parse_args(arguments)
+    if bool(options.checkpoint) != bool(options.data):
+        parser.error("--checkpoint and --data go together")
+    return options
+
+
+def stand_in(folder: Path, options: argparse.Namespace) -> None:
+    """A tiny model of random weights and walks in its size, for one clip."""
+    options.checkpoint = fresh_model(folder, {})
+    options.data, options.clips = [write_walks(folder / "walks", 64, trajectories=1)], 1
+
+
+def fresh_model(folder: Path, settings: dict[str, Any]) -> list[Path]:
+    """Checkpoints of an untrained model with an adapter for each memory of ``STAND_IN``."""
+    (folder / "base").mkdir()
+    backbone = make_backbone("cogvideox", settings)
+    save_base(backbone, folder / "base")
+    for name in STAND_IN:
+        recipe = make_recipe(read_recipe(f"tiny-stage2-{name}"), name)
+        assert recipe.memory is not None
+        backbone.add_adapter(name, MemoryMaker.of(recipe.memory).encoder.channels, recipe.adapter)
+        (folder / name).mkdir()
+        save_adapter(backbone, find_checkpoint(folder / "base"), recipe.memory, folder / name, folder / name)
+    return [folder / name for name in STAND_IN]
+
+
+def make_bench(options: argparse.Namespace) -> Bench:
+    checkpoints = [find_checkpoint(path) for path in options.checkpoint]
+    backbone = load_backbone(checkpoints[0])
+    samplers = options.samplers.split(",") if options.samplers else backbone.samplers
+    samplings = [Sampling(int(steps), sampler) for sampler in samplers for steps in options.steps.split(",")]
+    cases = PROTOCOL.find(Selected(options.data, 0, options.clips, backbone.frames_per_clip - 1))
+    adapters = sorted({name for each in checkpoints for name in each.adapters})
+    rows = make_rows(checkpoints, RowChoice([PLAIN, *adapters], (), samplings[0]), PROTOCOL, cases)
+    models = [row for row in rows if isinstance(row, ModelRow)]
+    wanted = options.adapter or next((name for name in ("voxel", *adapters) if name in adapters), None)
+    row = next((row for row in models if row.adapter == wanted), None)
+    if row is None:
+        raise CheckpointError(f"no checkpoint has a memory adapter {wanted!r}; there are: {', '.join(adapters)}")
+    measurer = Measurer.of(choose_metrics(FIGURES, METRICS), make_setup(cases))
+    return Bench(models, row, samplings, cases, measurer, Backbones(backbone, checkpoints[0]))
+
+
+def imagine(model: WorldModel, clip: CaseFrames) -> tuple[float, Observations]:
+    """Seconds that a clip took, its memory read and its frames decoded, and the frames with the given one."""
+    first = clip.observations[:1]
+    model.reset(first, clip.info)
+    start = time.perf_counter()
+    parts = [part[0] for part in imagine_together([model], [clip.observations.cameras[1:]], [clip.interactions])]
+    return time.perf_counter() - start, Observations.concatenate([first, *parts])
+
+
+def compare_samplers(bench: Bench) -> list[dict[str, Any]]:
+    """Seconds a clip, their ratio to the first sampling's, and figures of the predicted frames, for each sampling."""
+    names = [f"{each.sampler} {each.steps}" for each in bench.samplings]
+    seconds: dict[str, list[float]] = {name: [] for name in names}
+    figures: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for number in watched(range(len(bench.cases)), "samplers", "clip"):
+        model, clip = bench.start(bench.row, number)
+        if number == 0:
+            model.sampling = Sampling(1)
+            imagine(model, clip)  # does not count
+        for name, model.sampling in zip(names, bench.samplings, strict=True):
+            took, seen = imagine(model, clip)
+            seconds[name].append(took)
+            figures[name].append(bench.measurer.figures(seen.rgb, seen.depth, clip, name)[1:].mean(0).numpy())
+    times = Times({name: np.array(values) for name, values in seconds.items()})
+    return [
+        {"sampler": each.sampler, "steps": each.steps, "seconds": times.median(name)}
+        | {"ratio": times.ratio(name, names[0])}
+        | dict(zip(bench.measurer.by_frame, np.mean(figures[name], axis=0).tolist(), strict=True))
+        for name, each in zip(names, bench.samplings, strict=True)
+    ]
+
+
+def compare_memories(bench: Bench) -> list[dict[str, Any]]:
+    """Seconds to read each memory, seconds a clip of the first sampling, and their ratio to no memory's."""
+    reads: dict[str, list[float]] = {row.name: [] for row in bench.rows}
+    clips: dict[str, list[float]] = {row.name: [] for row in bench.rows}
+    for number in watched(range(len(bench.cases)), "memories", "clip"):
+        for row in bench.rows:
+            model, clip = bench.start(row, number)
+            length = model.backbone.frames_per_clip - 1
+            start = time.perf_counter()
+            model.recall(clip.observations.cameras[1 : length + 1], clip.interactions[:length])
+            reads[row.name].append(time.perf_counter() - start)
+            clips[row.name].append(imagine(model, clip)[0])
+    reading, whole = (Times({name: np.array(each) for name, each in part.items()}) for part in (reads, clips))
+    reference = next((row.name for row in bench.rows if row.adapter == FORGETFUL), bench.rows[0].name)
+    return [
+        {"memory": row.name, "read": reading.median(row.name), "seconds": whole.median(row.name)}
+        | {"ratio": whole.ratio(row.name, reference), "reference": reference}
+        for row in bench.rows
+    ]
+
+
+def show(bench: Bench, samplers: Sequence[dict[str, Any]], memories: Sequence[dict[str, Any]]) -> None:
+    """The two tables."""
+    for name, why in bench.measurer.obstacles.items():
+        say(f"{name}: n/a ({why})")
+    first = bench.samplings[0]
+    title = f"samplers, memory {bench.row.name}, clips of {bench.cases[0].frames - 1} frames: {len(bench.cases)}"
+    columns = ["sampler", "steps", "s a clip", f"time to {first.sampler} {first.steps}"]
+    rows = [
+        [each["sampler"], str(each["steps"]), f"{each['seconds']:.2f}", f"{each['ratio']:.3f}×"]
+        + [f"{each[name]:.3f}" if name in each else "n/a" for name in FIGURES]
+        for each in samplers
+    ]
+    print_table(title, columns + [METRICS[name].title for name in FIGURES], rows)
+    costs = [
+        (each["memory"], f"{1e3 * each['read']:.1f}", f"{each['seconds']:.2f}", f"{each['ratio']:.2f}×")
+        for each in memories
+    ]
+    columns = ["memory", "read, ms", "s a clip", f"time to {memories[0]['reference']}"]
+    print_table(f"memories, {first.sampler} {first.steps}", columns, costs)
+
+
+def conditions(bench: Bench) -> dict[str, Any]:
+    """What was measured where, JSON values."""
+    clips = [{"trajectory": case.trajectory, "start": case.start, "frames": case.frames} for case in bench.cases]
+    checkpoints = {row.checkpoint.folder: checkpoint_json(row.checkpoint) for row in bench.rows}
+    return {
+        "protocol": PROTOCOL.name,
+        "memory": bench.row.name,
+        "clips": clips,
+        "checkpoints": list(checkpoints.values()),
+        "metrics": metric_json(bench.measurer.by_frame),
+        "threads": torch.get_num_threads(),
+        "environment": environment(1),
+    }
+
+
+def draw(samplers: Sequence[dict[str, Any]], measurer: Measurer, path: Path) -> None:
+    """A plot for each figure: a line a sampler over seconds a clip, its dots named by their steps."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6 * len(measurer.by_frame), 4), layout="constrained")
+    plots = figure.subplots(1, len(measurer.by_frame), squeeze=False)[0]
+    for axes, (name, metric) in zip(plots, measurer.by_frame.items(), strict=True):
+        for sampler in dict.fromkeys(each["sampler"] for each in samplers):
+            dots = [each for each in samplers if each["sampler"] == sampler]
+            axes.plot([each["seconds"] for each in dots], [each[name] for each in dots], "o-", label=sampler)
+            for each in dots:
+                axes.annotate(f" {each['steps']}", (each["seconds"], each[name]))
+        axes.set(xlabel="seconds a clip", ylabel=f"{metric.title}, {metric.better} is better", xscale="log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("{x:g}")
+        axes.legend()
+    with written_aside(path) as aside:
+        figure.savefig(aside, format="png", dpi=120)
+
+
+if __name__ == "__main__":
+    main()

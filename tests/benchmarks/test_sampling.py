@@ -1,0 +1,56 @@
+import json
+
+import pytest
+from PIL import Image
+
+from persist_backbones.samplers import SAMPLERS
+from persist_cli.world.errors import CheckpointError
+from tests.benchmarks.bench_sampling import fresh_model, main
+from tests.walking import MICRO
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return fresh_model(tmp_path_factory.mktemp("model"), MICRO)
+
+
+def test_samplers_and_memories_are_compared_on_clips_that_return(model, walks, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))  # without weights of LPIPS
+    main(
+        [
+            "--checkpoint",
+            *map(str, model),
+            "--data",
+            str(walks),
+            "--clips",
+            "2",
+            "--steps",
+            "3,1",
+            "--out",
+            str(tmp_path),
+        ]
+    )
+    found = json.loads((tmp_path / "sampling.json").read_text())
+    assert [(each["sampler"], each["steps"]) for each in found["samplers"]] == [
+        (s, k) for s in SAMPLERS for k in (3, 1)
+    ]
+    assert found["samplers"][0]["ratio"] == 1.0
+    single = [each["psnr"] for each in found["samplers"] if each["steps"] == 1]
+    assert single == pytest.approx([single[0]] * len(SAMPLERS), abs=0.01)  # one step is one prediction for all of them
+    assert [each["memory"] for each in found["memories"]] == ["stage1", "none", "voxel"]
+    assert found["memories"][1]["ratio"] == 1.0
+    assert len(found["clips"]) == 2
+    assert Image.open(tmp_path / "sampling.png").width > 0
+    printed = capsys.readouterr().out
+    assert "lpips-alex: n/a (weights lpips-alex are not here" in printed
+    assert "time to ddim 3" in printed
+
+
+def test_a_memory_that_no_checkpoint_has_is_one_line(model, walks):
+    with pytest.raises(CheckpointError, match="no checkpoint has a memory adapter 'map2d'; there are: none, voxel"):
+        main(["--checkpoint", *map(str, model), "--data", str(walks), "--adapter", "map2d"])
+
+
+def test_a_checkpoint_without_data_is_refused(model):
+    with pytest.raises(SystemExit):
+        main(["--checkpoint", str(model[0])])
