@@ -3,10 +3,16 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint bench clean
+.PHONY: demo demo-train table1 test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.demo runs/demo
+	$(VENV)/bin/python -m persist_cli.demo_train runs/demo
+
+demo-train: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.demo_train runs/demo-train
+
+table1: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.table1 runs/table1
 
 test: $(STAMP) lint
 	$(VENV)/bin/python -m pytest -m "not slow and not gpu"

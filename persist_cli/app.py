@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from persist_cli import __version__
+from persist_cli.options import JsonOption
+from persist_cli.weights.app import weights_app
 from persist_cli.world.errors import PersistError
 
 app = typer.Typer(
@@ -18,8 +20,6 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -134,12 +134,35 @@ def finetune(
 
 
 @app.command()
+def export(
+    checkpoint: Annotated[Path, typer.Argument(help="A stage-1 run, or a checkpoint folder.")],
+    out: Annotated[Path, typer.Option(help="Checkpoint folder to write.")],
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="[[NAME=]RUN]...", help="Stage-2 runs on that base.")
+    ] = None,
+    dtype: Annotated[str, typer.Option(help="Of the weights: float16, bfloat16 or float32.")] = "float16",
+    default: Annotated[str | None, typer.Option(help="Adapter that is meant when none is named.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Write a base and memory adapters as one checkpoint folder that stands alone.
+
+    persist export runs/stage1 runs/none runs/voxel canvas=runs/voxel-canvas --default voxel --out runs/model
+    """
+    from persist_cli.exporting.export import ExportPlan, run_export
+
+    run_export(ExportPlan(checkpoint, runs or [], dtype, default), out, json)
+
+
+@app.command()
 def memorize(
     data: Annotated[list[str] | None, typer.Argument(metavar="DATA[#trajectory[:frames]]")] = None,
     out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
     memory: Annotated[str, typer.Option(help="A memory; `persist plugins` lists them.")] = "voxel",
-    encoder: Annotated[str, typer.Option(help="An encoder; `persist plugins` lists them.")] = "patches",
+    encoder: Annotated[str | None, typer.Option(help="An encoder; `persist plugins` lists them.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="As in memory.cell=[0.25,1,0.25].")] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="Whose adapter shall read it; the reference model when no setting is given.")
+    ] = None,
     merge: Annotated[list[Path] | None, typer.Option(help="Memory files to join: --merge A B.")] = None,
     json: JsonOption = False,
 ) -> None:
@@ -147,34 +170,37 @@ def memorize(
 
     persist memorize runs/houses#0:0-48 --memory voxel --out house.safetensors
     """
+    from persist_cli.memorizing.choice import MemorizePlan
     from persist_cli.memorizing.memorize import run_memorize, run_merge
 
     if merge:
         run_merge([*merge, *(Path(name) for name in data or [])], out, json)
     else:
-        run_memorize(data or [], memory, encoder, settings or [], out, json)
+        run_memorize(data or [], MemorizePlan(memory, encoder, settings or [], checkpoint), out, json)
 
 
 @app.command()
 def rollout(
-    checkpoint: Annotated[Path, typer.Argument(help="A finetune run, or a checkpoint folder.")],
     start: Annotated[str, typer.Option(help="Where to start: DATA#trajectory:frame.")],
     out: Annotated[Path, typer.Option(help="Folder for videos, sheets, maps and poses.")],
+    checkpoint: Annotated[
+        Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
+    ] = None,
     actions: Annotated[str | None, typer.Option(help='Actions, as in "left*4 forward*6".')] = None,
     follow: Annotated[bool, typer.Option("--follow", help="Take the trajectory's own actions.")] = False,
     frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
     memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
-    adapter: Annotated[str | None, typer.Option(help="Memory adapter; the checkpoint's own when it has one.")] = None,
+    adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
     write: Annotated[bool, typer.Option(help="Write what is generated into the memory.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 50,
-    sampler: Annotated[str, typer.Option(help="ddim or dpm.")] = "ddim",
+    sampler: Annotated[str, typer.Option(help="ddim, dpm, unipc or dpm++.")] = "ddim",
     guidance: Annotated[float, typer.Option(help="Weight of guidance over memory; 1 is none.")] = 1.0,
     json: JsonOption = False,
 ) -> None:
     """Roll out a world model from a start frame along actions, clip by clip.
 
-    persist rollout runs/voxel --start runs/houses#0:48 --actions "left*4 forward*6" --out runs/rollout
+    persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
     """
     from persist_cli.rollout.run import run_rollout
     from persist_cli.rollout.walk import RolloutPlan
@@ -189,7 +215,7 @@ def rollout(
 @app.command("eval")
 def evaluate(
     checkpoints: Annotated[
-        list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Finetune runs or checkpoints.")
+        list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Runs or checkpoints; else the reference.")
     ] = None,
     data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
     protocol: Annotated[str, typer.Option(help="revisit, return, long or unseen.")] = "revisit",
@@ -202,7 +228,7 @@ def evaluate(
     clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
     seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
     steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 50,
-    sampler: Annotated[str, typer.Option(help="ddim or dpm.")] = "ddim",
+    sampler: Annotated[str, typer.Option(help="ddim, dpm, unipc or dpm++.")] = "ddim",
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
     out: Annotated[Path, typer.Option(help="Folder for metrics.json; a stopped run goes on.")] = Path("runs/eval"),
@@ -223,8 +249,8 @@ def evaluate(
 
         run_compare(*compare, json, report)
         return
-    if not checkpoints or not data:
-        raise PersistError("give at least one CHECKPOINT and --data DATA, or --compare A.json B.json")
+    if not data:
+        raise PersistError("give --data DATA (--data sample comes with persist), or --compare A.json B.json")
     from persist_cli.evaluation.command import run_eval
     from persist_cli.evaluation.run import EvalPlan
 
@@ -233,47 +259,10 @@ def evaluate(
         metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds, steps=steps, sampler=sampler, batch=batch,
         noise=pose_noise,
     )  # fmt: skip
-    run_eval(checkpoints, plan, out, report, json)
+    run_eval(checkpoints or [], plan, out, report, json)
 
 
-weights_app = typer.Typer(no_args_is_help=True, help="Weights of encoders and metrics: what there is, fetch, path.")
 app.add_typer(weights_app, name="weights")
-
-
-@weights_app.command("list")
-def weights_list(json: JsonOption = False) -> None:
-    """List every weight with its use, licence, size and sources, and whether it is here."""
-    from persist_cli.weights.command import show_weights
-
-    show_weights(json)
-
-
-@weights_app.command("fetch")
-def weights_fetch(
-    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Weights; `persist weights list` lists them.")],
-    source: Annotated[
-        Path | None, typer.Option("--from", help="Directory to look into first; else $PERSIST_WEIGHTS.")
-    ] = None,
-    offline: Annotated[bool, typer.Option("--offline", help="Never ask the network.")] = False,
-) -> None:
-    """Bring weights into the cache, verified and as safetensors: from a directory, the hub, or a pinned archive.
-
-    persist weights fetch lpips-alex i3d-kinetics-400
-    """
-    from persist_cli.weights.fetch import run_fetch
-
-    run_fetch(names, source, offline)
-
-
-@weights_app.command("path")
-def weights_path(name: Annotated[str, typer.Argument(help="A fetched weight.")]) -> None:
-    """Print the folder of a fetched weight, and nothing else.
-
-    ls $(persist weights path lpips-alex)
-    """
-    from persist_cli.weights.command import show_path
-
-    show_path(name)
 
 
 @app.command()

@@ -21,6 +21,7 @@ from persist_cli.world.settings import parse_settings
 if TYPE_CHECKING:
     from persist_cli.world.backbone import Backbone
 
+CARD = "persist.json"
 VERSION = 1
 
 
@@ -36,6 +37,7 @@ class Checkpoint:
         settings: for the plugin.
         fingerprint: of the base's weights.
         adapters: folders of the memory adapters by name.
+        default: which of several adapters is meant when none is named.
     """
 
     folder: Path
@@ -45,6 +47,7 @@ class Checkpoint:
     settings: dict[str, Any]
     fingerprint: str
     adapters: dict[str, Path]
+    default: str | None = None
 
     def memory_choice(self, adapter: str) -> MemoryChoice:
         """What the adapter's memory is made of."""
@@ -59,7 +62,9 @@ class Checkpoint:
         return self.adapters[adapter]
 
     def default_adapter(self) -> str | None:
-        """The only adapter, or none when there is none; an error when there are several to choose from."""
+        """The card's default or the only adapter, or none when there is none; an error when one must be chosen."""
+        if self.default in self.adapters:
+            return self.default
         if len(self.adapters) > 1:
             raise CheckpointError(f"{self.folder}: choose an adapter of {', '.join(self.adapters)} with --adapter")
         return next(iter(self.adapters), None)
@@ -85,9 +90,16 @@ def find_checkpoint(path: Path) -> Checkpoint:
         if base_card["fingerprint"] != fingerprint:
             raise CheckpointError(f"{folder}: was trained on another base than the one now at {base_folder}")
         card = base_card
-    adapters = {each.name: each for each in sorted((folder / "adapters").glob("*")) if each.is_dir()}
-    name = folder.parent.parent.name if folder.name == "model" else folder.name
-    return Checkpoint(folder, name, base_folder, card["backbone"], card["settings"], fingerprint, adapters)
+    return Checkpoint(
+        folder=folder,
+        name=folder.parent.parent.name if folder.name == "model" else folder.name,
+        base_folder=base_folder,
+        backbone=card["backbone"],
+        settings=card["settings"],
+        fingerprint=fingerprint,
+        adapters={each.name: each for each in sorted((folder / "adapters").glob("*")) if each.is_dir()},
+        default=card.get("default_adapter"),
+    )
 
 
 def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
@@ -114,8 +126,12 @@ def save_base(backbone: Backbone, folder: Path) -> None:
     """Write the backbone's own files and its card into an existing folder."""
     backbone.save_base(folder)
     settings = backbone.checkpoint_settings()
-    card = {"backbone": backbone.name, "settings": settings, "fingerprint": fingerprint(folder)}
-    write_json(folder / "persist.json", {"format": "persist-checkpoint", "version": VERSION} | card)
+    write_card(folder, {"backbone": backbone.name, "settings": settings, "fingerprint": fingerprint(folder)})
+
+
+def write_card(folder: Path, card: dict[str, Any]) -> None:
+    """Write ``persist.json``, which makes a folder a checkpoint."""
+    write_json(folder / CARD, {"format": "persist-checkpoint", "version": VERSION} | card)
 
 
 def save_adapter(backbone: Backbone, base: Checkpoint, choice: MemoryChoice, folder: Path, home: Path) -> None:
@@ -134,21 +150,26 @@ def save_adapter(backbone: Backbone, base: Checkpoint, choice: MemoryChoice, fol
     write_json(adapter / "memory.json", dataclasses.asdict(choice))
     run = base.base_folder.parent.parent if base.base_folder.name == "model" else base.base_folder
     way = os.path.relpath(run.resolve(), home.resolve())
-    card = {"base": way, "fingerprint": base.fingerprint}
-    write_json(folder / "persist.json", {"format": "persist-checkpoint", "version": VERSION} | card)
+    write_card(folder, {"base": way, "fingerprint": base.fingerprint})
+
+
+def base_files(folder: Path, pattern: str) -> list[Path]:
+    """Files under a checkpoint folder in order of their names, those of adapters left out."""
+    found = (path for path in folder.rglob(pattern) if path.is_file())
+    return sorted(path for path in found if path.relative_to(folder).parts[0] != "adapters")
 
 
 def fingerprint(folder: Path) -> str:
-    """SHA-256 over every weight file under a folder, in order of their names."""
+    """SHA-256 over every weight file of a checkpoint's base, in order of their names."""
     digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*.safetensors")):
+    for path in base_files(folder, "*.safetensors"):
         digest.update(str(path.relative_to(folder)).encode())
         digest.update(bytes.fromhex(file_sha256(path)))
     return digest.hexdigest()
 
 
 def _model_folder(path: Path) -> Path:
-    if (path / "persist.json").is_file():
+    if (path / CARD).is_file():
         return path
     steps = step_folders(path)
     if not steps:
@@ -157,7 +178,7 @@ def _model_folder(path: Path) -> Path:
 
 
 def _read_card(folder: Path) -> dict[str, Any]:
-    path = folder / "persist.json"
+    path = folder / CARD
     card = read_json(path)
     if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
         raise CheckpointError(f"{path}: not the card of a persist checkpoint")

@@ -3,7 +3,10 @@ import sys
 
 import pytest
 
-COMMANDS = ("collect", "import", "inspect", "finetune", "memorize", "rollout", "eval", "weights", "plugins", "recipes")
+COMMANDS = (
+    *("collect", "import", "inspect", "finetune", "export", "memorize", "rollout", "eval"),
+    *("weights", "plugins", "recipes"),
+)
 
 
 def test_help_imports_no_torch():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from persist_cli.evaluation.processes import Processes
 from persist_cli.evaluation.provenance import checkpoint_json, command, environment, metric_json
 from persist_cli.evaluation.results import RowResults, Table
 from persist_cli.evaluation.run import EvalPlan, Evaluation, measure_rows, prepare
+from persist_cli.reference import reference_checkpoint
 from persist_cli.reporting.report import write_report
 from persist_cli.reporting.text import print_tables
+from persist_cli.trajectories.reference import data_folder
 from persist_cli.viewing.console import print_json, say
 from persist_cli.world.files import write_json
 
@@ -22,9 +25,13 @@ RESULTS = "metrics.json"
 
 
 def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | None, json: bool) -> None:
-    """Measure rows and leave ``metrics.json``, and a report where one is asked for; see ``persist eval --help``."""
+    """Measure rows and leave ``metrics.json``, and a report where one is asked for; see ``persist eval --help``.
+
+    Without paths it is the reference model's; the data set ``sample`` is that of the package.
+    """
     processes = Processes()
-    run, backbones = prepare(paths, plan, out, processes)
+    plan = replace(plan, data=tuple(data_folder(str(folder)) for folder in plan.data))
+    run, backbones = prepare(paths or [reference_checkpoint()], plan, out, processes)
     measure_rows(run, backbones, processes)
     if not processes.main:
         return

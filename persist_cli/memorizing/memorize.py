@@ -7,38 +7,37 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from torch import Tensor
 
+from persist_cli.memorizing.choice import MemorizePlan, choose_memory
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.sources import Source, common_reference, find_sources
 from persist_cli.registry import make_encoder, make_memory
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 from persist_cli.viewing.map import draw_map
-from persist_cli.world.errors import CheckpointError, RecipeError
+from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import remove_leftovers
 from persist_cli.world.memory import Memory
 
 
-def run_memorize(data: list[str], memory: str, encoder: str, settings: list[str], out: Path, json: bool) -> None:
+def run_memorize(data: list[str], plan: MemorizePlan, out: Path, json: bool) -> None:
     """Write the memory of some frames and its map from above, and say what is in it.
 
     Args:
         data: references to frames of one scene.
-        memory: name of the memory.
-        encoder: name of its encoder.
-        settings: ``memory.KEY=VALUE`` and ``encoder.KEY=VALUE``, values as in YAML.
+        plan: which memory, and what it is made of.
         out: memory file; the map is written beside it as PNG.
         json: print JSON instead of a table.
     """
     _check_out(out)
-    chosen = plugin_settings(settings)
+    chosen, origin = choose_memory(plan)
     sources = find_sources(data)
-    made = make_memory(memory, chosen["memory"], make_encoder(encoder, chosen["encoder"]), common_reference(sources))
+    encoder = make_encoder(chosen.encoder, chosen.encoder_settings)
+    made = make_memory(chosen.name, chosen.settings, encoder, common_reference(sources))
     seconds = write_sources(made, sources)
     frames = sum(len(source.frames) for source in sources)
     paths = {source.file.name: source.file.poses()[source.frames.start : source.frames.stop] for source in sources}
-    _finish(made, paths, out, json, {"frames": frames, "frames_per_second": frames / seconds})
+    _finish(made, paths, out, json, {"frames": frames, "frames_per_second": frames / seconds, "settings_of": origin})
 
 
 def run_merge(paths: list[Path], out: Path, json: bool) -> None:
@@ -59,25 +58,6 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
         except CheckpointError as error:
             raise CheckpointError(f"{paths[0]} and {path}: {error}") from error
     _finish(merged, {}, out, json, {"merged": len(paths)})
-
-
-def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Settings of the memory and of the encoder, from texts like ``memory.cell=[0.25,1,0.25]``.
-
-    Raises:
-        RecipeError: when a text is not of this form.
-    """
-    settings: dict[str, dict[str, Any]] = {"memory": {}, "encoder": {}}
-    for text in texts:
-        key, equals, value = text.partition("=")
-        kind, dot, name = key.strip().partition(".")
-        if not (equals and dot and name) or kind not in settings:
-            raise RecipeError(f"cannot read setting {text!r}; write memory.KEY=VALUE or encoder.KEY=VALUE")
-        try:
-            settings[kind][name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise RecipeError(f"cannot read the value of {text!r}: {str(error).splitlines()[0]}") from error
-    return settings
 
 
 def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
@@ -116,12 +96,14 @@ def _finish(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, 
         print_json(result)
     else:
         print_table(f"memory of {memory.reference.name}", ["", "value"], _rows(result))
+        if extra.get("settings_of"):
+            say(f"settings and encoder: those of {extra['settings_of']}")
         say(f"memory: {out}\nmap: {picture}")
 
 
 def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The result for people: large numbers grouped, bounds as ranges, paths left for a line of their own."""
-    shown = {name: value for name, value in result.items() if name not in ("file", "map")}
+    shown = {name: value for name, value in result.items() if name not in ("file", "map", "settings_of")}
     shown["bytes"] = f"{result['bytes']:,}"
     shown["cells"] = f"{result['cells']:,}"
     if result["bounds"] is None:

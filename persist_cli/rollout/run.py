@@ -12,6 +12,7 @@ import torch
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.reference import reference_checkpoint
 from persist_cli.rollout.outputs import write_outputs
 from persist_cli.rollout.walk import Rollout, RolloutPlan, Walk, plan_walk
 from persist_cli.rollout.world_model import WorldModel
@@ -23,11 +24,11 @@ from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations, TrajectoryInfo
 
 
-def run_rollout(path: Path, plan: RolloutPlan, out: Path, json: bool) -> None:
-    """Roll out and leave a folder; see ``persist rollout --help``."""
+def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> None:
+    """Roll out a checkpoint, or else the reference model, and leave a folder; see ``persist rollout --help``."""
     if (plan.actions is None) == (not plan.follow):
         raise PersistError("give either --actions TEXT or --follow")
-    checkpoint = find_checkpoint(path)
+    checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = plan.adapter or checkpoint.default_adapter()
     walk = plan_walk(plan)
     backbone = load_backbone(checkpoint)

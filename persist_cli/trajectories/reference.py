@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from persist_cli.world.observations import Trajectory
 
 FRAMES = re.compile(r"^(?P<first>\d+)(?:-(?P<end>\d+))?$")
+SAMPLE = "sample"
 FORM = "write DATA, DATA#trajectory or DATA#trajectory:frames, as in runs/houses#0:0-48"
 
 
@@ -93,11 +94,11 @@ def parse_reference(text: str) -> Reference:
     """What ``text`` means; nothing is opened yet.
 
     Args:
-        text: the trajectory is a name or a number (a name that is a number wins); frames are ``12``, or ``0-48``
-            where frame 48 is not included.
+        text: DATA is a folder, or ``sample``; the trajectory is a name or a number (a name that is a number wins);
+            frames are ``12``, or ``0-48`` where frame 48 is not included.
 
     Raises:
-        DataError: when it is not of this form.
+        DataError: when it is not of this form, or means the packaged sample and there is none.
     """
     folder, sharp, rest = text.rpartition("#")
     if not sharp:
@@ -107,7 +108,21 @@ def parse_reference(text: str) -> Reference:
         trajectory, frames = rest, ""
     if not folder or (sharp and not trajectory) or (colon and not frames):
         raise DataError(f"cannot read {text!r}; {FORM}")
-    return Reference(Path(folder), trajectory or None, _frames(frames, text) if frames else None, text)
+    return Reference(data_folder(folder), trajectory or None, _frames(frames, text) if frames else None, text)
+
+
+def data_folder(text: str) -> Path:
+    """The folder of a data set; ``sample`` is the one that comes with the package unless such a folder is here.
+
+    Raises:
+        DataError: when the packaged sample is meant and this installation has none.
+    """
+    folder = Path(text)
+    if text == SAMPLE and not folder.is_dir():
+        from persist_cli.reference import sample_data
+
+        return sample_data()
+    return folder
 
 
 def _frames(frames: str, text: str) -> slice:

@@ -171,8 +171,8 @@ def test_what_cannot_be_evaluated_is_one_line_and_leaves_nothing(persist, voxel,
 
 
 def test_eval_wants_a_checkpoint_and_data_that_are_there(persist, voxel, walks, tmp_path):
-    assert "give at least one CHECKPOINT and --data" in persist("eval", voxel).err
-    assert "give at least one CHECKPOINT and --data" in persist("eval", "--data", walks).err
+    assert "give --data DATA" in persist("eval", voxel).err
+    assert "give a CHECKPOINT" in persist("eval", "--data", walks).err
     assert "no trajectory" in persist("eval", voxel, "--data", tmp_path, "--memories", "voxel").err
 
 

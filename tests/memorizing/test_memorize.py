@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from persist_cli.app import main
-from persist_cli.memorizing.memorize import plugin_settings
+from persist_cli.memorizing.choice import plugin_settings
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.trajectories.store import Store, write_trajectory
 from persist_cli.world.errors import RecipeError

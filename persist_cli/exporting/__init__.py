@@ -1,0 +1,1 @@
+"""Whole checkpoints to give away, made of runs."""

@@ -1,0 +1,145 @@
+"""``persist export``: a stage-1 run and its memory adapters as one checkpoint folder that stands alone."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import uuid
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from persist_cli import __version__
+from persist_cli.checkpoints import CARD, Checkpoint, base_files, find_checkpoint, fingerprint, write_card
+from persist_cli.exporting.parts import Part, adapter_parts, known_recipes
+from persist_cli.viewing.console import print_json, print_table, say, watched
+from persist_cli.world.errors import CheckpointError, PersistError, hint
+from persist_cli.world.files import ASIDE, file_sha256, read_tensors, remove_leftovers, write_tensors, write_text
+
+PRECISIONS = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
+SUMS = "SHA256SUMS"
+OF_RUNS = {CARD, "recipe.yaml", SUMS}  # at the top of a checkpoint folder; an export makes its own
+
+
+@dataclass(frozen=True)
+class ExportPlan:
+    """The options of ``persist export``; see its help."""
+
+    checkpoint: Path
+    runs: Sequence[str]
+    dtype: str
+    default: str | None
+
+
+def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
+    """Write the checkpoint folder, whole or not at all, and say what is in it.
+
+    Raises:
+        PersistError: one line for whatever does not fit, and when ``out`` exists.
+    """
+    if plan.dtype not in PRECISIONS:
+        raise PersistError(f"unknown dtype {plan.dtype!r}; {hint(plan.dtype, PRECISIONS)}")
+    if out.exists():
+        raise PersistError(f"{out}: exists already; choose another --out")
+    base = find_checkpoint(plan.checkpoint)
+    parts = adapter_parts(base, plan.runs)
+    default = default_of(base, parts, plan.default)
+    with folder_aside(out) as folder:
+        card = write_checkpoint(folder, base, parts, PRECISIONS[plan.dtype])
+        write_card(folder, card | {"dtype": plan.dtype, "default_adapter": default, "exported_by": __version__})
+        files = write_sums(folder)
+    show(out, {"fingerprint": card["fingerprint"], "dtype": plan.dtype, "default_adapter": default}, files, json)
+
+
+def default_of(base: Checkpoint, parts: dict[str, Part], asked: str | None) -> str | None:
+    """The adapter that is meant when none is named: the one asked for, the checkpoint's, or the only one."""
+    if asked is None:
+        return base.default if base.default in parts else next(iter(parts)) if len(parts) == 1 else None
+    if asked not in parts:
+        raise CheckpointError(f"no adapter {asked!r} to be the default; {hint(asked, parts, 'there are')}")
+    return asked
+
+
+@contextlib.contextmanager
+def folder_aside(out: Path) -> Iterator[Path]:
+    """A temporary folder beside ``out`` that becomes it when the block ends well."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(out.parent, out.name)
+    aside = out.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{out.name}"
+    aside.mkdir()
+    try:
+        yield aside
+        aside.rename(out)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dtype: torch.dtype) -> dict[str, Any]:
+    """Write base, adapters and recipes into the folder, weights in this precision; returns what the card must say."""
+    home = base.base_folder
+    mine = [path for path in base_files(home, "*") if belongs(path.relative_to(home))]
+    jobs = [(path, folder / path.relative_to(home)) for path in mine]
+    for name, part in parts.items():
+        files = sorted(path for path in part.folder.glob("[!.]*") if path.is_file())
+        jobs += [(path, folder / "adapters" / name / path.name) for path in files]
+    for source, target in watched(jobs, "export", "file"):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            convert(source, target, dtype) if source.suffix == ".safetensors" else shutil.copyfile(source, target)
+        except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
+            raise CheckpointError(f"{source}: cannot be exported ({error.strerror})") from error
+    for name, text in known_recipes(base, parts).items():
+        (folder / "recipes").mkdir(exist_ok=True)
+        write_text(folder / "recipes" / name, text)
+    return {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(folder)}
+
+
+def belongs(path: Path) -> bool:
+    """Whether a file of a base is the backbone's, by its path in the folder: not one that every export makes anew."""
+    hidden = any(part.startswith(".") for part in path.parts)
+    return str(path) not in OF_RUNS and path.parts[0] != "recipes" and not hidden
+
+
+def convert(source: Path, target: Path, dtype: torch.dtype) -> None:
+    """Write a weight file in another precision; whole numbers stay what they are.
+
+    Raises:
+        CheckpointError: when a value is too large for the precision, naming the tensor.
+    """
+    tensors, metadata = read_tensors(source)
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            continue
+        tensors[name] = tensor.to(dtype)
+        if not torch.equal(tensors[name].isfinite(), tensor.isfinite()):
+            most, limit = float(tensor.abs().max()), torch.finfo(dtype).max
+            raise CheckpointError(
+                f"{source}: {name!r} holds {most:.4g}, more than {str(dtype).removeprefix('torch.')} can "
+                f"({limit:.4g}); export with --dtype bfloat16 or float32"
+            )
+    write_tensors(target, tensors, metadata)
+
+
+def write_sums(folder: Path) -> dict[str, dict[str, Any]]:
+    """Write ``SHA256SUMS`` for ``sha256sum -c``; returns size and hash of every file by its path in the folder."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    table = {
+        path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+        for path in files
+    }
+    write_text(folder / SUMS, "".join(f"{each['sha256']}  {name}\n" for name, each in table.items()))
+    return table
+
+
+def show(out: Path, card: dict[str, Any], files: dict[str, dict[str, Any]], json: bool) -> None:
+    """Print the files with their sizes."""
+    total = sum(each["bytes"] for each in files.values())
+    if json:
+        print_json({"folder": str(out), **card, "bytes": total, "files": files})
+        return
+    rows = [(name, f"{each['bytes']:,}") for name, each in files.items()]
+    print_table(str(out), ("file", "bytes"), [*rows, ("all", f"{total:,}")])
+    say(f"{total / 1e6:.1f} MB, weights in {card['dtype']}; check them with: cd {out} && sha256sum -c {SUMS}")

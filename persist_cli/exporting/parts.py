@@ -1,0 +1,119 @@
+"""What an export is made of: a base, adapters under their names, and the recipes behind them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from persist_cli.checkpoints import Checkpoint, find_checkpoint
+from persist_cli.recipe import parse_yaml_mapping
+from persist_cli.world.errors import CheckpointError, PersistError
+
+NAMED = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9_-]*)=(?P<run>.+)")
+PLAIN = "stage1"  # what evaluations call the base without any adapter
+
+
+@dataclass(frozen=True)
+class Part:
+    """One adapter of an export.
+
+    Args:
+        checkpoint: that has it.
+        adapter: what it is called there.
+    """
+
+    checkpoint: Checkpoint
+    adapter: str
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are."""
+        return self.checkpoint.adapter_folder(self.adapter)
+
+
+def adapter_parts(base: Checkpoint, runs: Sequence[str]) -> dict[str, Part]:
+    """The base's own adapters and those of the runs, by the names that they get.
+
+    Args:
+        base: whose backbone is exported.
+        runs: ``RUN``, whose adapters keep their names, or ``NAME=RUN``.
+
+    Raises:
+        CheckpointError: for an adapter of another base, and for one name twice.
+    """
+    parts = {name: Part(base, name) for name in base.adapters}
+    for text in runs:
+        for name, part in _parts_of_run(text).items():
+            if part.checkpoint.fingerprint != base.fingerprint:
+                raise CheckpointError(f"{part.checkpoint.folder}: its adapter is of another base than {base.folder}")
+            if name in parts:
+                raise CheckpointError(
+                    f"{part.checkpoint.folder}: adapter {name!r} is there already, from {parts[name].checkpoint.folder}"
+                    f"; name this one, as in {name}-other={text.removeprefix(f'{name}=')}"
+                )
+            parts[name] = part
+    return parts
+
+
+def _parts_of_run(text: str) -> dict[str, Part]:
+    match = None if Path(text).exists() else NAMED.fullmatch(text)
+    found = find_checkpoint(Path(match["run"] if match else text))
+    if not found.adapters:
+        raise CheckpointError(f"{found.folder}: has no memory adapter; name stage-2 runs after the CHECKPOINT")
+    if match is None:
+        return {name: Part(found, name) for name in found.adapters}
+    if len(found.adapters) > 1:
+        raise CheckpointError(f"{found.folder}: NAME=RUN names one adapter, there are {', '.join(found.adapters)}")
+    if match["name"] == PLAIN:
+        raise CheckpointError(f"{text}: {PLAIN!r} is the base without an adapter; choose another name")
+    return {match["name"]: Part(found, next(iter(found.adapters)))}
+
+
+def known_recipes(base: Checkpoint, parts: dict[str, Part]) -> dict[str, str]:
+    """Texts of the recipes behind an export by file name: ``codec.yaml``, ``stage1.yaml`` and one for each adapter.
+
+    Absolute paths are cut to their last part: they say nothing elsewhere.
+    """
+    recipes = _base_recipes(base.base_folder)
+    for name, part in parts.items():
+        folder = part.checkpoint.folder
+        for path in (folder / "recipes" / f"{part.adapter}.yaml", folder / "recipe.yaml"):
+            if path.is_file():
+                recipes[f"{name}.yaml"] = path.read_text(encoding="utf-8")
+                break
+    return {name: _without_places(text, name) for name, text in recipes.items()}
+
+
+def _base_recipes(folder: Path) -> dict[str, str]:
+    """The recipe of the base's last stage, and those of the stages before as far as their runs are still there."""
+    if (folder / "recipes").is_dir():
+        names = ("codec.yaml", "stage1.yaml")
+        kept = (folder / "recipes" / name for name in names)
+        return {path.name: path.read_text(encoding="utf-8") for path in kept if path.is_file()}
+    path = folder / "recipe.yaml"
+    if not path.is_file():
+        return {}
+    text = path.read_text(encoding="utf-8")
+    values = parse_yaml_mapping(text, str(path))
+    before: dict[str, str] = {}
+    if values.get("base"):
+        try:
+            before = _base_recipes(find_checkpoint(Path(values["base"])).base_folder)
+        except PersistError:
+            before = {}  # the run before is not there any more, so its recipe is not known
+    return before | {"codec.yaml" if values.get("stage") == "codec" else "stage1.yaml": text}
+
+
+def _without_places(text: str, where: str) -> str:
+    values = parse_yaml_mapping(text, where)
+    data: dict[str, Any] = values.get("data") or {}
+    settings: dict[str, Any] = (values.get("backbone") or {}).get("settings") or {}
+    for owner, key in ((values, "base"), (data, "path"), (settings, "pretrained")):
+        if Path(str(owner.get(key) or "")).is_absolute():
+            owner[key] = Path(str(owner[key])).name
+    return yaml.safe_dump(values, sort_keys=False)

@@ -1,0 +1,169 @@
+import hashlib
+import json
+
+import pytest
+import torch
+
+from persist_backbones.parts import load_exactly
+from persist_cli.checkpoints import find_checkpoint, load_adapter, load_backbone
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.files import read_tensors, write_tensors
+from tests.backbones.micro import random_clips, random_tokens
+from tests.exporting.runs import write_adapter, write_base, write_runs
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    return write_runs(tmp_path_factory.mktemp("exporting"))
+
+
+@pytest.fixture
+def export(persist, runs):
+    """``persist export`` of the stage-1 run."""
+
+    def run(out, *arguments):
+        ended = persist("export", runs / "stage1", *arguments, "--out", out)
+        assert ended.code == 0, ended.err
+        return ended.out
+
+    return run
+
+
+def generated(path, adapter, original=None):
+    """A clip with memory tokens, from the checkpoint's base and one of its adapters."""
+    checkpoint = find_checkpoint(path)
+    backbone = load_backbone(checkpoint).eval()
+    load_adapter(backbone, checkpoint, adapter)
+    return backbone.generate(random_clips(1, random_tokens(1, 5)), Sampling(2))
+
+
+def test_a_float32_export_generates_bit_for_bit_what_the_runs_do(export, runs, tmp_path):
+    export(tmp_path / "m", runs / "voxel", f"fine={runs / 'canvas'}", "--dtype", "float32")
+    for run, adapter, name in (("stage1", None, None), ("voxel", "voxel", "voxel"), ("canvas", "voxel", "fine")):
+        for expected, found in zip(generated(runs / run, adapter), generated(tmp_path / "m", name), strict=True):
+            assert torch.equal(expected, found)
+    rgb = [generated(tmp_path / "m", name)[0] for name in (None, "voxel", "fine")]
+    assert not torch.equal(rgb[0], rgb[1])
+    assert not torch.equal(rgb[1], rgb[2])
+
+
+@pytest.mark.parametrize(("dtype", "kind"), [("float16", torch.float16), ("bfloat16", torch.bfloat16)])
+def test_weights_equal_the_originals_to_the_precision_asked_for(export, runs, tmp_path, dtype, kind):
+    export(tmp_path / "m", runs / "voxel", "--dtype", dtype)
+    files = list((tmp_path / "m").rglob("*.safetensors"))
+    assert len(files) == 4
+    for path in files:
+        owner = runs / ("voxel" if "adapters" in path.parts else "stage1")
+        original, metadata = read_tensors(owner / path.relative_to(tmp_path / "m"))
+        found, kept = read_tensors(path)
+        assert metadata == kept
+        assert found.keys() == original.keys()
+        assert all(torch.equal(found[name], original[name].to(kind)) for name in original)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_half_precision_files_give_float32_parameters(export, runs, tmp_path, dtype):
+    export(tmp_path / "m", runs / "voxel", "--dtype", dtype)
+    checkpoint = find_checkpoint(tmp_path / "m")
+    backbone = load_backbone(checkpoint)
+    load_adapter(backbone, checkpoint, "voxel")
+    assert {value.dtype for value in backbone.state_dict().values() if value.is_floating_point()} == {torch.float32}
+    expected, _ = read_tensors(runs / "stage1/world.safetensors")
+    assert torch.allclose(backbone.prompt, expected["prompt"], atol=1e-2)
+
+
+def test_tensors_assigned_to_a_module_without_storage_take_its_precision(tmp_path):
+    with torch.device("meta"):
+        module = torch.nn.Linear(2, 2)
+    tensors = {"weight": torch.ones(2, 2).half(), "bias": torch.ones(2).bfloat16()}
+    load_exactly(module, tensors, {"weight", "bias"}, tmp_path)
+    assert (module.weight.dtype, module.bias.dtype) == (torch.float32, torch.float32)
+    assert module(torch.ones(1, 2)).tolist() == [[3, 3]]
+
+
+def test_an_export_of_an_export_is_the_same(export, persist, runs, tmp_path):
+    export(tmp_path / "m", runs / "none", runs / "voxel", "--default", "voxel")
+    assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
+    assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
+    assert find_checkpoint(tmp_path / "again").default_adapter() == "voxel"
+
+
+def test_a_stage_2_run_stands_for_its_base_and_adapter(persist, export, runs, tmp_path):
+    assert persist("export", runs / "voxel", "--out", tmp_path / "a").code == 0
+    export(tmp_path / "b", runs / "voxel")
+    assert (tmp_path / "a/SHA256SUMS").read_bytes() == (tmp_path / "b/SHA256SUMS").read_bytes()
+
+
+def test_the_sums_are_those_of_all_files(export, runs, tmp_path):
+    export(tmp_path / "m", runs / "voxel")
+    lines = [line.split("  ") for line in (tmp_path / "m/SHA256SUMS").read_text().splitlines()]
+    files = {path.relative_to(tmp_path / "m").as_posix() for path in (tmp_path / "m").rglob("*") if path.is_file()}
+    assert files == {name for _, name in lines} | {"SHA256SUMS"}
+    assert all(hashlib.sha256((tmp_path / "m" / name).read_bytes()).hexdigest() == sum_ for sum_, name in lines)
+
+
+def test_the_table_and_json_tell_the_size_of_every_file(export, runs, tmp_path):
+    assert "adapters/voxel/adapter.safetensors" in export(tmp_path / "m", runs / "voxel")
+    told = json.loads(export(tmp_path / "n", runs / "voxel", "--json"))
+    sizes = {name: (tmp_path / "n" / name).stat().st_size for name in told["files"]}
+    assert sizes == {name: each["bytes"] for name, each in told["files"].items()}
+    assert told["bytes"] == sum(sizes.values())
+    assert told["fingerprint"] == find_checkpoint(tmp_path / "n").fingerprint
+    assert told["default_adapter"] == "voxel"
+
+
+def test_an_adapter_trained_on_the_export_joins_it(export, persist, runs, tmp_path):
+    export(tmp_path / "m")
+    model = find_checkpoint(tmp_path / "m")
+    later = write_adapter(load_backbone(model), tmp_path / "m", tmp_path / "later", "voxel")
+    assert persist("export", tmp_path / "m", later, "--out", tmp_path / "n").code == 0
+    assert (find_checkpoint(tmp_path / "n").fingerprint, find_checkpoint(later).fingerprint) == (model.fingerprint,) * 2
+
+
+def test_recipes_of_all_stages_are_kept_without_places_of_this_machine(persist, codec, stage1, voxel, tmp_path):
+    assert persist("export", stage1, f"mine={voxel}", "--out", tmp_path / "m").code == 0
+    kept = {path.name: path.read_text() for path in (tmp_path / "m/recipes").iterdir()}
+    assert sorted(kept) == ["codec.yaml", "mine.yaml", "stage1.yaml"]
+    assert "base: stage1" in kept["mine.yaml"]
+    assert not any(str(codec.parent) in text for text in kept.values())
+    assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
+    assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
+
+
+def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
+    (tmp_path / "here").mkdir()
+    base, voxel, canvas, out = runs / "stage1", runs / "voxel", runs / "canvas", tmp_path / "m"
+    for arguments, cause in (
+        ((base, runs / "other", "--out", out), "is of another base than"),
+        ((base, voxel, canvas, "--out", out), "adapter 'voxel' is there already, from"),
+        ((base, f"a={voxel}", f"a={canvas}", "--out", out), "name this one, as in a-other="),
+        ((base, f"stage1={voxel}", "--out", out), "choose another name"),
+        ((base, base, "--out", out), "has no memory adapter"),
+        ((base, tmp_path / "gone", "--out", out), "no checkpoint there"),
+        ((tmp_path / "here", "--out", out), "no checkpoint there"),
+        ((base, "--out", tmp_path / "here"), "exists already"),
+        ((base, "--dtype", "float61", "--out", out), "did you mean 'float16'"),
+        ((base, voxel, "--default", "voxels", "--out", out), "did you mean 'voxel'"),
+    ):
+        ended = persist("export", *arguments)
+        assert (ended.code, cause in ended.err) == (1, True), ended.err
+        assert len(ended.err.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
+def test_a_value_beyond_float16_is_refused_by_name_and_bfloat16_takes_it(persist, tmp_path):
+    write_base(tmp_path / "stage1")
+    path = tmp_path / "stage1/world.safetensors"
+    tensors, metadata = read_tensors(path)
+    write_tensors(path, tensors | {"prompt": tensors["prompt"] + 1e5}, metadata)
+    refused = persist("export", tmp_path / "stage1", "--out", tmp_path / "m")
+    assert refused.code == 1
+    assert "world.safetensors: 'prompt' holds 1e+05, more than float16 can (6.55e+04)" in refused.err
+    assert [path.name for path in tmp_path.iterdir()] == ["stage1"]
+    assert persist("export", tmp_path / "stage1", "--dtype", "bfloat16", "--out", tmp_path / "m").code == 0
+
+
+def test_several_adapters_without_a_default_must_be_chosen_from(export, runs, tmp_path):
+    export(tmp_path / "m", runs / "voxel", runs / "none")
+    with pytest.raises(Exception, match="choose an adapter of none, voxel with --adapter"):
+        find_checkpoint(tmp_path / "m").default_adapter()
