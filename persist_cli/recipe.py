@@ -52,7 +52,8 @@ class DataSettings:
 
     Args:
         path: data set folder; ``--data`` sets it.
-        strides: every n-th frame; one of these is drawn for each clip.
+        strides: every n-th frame; one of these is drawn for each clip. A negative one plays the clip backwards, with
+            what was seen on the way there as its context.
         context_frames: most earlier frames that a clip's memory is made of (stage 2).
         clips_per_trajectory: how many fixed clips, with fixed contexts, each trajectory offers, so that clips come
             again and can be cached; 0 draws from all that there are.

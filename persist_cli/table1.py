@@ -40,7 +40,7 @@ def train_commands(out: Path) -> list[str]:
         f"finetune houses-64-stage1 {kept} --out {out}/stage1 base={out}/codec",
         *(f"finetune houses-64-stage2-{memory} {stage2} --out {out}/{memory}" for memory in MEMORIES),
         *(f"finetune houses-64-stage2-voxel-{form} {stage2} --out {out}/voxel-{form}" for form in FORMS),
-        f"finetune houses-64-stage1-rgb {kept} --out {out}/stage1-rgb base={out}/codec",
+        f"finetune houses-64-stage1-rgb {kept} --out {out}/stage1-rgb base={out}/stage1",
         f"finetune houses-64-stage2-voxel-rgb {kept} --out {out}/voxel-rgb base={out}/stage1-rgb",
     ]
 

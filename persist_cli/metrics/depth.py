@@ -27,7 +27,7 @@ class AbsRel(DepthMetric):
     definition = f"mean |z - z*| / z* {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Error of each frame, NaN without any true depth."""
+        """Error of each frame, NaN without any true or generated depth."""
         depth, truth, known = _depths(prediction)
         return _mean((depth - truth).abs() / truth.clamp_min(1e-6), known)
 
@@ -41,7 +41,7 @@ class Rmse(DepthMetric):
     definition = f"metres, root of the mean (z - z*)² of a frame {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Metres for each frame, NaN without any true depth."""
+        """Metres for each frame, NaN without any true or generated depth."""
         depth, truth, known = _depths(prediction)
         return _mean((depth - truth).square(), known).sqrt()
 
@@ -55,14 +55,15 @@ class Delta1(DepthMetric):
     definition = f"share of pixels with max(z / z*, z* / z) < 1.25 {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Share for each frame between 0 and 1, NaN without any true depth."""
+        """Share for each frame between 0 and 1, NaN without any true or generated depth."""
         depth, truth, known = _depths(prediction)
         return _mean(((depth < 1.25 * truth) & (truth < 1.25 * depth)).double(), known)
 
 
 def _depths(prediction: Prediction) -> tuple[Tensor, Tensor, Bool[Tensor, "frame height width"]]:
     truth = prediction.truth.depth.double()
-    return prediction.depth.double(), truth, truth > 0
+    given = prediction.depth[1:].any()  # a model of RGB alone gives none after the given frame
+    return prediction.depth.double(), truth, (truth > 0) & given
 
 
 def _mean(values: Float[Tensor, "frame height width"], known: Bool[Tensor, "frame height width"]) -> Tensor:

@@ -70,7 +70,7 @@ class ClipPlan:
 
     Args:
         frames: frames a clip.
-        strides: one is drawn for each clip, among those that fit the trajectory.
+        strides: one is drawn for each clip, among those that fit the trajectory; a negative one plays it backwards.
         context_frames: most earlier frames to give along; 0 gives none.
         seed: of the draws.
         image_size: height and width that the frames must have.
@@ -96,10 +96,13 @@ class ClipDataset(Dataset[ClipSample]):
     def __init__(self, folder: Path, plan: ClipPlan) -> None:
         self.plan = plan
         store = Store(folder)
-        self.files = [file for file in store if len(file) > (plan.frames - 1) * min(plan.strides)]
+        shortest = min(map(abs, plan.strides), default=0)
+        if not shortest:
+            raise DataError(f"data.strides {list(plan.strides)} must name at least one stride, and none of 0")
+        self.files = [file for file in store if len(file) > (plan.frames - 1) * shortest]
         if not self.files:
             longest = max(len(file) for file in store)
-            needed = (plan.frames - 1) * min(plan.strides) + 1
+            needed = (plan.frames - 1) * shortest + 1
             raise DataError(f"{folder}: a clip needs {needed} frames, the longest trajectory has {longest}")
         for file in self.files:
             check_size(file.info, plan.image_size, f"{folder}#{file.name}")
@@ -129,11 +132,12 @@ class ClipDataset(Dataset[ClipSample]):
             context: false leaves the context unread.
         """
         file, frames = choice.file, choice.frames
-        actions = file.actions()[frames[0] : frames[-1]]
+        actions = file.actions()[frames[0] : frames[-1]]  # none backwards: what was done to the world is not undone
+        done = strided_interactions(actions, abs(frames.step), file.info.vocabulary)
         wanted = choice.context if context else ()
         return ClipSample(
             observations=file.read(list(frames)).observations if images else unseen(file, frames),
-            interactions=strided_interactions(actions, frames.step, file.info.vocabulary),
+            interactions=done or (None,) * (len(frames) - 1),
             context=file.read(wanted).observations if wanted else None,
             info=file.info,
             seed=choice.seed,
@@ -143,10 +147,10 @@ class ClipDataset(Dataset[ClipSample]):
     def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:
         """Frames of a random clip and of its context."""
         steps = self.plan.frames - 1
-        stride = int(random.choice([stride for stride in self.plan.strides if steps * stride < len(file)]))
-        start = int(random.integers(len(file) - steps * stride))
-        frames = range(start, start + steps * stride + 1, stride)
-        return frames, tuple(self._context_frames(start, random)) if self.plan.context_frames else ()
+        stride = int(random.choice([stride for stride in self.plan.strides if steps * abs(stride) < len(file)]))
+        start = int(random.integers(len(file) - steps * abs(stride)))
+        frames = range(start, start + steps * abs(stride) + 1, abs(stride))[:: 1 if stride > 0 else -1]
+        return frames, tuple(self._context_frames(frames[0], random)) if self.plan.context_frames else ()
 
     def _context_frames(self, start: int, random: np.random.Generator) -> list[int]:
         """The clip's first frame and a random choice of those before it, in order."""

@@ -9,13 +9,14 @@ from persist_cli.world.tokens import MemoryTokens
 from tests.backbones.micro import CHANNELS, micro, random_clips, random_tokens, shaken, with_adapter
 from tests.backbones.test_memory_adapter import velocity
 
-every_form = pytest.mark.parametrize("form", FORMS)
+FINE = {"form": "canvas", "canvas_scale": 2, "ff_factor": 0}  # drawn larger than the latents, without feed-forward
+every_form = pytest.mark.parametrize("form", [*FORMS, "fine canvas"])
 told_by_cameras = pytest.mark.parametrize("form", ["projected", "canvas"])
 
 
 def trained(form, **settings):
     """A micro model with an adapter whose weights are no longer fresh."""
-    backbone = with_adapter(micro(), form=form, **settings)
+    backbone = with_adapter(micro(), **(FINE if form == "fine canvas" else {"form": form}), **settings)
     shaken(backbone)
     return backbone
 

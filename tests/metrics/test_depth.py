@@ -56,6 +56,13 @@ def test_missing_generated_depth_counts_as_an_error(name, figure):
     assert measured(name, holes, flat) == pytest.approx([figure] * 2, abs=0.03)
 
 
+@pytest.mark.parametrize("name", ["absrel", "rmse", "delta1"])
+def test_a_model_that_gives_no_depth_after_the_first_frame_is_not_measured(name):
+    _, depth = noise(0)
+    given = torch.cat([depth[:1], torch.zeros_like(depth[1:])])
+    assert all(map(math.isnan, measured(name, given, depth)))
+
+
 @pytest.mark.parametrize("name", PERFECT)
 def test_data_without_depth_is_not_measured(name):
     assert METRICS[name].obstacle(setup(depth=False)) == "the data has no depth"

@@ -35,6 +35,18 @@ def test_interactions_of_skipped_frames_are_kept(walks):
     assert all(len(each) == 8 for each in found)
 
 
+def test_a_negative_stride_plays_backwards_with_what_was_seen_on_the_way_there(walks):
+    clips = ClipDataset(walks, plan(strides=(-2,), context_frames=100))
+    for number in range(10):
+        choice, sample = clips.choose(number), clips[number]
+        assert choice.frames.step == -2
+        assert set(choice.frames) <= set(choice.context)
+        assert sample.interactions == (None,) * 8
+        forth = choice.file.read(sorted(choice.frames)).observations
+        assert torch.equal(sample.observations.rgb, forth.rgb.flip(0))
+        assert torch.equal(sample.observations.cameras.centers, forth.cameras.centers.flip(0))
+
+
 def test_few_clips_a_trajectory_come_again_with_their_context_and_with_new_noise(walks):
     clips = ClipDataset(walks, plan(clips_per_trajectory=2))
     drawn = [clips.choose(number) for number in range(60)]
@@ -60,6 +72,8 @@ def test_processes_and_micro_batches_share_the_same_samples_of_each_step(process
 def test_what_cannot_be_drawn_is_one_line(walks):
     with pytest.raises(DataError, match="a clip needs 65 frames, the longest trajectory has 24"):
         ClipDataset(walks, plan(frames=65))
+    with pytest.raises(DataError, match=r"strides \[0\] must name at least one stride, and none of 0"):
+        ClipDataset(walks, plan(strides=(0,)))
     with pytest.raises(DataError, match="images are 32x32, the model takes 64x64"):
         ClipDataset(walks, plan(image_size=(64, 64)))
     with pytest.raises(DataError, match="cannot be shared by 3 processes"):
