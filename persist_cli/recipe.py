@@ -212,8 +212,8 @@ def _inconsistencies(recipe: Recipe) -> list[str]:
         problems.append("stage 2 needs a memory, the other stages take none")
     if recipe.stage == "2" and recipe.base is None:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
-    if not recipe.data.strides or min(recipe.data.strides) < 1:
-        problems.append("data.strides must be whole numbers of at least 1")
+    if not recipe.data.strides or 0 in recipe.data.strides:
+        problems.append("data.strides must be whole numbers, at least one and none of them 0")
     if recipe.data.clips_per_trajectory < 0:
         problems.append(f"data.clips_per_trajectory must be at least 0, not {recipe.data.clips_per_trajectory}")
     if training.batch % max(1, training.accumulation):

@@ -72,8 +72,6 @@ def test_processes_and_micro_batches_share_the_same_samples_of_each_step(process
 def test_what_cannot_be_drawn_is_one_line(walks):
     with pytest.raises(DataError, match="a clip needs 65 frames, the longest trajectory has 24"):
         ClipDataset(walks, plan(frames=65))
-    with pytest.raises(DataError, match=r"strides \[0\] must name at least one stride, and none of 0"):
-        ClipDataset(walks, plan(strides=(0,)))
     with pytest.raises(DataError, match="images are 32x32, the model takes 64x64"):
         ClipDataset(walks, plan(image_size=(64, 64)))
     with pytest.raises(DataError, match="cannot be shared by 3 processes"):
