@@ -142,6 +142,8 @@ def export(
     ] = None,
     dtype: Annotated[str, typer.Option(help="Of the weights: float16, bfloat16 or float32.")] = "float16",
     default: Annotated[str | None, typer.Option(help="Adapter that is meant when none is named.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps when none are named.")] = None,
+    sampler: Annotated[str | None, typer.Option(help="Sampler when none is named.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Write a base and memory adapters as one checkpoint folder that stands alone.
@@ -150,7 +152,7 @@ def export(
     """
     from persist_cli.exporting.export import ExportPlan, run_export
 
-    run_export(ExportPlan(checkpoint, runs or [], dtype, default), out, json)
+    run_export(ExportPlan(checkpoint, runs or [], dtype, default, steps, sampler), out, json)
 
 
 @app.command()
@@ -193,8 +195,8 @@ def rollout(
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
     write: Annotated[bool, typer.Option(help="Write what is generated into the memory.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
-    steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 50,
-    sampler: Annotated[str, typer.Option(help="ddim, dpm, unipc or dpm++.")] = "ddim",
+    steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps; the checkpoint's, else 50.")] = None,
+    sampler: Annotated[str | None, typer.Option(help="ddim, dpm, unipc or dpm++; the checkpoint's, else ddim.")] = None,
     guidance: Annotated[float, typer.Option(help="Weight of guidance over memory; 1 is none.")] = 1.0,
     json: JsonOption = False,
 ) -> None:
@@ -227,8 +229,8 @@ def evaluate(
     frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
     clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
     seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
-    steps: Annotated[int, typer.Option(min=1, help="Denoising steps.")] = 50,
-    sampler: Annotated[str, typer.Option(help="ddim, dpm, unipc or dpm++.")] = "ddim",
+    steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps; the checkpoint's, else 50.")] = None,
+    sampler: Annotated[str | None, typer.Option(help="ddim, dpm, unipc or dpm++; the checkpoint's, else ddim.")] = None,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
     out: Annotated[Path, typer.Option(help="Folder for metrics.json; a stopped run goes on.")] = Path("runs/eval"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,7 @@ class Checkpoint:
         fingerprint: of the base's weights.
         adapters: folders of the memory adapters by name.
         default: which of several adapters is meant when none is named.
+        sampling: ``steps`` and ``sampler`` that are meant when none are named, as far as the card says.
     """
 
     folder: Path
@@ -48,6 +49,7 @@ class Checkpoint:
     fingerprint: str
     adapters: dict[str, Path]
     default: str | None = None
+    sampling: dict[str, Any] = field(default_factory=dict)
 
     def memory_choice(self, adapter: str) -> MemoryChoice:
         """What the adapter's memory is made of."""
@@ -99,6 +101,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
         fingerprint=fingerprint,
         adapters={each.name: each for each in sorted((folder / "adapters").glob("*")) if each.is_dir()},
         default=card.get("default_adapter"),
+        sampling=card.get("sampling", {}),
     )
 
 
@@ -112,6 +115,14 @@ def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None
         backbone = make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
     backbone.load_base(checkpoint.base_folder)
     return backbone
+
+
+def sampling_of(checkpoint: Checkpoint, steps: int | None, sampler: str | None) -> tuple[int, str]:
+    """Steps and sampler: those asked for, else the checkpoint's, else 50 steps of DDIM."""
+    from persist_cli.world.backbone import Sampling
+
+    own: dict[str, Any] = {"steps": Sampling.steps, "sampler": Sampling.sampler} | checkpoint.sampling
+    return steps or int(own["steps"]), sampler or str(own["sampler"])
 
 
 def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:
@@ -186,4 +197,11 @@ def _read_card(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: checkpoint version {card.get('version')}, this persist reads {VERSION}")
     if not card.get("fingerprint") or not (card.get("base") or {"backbone", "settings"} <= set(card)):
         raise CheckpointError(f"{path}: the card is incomplete")
+    if not _is_sampling(card.get("sampling", {})):
+        raise CheckpointError(f"{path}: its sampling must hold a number of steps and the name of a sampler")
     return card
+
+
+def _is_sampling(value: Any) -> bool:
+    kinds = {"steps": int, "sampler": str}
+    return isinstance(value, dict) and all(isinstance(value[key], kinds[key]) for key in value.keys() & kinds.keys())

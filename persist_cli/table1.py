@@ -19,13 +19,13 @@ METRICS = "psnr,ssim,lpips-alex,lpips-vgg,absrel,delta1"
 
 
 def collect_commands(out: Path) -> list[str]:
-    """2,400 training houses of 100 frames, and 100 held-out ones on paths of three kinds."""
+    """2,400 training houses of 100 frames, and 100 held-out ones of 129, on paths of three kinds."""
     collect = "collect miniworld --size 64x64"
     return [
         f"{collect} --out {out}/houses/path --scenes 0:1600 --frames 100 --policy path",
         f"{collect} --out {out}/houses/explore --scenes 1600:2400 --frames 100 --policy explore",
-        f"{collect} --out {out}/test/path --scenes 0:100 --frames 100 --policy path --split test",
-        f"{collect} --out {out}/test/explore --scenes 0:100 --frames 100 --policy explore --split test",
+        f"{collect} --out {out}/test/path --scenes 0:50 --frames 129 --policy path --split test",
+        f"{collect} --out {out}/test/explore --scenes 50:100 --frames 129 --policy explore --split test",
         f"{collect} --out {out}/there-and-back --scenes 0:100 --frames 129 --policy there-and-back --split test",
     ]
 

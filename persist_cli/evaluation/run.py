@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 from rich.progress import Progress
 from torch import Tensor
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone, sampling_of
 from persist_cli.evaluation.cases import Case, CaseFrames, read_case
 from persist_cli.evaluation.journal import Journal, Unit
 from persist_cli.evaluation.measuring import VIDEO, Measurer, choose_metrics, make_setup
@@ -46,15 +46,16 @@ class EvalPlan:
     frames: int
     clips: int
     seeds: int
-    steps: int
-    sampler: str
+    steps: int | None
+    sampler: str | None
     batch: int
     noise: tuple[float, float]
 
     @property
     def choice(self) -> RowChoice:
         """Which rows."""
-        return RowChoice(self.memories, self.controls, Sampling(self.steps, self.sampler), self.noise)
+        sampling = Sampling(self.steps or Sampling.steps, self.sampler or Sampling.sampler)
+        return RowChoice(self.memories, self.controls, sampling, self.noise)
 
 
 @dataclass(frozen=True)
@@ -125,13 +126,15 @@ def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Process
         PersistError: one line for whatever does not fit.
     """
     checkpoints = list({each.folder.resolve(): each for each in map(find_checkpoint, paths)}.values())
+    steps, sampler = sampling_of(checkpoints[0], plan.steps, plan.sampler)
+    plan = replace(plan, steps=steps, sampler=sampler)
     check_choice(plan.choice)
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
     protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
     backbone = load_backbone(checkpoints[0])
-    if plan.sampler not in backbone.samplers:
-        raise PersistError(f"unknown sampler {plan.sampler!r}; this backbone has {', '.join(backbone.samplers)}")
+    if sampler not in backbone.samplers:
+        raise PersistError(f"unknown sampler {sampler!r}; this backbone has {', '.join(backbone.samplers)}")
     make_rows(checkpoints, plan.choice, protocol, ())  # what is wrong with rows is told before clips are sought
     for folder in plan.data:
         for file in Store(folder):

@@ -32,6 +32,8 @@ class ExportPlan:
     runs: Sequence[str]
     dtype: str
     default: str | None
+    steps: int | None = None
+    sampler: str | None = None
 
 
 def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
@@ -47,11 +49,14 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     base = find_checkpoint(plan.checkpoint)
     parts = adapter_parts(base, plan.runs)
     default = default_of(base, parts, plan.default)
+    named = {"steps": plan.steps, "sampler": plan.sampler}
+    sampling = base.sampling | {key: value for key, value in named.items() if value is not None}
     with folder_aside(out) as folder:
         card = write_checkpoint(folder, base, parts, PRECISIONS[plan.dtype])
-        write_card(folder, card | {"dtype": plan.dtype, "default_adapter": default, "exported_by": __version__})
+        meant = {"dtype": plan.dtype, "default_adapter": default, "sampling": sampling}
+        write_card(folder, card | meant | {"exported_by": __version__})
         files = write_sums(folder)
-    show(out, {"fingerprint": card["fingerprint"], "dtype": plan.dtype, "default_adapter": default}, files, json)
+    show(out, {"fingerprint": card["fingerprint"]} | meant, files, json)
 
 
 def default_of(base: Checkpoint, parts: dict[str, Part], asked: str | None) -> str | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone, sampling_of
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.reference import reference_checkpoint
@@ -33,8 +33,10 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     walk = plan_walk(plan)
     backbone = load_backbone(checkpoint)
     check_size(walk.info, backbone.image_size, plan.start)
-    if plan.sampler not in backbone.samplers:
-        raise PersistError(f"unknown sampler {plan.sampler!r}; this backbone has {', '.join(backbone.samplers)}")
+    steps, sampler = sampling_of(checkpoint, plan.steps, plan.sampler)
+    plan = dataclasses.replace(plan, steps=steps, sampler=sampler)
+    if sampler not in backbone.samplers:
+        raise PersistError(f"unknown sampler {sampler!r}; this backbone has {', '.join(backbone.samplers)}")
     load_adapter(backbone, checkpoint, adapter)
     backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     rollout = roll(backbone, open_memory(checkpoint, adapter, plan, walk.info), walk, plan)
@@ -70,7 +72,7 @@ def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
 
 def roll(backbone: Backbone, memory: Memory | None, walk: Walk, plan: RolloutPlan) -> Rollout:
     """Imagine the walk, clip by clip, with a progress bar."""
-    sampling = Sampling(plan.steps, plan.sampler, plan.guidance)
+    sampling = Sampling(plan.steps or Sampling.steps, plan.sampler or Sampling.sampler, plan.guidance)
     before = copy_of(memory)
     model = WorldModel(backbone, memory, sampling, plan.seed, plan.write)
     began = time.monotonic()

@@ -28,8 +28,8 @@ class RolloutPlan:
     adapter: str | None
     write: bool
     seed: int
-    steps: int
-    sampler: str
+    steps: int | None
+    sampler: str | None
     guidance: float
 
 

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from persist_backbones.parts import load_exactly
-from persist_cli.checkpoints import find_checkpoint, load_adapter, load_backbone
+from persist_cli.checkpoints import find_checkpoint, load_adapter, load_backbone, sampling_of
 from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
 from tests.backbones.micro import random_clips, random_tokens
 from tests.exporting.runs import write_adapter, write_base, write_runs
@@ -92,6 +93,18 @@ def test_a_stage_2_run_stands_for_its_base_and_adapter(persist, export, runs, tm
     assert persist("export", runs / "voxel", "--out", tmp_path / "a").code == 0
     export(tmp_path / "b", runs / "voxel")
     assert (tmp_path / "a/SHA256SUMS").read_bytes() == (tmp_path / "b/SHA256SUMS").read_bytes()
+
+
+def test_steps_and_sampler_of_the_card_are_meant_where_none_are_named(export, runs, tmp_path):
+    export(tmp_path / "m", "--steps", "7", "--sampler", "unipc")
+    exported, run = find_checkpoint(tmp_path / "m"), find_checkpoint(runs / "stage1")
+    assert sampling_of(exported, None, None) == (7, "unipc")
+    assert sampling_of(exported, 3, "ddim") == (3, "ddim")
+    assert sampling_of(run, None, None) == (50, "ddim")
+    card = json.loads((tmp_path / "m" / "persist.json").read_text())
+    (tmp_path / "m" / "persist.json").write_text(json.dumps(card | {"sampling": {"steps": "many"}}))
+    with pytest.raises(CheckpointError, match="its sampling must hold a number of steps"):
+        find_checkpoint(tmp_path / "m")
 
 
 def test_the_sums_are_those_of_all_files(export, runs, tmp_path):
