@@ -14,11 +14,16 @@ from persist_cli.evaluation.cases import Case
 from persist_cli.evaluation.protocols import Protocol, Selection
 from persist_cli.metrics.metric import FrameMetric, Metric
 
-IN_PARTS = ("psnr", "ssim", "lpips-alex", "lpips-vgg", "dreamsim")  # also shown at the last frame or the return
+ENDS: tuple[Selection, ...] = ("all", "last", "return")
+PARTS: dict[str, tuple[Selection, ...]] = {  # what is shown over more than all frames, where the protocol has them
+    "psnr": (*ENDS, "new"), "ssim": ENDS, "lpips-alex": ENDS, "lpips-vgg": ENDS, "dreamsim": ENDS,
+}  # fmt: skip
+FAMILIAR = 0.9  # share of a view seen before from which on nothing of it counts as new
 SUFFIXES: dict[Selection, tuple[str, str, str]] = {
     "all": ("", "", "mean over the predicted frames"),
     "last": ("-last", " last", "at the last frame only"),
     "return": ("-return", " at return", "at the frames that return to an earlier pose only"),
+    "new": ("-new", " where new", f"at frames of whose view less than {FAMILIAR:.0%} was seen before only"),
 }
 
 
@@ -47,8 +52,9 @@ def make_columns(metrics: Mapping[str, Metric], protocol: Protocol) -> list[Colu
     """The columns of a protocol's table."""
     columns = []
     for name, metric in metrics.items():
-        selections = protocol.selections if name in IN_PARTS else ("all",)
-        for selection in selections:
+        for selection in protocol.selections:
+            if selection not in PARTS.get(name, ("all",)):
+                continue
             suffix, title, words = SUFFIXES[selection]
             definition = metric.definition
             if isinstance(metric, FrameMetric):
@@ -69,5 +75,8 @@ def chosen_frames(cases: Sequence[Case], frames: Selection) -> Bool[Tensor, "cli
         chosen[:, :-1] = False
     if frames == "return":
         chosen = torch.tensor([case.first_visits for case in cases]) >= 0
+    if frames == "new":
+        shares = [[1.0 if share is None else share for share in case.seen_before] for case in cases]
+        chosen = torch.tensor(shares) < FAMILIAR
     chosen[:, 0] = False
     return chosen

@@ -72,16 +72,12 @@ class Table:
     journal: Journal
 
     def to_json(self, rows: Sequence[RowResults]) -> dict[str, Any]:
-        """Every row with its columns and curves; differences are to the first row."""
-        first: dict[str, Figure] = {}
+        """Every row with its columns and curves; differences are to the first row, and to every other one."""
+        figures = {each.row.name: self.figures(each) for each in rows}
         table: dict[str, Any] = {}
         for each in rows:
-            figures = self.figures(each)
-            first = first or figures
-            table[each.row.name] = self.describe(each) | {
-                "columns": {column.name: self.cell(column, figures, first) for column in self.columns},
-                "curves": self.curves(each),
-            }
+            cells = {column.name: self.cell(column, each.row.name, figures) for column in self.columns}
+            table[each.row.name] = self.describe(each) | {"columns": cells, "curves": self.curves(each)}
         return {"name": self.name, "clips": list(self.clips), "rows": table}
 
     def describe(self, each: RowResults) -> dict[str, Any]:
@@ -93,15 +89,17 @@ class Table:
             "kind": each.row.kind, "definition": each.row.definition, "checkpoint": checkpoint, "memory": adapter,
         }  # fmt: skip
 
-    def cell(self, column: Column, figures: Mapping[str, Figure], first: Mapping[str, Figure]) -> dict[str, Any]:
+    def cell(self, column: Column, row: str, figures: Mapping[str, Mapping[str, Figure]]) -> dict[str, Any]:
         """One figure as JSON values, or why there is none."""
         if column.metric in self.measurer.obstacles:
             return {"na": self.measurer.obstacles[column.metric]}
-        figure = figures[column.name]
+        figure = figures[row][column.name]
         if not np.isfinite(figure.mean):
             return {"na": "not defined for any of these clips"}
-        changed = None if figures is first else difference(figure, first[column.name])
-        return figure.to_json() | {"difference": changed}
+        others = [name for name in figures if name != row]
+        differences = {name: difference(figure, figures[name][column.name]) for name in others}
+        first = differences.get(next(iter(figures)))
+        return figure.to_json() | {"difference": first, "differences": differences}
 
     def figures(self, each: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""

@@ -93,7 +93,7 @@ class Column(Part):
 
 
 class Difference(Part):
-    """Paired difference to the first row with its 95 % interval."""
+    """Paired difference to another row with its 95 % interval."""
 
     mean: Figure
     low: Figure = None
@@ -116,6 +116,7 @@ class Cell(Part):
     count: int | None = None
     per_clip: list[Figure] | None = None
     difference: Difference | None = None
+    differences: dict[str, Difference | None] = {}
 
 
 class Bin(Part):

@@ -1,3 +1,4 @@
+import itertools
 import json
 import shutil
 import signal
@@ -40,6 +41,10 @@ def test_eval_leaves_figures_intervals_and_differences(whole):
     assert psnr["low"] <= psnr["mean"] <= psnr["high"]
     assert psnr["difference"]["mean"] == pytest.approx(psnr["mean"] - rows["stage1"]["columns"]["psnr"]["mean"])
     assert rows["stage1"]["columns"]["psnr"]["difference"] is None
+    for one, other in itertools.permutations(rows, 2):
+        there, back = (rows[a]["columns"]["psnr"]["differences"][b] for a, b in ((one, other), (other, one)))
+        assert there["mean"] == pytest.approx(-back["mean"])
+        assert (there["low"], there["high"]) == pytest.approx((-back["high"], -back["low"]))
     assert rows["codec reconstruction"]["columns"]["psnr"]["std"] is None
     assert len(rows["voxel"]["curves"]["psnr"]["per_frame"]) == 8
     assert rows["voxel"]["curves"]["psnr"]["by_seen_before"]

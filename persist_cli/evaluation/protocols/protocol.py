@@ -14,7 +14,7 @@ from persist_cli.trajectories.store import Store, TrajectoryFile
 from persist_cli.world.errors import DataError
 from persist_cli.world.observations import Observations
 
-Selection = Literal["all", "last", "return"]  # frames of a clip that a column is the mean over
+Selection = Literal["all", "last", "return", "new"]  # frames of a clip that a column is the mean over
 
 
 @dataclass(frozen=True)

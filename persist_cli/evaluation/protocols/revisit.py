@@ -22,7 +22,7 @@ class Revisit(Protocol):
         "before the clip and not from its first frame; memory of all true frames up to the first; nothing is written"
     )
     writes = False
-    selections = ("all", "last")
+    selections = ("all", "last", "new")
 
     def find(self, asked: Selected) -> list[Case]:
         """The clips with the most to recall, taking turns over trajectories, disjoint within each."""
