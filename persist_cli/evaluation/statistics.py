@@ -65,7 +65,7 @@ def mean_figure(values: Array) -> Figure:
     low, high = interval(drawn)
     return Figure(
         mean=float(mean(by_seed)),
-        std=float(np.nanstd(by_seed, ddof=1)) if len(by_seed) > 1 else None,
+        std=float(np.nanstd(by_seed, ddof=1)) if np.isfinite(by_seed).sum() > 1 else None,
         low=low,
         high=high,
         count=int(np.isfinite(per_clip).sum()),

@@ -139,8 +139,8 @@ def test_blocks_stand_where_every_says():
     assert set(with_adapter(micro(), every=2).adapter.blocks) == {"1"}
     assert set(with_adapter(micro()).adapter.blocks) == {"0", "1"}
     assert set(with_adapter(micro(), form="projected", every=2).adapter.blocks) == {"1"}
-    assert set(with_adapter(micro(), form="canvas", every=2).adapter.outs) == {"0"}
-    assert set(with_adapter(micro(), form="canvas").adapter.outs) == {"0", "1"}
+    assert set(with_adapter(micro(), form="canvas", every=2).adapter.blocks) == {"0"}
+    assert set(with_adapter(micro(), form="canvas").adapter.blocks) == {"0", "1"}
 
 
 @every_form

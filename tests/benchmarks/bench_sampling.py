@@ -4,7 +4,8 @@
 
 Prints two tables, asserts nothing; ``--out`` keeps them as ``sampling.json`` and the curve as ``sampling.png``. The
 clips are those of ``persist eval --protocol revisit``, one at a time as in a rollout, and all settings take turns on
-each. Without a checkpoint a tiny model of random weights stands in: its seconds say something, its quality nothing.
+each. Without a checkpoint it is the reference model on the sample houses; where that is not installed a tiny model of
+random weights stands in, whose seconds say something and whose quality nothing.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from persist_cli.evaluation.run import Backbones
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.metrics import METRICS
 from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.reference import reference_checkpoint, sample_data
 from persist_cli.registry import make_backbone
 from persist_cli.rollout.world_model import WorldModel, clip_seed, imagine_together
 from persist_cli.viewing.console import print_table, say, watched
@@ -80,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     say_conditions("one clip at a time, all settings taking turns on each")
     with TemporaryDirectory() as folder:
         if not options.checkpoint:
-            stand_in(Path(folder), options)
+            find_model(Path(folder), options)
         bench = make_bench(options)
         samplers, memories = compare_samplers(bench), compare_memories(bench)
     show(bench, samplers, memories)
@@ -107,8 +109,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def stand_in(folder: Path, options: argparse.Namespace) -> None:
-    """A tiny model of random weights and walks in its size, for one clip."""
+def find_model(folder: Path, options: argparse.Namespace) -> None:
+    """The reference model, or else a tiny one of random weights and walks in its size, for one clip."""
+    try:
+        options.checkpoint, options.data = [reference_checkpoint()], [sample_data()]
+        return
+    except CheckpointError as error:
+        say(f"{error}; a tiny model of random weights stands in")
     options.checkpoint = fresh_model(folder, {})
     options.data, options.clips = [write_walks(folder / "walks", 64, trajectories=1)], 1
 
