@@ -15,7 +15,7 @@ from persist_cli.viewing.console import say
 
 MEMORIES = ("none", "voxel", "map2d", "snapshots")
 FORMS = ("cross", "projected")
-METRICS = "psnr,ssim,lpips-alex,lpips-vgg,absrel,delta1"
+METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
 
 
 def collect_commands(out: Path) -> list[str]:
@@ -54,14 +54,15 @@ def evaluate_commands(out: Path) -> list[str]:
         return f"eval {checkpoints} {given} --out {out}/eval-{name} --report {out}/report-{name}"
 
     revisit = f"--data {out}/test --protocol revisit --frames 17 --clips 200"
-    both = f"--memories {','.join(MEMORIES)}"
-    controls = "--controls copy,nearest,warp,codec,shuffled,emptied,oracle,noisy"
+    both, back = f"--memories {','.join(MEMORIES)}", f"--data {out}/there-and-back"
+    two, disturbed = f"{out}/none {out}/voxel", "--memories none,voxel --controls shuffled,emptied,oracle,noisy"
     return [
         "weights fetch lpips-alex lpips-vgg i3d-kinetics-400 efficientnet-lite0",
-        evaluation("revisit", rows, f"{revisit} {both} {controls}"),
-        evaluation("forms", forms, f"{revisit} --memories voxel --controls codec"),
-        evaluation("return", rows, f"--data {out}/there-and-back --protocol return --clips 100 {both} --controls warp"),
-        evaluation("long", rows, f"--data {out}/there-and-back --protocol long --metrics {METRICS} --clips 16 {both}"),
+        evaluation("revisit", rows, f"{revisit} {both} --controls copy,nearest,warp,codec"),
+        evaluation("disturbed", two, f"{revisit} {disturbed} --metrics {METRICS}"),
+        evaluation("forms", forms, f"{revisit} --memories voxel --controls codec --metrics {METRICS}"),
+        evaluation("return", rows, f"{back} --protocol return --clips 100 {both} --controls warp"),
+        evaluation("long", two, f"{back} --protocol long --clips 16 --memories none,voxel --metrics {METRICS}"),
     ]
 
 
