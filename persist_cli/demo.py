@@ -54,16 +54,17 @@ def run_demo(out: Path) -> None:
 
 
 def gather(out: Path) -> None:
-    """``rollout.mp4``, ``sheet.png``, ``map.png`` and ``metrics.json`` from what the commands left."""
+    """``rollout.mp4``, ``rollout.gif``, ``sheet.png``, ``map.png`` and ``metrics.json`` from what the commands left."""
     from persist_cli.trajectories.reference import parse_reference
     from persist_cli.viewing.sheet import write_sheet
-    from persist_cli.viewing.video import beside, read_video, write_video
+    from persist_cli.viewing.video import beside, enlarge, labelled, read_video, write_gif, write_video
 
     truth = parse_reference("sample#0").single().read(slice(HALF, None)).observations.rgb
     rows = [("ground truth", truth)]
     for name in MEMORIES:
         rows.append((name.replace("-", " "), read_video(out / name / "rgb.mp4", truth.shape[1], truth.shape[2])))
     write_video(out / "rollout.mp4", beside([video for _, video in rows]))
+    write_gif(out / "rollout.gif", beside([labelled(enlarge(video), name) for name, video in rows]))
     write_sheet(out / "sheet.png", rows, most=12)
     shutil.copyfile(out / "house.png", out / "map.png")
     shutil.copyfile(out / "eval" / "metrics.json", out / "metrics.json")

@@ -132,7 +132,7 @@ def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monk
     monkeypatch.setattr(demo, "STEPS", 1)
     demo.run_demo(here / "demo")
     names = {path.name for path in (here / "demo").iterdir()}
-    assert {"rollout.mp4", "sheet.png", "map.png", "metrics.json", "report"} <= names
+    assert {"rollout.mp4", "rollout.gif", "sheet.png", "map.png", "metrics.json", "report"} <= names
     assert (here / "demo/report/report.html").is_file()
     said = capsys.readouterr().out
     assert "On the way back (12 frames) PSNR is" in said

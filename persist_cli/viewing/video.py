@@ -86,6 +86,16 @@ def write_video(path: Path, video: UInt8[Tensor, "frame height width 3"], frames
         container.mux(stream.encode())
 
 
+def write_gif(path: Path, video: UInt8[Tensor, "frame height width 3"], frames_per_second: int = 8) -> None:
+    """An endless GIF of the frames in their own size, whole or not at all: for pages that do not play videos."""
+    from PIL import Image
+
+    first, *others = (Image.fromarray(frame.numpy()).quantize(256) for frame in video)
+    milliseconds = 1000 // frames_per_second
+    with written_aside(path) as aside:
+        first.save(aside, format="GIF", save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+
 def read_video(path: Path, height: int, width: int) -> UInt8[Tensor, "frame height width 3"]:
     """Frames of a video file, reduced to a size by averaging.
 

@@ -1,0 +1,32 @@
+import torch
+from PIL import Image
+
+from persist_cli.viewing.video import beside, enlarge, labelled, read_video, write_gif, write_video
+
+RAMP = (torch.linspace(0, 255, 64)[None, None, :, None] * torch.linspace(0.5, 1, 5)[:, None, None, None]).expand(
+    5, 64, 64, 3
+)
+VIDEO = RAMP.round().to(torch.uint8)
+
+
+def test_a_video_comes_back_as_it_was_but_for_the_codec(tmp_path):
+    write_video(tmp_path / "a.mp4", VIDEO)
+    back = read_video(tmp_path / "a.mp4", 64, 64)
+    assert back.shape == VIDEO.shape
+    assert (back.int() - VIDEO.int()).abs().float().mean() < 4
+
+
+def test_a_gif_holds_every_frame_in_nearly_its_colours_and_never_ends(tmp_path):
+    write_gif(tmp_path / "a.gif", VIDEO, frames_per_second=10)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert (image.n_frames, image.info["duration"], image.info["loop"]) == (5, 100, 0)
+        for number in range(5):
+            image.seek(number)
+            frame = torch.frombuffer(bytearray(image.convert("RGB").tobytes()), dtype=torch.uint8).reshape(64, 64, 3)
+            assert (frame.int() - VIDEO[number].int()).abs().float().mean() < 4
+
+
+def test_videos_under_their_names_stand_side_by_side():
+    both = beside([labelled(enlarge(VIDEO), name) for name in ("one", "two")])
+    assert both.shape == (5, 276, 2 * 256 + 2, 3)
+    assert torch.equal(both[:, 20:, :256], both[:, 20:, 258:])
