@@ -83,6 +83,9 @@ class SparseGrid:
 
     def __init__(self, columns: Mapping[str, Column]) -> None:
         self.columns = dict(columns)
+        self.keys: Tensor
+        self._rows: Tensor
+        self._buffers: dict[str, Tensor]
         self._blocks: tuple[Tensor, Tensor, Tensor] | None = None
         self.clear()
 
@@ -118,7 +121,8 @@ class SparseGrid:
         """Forget all cells but those chosen, in the order of keys."""
         rows = self._rows[chosen]
         self._buffers = {name: buffer[rows] for name, buffer in self._buffers.items()}
-        self.keys, self._rows = self.keys[chosen], torch.arange(len(rows), device=self.device)
+        self.keys = self.keys[chosen]
+        self._rows = torch.arange(len(rows), device=self.device)
         self._blocks = None
 
     def values(self, name: str, at: Tensor | None = None) -> Tensor:
