@@ -6,10 +6,10 @@ STAMP := $(VENV)/.installed
 .PHONY: demo demo-train table1 test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.demo_train runs/demo
+	$(VENV)/bin/python -m persist_cli.demos.training runs/demo
 
 demo-train: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.demo_train runs/demo-train
+	$(VENV)/bin/python -m persist_cli.demos.training runs/demo-train
 
 table1: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.table1 runs/table1

@@ -126,11 +126,13 @@ def test_without_the_variable_both_are_sought_in_the_package(monkeypatch):
 
 
 def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monkeypatch, capsys):
-    from persist_cli import demo
+    from persist_cli.demos import demo
+    from persist_cli.demos import reference as shown
 
     monkeypatch.setattr(demo, "HALF", 11)
-    monkeypatch.setattr(demo, "STEPS", 1)
-    demo.run_demo(here / "demo")
+    monkeypatch.setattr(shown, "HALF", 11)
+    monkeypatch.setattr(shown, "STEPS", 1)
+    demo.run_demo(shown.DEMO, here / "demo")
     names = {path.name for path in (here / "demo").iterdir()}
     assert {"rollout.mp4", "rollout.gif", "sheet.png", "map.png", "metrics.json", "report"} <= names
     assert (here / "demo/report/report.html").is_file()

@@ -1,0 +1,1 @@
+"""The demos: ``persist`` from end to end, by the commands that a user would type."""
