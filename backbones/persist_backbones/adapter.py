@@ -8,54 +8,39 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, ClassVar, Generic, Self, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import NonNegativeFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.tokens import MemoryTokens
 
+NEAR = 0.05  # metres in front of a camera; a token nearer than that is not in its picture
+
 
 @dataclass(frozen=True)
 class AdapterSettings:
-    """A memory adapter.
+    """What every form has.
 
     Args:
-        form: how tokens reach the video: ``cross``, the paper's cross-attention to positions in metres;
-            ``projected``, the same to positions in each latent frame's own cameras; ``canvas``, tokens drawn into
-            each view and added.
-        every: a memory block stands after every n-th transformer block; ``canvas`` is added before every n-th, the
-            first included.
+        form: one of ``FORMS``.
+        every: a block of the adapter stands at every n-th transformer block.
         width: channels of the tokens inside the blocks, or of the canvas at a video token.
-        heads: attention heads (``cross`` and ``projected``).
-        ff_factor: hidden width of the feed-forward over the video's; 0 leaves it out (``canvas`` alone).
-        frequencies: of the position code, for each axis (``cross`` and ``projected``).
-        positions: ``relative`` to the first camera of the clip, or ``absolute`` as in the paper (``cross`` alone).
-        canvas_channels: features of a token as drawn (``canvas``).
-        canvas_scale: pixels of the canvas along the edge of a latent pixel (``canvas``).
-        token_size: edge in metres of what a token stands for (``canvas``); 0 draws points.
-        splat_pixels: most canvas pixels along the edge of a drawn token, odd (``canvas``); 1 draws points.
+        ff_factor: hidden width of the feed-forward over the video's.
         token_budget: most tokens read for a clip.
         dropout: part of the training samples that see no memory, for guidance over memory.
     """
 
-    form: str = "cross"
+    form: str
     every: PositiveInt = 1
     width: PositiveInt = 128
-    heads: PositiveInt = 4
-    ff_factor: float = 2.0
-    frequencies: PositiveInt = 10
-    positions: Literal["relative", "absolute"] = "relative"
-    canvas_channels: PositiveInt = 32
-    canvas_scale: PositiveInt = 1
-    token_size: NonNegativeFloat = 0.25
-    splat_pixels: PositiveInt = 5
-    token_budget: int = 256
-    dropout: float = 0.1
+    ff_factor: NonNegativeFloat = 2.0
+    token_budget: PositiveInt = 256
+    dropout: Annotated[float, Field(ge=0, le=1)] = 0.1
 
 
 @dataclass(frozen=True)
@@ -88,54 +73,70 @@ class PreparedMemory:
     Args:
         tokens: what the form's blocks take.
         mask: what of it there is; nothing behind it changes the video.
-        places: position code of each video token, for forms whose queries have one.
     """
 
     tokens: Float[Tensor, "batch *group token width"]
     mask: Bool[Tensor, "batch *group token"]
-    places: Float[Tensor, "video_token code"] | None = None
 
-    def only(self, kept: Bool[Tensor, " batch"]) -> PreparedMemory:
+    def only(self, kept: Bool[Tensor, " batch"]) -> Self:
         """The same batch in which all other samples see no memory."""
         kept = kept.reshape(-1, *[1] * (self.mask.ndim - 1))
         return dataclasses.replace(self, mask=self.mask & kept)
 
-    def emptied(self) -> PreparedMemory:
+    def emptied(self) -> Self:
         """The same batch with every token behind the mask."""
         return dataclasses.replace(self, mask=torch.zeros_like(self.mask))
 
 
-class Adapter(nn.Module, ABC):
+Prepared = TypeVar("Prepared", bound=PreparedMemory)
+
+
+class Adapter(nn.Module, ABC, Generic[Prepared]):
     """A form of memory adapter.
 
     Args:
         channels: of the memory's features.
-        settings: sizes.
+        settings: an instance of ``settings_type``.
         video: the model it stands in.
+
+    Raises:
+        CheckpointError: when no block would stand anywhere, or sizes do not go together.
     """
+
+    settings_type: ClassVar[type[AdapterSettings]]
+    settings: AdapterSettings
+    blocks: nn.ModuleDict  # by the number of the transformer block at which each stands
 
     def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
         super().__init__()
+        if settings.every > video.layers:
+            raise CheckpointError(f"adapter: every is {settings.every}, but the model has {video.layers} layers")
         self.channels = channels
         self.settings = settings
         self.video = video
 
     @abstractmethod
-    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
+    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> Prepared:
         """Embed the tokens of a batch for the clip that the cameras look at."""
 
-    def before_block(self, layer: int, video: Tensor, memory: PreparedMemory) -> Tensor:
-        """The hidden states ``[batch, token, channel]`` before transformer block ``layer``; unchanged by default."""
-        return video
+    def before_block(
+        self, layer: int, video: Float[Tensor, "batch token channel"], memory: Prepared
+    ) -> Float[Tensor, "batch token channel"]:
+        """The hidden states before transformer block ``layer``."""
+        return self.change_before(self.blocks[str(layer)], video, memory) if str(layer) in self.blocks else video
 
     def after_block(
-        self, layer: int, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
+        self, layer: int, video: Tensor, memory: Prepared, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
-        """The hidden states after transformer block ``layer``; unchanged by default."""
+        """The hidden states after transformer block ``layer``."""
+        if str(layer) not in self.blocks:
+            return video
+        return self.change_after(self.blocks[str(layer)], video, memory, camera, time)
+
+    def change_before(self, block: nn.Module, video: Tensor, memory: Prepared) -> Tensor:
+        """What a block of the adapter makes of the hidden states before its transformer block; the same by default."""
         return video
 
-
-def refuse_absolute(settings: AdapterSettings) -> None:
-    """Raise ``CheckpointError`` when a form that places tokens by cameras alone is asked for absolute positions."""
-    if settings.positions == "absolute":
-        raise CheckpointError(f"adapter form {settings.form!r} has no absolute positions; only 'cross' has")
+    def change_after(self, block: nn.Module, video: Tensor, memory: Prepared, camera: Tensor, time: Tensor) -> Tensor:
+        """What a block of the adapter makes of the hidden states after its transformer block; the same by default."""
+        return video

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from pydantic import NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape, refuse_absolute
-from persist_backbones.conditioning import fold_frames
-from persist_backbones.splat import place, splat
+from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
+from persist_backbones.conditioning import fold_frames, tokens_of
+from persist_backbones.splat import rasterize, splat
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.tokens import MemoryTokens
@@ -49,17 +53,40 @@ class CanvasBlock(nn.Module):
         return video + (added * mask[..., None]).to(video.dtype)
 
 
-class CanvasAdapter(Adapter):
+@dataclass(frozen=True)
+class CanvasSettings(AdapterSettings):
+    """Tokens drawn into each view and added before every n-th transformer block, the first included.
+
+    An ``ff_factor`` of 0 leaves the feed-forward out.
+
+    Args:
+        canvas_channels: features of a token as drawn.
+        canvas_scale: pixels of the canvas along the edge of a latent pixel.
+        token_size: edge in metres of what a token stands for; 0 draws points.
+        splat_pixels: most canvas pixels along the edge of a drawn token, odd; 1 draws points.
+    """
+
+    form: Literal["canvas"] = "canvas"
+    canvas_channels: PositiveInt = 32
+    canvas_scale: PositiveInt = 1
+    token_size: NonNegativeFloat = 0.25
+    splat_pixels: PositiveInt = 5
+
+
+class CanvasAdapter(Adapter[PreparedMemory]):
     """Tokens splatted with a z-buffer into the view of each frame, embedded like patches and added.
 
     The views have the latents' size times ``canvas_scale``; frames are folded into channels as the camera latents
-    are. Nothing after the drawing has a bias and every activation keeps zero, so a video token on whose pixels no
-    memory token falls is that of stage 1 to the bit, before and after training alike.
+    are. Nothing after the drawing has a bias and every activation keeps zero, so to a video token on whose pixels no
+    memory token falls nothing is added, before and after training alike; a clip on whose views none falls at all is
+    that of stage 1 to the bit.
     """
 
-    def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
+    settings_type = CanvasSettings
+    settings: CanvasSettings
+
+    def __init__(self, channels: int, settings: CanvasSettings, video: VideoShape) -> None:
         super().__init__(channels, settings, video)
-        refuse_absolute(settings)
         if settings.splat_pixels % 2 == 0:
             raise CheckpointError(f"splat_pixels must be odd, not {settings.splat_pixels}")
         drawn = settings.canvas_channels
@@ -73,30 +100,20 @@ class CanvasAdapter(Adapter):
 
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
         """Draw the tokens, fold frames, and embed the patch of each video token; the mask says where one fell."""
-        patches = patchify(fold_frames(self.draw(tokens, cameras), self.video.temporal), self.patch)
+        folded = fold_frames(self.draw(tokens, cameras), self.video.temporal)
+        patches = tokens_of(F.pixel_unshuffle(folded, self.patch))
         return PreparedMemory(F.gelu(self.patches(patches)), patches.detach().ne(0).any(dim=-1))
 
     def draw(self, tokens: MemoryTokens, cameras: Cameras) -> Float[Tensor, "batch frame channel height width"]:
         """What each frame's camera sees of the memory: embedded features, coverage and log depth."""
         height, width = (side // self.video.spatial for side in (cameras.height, cameras.width))
         views = cameras.resized(height * self.settings.canvas_scale, width * self.settings.canvas_scale)
-        splats = place(tokens.positions, tokens.mask, views, self.settings.token_size, self.settings.splat_pixels)
+        splats = rasterize(tokens.positions, tokens.mask, views, self.settings.token_size, self.settings.splat_pixels)
         batch, frames = tokens.mask.shape[0], views.world_from_camera.shape[1]
         features = self.embed(tokens.features.to(self.patches.weight.dtype))
         return splat(features, splats, (batch, frames, views.height, views.width))
 
-    def before_block(self, layer: int, video: Tensor, memory: PreparedMemory) -> Tensor:
-        """The canvas added before this layer, where it is."""
-        if str(layer) not in self.blocks:
-            return video
-        changed: Tensor = self.blocks[str(layer)](video, memory.tokens, memory.mask)
+    def change_before(self, block: nn.Module, video: Tensor, memory: PreparedMemory) -> Tensor:
+        """The video with the canvas added."""
+        changed: Tensor = block(video, memory.tokens, memory.mask)
         return changed
-
-
-def patchify(
-    latents: Float[Tensor, "batch frame channel height width"], patch: int
-) -> Float[Tensor, "batch token value"]:
-    """All values of each video token's patch, in the order of the transformer's tokens."""
-    parts = F.pixel_unshuffle(latents, patch)
-    tokens: Tensor = parts.flatten(3).transpose(2, 3).flatten(1, 2)
-    return tokens

@@ -9,39 +9,42 @@ import math
 import torch
 import torch.nn.functional as F
 from diffusers import AutoencoderKLCogVideoX
-from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
-from persist_backbones.still import apart, code_frames_alone, together
+from persist_backbones.framewise import batch_to_frames, code_frames_alone, frames_to_batch
 from persist_cli.world.errors import CheckpointError
-
-CALM = -6.0  # log variance of fresh latents: noise that does not drown what has not been learnt yet
-
-
-def calm(vae: AutoencoderKLCogVideoX) -> None:
-    """Begin a fresh VAE with residual blocks that are the identity and latents with little noise.
-
-    Measured on houses at 64×64 after 150 steps: 22.8 dB instead of 20.1 with diffusers' own beginning.
-    """
-    with torch.no_grad():
-        vae.encoder.conv_out.conv.bias[vae.config.latent_channels :] = CALM
-        for module in vae.modules():
-            if isinstance(module, CogVideoXResnetBlock3D):
-                module.conv2.conv.weight.zero_()
-                module.conv2.conv.bias.zero_()
 
 
 def pixel_patch(vae: AutoencoderKLCogVideoX) -> int:
     """Edge of the square of pixels that is folded into the VAE's input channels, 1 for CogVideoX's own."""
-    return math.isqrt(vae.config.in_channels // 3)
+    return max(1, math.isqrt(vae.config.in_channels // 3))
 
 
 def spatial_compression(vae: AutoencoderKLCogVideoX) -> int:
     """Pixels along the edge of a latent pixel."""
     return pixel_patch(vae) * int(2 ** (len(vae.config.block_out_channels) - 1))
+
+
+def check_vae(vae: AutoencoderKLCogVideoX) -> None:
+    """Raise ``CheckpointError`` when a VAE does not take and give RGB, or compresses otherwise than it says."""
+    config, patch = vae.config, pixel_patch(vae)
+    if not config.in_channels == config.out_channels == 3 * patch**2:
+        raise CheckpointError(
+            f"a VAE of {config.in_channels} input and {config.out_channels} output channels; both must be 3 p², RGB "
+            "with p×p pixels folded"
+        )
+    stages = [len(each) for each in (config.block_out_channels, config.down_block_types, config.up_block_types)]
+    if len(set(stages)) > 1:
+        raise CheckpointError(f"a VAE of {stages[0]} block_out_channels, {stages[1]} down and {stages[2]} up blocks")
+    ratios = [2**halvings for halvings in range(stages[0])]
+    if config.temporal_compression_ratio not in ratios:
+        raise CheckpointError(
+            f"a VAE of {stages[0]} blocks cannot compress time by {config.temporal_compression_ratio}, only by "
+            f"{', '.join(map(str, ratios))}"
+        )
 
 
 def fold_pixels(
@@ -74,6 +77,7 @@ class Codec(nn.Module):
     def __init__(self, vae: AutoencoderKLCogVideoX) -> None:
         super().__init__()
         self.vae = vae
+        self._fingerprint: tuple[object, str] | None = None  # with what tells whether it still holds
         if self.frames_alone:
             code_frames_alone(vae)
 
@@ -98,13 +102,20 @@ class Codec(nn.Module):
         return self.temporal == 1
 
     def fingerprint(self) -> str:
-        """SHA-256 of the VAE's weights and configuration: what ``encode`` depends on besides the clips."""
+        """SHA-256 of the VAE's weights and configuration: what ``encode`` depends on besides the clips.
+
+        Computed again only when one of them was changed or moved.
+        """
         config = {name: value for name, value in self.vae.config.items() if not name.startswith("_")}
-        digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
-        for name, tensor in sorted(self.vae.state_dict().items()):
-            digest.update(f"{name} {tensor.dtype}".encode())
-            digest.update(tensor.cpu().reshape(-1).view(torch.uint8).numpy())
-        return digest.hexdigest()
+        settings, weights = json.dumps(config, sort_keys=True), sorted(self.vae.state_dict().items())
+        state = (settings, *((tensor.data_ptr(), tensor._version, tensor.dtype) for _, tensor in weights))
+        if self._fingerprint is None or self._fingerprint[0] != state:
+            digest = hashlib.sha256(settings.encode())
+            for name, tensor in weights:
+                digest.update(f"{name} {tensor.dtype}".encode())
+                digest.update(tensor.cpu().reshape(-1).view(torch.uint8).numpy())
+            self._fingerprint = state, digest.hexdigest()
+        return self._fingerprint[1]
 
     def images(
         self, rgb: UInt8[Tensor, "batch frame height width 3"], depth: Float[Tensor, "batch frame height width"]
@@ -122,27 +133,30 @@ class Codec(nn.Module):
         color, grey = (mean * self.vae.config.scaling_factor).transpose(1, 2).chunk(2)
         return torch.cat([color, grey], dim=2)
 
-    def decode(self, latents: Float[Tensor, "batch frame channel height width"]) -> tuple[Tensor, Tensor]:
-        """RGB uint8 ``[batch, frame, height, width, 3]`` and depth in metres of latents that ``encode`` gave."""
-        stacked = torch.cat(latents.chunk(2, dim=2)).transpose(1, 2) / self.vae.config.scaling_factor
-        color, grey = self.images_of(stacked).float().chunk(2)
+    def decode(
+        self, latents: Float[Tensor, "batch frame channel height width"], depth: bool = True
+    ) -> tuple[UInt8[Tensor, "batch frame height width 3"], Float[Tensor, "batch frame height width"]]:
+        """RGB and depth in metres of latents that ``encode`` gave; without ``depth`` none (0), and none is decoded."""
+        parts = latents.chunk(2, dim=2)[: 2 if depth else 1]
+        stacked = torch.cat(parts).transpose(1, 2) / self.vae.config.scaling_factor
+        color, *grey = self.images_of(stacked).float().chunk(len(parts))
         rgb = ((color.permute(0, 2, 3, 4, 1) + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
-        return rgb, decode_depth(grey.mean(dim=1))
+        return rgb, decode_depth(grey[0].mean(dim=1)) if depth else color.new_zeros(rgb.shape[:-1])
 
     def posterior(self, images: Float[Tensor, "stacked 3 frame height width"]) -> DiagonalGaussianDistribution:
         """Distribution of the unscaled latents ``[stacked, channel, latent_frame, rows, columns]``."""
         folded = fold_pixels(images, pixel_patch(self.vae))
         if not self.frames_alone:
             return self.vae.encode(folded).latent_dist
-        found = self.vae.encode(apart(folded)).latent_dist
-        return DiagonalGaussianDistribution(together(found.parameters, images.shape[2]))
+        found = self.vae.encode(frames_to_batch(folded)).latent_dist
+        return DiagonalGaussianDistribution(batch_to_frames(found.parameters, images.shape[2]))
 
     def images_of(
         self, latents: Float[Tensor, "stacked channel latent_frame rows columns"]
     ) -> Float[Tensor, "stacked 3 frame height width"]:
         """The images of unscaled latents."""
         if self.frames_alone:
-            folded = together(self.vae.decode(apart(latents)).sample, latents.shape[2])
+            folded = batch_to_frames(self.vae.decode(frames_to_batch(latents)).sample, latents.shape[2])
         else:
             folded = self.vae.decode(latents).sample
         return unfold_pixels(folded, pixel_patch(self.vae))

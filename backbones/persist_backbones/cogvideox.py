@@ -11,16 +11,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
+from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape
 from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
-from persist_backbones.diffusion import draw_timesteps, generators_of, noise_like
-from persist_backbones.forms import make_adapter
+from persist_backbones.forms import load_adapter, make_adapter, save_adapter
+from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
 from persist_backbones.parts import (
     DiffusersParts,
     check_fit,
-    load_exactly,
     load_parts,
     load_world,
     make_parts,
@@ -29,12 +28,10 @@ from persist_backbones.parts import (
 )
 from persist_backbones.presets import CogVideoXSettings
 from persist_backbones.rotary import rotary_positions
-from persist_backbones.samplers import SAMPLERS, denoise
+from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
 from persist_backbones.world_transformer import Conditions
 from persist_cli.world.backbone import Backbone, Clips, Sampling, Stage
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
-from persist_cli.world.settings import parse_settings
 from persist_cli.world.tokens import MemoryTokens
 
 
@@ -78,8 +75,17 @@ class CogVideoX(Backbone):
         """Those of diffusers that keep to the noise levels of training."""
         return tuple(SAMPLERS)
 
+    def check_sampling(self, sampling: Sampling) -> None:
+        """Raise ``PersistError`` for an unknown sampler, and for more steps than the training has noise levels."""
+        check_sampling(self.scheduler, sampling.sampler, sampling.steps)
+
     @property
-    def adapter(self) -> Adapter | None:
+    def gives_depth(self) -> bool:
+        """What the settings say."""
+        return self.settings.depth
+
+    @property
+    def adapter(self) -> Adapter[Any] | None:
         """The memory adapter in use."""
         return None if self.adapter_name is None else self.adapters[self.adapter_name]  # type: ignore[return-value]
 
@@ -121,7 +127,8 @@ class CogVideoX(Backbone):
                 rgb, depth = self.codec.windows(rgb, depth, self.settings.codec_window, generators)
             return self.codec.loss(rgb, depth, self.settings.kl_weight, generators)
         kept = self.encode(clips) if clips.latents is None else clips.latents
-        latents, image = kept[:, :-1], self.image_condition(kept[:, -1:])
+        latents, first = (kept, kept[:, :1]) if self.frames_alone else (kept[:, :-1], kept[:, -1:])
+        image = self.image_condition(first)
         timesteps = draw_timesteps(self.scheduler, generators).to(latents.device)
         noise = noise_like(latents, generators)
         target = predicted_target(self.scheduler, latents, noise, timesteps)
@@ -142,14 +149,16 @@ class CogVideoX(Backbone):
 
     @torch.no_grad()
     def encode(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
-        """Latents of the clips, and behind them one frame more: the latents of the first image alone."""
+        """Latents of the clips, behind them those of the first image alone where the first latent frame is not that."""
         whole = self.codec.encode(clips.rgb, clips.depth)
-        first = whole[:, :1] if self.frames_alone else self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1])
-        return torch.cat([whole, first], dim=1)
+        if self.frames_alone:
+            return whole
+        return torch.cat([whole, self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1])], dim=1)
 
     @torch.no_grad()
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
         """Clips denoised from each sample's own noise; the first frame is the given one."""
+        self.check_sampling(sampling)
         generators = generators_of(first.seeds)
         image = self.encode_first(first)
         memory = self.prepare_memory(first)
@@ -157,24 +166,22 @@ class CogVideoX(Backbone):
 
         def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
             given = dataclasses.replace(conditions, timestep=timesteps)
-            velocity = self.predict(latents, image, given)
+            predicted = self.predict(latents, image, given)
             if sampling.memory_guidance == 1.0 or memory is None:
-                return velocity
+                return predicted
             blind = self.predict(latents, image, dataclasses.replace(given, memory=memory.emptied()))
-            return blind + sampling.memory_guidance * (velocity - blind)
+            return blind + sampling.memory_guidance * (predicted - blind)
 
         noise = noise_like(image, generators)
         latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
-        rgb, depth = self.codec.decode(latents)
-        if not self.settings.depth:
-            depth = torch.zeros_like(depth)
+        rgb, depth = self.codec.decode(latents, self.settings.depth)
         rgb[:, 0], depth[:, 0] = first.rgb[:, 0], first.depth[:, 0]
         return rgb, depth
 
     @torch.no_grad()
     def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
-        """RGB and depth after encoding and decoding."""
-        return self.codec.decode(self.codec.encode(clips.rgb, clips.depth))
+        """RGB and depth after encoding and decoding; no depth (0) from a model without."""
+        return self.codec.decode(self.codec.encode(clips.rgb, clips.depth), self.settings.depth)
 
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """The image condition of the clips' first frames."""
@@ -197,7 +204,8 @@ class CogVideoX(Backbone):
                 f"was trained with {self.adapter.channels}; use the encoder it was trained with"
             )
         device = self.prompt.device
-        return self.adapter.prepare(tokens.to(device), clips.cameras.to(device))
+        prepared: PreparedMemory = self.adapter.prepare(tokens.to(device), clips.cameras.to(device))
+        return prepared
 
     def drop_memory(self, memory: PreparedMemory | None, generators: list[torch.Generator]) -> PreparedMemory | None:
         """Hide the memory of some training samples, for guidance over memory."""
@@ -234,8 +242,8 @@ class CogVideoX(Backbone):
         latents = torch.cat([color, color_image, depth, depth_image, given.camera.to(noisy.dtype)], dim=2)
         patch = self.transformer.base.config.patch_size
         given = dataclasses.replace(given, camera=camera_tokens(given.camera, patch))
-        velocity: Tensor = self.transformer(latents, given, self.adapter)
-        return velocity
+        predicted: Tensor = self.transformer(latents, given, self.adapter)
+        return predicted
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """After the codec's stage, measure the scale of its latents on these clips."""
@@ -245,9 +253,7 @@ class CogVideoX(Backbone):
 
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter and use it."""
-        parsed = parse_settings(AdapterSettings, settings, f"adapter {name!r}")
-        self.adapters[name] = make_adapter(channels, parsed, self.video_shape).to(self.prompt.device)
-        self.adapter_name = name
+        self._take_adapter(name, make_adapter(channels, settings, self.video_shape, f"adapter {name!r}"))
 
     def use_adapter(self, name: str | None) -> None:
         """Use one of the adapters, or none: plain stage 1."""
@@ -256,8 +262,8 @@ class CogVideoX(Backbone):
         self.adapter_name = name
 
     def checkpoint_settings(self) -> dict[str, Any]:
-        """The settings without the directory that the weights once came from."""
-        return super().checkpoint_settings() | {"pretrained": None}
+        """The settings without the directory that the weights once came from, and with what they predict."""
+        return super().checkpoint_settings() | {"pretrained": None, "prediction": self.scheduler.config.prediction_type}
 
     def save_base(self, folder: Path) -> None:
         """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
@@ -273,16 +279,14 @@ class CogVideoX(Backbone):
 
     def save_adapter(self, folder: Path) -> None:
         """Write the adapter in use."""
-        adapter = self.adapter
-        if adapter is None:
+        if self.adapter is None:
             raise CheckpointError("no memory adapter is in use, so none can be saved")
-        write_json(folder / "adapter.json", {"channels": adapter.channels} | dataclasses.asdict(adapter.settings))
-        write_tensors(folder / "adapter.safetensors", adapter.state_dict())
+        save_adapter(self.adapter, folder)
 
     def load_adapter(self, name: str, folder: Path) -> None:
         """Add the adapter that ``save_adapter`` wrote, and use it."""
-        settings = dict(read_json(folder / "adapter.json"))
-        path = folder / "adapter.safetensors"
-        tensors, _ = read_tensors(path)
-        self.add_adapter(name, int(settings.pop("channels")), settings)
-        load_exactly(self.adapters[name], tensors, set(self.adapters[name].state_dict()), path)
+        self._take_adapter(name, load_adapter(folder, self.video_shape))
+
+    def _take_adapter(self, name: str, adapter: Adapter[Any]) -> None:
+        self.adapters[name] = adapter.to(self.prompt.device)
+        self.adapter_name = name

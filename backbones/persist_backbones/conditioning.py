@@ -27,7 +27,7 @@ def camera_latents(
     its channels: 9×512×512×6 → 3×64×64×24.
 
     Args:
-        cameras: ``[batch, frame]``, 4n + 1 frames.
+        cameras: ``[batch, frame]``, one frame and a multiple of ``temporal``.
         spatial: compression in height and width.
         temporal: compression in time.
         printed: directions as the paper prints them.
@@ -51,8 +51,14 @@ def camera_tokens(
     latents: Float[Tensor, "batch frame channel height width"], patch: int
 ) -> Float[Tensor, "batch token channel"]:
     """The camera embedding at each video token: the mean over its patch."""
-    pooled = F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, latents.shape[:2])
-    tokens: Tensor = pooled.flatten(3).transpose(2, 3).flatten(1, 2)
+    return tokens_of(F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, latents.shape[:2]))
+
+
+def tokens_of(
+    latents: Float[Tensor, "batch frame channel row column"],
+) -> Float[Tensor, "batch token channel"]:
+    """Values at each place of each frame, in the order of the transformer's video tokens."""
+    tokens: Tensor = latents.flatten(3).transpose(2, 3).flatten(1, 2)
     return tokens
 
 

@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
-from persist_backbones.memory_block import MemoryBlock, position_code
+from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape
+from persist_backbones.memory_block import AttentionSettings, memory_blocks, position_code
 from persist_cli.world.cameras import Cameras, invert_rigid
 from persist_cli.world.geometry import transform
 from persist_cli.world.tokens import MemoryTokens
 
 
-class CrossAdapter(Adapter):
+@dataclass(frozen=True)
+class CrossSettings(AttentionSettings):
+    """The paper's cross-attention to positions in metres.
+
+    Args:
+        positions: ``relative`` to the first camera of the clip, or ``absolute`` as in the paper.
+    """
+
+    form: Literal["cross"] = "cross"
+    positions: Literal["relative", "absolute"] = "relative"
+
+
+class CrossAdapter(Adapter[PreparedMemory]):
     """The paper's form: features with a position code, cross-attended after transformer blocks."""
 
-    def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
+    settings_type = CrossSettings
+    settings: CrossSettings
+
+    def __init__(self, channels: int, settings: CrossSettings, video: VideoShape) -> None:
         super().__init__(channels, settings, video)
         self.embed = nn.Linear(channels + 6 * settings.frequencies, settings.width)
         self.blocks = memory_blocks(settings, video, video.camera_channels)
@@ -31,24 +49,9 @@ class CrossAdapter(Adapter):
         hidden = self.embed(torch.cat([tokens.features, code], dim=-1).to(self.embed.weight.dtype))
         return PreparedMemory(hidden * tokens.mask[..., None], tokens.mask)
 
-    def after_block(
-        self, layer: int, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
+    def change_after(
+        self, block: nn.Module, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
-        """The memory block of this layer, where one stands."""
-        if str(layer) not in self.blocks:
-            return video
-        block: MemoryBlock = self.blocks[str(layer)]  # type: ignore[assignment]
-        return block(video, memory.tokens, memory.mask, camera, time)  # type: ignore[no-any-return]
-
-
-def memory_blocks(settings: AdapterSettings, video: VideoShape, query_channels: int) -> nn.ModuleDict:
-    """The paper's memory block after every n-th transformer block, by the layer's number.
-
-    Args:
-        settings: sizes.
-        video: the model they stand in.
-        query_channels: of what is concatenated to the hidden states in the query.
-    """
-    layers = range(settings.every - 1, video.layers, settings.every)
-    sizes = (video.channels, query_channels, settings.width, settings.heads, settings.ff_factor, video.time_channels)
-    return nn.ModuleDict({str(layer): MemoryBlock(*sizes) for layer in layers})
+        """The video after the memory block."""
+        changed: Tensor = block(video, memory.tokens, memory.mask, camera, time)
+        return changed

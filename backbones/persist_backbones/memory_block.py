@@ -3,14 +3,33 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
+from persist_backbones.adapter import AdapterSettings, VideoShape
+from persist_cli.world.errors import CheckpointError
+
 SHORTEST, LONGEST = 0.5, 128.0  # wavelengths of the position code in metres: two cells, twice the paper's map
+
+
+@dataclass(frozen=True)
+class AttentionSettings(AdapterSettings):
+    """What the forms have whose blocks are memory blocks, each after every n-th transformer block.
+
+    Args:
+        heads: attention heads; they divide ``width``.
+        frequencies: of the position code, for each axis.
+    """
+
+    ff_factor: PositiveFloat = 2.0
+    heads: PositiveInt = 4
+    frequencies: PositiveInt = 10
 
 
 class Modulation(NamedTuple):
@@ -104,3 +123,21 @@ class MemoryBlock(nn.Module):
         out = F.scaled_dot_product_attention(q, k, v, attn_mask=allowed[:, None, None])
         seen: Tensor = self.to_out(out.transpose(1, 2).flatten(2))
         return seen * some[:, None, None]
+
+
+def memory_blocks(settings: AttentionSettings, video: VideoShape, query_channels: int) -> nn.ModuleDict:
+    """The paper's memory block after every n-th transformer block, by the layer's number.
+
+    Args:
+        settings: sizes.
+        video: the model they stand in.
+        query_channels: of what is concatenated to the hidden states in the query.
+
+    Raises:
+        CheckpointError: when the heads do not divide the width.
+    """
+    if settings.width % settings.heads:
+        raise CheckpointError(f"adapter: {settings.heads} heads do not divide a width of {settings.width}")
+    layers = range(settings.every - 1, video.layers, settings.every)
+    sizes = (video.channels, query_channels, settings.width, settings.heads, settings.ff_factor, video.time_channels)
+    return nn.ModuleDict({str(layer): MemoryBlock(*sizes) for layer in layers})

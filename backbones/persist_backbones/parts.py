@@ -8,10 +8,12 @@ from typing import Any
 
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
+from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
 from torch import Tensor, nn
 
-from persist_backbones.codec import calm, spatial_compression
+from persist_backbones.codec import check_vae, spatial_compression
 from persist_backbones.conditioning import RAY_CHANNELS
+from persist_backbones.objective import check_prediction
 from persist_backbones.presets import PRESETS, CogVideoXSettings
 from persist_backbones.world_transformer import WorldTransformer
 from persist_cli.world.errors import CheckpointError
@@ -22,6 +24,8 @@ SUBFOLDERS = {
     "vae": AutoencoderKLCogVideoX,
     "scheduler": CogVideoXDDIMScheduler,
 }
+
+INITIAL_LOG_VARIANCE = -6.0  # of fresh latents: noise that does not drown what has not been learnt yet
 
 
 @dataclass(frozen=True)
@@ -36,24 +40,28 @@ class DiffusersParts:
 def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
     """Freshly initialised parts of the settings' preset and sizes."""
     preset = PRESETS[settings.preset]
-    vae = AutoencoderKLCogVideoX(
-        **(preset["vae"] | {"sample_height": settings.height, "sample_width": settings.width} | settings.vae)
-    )
-    calm(vae)
+    shown = {"sample_height": settings.height, "sample_width": settings.width}
+    vae = _make_part("vae", preset["vae"] | shown | settings.vae)
+    initialize(vae)
     spatial = spatial_compression(vae)
     size = {
         "sample_height": settings.height // spatial,
         "sample_width": settings.width // spatial,
         "sample_frames": settings.frames,
     }
-    transformer = CogVideoXTransformer3DModel(**(preset["transformer"] | size | settings.transformer))
-    return DiffusersParts(transformer, vae, make_scheduler(settings))
+    transformer = _make_part("transformer", preset["transformer"] | size | settings.transformer)
+    prediction = {"prediction_type": settings.prediction} if settings.prediction else {}
+    return DiffusersParts(transformer, vae, CogVideoXDDIMScheduler(**(preset["scheduler"] | prediction)))
 
 
-def make_scheduler(settings: CogVideoXSettings) -> CogVideoXDDIMScheduler:
-    """The noise levels of the settings' preset, for what the settings predict."""
-    preset = PRESETS[settings.preset]["scheduler"]
-    return CogVideoXDDIMScheduler(**(preset | {"prediction_type": settings.prediction}))
+def initialize(vae: AutoencoderKLCogVideoX) -> None:
+    """Begin a fresh VAE with residual blocks that are the identity and latents with little noise."""
+    with torch.no_grad():
+        vae.encoder.conv_out.conv.bias[vae.config.latent_channels :] = INITIAL_LOG_VARIANCE
+        for module in vae.modules():
+            if isinstance(module, CogVideoXResnetBlock3D):
+                module.conv2.conv.weight.zero_()
+                module.conv2.conv.bias.zero_()
 
 
 def load_parts(folder: Path) -> DiffusersParts:
@@ -74,26 +82,33 @@ def _load_part(folder: Path, name: str) -> Any:
     try:
         return SUBFOLDERS[name].from_pretrained(folder, subfolder=name, local_files_only=True, **options)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
-        cause = str(error).strip().splitlines()
-        raise CheckpointError(
-            f"{folder / name}: cannot be loaded ({cause[0] if cause else type(error).__name__})"
-        ) from error
+        raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
+
+
+def _make_part(name: str, config: dict[str, Any]) -> Any:
+    try:
+        return SUBFOLDERS[name](**config)
+    except (TypeError, ValueError, IndexError) as error:
+        raise CheckpointError(f"diffusers cannot make a {name} of these settings ({_cause(error)})") from error
+
+
+def _cause(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
 
 
 def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
     """Raise ``CheckpointError`` when the parts do not work together at the settings' size."""
+    check_vae(parts.vae)
+    check_prediction(parts.scheduler, settings.prediction)
+    check_frames(int(parts.vae.config.temporal_compression_ratio), settings)
     config, vae = parts.transformer.config, parts.vae.config
     spatial = spatial_compression(parts.vae)
-    temporal = int(vae.temporal_compression_ratio)
     unit = spatial * config.patch_size
     if config.patch_size_t is not None or config.ofs_embed_dim:
         raise CheckpointError("CogVideoX 1.5 (patch_size_t, ofs) is not supported yet; use a CogVideoX 1.0 checkpoint")
     if settings.height % unit or settings.width % unit:
         raise CheckpointError(f"image size {settings.height}x{settings.width} must be a multiple of {unit}")
-    for name, frames in (("frames", settings.frames), ("codec_window's frames", (settings.codec_window or (1,))[0])):
-        # diffusers' decoder doubles time in halves and tells a first frame from an odd number of latent frames
-        if (frames - 1) % (2 * temporal) or (name == "frames" and frames == 1):
-            raise CheckpointError(f"{name} must be {2 * temporal}n + 1 with n > 0, not {frames}")
     if config.in_channels not in (vae.latent_channels, 2 * vae.latent_channels):
         raise CheckpointError(
             f"a transformer of {config.in_channels} channels does not fit a VAE of {vae.latent_channels}"
@@ -103,6 +118,17 @@ def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
         raise CheckpointError(
             f"learned positions are for {given[0]}x{given[1]} images, not {settings.height}x{settings.width}"
         )
+
+
+def check_frames(temporal: int, settings: CogVideoXSettings) -> None:
+    """Raise ``CheckpointError`` when the codec, of this compression in time, cannot code the settings' frames."""
+    # diffusers' decoder doubles time in halves and tells a first frame from an odd number of latent frames
+    step = 2 * temporal if temporal > 1 else 1
+    rule, window = f"{step}n + 1, " if step > 1 else "", (settings.codec_window or (1,))[0]
+    if settings.frames < 2 or (settings.frames - 1) % step:
+        raise CheckpointError(f"frames must be {rule}at least 2, not {settings.frames}")
+    if window < 1 or (window - 1) % step:
+        raise CheckpointError(f"codec_window's frames must be {rule}at least 1, not {window}")
 
 
 def widen(parts: DiffusersParts, settings: CogVideoXSettings) -> WorldTransformer:

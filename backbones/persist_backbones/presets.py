@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from pydantic import NonNegativeFloat, PositiveFloat
+
 from persist_backbones.objective import Prediction, Weighting
 
 VAE_8X = {
@@ -82,17 +84,18 @@ class CogVideoXSettings:
             its configuration replaces the preset's.
         height: pixels.
         width: pixels.
-        frames: frames a clip, 8n + 1.
+        frames: frames a clip, at least two; for a VAE that compresses time by c > 1, 2cn + 1: 9, 17, … for CogVideoX's.
         interactions: actions that change the world; each gets an embedding for each step of a clip.
         rays: ``correct`` Plücker directions, or as the paper ``printed`` them, with the translation added.
         depth: false holds depth at zero in the input and leaves it out of the loss: a model of RGB alone with as many
             parameters, whose clips have no depth (0) after the given frame.
-        prediction: ``v_prediction`` as CogVideoX, or ``sample``, the clean latents; a preset's only.
+        prediction: ``v_prediction`` as CogVideoX, or ``sample``, the clean latents; by default what the preset or the
+            pretrained weights predict, which nothing else can replace.
         weighting: of errors over noise levels: ``uniform``, ``min-snr`` or ``min-snr-plus-one`` (see ``objective``).
         snr_gamma: of min-SNR.
         kl_weight: of the codec's latent prior.
-        codec_window: frames (1 or 8n + 1), height and width of the random windows that the codec is trained on; a
-            quarter of the pixels costs a quarter of the time.
+        codec_window: frames (any number that ``frames`` may be, or 1), height and width of the random windows that the
+            codec is trained on; a quarter of the pixels costs a quarter of the time.
         transformer: changes to the preset's transformer configuration.
         vae: changes to the preset's VAE configuration.
     """
@@ -105,10 +108,10 @@ class CogVideoXSettings:
     interactions: tuple[str, ...] = ("pick_up", "drop", "toggle")
     rays: Literal["correct", "printed"] = "correct"
     depth: bool = True
-    prediction: Prediction = "v_prediction"
+    prediction: Prediction | None = None
     weighting: Weighting = "uniform"
-    snr_gamma: float = 5.0
-    kl_weight: float = 1e-6
+    snr_gamma: PositiveFloat = 5.0
+    kl_weight: NonNegativeFloat = 1e-6
     codec_window: tuple[int, int, int] | None = None
     transformer: dict[str, Any] = field(default_factory=dict)
     vae: dict[str, Any] = field(default_factory=dict)

@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape, refuse_absolute
+from persist_backbones.adapter import NEAR, Adapter, PreparedMemory, VideoShape
 from persist_backbones.conditioning import fold_frames
-from persist_backbones.cross import memory_blocks
-from persist_backbones.memory_block import MemoryBlock, position_code
+from persist_backbones.memory_block import AttentionSettings, memory_blocks, position_code
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.geometry import pixel_centers, project
 from persist_cli.world.tokens import MemoryTokens
 
-SHORTEST, LONGEST = 1 / 16, 2.0  # wavelengths in images; twice an image tells both sides of it and a margin apart
+WAVELENGTHS = (1 / 16, 2.0)  # in images; twice an image tells both sides of it and a margin apart
 MARGIN = 0.25  # of the image: a token's cell reaches into view before its middle does
-NEAR = 0.05  # metres
 OCTAVES = 8.0  # 6 cm to 16 m, the depths of rooms, span one unit of log z as the image spans one of u and v
 
 
-class ProjectedAdapter(Adapter):
+@dataclass(frozen=True)
+class ProjectedSettings(AttentionSettings):
+    """The paper's memory block with positions in each latent frame's own cameras."""
+
+    form: Literal["projected"] = "projected"
+
+
+@dataclass(frozen=True)
+class ProjectedMemory(PreparedMemory):
+    """Tokens for each latent frame, and where the video tokens are.
+
+    Args:
+        places: position code of each video token of a latent frame.
+    """
+
+    places: Float[Tensor, "video_token code"]
+
+
+class ProjectedAdapter(Adapter[ProjectedMemory]):
     """Each latent frame attends to the tokens at their projection (u, v, log z) into its own cameras.
 
     A latent frame that folds four frames sees the projections into all four, concatenated as the camera latents are:
@@ -30,15 +49,17 @@ class ProjectedAdapter(Adapter):
     the code of the video token's own (u, v), at the same wavelengths.
     """
 
-    def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
+    settings_type = ProjectedSettings
+    settings: ProjectedSettings
+
+    def __init__(self, channels: int, settings: ProjectedSettings, video: VideoShape) -> None:
         super().__init__(channels, settings, video)
-        refuse_absolute(settings)
         code = video.temporal * (6 * settings.frequencies + 1)
         self.embed = nn.Linear(channels, settings.width)
         self.place = nn.Linear(code, settings.width, bias=False)
         self.blocks = memory_blocks(settings, video, video.camera_channels + 4 * settings.frequencies)
 
-    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
+    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> ProjectedMemory:
         """Features and position codes projected and summed, for each latent frame."""
         temporal, dtype = self.video.temporal, self.embed.weight.dtype
         places, seen = image_places(tokens, cameras)
@@ -46,15 +67,12 @@ class ProjectedAdapter(Adapter):
         folded = fold_frames(code.transpose(2, 3), temporal).transpose(2, 3)
         mask = fold_frames(seen[:, :, None], temporal).any(dim=2)
         hidden = self.embed(tokens.features.to(dtype))[:, None] + self.place(folded.to(dtype))
-        return PreparedMemory(hidden * mask[..., None], mask, self.query_places(cameras).to(dtype))
+        return ProjectedMemory(hidden * mask[..., None], mask, self.query_places(cameras).to(dtype))
 
-    def after_block(
-        self, layer: int, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
+    def change_after(
+        self, block: nn.Module, video: Tensor, memory: ProjectedMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
-        """The memory block of this layer, where one stands, on each latent frame by itself."""
-        if str(layer) not in self.blocks or memory.places is None:
-            return video
-        block: MemoryBlock = self.blocks[str(layer)]  # type: ignore[assignment]
+        """The video after the memory block, which takes each latent frame by itself."""
         frames = memory.mask.shape[1]
         places = memory.places.expand(len(video) * frames, -1, -1)
         split, views = (part.unflatten(1, (frames, -1)).flatten(0, 1) for part in (video, camera))
@@ -66,7 +84,7 @@ class ProjectedAdapter(Adapter):
 
     def code(self, places: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch code"]:
         """Sines and cosines of places in the image."""
-        return position_code(places, self.settings.frequencies, SHORTEST, LONGEST)
+        return position_code(places, self.settings.frequencies, *WAVELENGTHS)
 
     def query_places(self, cameras: Cameras) -> Float[Tensor, "video_token code"]:
         """The code of (u, v) at the middle of each video token of a latent frame."""

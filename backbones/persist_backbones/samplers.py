@@ -58,17 +58,22 @@ def make_schedule(config: Any, sampler: str, steps: int) -> Any:
     Raises:
         PersistError: for an unknown sampler, and for more steps than the training has noise levels.
     """
-    if sampler not in SAMPLERS:
-        raise PersistError(f"unknown sampler {sampler!r}; known: {', '.join(SAMPLERS)}")
     trained = CogVideoXDDIMScheduler.from_config(config)
-    if not 1 <= steps <= trained.config.num_train_timesteps:
-        raise PersistError(f"{steps} denoising steps; it must be 1 to {trained.config.num_train_timesteps}")
+    check_sampling(trained, sampler, steps)
     schedule = COGVIDEOX[sampler].from_config(config) if sampler in COGVIDEOX else multistep(sampler, trained)
     schedule.set_timesteps(steps)
     schedule.timesteps = schedule.timesteps[:steps]  # rounding gives some numbers, as 61, one timestep more: -1
     if sampler in MULTISTEP:
         schedule.sigmas = torch.cat([schedule.sigmas[:steps], torch.zeros(1)])
     return schedule
+
+
+def check_sampling(trained: CogVideoXDDIMScheduler, sampler: str, steps: int) -> None:
+    """Raise ``PersistError`` for an unknown sampler, and for more steps than the training has noise levels."""
+    if sampler not in SAMPLERS:
+        raise PersistError(f"unknown sampler {sampler!r}; known: {', '.join(SAMPLERS)}")
+    if not 1 <= steps <= trained.config.num_train_timesteps:
+        raise PersistError(f"{steps} denoising steps; it must be 1 to {trained.config.num_train_timesteps}")
 
 
 def multistep(sampler: str, trained: CogVideoXDDIMScheduler) -> Any:

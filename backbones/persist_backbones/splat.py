@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from persist_backbones.adapter import NEAR
 from persist_cli.world.cameras import Cameras
-from persist_cli.world.geometry import project
+from persist_cli.world.geometry import nearest_at, project
 
-NEAR = 0.05  # metres
 TIE = 1e-4  # of the depth: a wall seen face on is one depth up to rounding, whichever way the world is turned
 SNAP = 1e-6  # pixels: a token on the border of two pixels stays in one of them whatever the rounding
 
@@ -43,9 +43,10 @@ def splat(
         shape: batch, frames, height and width of the canvas.
     """
     pixels = shape[0] * shape[1] * shape[2] * shape[3]
-    nearest = splats.depth.new_full((pixels,), torch.inf).scatter_reduce(0, splats.pixel, splats.depth, "amin")
+    nearest = nearest_at(splats.pixel, splats.depth, pixels)
     won = splats.depth <= nearest[splats.pixel] * (1 + TIE)
     pixel, token = splats.pixel[won], splats.token[won]
+    # on CUDA the order of this sum, and so its last bit, is not fixed where three or more tokens are as near
     drawn = features.new_zeros(pixels, features.shape[-1]).index_add(0, pixel, features.flatten(0, 1)[token])
     count = features.new_zeros(pixels).index_add(0, pixel, features.new_ones(len(pixel)))
     covered = count > 0
@@ -57,7 +58,7 @@ def splat(
     return result
 
 
-def place(
+def rasterize(
     positions: Float[Tensor, "batch token 3"],
     mask: Bool[Tensor, "batch token"],
     views: Cameras,

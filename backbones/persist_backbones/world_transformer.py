@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from persist_backbones.adapter import Adapter, PreparedMemory
+from persist_backbones.conditioning import tokens_of
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Conditions:
 
 
 class WorldTransformer(nn.Module):
-    """Predicts velocities of RGB and depth latents.
+    """Predicts of RGB and depth latents what the objective asks for (see ``objective``).
 
     Args:
         base: diffusers' transformer.
@@ -72,9 +73,12 @@ class WorldTransformer(nn.Module):
                 nn.init.zeros_(parameter)
 
     def forward(
-        self, latents: Float[Tensor, "batch frame channel height width"], given: Conditions, adapter: Adapter | None
+        self,
+        latents: Float[Tensor, "batch frame channel height width"],
+        given: Conditions,
+        adapter: Adapter[Any] | None,
     ) -> Float[Tensor, "batch frame out height width"]:
-        """Velocities of RGB and depth latents, concatenated on channels."""
+        """Predictions of RGB and depth latents, concatenated on channels."""
         time = self.embed_time(given, latents.dtype)
         text, video = self.embed_patches(latents, given.text.to(latents.dtype))
         for layer, block in enumerate(self.base.transformer_blocks):
@@ -97,9 +101,9 @@ class WorldTransformer(nn.Module):
         """Text and video tokens: diffusers' patch embedding of its own channels plus that of the new ones."""
         known = self.base.config.in_channels
         tokens: Tensor = self.base.patch_embed(text, latents[:, :, :known])
-        extra = self.extra_in(latents[:, :, known:].flatten(0, 1)).flatten(2).transpose(1, 2)
+        extra = self.extra_in(latents[:, :, known:].flatten(0, 1)).unflatten(0, latents.shape[:2])
         words = text.shape[1]
-        video = tokens[:, words:] + extra.unflatten(0, latents.shape[:2]).flatten(1, 2)
+        video = tokens[:, words:] + tokens_of(extra)
         return tokens[:, :words], self.base.embedding_dropout(video)
 
     def run_block(

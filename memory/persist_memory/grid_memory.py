@@ -70,9 +70,6 @@ class GridMemory(Memory):
     def heights(self, positions: Float[Tensor, "token 3"], cameras: Cameras) -> Float[Tensor, " token"]:
         """The middle coordinate, in the grid's axes, that the tokens of cells are given."""
 
-    def forget(self, observations: Observations) -> None:
-        """Remove the cells that frames about to be written contradict; none by default."""
-
     @property
     def grid(self) -> SparseGrid:
         """The cells; made when first wanted, since an encoder may have to open a file to know its channels."""
@@ -95,7 +92,6 @@ class GridMemory(Memory):
         """
         check_observations(observations, f"memory {self.name!r}")
         for part in self._parts(observations):
-            self.forget(part)
             self._write(part)
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:

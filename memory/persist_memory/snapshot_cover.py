@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from persist_cli.world.geometry import nearest_at
 from persist_memory.snapshot_store import SnapshotStore
 
 Located = tuple[
@@ -50,8 +51,7 @@ def covered_view(
     places = len(world_from_camera) * rows * columns
     offset = torch.arange(len(world_from_camera), device=cell.device)[:, None] * (rows * columns)
     place = torch.where(inside, cell + offset, places)
-    nearest = torch.full((places + 1,), torch.inf, dtype=torch.float64, device=cell.device)
-    nearest = nearest.scatter_reduce(0, place.flatten(), depth.flatten(), "amin")
+    nearest = nearest_at(place.flatten(), depth.flatten(), places + 1)
     place = torch.where(depth <= (1 + SAME_PLACE) * nearest[place], place, places)
     covered = torch.zeros(len(store), places + 1, dtype=torch.bool, device=cell.device)
     return covered.scatter_(1, place.flatten(1), True)[:, :places]

@@ -117,14 +117,6 @@ class SparseGrid:
         if not bool(known.all()):
             self._append(keys[~known], places[~known], ~known, values)
 
-    def keep(self, chosen: Bool[Tensor, " cell"]) -> None:
-        """Forget all cells but those chosen, in the order of keys."""
-        rows = self._rows[chosen]
-        self._buffers = {name: buffer[rows] for name, buffer in self._buffers.items()}
-        self.keys = self.keys[chosen]
-        self._rows = torch.arange(len(rows), device=self.device)
-        self._blocks = None
-
     def values(self, name: str, at: Tensor | None = None) -> Tensor:
         """A column's values in the order of keys, of all cells or of those at some positions of that order."""
         rows = self._rows if at is None else self._rows[at]

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from persist_cli.world.cameras import Cameras
+from persist_cli.world.errors import PersistError
 from persist_cli.world.settings import NoSettings
 from persist_cli.world.tokens import MemoryTokens
 
@@ -89,6 +90,18 @@ class Backbone(nn.Module, ABC):
     def samplers(self) -> tuple[str, ...]:
         """Names that ``Sampling.sampler`` may have."""
 
+    def check_sampling(self, sampling: Sampling) -> None:
+        """Raise ``PersistError``, one line, when ``generate`` cannot draw a clip like that."""
+        if sampling.sampler not in self.samplers:
+            raise PersistError(f"unknown sampler {sampling.sampler!r}; known: {', '.join(self.samplers)}")
+        if sampling.steps < 1:
+            raise PersistError(f"{sampling.steps} denoising steps; it must be at least 1")
+
+    @property
+    def gives_depth(self) -> bool:
+        """Whether clips have depth after their first frame."""
+        return True
+
     @abstractmethod
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Freeze all that the stage does not train and return the rest by name."""
@@ -107,7 +120,7 @@ class Backbone(nn.Module, ABC):
 
     @property
     def frames_alone(self) -> bool:
-        """Whether ``encode`` gives one row a frame, and one more that repeats the first's, each of its frame alone.
+        """Whether ``encode`` gives one row a frame, each of its frame alone.
 
         The latents of a whole trajectory then serve all clips of it.
         """
@@ -125,12 +138,13 @@ class Backbone(nn.Module, ABC):
             sampling: steps, sampler and guidance.
 
         Returns:
-            rgb uint8 ``[batch, frame, height, width, 3]`` and depth float32 metres, the first frame as given.
+            rgb uint8 ``[batch, frame, height, width, 3]`` and depth float32 metres, the first frame as given; where
+            the backbone does not give depth, 0 after it.
         """
 
     @abstractmethod
     def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
-        """RGB and depth after the codec alone: the ceiling of what can be generated."""
+        """RGB and depth after the codec alone: the ceiling of what can be generated; 0 depth where none is given."""
 
     @abstractmethod
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from persist_cli.world.errors import CheckpointError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 ASIDE = ".partial-"
 
@@ -23,7 +25,7 @@ ASIDE = ".partial-"
 def written_aside(path: Path) -> Iterator[Path]:
     """A temporary path in the same folder that becomes ``path`` when the block ends well."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{path.name}"
+    aside = _place_aside(path)
     try:
         yield aside
         with aside.open("rb") as file:
@@ -40,24 +42,37 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON, whole or not at all."""
-    write_text(path, json.dumps(value, indent=2) + "\n")
+    """Write JSON, whole or not at all; NaN and infinity become null."""
+    write_text(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """JSON values without NaN and infinity, which JSON does not have: they become null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write a safetensors file, whole or not at all."""
+    """Write a safetensors file, whole or not at all.
+
+    Raises:
+        OSError: when it cannot be written, as on a full disk.
+    """
+    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     # safetensors writes a nameless temporary file beside its target: a folder around both can be found after a kill
-    around = path.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{path.name}"
-    around.mkdir(parents=True)
-    try:
+    with empty_folder_aside(path) as around:
         with written_aside(around / path.name) as aside:
-            save_file(contiguous, aside, dict(metadata or {}))
+            try:
+                save_file(contiguous, aside, dict(metadata or {}))
+            except SafetensorError as error:
+                raise OSError(f"{path}: {str(error).splitlines()[0]}") from error
         (around / path.name).replace(path)
-    finally:
-        shutil.rmtree(around, ignore_errors=True)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -97,12 +112,46 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+@contextlib.contextmanager
+def empty_folder_aside(path: Path) -> Iterator[Path]:
+    """A temporary folder beside ``path``; what is still in it when the block ends is removed with it."""
+    aside = _place_aside(path)
+    aside.mkdir(parents=True)
+    try:
+        yield aside
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def folder_aside(path: Path) -> Iterator[Path]:
+    """A temporary folder that becomes ``path`` when the block ends well, in the place of what is there by then.
+
+    What a killed writer of ``path`` left aside is removed first.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(path.parent, path.name)
+    with empty_folder_aside(path) as aside:
+        yield aside
+        if path.exists():  # no folder can be renamed over one that holds something: the old one steps aside first
+            with empty_folder_aside(path) as old:
+                path.rename(old / path.name)
+                aside.rename(path)
+        else:
+            aside.rename(path)
+
+
 def remove_leftovers(folder: Path, name: str = "") -> None:
     """Delete what a killed writer left aside in ``folder``, of all files or of those of one ``name``."""
     for leftover in folder.glob(f"{ASIDE}*"):
-        if not leftover.name.endswith(name and f"-{name}"):
+        owner = leftover.name.removeprefix(ASIDE).partition("-")[2]
+        if name and owner != name:
             continue
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
         else:
             leftover.unlink(missing_ok=True)
+
+
+def _place_aside(path: Path) -> Path:
+    return path.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{path.name}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from persist_cli.world.cameras import Cameras, invert_rigid
@@ -56,6 +56,11 @@ def project(
     image = torch.einsum("...ij,...pj->...pi", cameras.intrinsics.double(), local)
     safe = torch.where(depth.abs() < 1e-9, torch.full_like(depth, 1e-9), depth)
     return image[..., :2] / safe[..., None], depth
+
+
+def nearest_at(places: Int64[Tensor, " point"], depth: Float[Tensor, " point"], count: int) -> Float[Tensor, " place"]:
+    """A z-buffer: the least depth that falls on each of ``count`` places, infinite where none does."""
+    return depth.new_full((count,), torch.inf).scatter_reduce(0, places, depth, "amin")
 
 
 def pose_differences(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from persist_backbones.adapter import PreparedMemory
 from persist_backbones.cogvideox import CogVideoX
 from persist_cli.registry import make_backbone
 from persist_cli.world.backbone import Clips
@@ -27,7 +30,7 @@ def micro(**settings: Any) -> CogVideoX:
 def with_adapter(backbone: CogVideoX, **settings: Any) -> CogVideoX:
     """The model with a fresh adapter in use."""
     torch.manual_seed(1)
-    backbone.add_adapter("voxel", CHANNELS, {"width": 16, "heads": 2, "dropout": 0.0} | settings)
+    backbone.add_adapter("voxel", CHANNELS, {"width": 16, "dropout": 0.0} | settings)
     return backbone
 
 
@@ -62,3 +65,16 @@ def random_clips(batch: int = 2, tokens: MemoryTokens | None = None, interaction
         tokens=tokens,
         seeds=list(range(batch)),
     )
+
+
+def predicted(backbone: CogVideoX, clips: Clips, tokens: MemoryTokens | None) -> Tensor:
+    """What the transformer says of the clips' latents at one noise level."""
+    return predicted_of(backbone, clips, backbone.prepare_memory(dataclasses.replace(clips, tokens=tokens)))
+
+
+@torch.no_grad()
+def predicted_of(backbone: CogVideoX, clips: Clips, memory: PreparedMemory | None) -> Tensor:
+    """The same of prepared tokens."""
+    latents = backbone.codec.encode(clips.rgb, clips.depth)
+    given = backbone.conditions(clips, torch.full((len(clips.seeds),), 500), memory)
+    return backbone.predict(latents, backbone.encode_first(clips), given)

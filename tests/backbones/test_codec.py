@@ -1,6 +1,9 @@
-"""The codec: frames coded alone, pixels folded into channels, and a calm beginning."""
+"""The codec: frames coded alone, pixels folded into channels, and how it begins."""
 
 from __future__ import annotations
+
+import dataclasses
+import hashlib
 
 import pytest
 import torch
@@ -8,8 +11,9 @@ from diffusers import AutoencoderKLCogVideoX
 
 from persist_backbones.codec import fold_pixels, unfold_pixels
 from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.still import apart, together
+from persist_backbones.framewise import batch_to_frames, frames_to_batch
 from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import CheckpointError
 from tests.backbones.micro import micro, random_clips, shaken
 
 STILL = {
@@ -41,7 +45,7 @@ def test_a_frame_coded_alone_does_not_depend_on_the_others(still: CogVideoX) -> 
     for frame in (0, 4, 8):
         alone = still.codec.encode(clips.rgb[:, frame : frame + 1], clips.depth[:, frame : frame + 1])
         assert torch.allclose(alone[:, 0], whole[:, frame], atol=1e-5)
-    assert torch.equal(still.encode(clips)[:, -1], still.encode(clips)[:, 0])
+    assert torch.equal(still.encode(clips), whole)
 
 
 def test_the_fast_convolution_gives_what_diffusers_gives_for_videos_of_one_frame(still: CogVideoX) -> None:
@@ -50,6 +54,17 @@ def test_the_fast_convolution_gives_what_diffusers_gives_for_videos_of_one_frame
     image = torch.randn(3, 48, 1, 8, 8, generator=torch.Generator().manual_seed(0))
     latents = plain.encode(image).latent_dist.mode()
     assert torch.allclose(still.codec.vae.encode(image).latent_dist.mode(), latents, atol=1e-4)
+    assert torch.allclose(still.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
+
+
+def test_the_fast_convolution_goes_on_with_a_video_as_diffusers_does(still: CogVideoX) -> None:
+    plain = AutoencoderKLCogVideoX(**{k: v for k, v in still.codec.vae.config.items() if not k.startswith("_")})
+    plain.load_state_dict(still.codec.vae.state_dict())
+    for vae in (plain, still.codec.vae):
+        vae.num_latent_frames_batch_size = vae.num_sample_frames_batch_size = 1
+    video = torch.randn(2, 48, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    latents = plain.encode(video).latent_dist.mode()
+    assert torch.allclose(still.codec.vae.encode(video).latent_dist.mode(), latents, atol=1e-4)
     assert torch.allclose(still.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
 
 
@@ -67,7 +82,7 @@ def test_the_fast_convolution_learns_what_diffusers_would(still: CogVideoX) -> N
 def test_folding_loses_nothing() -> None:
     videos = torch.randn(2, 3, 5, 8, 12)
     assert torch.equal(unfold_pixels(fold_pixels(videos, 4), 4), videos)
-    assert torch.equal(together(apart(videos), 5), videos)
+    assert torch.equal(batch_to_frames(frames_to_batch(videos), 5), videos)
     assert fold_pixels(videos, 4).shape == (2, 48, 5, 2, 3)
 
 
@@ -86,3 +101,61 @@ def test_a_model_that_codes_frames_alone_trains_and_generates(still: CogVideoX) 
     rgb, depth = still.generate(clips, Sampling(2))
     assert rgb.shape == clips.rgb.shape
     assert depth.shape == clips.depth.shape
+
+
+@pytest.mark.parametrize("settings", [{}, STILL], ids=["video", "frames alone"])
+def test_kept_latents_train_as_the_images_that_they_were_made_of(settings: dict) -> None:
+    backbone, clips = micro(**settings), random_clips(2)
+    shaken(backbone)
+    kept = dataclasses.replace(clips, latents=backbone.encode(clips), rgb=clips.rgb[:, :0], depth=clips.depth[:, :0])
+    losses, again = backbone(clips, "1"), backbone(kept, "1")
+    assert all(torch.equal(value, again[name]) for name, value in losses.items())
+
+
+def test_a_fingerprint_follows_the_weights_and_their_scale_and_nothing_else(still: CogVideoX) -> None:
+    first = still.encoding("1")
+    shaken(still.transformer)
+    assert still.encoding("1") == still.encoding("2") == first
+    assert still.encoding("codec") is None
+    shaken(still.codec)
+    second = still.encoding("1")
+    still.finish_stage("codec", [random_clips(1)])
+    third = still.encoding("1")
+    still.to(torch.bfloat16)
+    assert len({first, second, third, still.encoding("1")}) == 4
+
+
+def test_unchanged_weights_are_hashed_once(still: CogVideoX, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = still.encoding("1")
+    monkeypatch.setattr(hashlib, "sha256", None)
+    assert still.encoding("2") == first
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"in_channels": 12}, "12 input and 3 output channels"),
+        ({"in_channels": 24, "out_channels": 24}, "24 input and 24 output channels; both must be 3 p²"),
+        ({"in_channels": 2, "out_channels": 2}, "2 input and 2 output channels"),
+        ({"block_out_channels": [8, 8, 8, 8]}, "4 block_out_channels, 3 down and 3 up blocks"),
+        ({"temporal_compression_ratio": 3}, "cannot compress time by 3, only by 1, 2, 4"),
+        ({"temporal_compression_ratio": 8}, "cannot compress time by 8, only by 1, 2, 4"),
+        ({"norm_num_groups": 3}, "diffusers cannot make a vae of these settings"),
+        ({"chanels": 3}, "diffusers cannot make a vae of these settings"),
+    ],
+)
+def test_a_vae_that_cannot_work_is_refused_in_one_line(change: dict, cause: str) -> None:
+    vae = {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4}
+    with pytest.raises(CheckpointError, match=cause) as error:
+        micro(vae=vae | change)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("frames", [2, 3, 4, 9])
+def test_a_codec_of_single_frames_takes_any_number_of_them(frames: int) -> None:
+    still = micro(**STILL, frames=frames, codec_window=[frames - 1, 32, 32])
+    assert still.frames_per_clip == frames
+    with pytest.raises(CheckpointError, match="frames must be at least 2, not 1"):
+        micro(**STILL, frames=1)
+    with pytest.raises(CheckpointError, match="codec_window's frames must be at least 1, not 0"):
+        micro(**STILL, codec_window=[0, 32, 32])

@@ -1,3 +1,5 @@
+"""From a first frame to a clip: conditions, seeds, saving, and the losses of the stages."""
+
 import dataclasses
 
 import pytest
@@ -6,7 +8,7 @@ import torch
 from persist_backbones.conditioning import camera_latents
 from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
 from persist_backbones.objective import loss_weights
-from persist_cli.world.backbone import Sampling
+from persist_cli.world.backbone import Backbone, Sampling
 from persist_cli.world.errors import CheckpointError, DataError, PersistError
 from tests.backbones.micro import micro, random_clips, shaken
 
@@ -100,7 +102,7 @@ def test_min_snr_lowers_the_weight_of_clean_samples_and_never_exceeds_one():
     signal = scheduler.alphas_cumprod[torch.tensor([0, 300, 999])].double()
     snr = signal / (1 - signal)
     assert torch.allclose(weights.double(), snr.clamp_max(5.0) / (snr + 1), atol=1e-6)
-    assert loss_weights(scheduler, torch.tensor([0, 999]), "uniform", 5.0).tolist() == pytest.approx([1.0, 1.0])
+    assert loss_weights(scheduler, torch.tensor([0, 999]), "uniform", 5.0).tolist() == [1.0, 1.0]
     assert float(loss_weights(scheduler, torch.tensor([999]), "min-snr-plus-one", 5.0)) == pytest.approx(1.0)
 
 
@@ -114,3 +116,31 @@ def test_the_printed_rays_are_another_model_input():
     assert not torch.equal(
         micro(rays="printed").camera_latents(random_clips(1)), micro().camera_latents(random_clips(1))
     )
+
+
+@pytest.mark.parametrize(
+    ("sampling", "cause"),
+    [
+        (Sampling(4, "euler"), r"^unknown sampler 'euler'; known: ddim, dpm, unipc, dpm\+\+$"),
+        (Sampling(0), "^0 denoising steps; it must be 1 to 1000$"),
+        (Sampling(1001), "^1001 denoising steps; it must be 1 to 1000$"),
+    ],
+)
+def test_a_sampling_that_cannot_be_drawn_is_told_before_anything_is_made(sampling, cause):
+    backbone = micro()
+    for attempt in (lambda: backbone.check_sampling(sampling), lambda: backbone.generate(random_clips(1), sampling)):
+        with pytest.raises(PersistError, match=cause):
+            attempt()
+    for sampler in backbone.samplers:
+        backbone.check_sampling(Sampling(1000, sampler))
+
+
+def test_a_backbone_that_says_no_more_has_depth_and_keeps_nothing_of_a_clip():
+    backbone = micro(depth=False)
+    with pytest.raises(NotImplementedError, match="backbone 'cogvideox' keeps nothing of a clip"):
+        Backbone.encode(backbone, random_clips(1))
+    assert Backbone.gives_depth.fget(backbone)
+    assert Backbone.encoding(backbone, "1") is None
+    for sampling, cause in ((Sampling(0), "0 denoising steps"), (Sampling(1, "euler"), "unknown sampler 'euler'")):
+        with pytest.raises(PersistError, match=cause):
+            Backbone.check_sampling(backbone, sampling)

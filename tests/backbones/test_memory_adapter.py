@@ -1,3 +1,5 @@
+"""Every form of memory adapter: nothing before it is trained, and after that no more than its tokens say."""
+
 import dataclasses
 
 import pytest
@@ -10,7 +12,7 @@ from persist_cli.world.backbone import Sampling
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import CHANNELS, micro, random_clips, random_tokens, shaken, with_adapter
+from tests.backbones.micro import CHANNELS, micro, predicted, random_clips, random_tokens, shaken, with_adapter
 
 QUICK = Sampling(steps=2)
 every_form = pytest.mark.parametrize("form", FORMS)
@@ -25,15 +27,6 @@ def padded(tokens: MemoryTokens, extra: int) -> MemoryTokens:
         torch.cat([tokens.positions, near], 1),
         torch.cat([tokens.mask, torch.zeros(batch, extra, dtype=torch.bool)], 1),
     )
-
-
-def velocity(backbone, clips, tokens):
-    """One prediction of the transformer."""
-    with torch.no_grad():
-        memory = backbone.prepare_memory(dataclasses.replace(clips, tokens=tokens))
-        latents = backbone.codec.encode(clips.rgb, clips.depth)
-        given = backbone.conditions(clips, torch.full((len(clips.seeds),), 500), memory)
-        return backbone.predict(latents, backbone.encode_first(clips), given)
 
 
 @every_form
@@ -53,7 +46,7 @@ def test_a_trained_adapter_uses_its_tokens(form):
     backbone, clips = with_adapter(micro(), form=form), random_clips()
     shaken(backbone)
     assert not torch.allclose(
-        velocity(backbone, clips, random_tokens(2, 9)), velocity(backbone, clips, random_tokens(2, 9, 4))
+        predicted(backbone, clips, random_tokens(2, 9)), predicted(backbone, clips, random_tokens(2, 9, 4))
     )
 
 
@@ -61,7 +54,7 @@ def test_a_trained_adapter_uses_its_tokens(form):
 def test_padding_behind_the_mask_changes_nothing(form):
     backbone, clips, tokens = with_adapter(micro(), form=form), random_clips(), random_tokens(2, 9)
     shaken(backbone)
-    assert torch.allclose(velocity(backbone, clips, tokens), velocity(backbone, clips, padded(tokens, 20)), atol=1e-5)
+    assert torch.allclose(predicted(backbone, clips, tokens), predicted(backbone, clips, padded(tokens, 20)), atol=1e-5)
 
 
 @every_form
@@ -70,10 +63,10 @@ def test_a_batch_may_hold_a_sample_without_any_token(form):
     shaken(backbone)
     some = random_tokens(2, 9)
     mixed = dataclasses.replace(some, mask=some.mask & torch.tensor([[True], [False]]))
-    result = velocity(backbone, clips, mixed)
+    result = predicted(backbone, clips, mixed)
     assert result.isfinite().all()
-    assert torch.allclose(result[1], velocity(backbone, clips, None)[1], atol=1e-5)
-    assert torch.allclose(result[0], velocity(backbone, clips, some)[0], atol=1e-5)
+    assert torch.allclose(result[1], predicted(backbone, clips, None)[1], atol=1e-5)
+    assert torch.allclose(result[0], predicted(backbone, clips, some)[0], atol=1e-5)
 
 
 @every_form
@@ -111,8 +104,8 @@ def test_moving_the_whole_world_changes_no_prediction(form):
     motion[:3, 3] = torch.tensor([40.0, -3.0, 12.0])
     moved_cameras = Cameras(motion @ clips.cameras.world_from_camera, clips.cameras.intrinsics, 32, 32)
     moved_tokens = dataclasses.replace(tokens, positions=tokens.positions @ motion[:3, :3].T + motion[:3, 3])
-    here = velocity(backbone, clips, tokens)
-    there = velocity(backbone, dataclasses.replace(clips, cameras=moved_cameras), moved_tokens)
+    here = predicted(backbone, clips, tokens)
+    there = predicted(backbone, dataclasses.replace(clips, cameras=moved_cameras), moved_tokens)
     assert torch.allclose(here, there, atol=1e-4)
 
 
@@ -120,7 +113,7 @@ def test_absolute_positions_see_where_the_origin_is():
     backbone, clips, tokens = with_adapter(micro(), positions="absolute"), random_clips(), random_tokens(2, 9)
     shaken(backbone)
     moved = dataclasses.replace(tokens, positions=tokens.positions + 1.0)
-    assert not torch.allclose(velocity(backbone, clips, tokens), velocity(backbone, clips, moved))
+    assert not torch.allclose(predicted(backbone, clips, tokens), predicted(backbone, clips, moved))
 
 
 @every_form
@@ -164,12 +157,6 @@ def test_what_does_not_fit_is_one_line(tmp_path):
     narrow = random_clips(tokens=MemoryTokens.stack([MemoryTokens.empty(3)] * 2))
     with pytest.raises(CheckpointError, match="features of 3 channels"):
         backbone.generate(narrow, QUICK)
-    with pytest.raises(CheckpointError, match="unknown adapter form 'splat'; known: cross, projected, canvas"):
-        backbone.add_adapter("other", 3, {"form": "splat"})
-    with pytest.raises(CheckpointError, match="form 'canvas' has no absolute positions"):
-        backbone.add_adapter("other", 3, {"form": "canvas", "positions": "absolute"})
-    with pytest.raises(CheckpointError, match="splat_pixels must be odd, not 4"):
-        backbone.add_adapter("other", 3, {"form": "canvas", "splat_pixels": 4})
     with pytest.raises(CheckpointError, match="no memory adapter 'map2d'; there are: voxel"):
         backbone.use_adapter("map2d")
 

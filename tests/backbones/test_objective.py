@@ -1,14 +1,15 @@
-"""Objectives: clean latents or velocities, with or without depth."""
+"""Objectives: clean latents or velocities, and what an error counts."""
 
 from __future__ import annotations
 
-import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
 
 from persist_backbones.objective import loss_weights, predicted_target
 from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import CheckpointError, RecipeError
 from tests.backbones.micro import micro, random_clips, shaken
 
 STEPS = torch.tensor([10, 300, 990])
@@ -30,26 +31,44 @@ def test_an_error_counts_the_same_said_as_velocity_or_as_clean_latents(weighting
     assert torch.allclose(losses["sample"].double(), losses["v_prediction"].double(), rtol=1e-3)
 
 
-def test_a_model_without_depth_neither_sees_nor_gives_any() -> None:
-    backbone, clips = micro(depth=False), random_clips(1)
-    shaken(backbone.transformer)
-    other = dataclasses.replace(clips, depth=clips.depth + 1)
-    rgb, depth = backbone.generate(clips, Sampling(2))
-    assert torch.equal(backbone.generate(other, Sampling(2))[0], rgb)
-    assert torch.equal(backbone(clips, "1")["loss"], backbone(other, "1")["loss"])
-    assert torch.equal(depth[:, 0], clips.depth[:, 0])
-    assert not depth[:, 1:].any()
-
-
-def test_a_model_without_depth_has_as_many_parameters() -> None:
-    sizes = {sum(each.numel() for each in micro(depth=depth).parameters()) for depth in (True, False)}
-    assert len(sizes) == 1
-
-
-def test_the_clean_latents_survive_saving_and_loading(tmp_path) -> None:
+def test_the_clean_latents_survive_saving_and_loading(tmp_path: Path) -> None:
     backbone, clips = micro(prediction="sample"), random_clips(1)
     shaken(backbone)
     backbone.save_base(tmp_path)
     other = micro()
     other.load_base(tmp_path)
     assert torch.equal(backbone.generate(clips, Sampling(2))[0], other.generate(clips, Sampling(2))[0])
+
+
+def test_a_card_says_what_the_weights_predict(tmp_path: Path) -> None:
+    kinds = {kind: micro(prediction=kind).checkpoint_settings()["prediction"] for kind in ("v_prediction", "sample")}
+    assert all(kind == said for kind, said in kinds.items())
+    micro(prediction="sample").save_base(tmp_path)
+    other = micro()
+    assert other.checkpoint_settings()["prediction"] == "v_prediction"
+    other.load_base(tmp_path)
+    assert other.checkpoint_settings()["prediction"] == "sample"
+    assert micro(pretrained=str(tmp_path)).checkpoint_settings()["prediction"] == "sample"
+
+
+def test_weights_cannot_be_asked_for_another_prediction(tmp_path: Path) -> None:
+    micro(prediction="sample").save_base(tmp_path)
+    cause = "^prediction is 'v_prediction', but the weights were trained for 'sample'; leave it out$"
+    with pytest.raises(CheckpointError, match=cause):
+        micro(prediction="v_prediction").load_base(tmp_path)
+    with pytest.raises(CheckpointError, match=cause):
+        micro(prediction="v_prediction", pretrained=str(tmp_path))
+
+
+def test_a_scheduler_that_predicts_noise_is_refused(tmp_path: Path) -> None:
+    micro().save_base(tmp_path)
+    config = tmp_path / "scheduler" / "scheduler_config.json"
+    config.write_text(config.read_text().replace("v_prediction", "epsilon"))
+    with pytest.raises(CheckpointError, match=r"^the scheduler predicts 'epsilon'; known: v_prediction, sample$"):
+        micro(pretrained=str(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "value"), [("snr_gamma", 0.0), ("snr_gamma", -5.0), ("kl_weight", -1e-6)])
+def test_a_weight_that_would_turn_the_loss_around_is_refused(name: str, value: float) -> None:
+    with pytest.raises(RecipeError, match=f"{name}: Input should be greater than"):
+        micro(**{name: value})

@@ -1,16 +1,20 @@
+"""Samplers: each asks a denoiser once a step, and ends where the denoiser says."""
+
+import functools
+import json
 from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
-from persist_backbones.diffusion import generators_of, noise_like
+from persist_backbones.noise import generators_of, noise_like
 from persist_backbones.presets import PRESETS
 from persist_backbones.samplers import MULTISTEP, SAMPLERS, denoise, make_schedule
 from persist_cli.world.errors import PersistError
 
-TINY, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3
-CONFIGS = pytest.mark.parametrize("config", [TINY, SHIFTED], ids=["shift 1", "shift 3"])
+UNSHIFTED, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3
+CONFIGS = pytest.mark.parametrize("config", [UNSHIFTED, SHIFTED], ids=["shift 1", "shift 3"])
 EVERY = pytest.mark.parametrize("sampler", SAMPLERS)
 STEPS = pytest.mark.parametrize("steps", [1, 2, 4, 7, 10, 50, 61])
 # Where training knows no signal the multistep schedulers assume a share of 2⁻¹², and so leave that much of the noise;
@@ -19,9 +23,15 @@ TOLERANCE = 5 * 2**-12  # noise of the tests stays below 5
 SHAPE = (3, 4, 2, 2)
 
 
+@functools.cache
+def alphas(config: str) -> Tensor:
+    """Share of signal in the variance at each noise level of training."""
+    return make_schedule(json.loads(config), "ddim", 1).alphas_cumprod
+
+
 def levels(config: dict, timesteps: Tensor) -> tuple[Tensor, Tensor]:
     """Shares of signal and noise in training, for each sample."""
-    signal = make_schedule(config, "ddim", 1).alphas_cumprod[timesteps].float()[:, None, None, None, None]
+    signal = alphas(json.dumps(config))[timesteps].float()[:, None, None, None, None]
     return signal.sqrt(), (1 - signal).sqrt()
 
 
@@ -75,7 +85,7 @@ def test_a_denoiser_that_knows_the_clean_latents_is_asked_once_a_step_and_brings
 def test_a_model_that_predicts_clean_latents_is_sampled_alike(sampler, steps):
     clean = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4))
     noise, generators = drawn([0, 1])
-    config = TINY | {"prediction_type": "sample"}
+    config = UNSHIFTED | {"prediction_type": "sample"}
     assert torch.allclose(denoise(lambda *_: clean, noise, config, sampler, steps, generators), clean, atol=1e-6)
 
 
@@ -84,11 +94,10 @@ def test_a_model_that_predicts_clean_latents_is_sampled_alike(sampler, steps):
 @pytest.mark.parametrize("steps", [4, 7, 50, 61])
 def test_the_last_step_leaves_no_noise(config, sampler, steps):
     cleaned = []
-    schedule = make_schedule(config, "ddim", 1)
 
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
         alpha, sigma = levels(config, timesteps)
-        velocity = torch.sin(3 * latents) + schedule.alphas_cumprod[timesteps[0]].float() * 0.3
+        velocity = torch.sin(3 * latents) + alphas(json.dumps(config))[timesteps[0]].float() * 0.3
         cleaned.append(alpha * latents - sigma * velocity)
         return velocity
 
@@ -105,7 +114,7 @@ def test_a_sample_depends_on_its_seed_and_not_on_its_batch(sampler, steps):
 
     def denoised(seeds: list[int]) -> Tensor:
         noise, generators = drawn(seeds)
-        return denoise(predict, noise, TINY, sampler, steps, generators)
+        return denoise(predict, noise, UNSHIFTED, sampler, steps, generators)
 
     together, alone, other = denoised([3, 4, 5]), denoised([4]), denoised([6])
     assert torch.allclose(together[1], alone[0], atol=1e-6)
@@ -156,7 +165,7 @@ def distance_from_flow(spread: float, config: dict, sampler: str, steps: int) ->
 
 def test_an_unknown_sampler_or_number_of_steps_is_one_line():
     with pytest.raises(PersistError, match=r"^unknown sampler 'euler'; known: ddim, dpm, unipc, dpm\+\+$"):
-        make_schedule(TINY, "euler", 4)
+        make_schedule(UNSHIFTED, "euler", 4)
     for steps in (0, 1001):
         with pytest.raises(PersistError, match=f"^{steps} denoising steps; it must be 1 to 1000$"):
-            make_schedule(TINY, "unipc", steps)
+            make_schedule(UNSHIFTED, "unipc", steps)

@@ -1,11 +1,11 @@
+"""Tokens as a camera sees them: where they fall, how large, and what hides what."""
+
 import pytest
 import torch
 
-from persist_backbones.canvas import patchify
-from persist_backbones.splat import place, splat
+from persist_backbones.splat import rasterize, splat
 from persist_cli.world.actions import rotation_about
 from persist_cli.world.cameras import Cameras
-from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
 
 SIDE, FOCAL = 8, 5.6
 
@@ -26,7 +26,7 @@ def drawn(points, features, cameras=None, size=0.0, most=1):
     """The first view's canvas: features, coverage, log depth."""
     cameras = cameras or views()
     positions = torch.tensor(points, dtype=torch.float64)[None]
-    splats = place(positions, torch.ones(1, len(points), dtype=torch.bool), cameras, size, most)
+    splats = rasterize(positions, torch.ones(1, len(points), dtype=torch.bool), cameras, size, most)
     values = torch.tensor(features, dtype=torch.float32)[None, :, None]
     return splat(values, splats, (1, cameras.world_from_camera.shape[1], SIDE, SIDE))[0, 0]
 
@@ -83,21 +83,7 @@ def test_a_wall_of_cells_seen_face_on_is_the_same_picture_however_the_world_is_t
 def test_every_frame_has_its_own_view():
     camera = views(2)
     camera.world_from_camera[0, 1, 2, 3] = 2.5  # past the token
-    splats = place(torch.tensor([[[0.1, 0.1, 2.0]]]).double(), torch.ones(1, 1, dtype=torch.bool), camera, 0.25, 3)
+    splats = rasterize(torch.tensor([[[0.1, 0.1, 2.0]]]).double(), torch.ones(1, 1, dtype=torch.bool), camera, 0.25, 3)
     canvas = splat(torch.ones(1, 1, 1), splats, (1, 2, SIDE, SIDE))
     assert canvas[0, 0, 1].any()
     assert not canvas[0, 1].any()
-
-
-def test_patches_are_in_the_order_of_the_video_tokens():
-    latents = torch.zeros(1, 3, 2, SIDE, SIDE)
-    latents[0, 1, :, 5, 2] = 1.0  # latent frame 1, row 2 and column 1 of 4 × 4 video tokens
-    assert patchify(latents, 2).any(-1).nonzero().tolist() == [[0, 16 + 2 * 4 + 1]]
-
-
-def test_the_mask_of_a_canvas_is_where_tokens_fell():
-    adapter, clips, tokens = with_adapter(micro(), form="canvas").adapter, random_clips(), random_tokens(2, 5)
-    memory = adapter.prepare(tokens, clips.cameras)
-    assert memory.mask.shape == memory.tokens.shape[:2] == (2, 3 * 4 * 4)
-    assert memory.tokens[~memory.mask].count_nonzero() == 0
-    assert memory.tokens[memory.mask].any(-1).all()

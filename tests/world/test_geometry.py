@@ -6,7 +6,7 @@ import torch
 from persist_cli.world.actions import rotation_about
 from persist_cli.world.cameras import Cameras, check_intrinsics, check_poses, invert_rigid
 from persist_cli.world.errors import DataError
-from persist_cli.world.geometry import pixel_centers, plucker, project, transform, unproject
+from persist_cli.world.geometry import nearest_at, pixel_centers, plucker, project, transform, unproject
 
 K = torch.tensor([[40.0, 0.0, 33.0], [0.0, 42.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
@@ -79,3 +79,9 @@ def test_a_pose_that_is_no_rigid_motion_is_named(broken, cause):
 def test_singular_intrinsics_are_named():
     with pytest.raises(DataError, match=r"kitchen: the intrinsics .* singular"):
         check_intrinsics(torch.zeros(3, 3), "kitchen")
+
+
+def test_a_z_buffer_has_the_nearest_depth_of_each_place_and_nothing_elsewhere():
+    places, depth = torch.tensor([0, 2, 0, 2, 2]), torch.tensor([3.0, 1.0, 2.0, 4.0, 1.5])
+    assert nearest_at(places, depth, 4).tolist() == [2.0, math.inf, 1.0, math.inf]
+    assert nearest_at(places[:0], depth[:0], 2).tolist() == [math.inf] * 2

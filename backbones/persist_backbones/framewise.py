@@ -15,35 +15,37 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-class StillConv(CogVideoXCausalConv3d):  # type: ignore[misc]
-    """diffusers' causal convolution, as a 2D convolution where the video is one frame."""
+class FramewiseConv(CogVideoXCausalConv3d):  # type: ignore[misc]
+    """diffusers' causal convolution, as a 2D convolution where the video begins with a single frame."""
 
     def forward(self, inputs: Tensor, conv_cache: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """The convolved video, and what a next piece of it would need: nothing after a single frame."""
-        if inputs.shape[2] != 1 or self.pad_mode == "replicate":
+        """The convolved video, and what the next piece of it needs: the frames that its first taps see."""
+        if inputs.shape[2] != 1 or conv_cache is not None or self.pad_mode == "replicate":
             result: tuple[Tensor, Tensor | None] = super().forward(inputs, conv_cache)
             return result
         conv = self.conv
         padding = (self.height_pad, self.width_pad)
         out = F.conv2d(inputs[:, :, 0], conv.weight.sum(2), conv.bias, conv.stride[1:], padding, conv.dilation[1:])
-        return out[:, :, None], None
+        return out[:, :, None], inputs.expand(-1, -1, max(1, self.time_kernel_size - 1), -1, -1)
 
 
 def code_frames_alone(vae: AutoencoderKLCogVideoX) -> None:
     """Make a VAE fast for videos of one frame; its parameters and their names stay as they are."""
     for module in vae.modules():
         if type(module) is CogVideoXCausalConv3d:
-            module.__class__ = StillConv
+            module.__class__ = FramewiseConv
 
 
-def apart(videos: Float[Tensor, "batch channel frame height width"]) -> Float[Tensor, "image channel 1 height width"]:
+def frames_to_batch(
+    videos: Float[Tensor, "batch channel frame height width"],
+) -> Float[Tensor, "image channel 1 height width"]:
     """Every frame as a video of its own."""
     return videos.transpose(1, 2).flatten(0, 1)[:, :, None]
 
 
-def together(
+def batch_to_frames(
     images: Float[Tensor, "image channel 1 height width"], frames: int
 ) -> Float[Tensor, "batch channel frame height width"]:
-    """The videos that ``apart`` took apart, whatever became of channels and sizes."""
+    """The videos that ``frames_to_batch`` took apart, whatever became of channels and sizes."""
     videos: Tensor = torch.movedim(images[:, :, 0].unflatten(0, (-1, frames)), 1, 2)
     return videos

@@ -1,0 +1,70 @@
+"""Settings of adapters: each form has its own, and what cannot work is one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from persist_cli.world.errors import CheckpointError, PersistError, RecipeError
+from tests.backbones.micro import CHANNELS, micro, with_adapter
+
+OWN = {
+    "cross": {"heads", "frequencies", "positions"},
+    "projected": {"heads", "frequencies"},
+    "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels"},
+}
+SHARED = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dropout"}
+
+
+@pytest.mark.parametrize("form", OWN)
+def test_a_form_has_the_settings_that_it_uses(form: str, tmp_path: Path) -> None:
+    with_adapter(micro(), form=form).save_adapter(tmp_path)
+    assert set(json.loads((tmp_path / "adapter.json").read_text())) == SHARED | OWN[form]
+
+
+@pytest.mark.parametrize(
+    ("form", "key"), [(form, key) for form in OWN for key in set().union(*OWN.values()) - OWN[form]]
+)
+def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Path) -> None:
+    backbone = with_adapter(micro(), form=form)
+    with pytest.raises(RecipeError, match=f"^adapter 'other': unknown key '{key}'"):
+        backbone.add_adapter("other", CHANNELS, {"form": form, key: 1})
+    backbone.save_adapter(tmp_path)
+    card = tmp_path / "adapter.json"
+    card.write_text(json.dumps(json.loads(card.read_text()) | {key: 1}))
+    with pytest.raises(RecipeError, match=f"adapter.json: unknown key '{key}'"):
+        backbone.load_adapter("other", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "cause"),
+    [
+        ({"dropout": 1.5}, "dropout: .*less than or equal to 1"),
+        ({"dropout": -0.1}, "dropout: .*greater than or equal to 0"),
+        ({"token_budget": 0}, "token_budget: .*greater than 0"),
+        ({"ff_factor": -1}, "ff_factor: .*greater than"),
+        ({"form": "cross", "ff_factor": 0}, "ff_factor: .*greater than 0"),
+        ({"form": "canvas", "ff_factor": -1}, "ff_factor: .*greater than or equal to 0"),
+        ({"width": 16, "heads": 3}, "3 heads do not divide a width of 16"),
+        ({"form": "projected", "width": 16, "heads": 5}, "5 heads do not divide a width of 16"),
+        ({"every": 3}, "every is 3, but the model has 2 layers"),
+        ({"form": "canvas", "every": 3}, "every is 3, but the model has 2 layers"),
+        ({"form": "canvas", "splat_pixels": 4}, "splat_pixels must be odd, not 4"),
+        ({"form": "splat"}, "unknown adapter form 'splat'; known: cross, projected, canvas"),
+    ],
+)
+def test_an_adapter_that_cannot_work_is_refused_in_one_line(settings: dict, cause: str) -> None:
+    with pytest.raises(PersistError, match=cause) as error:
+        micro().add_adapter("other", CHANNELS, settings)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("card", ["[]", "{}", '{"channels": "many"}'])
+def test_a_damaged_card_is_one_line(card: str, tmp_path: Path) -> None:
+    backbone = with_adapter(micro())
+    backbone.save_adapter(tmp_path)
+    (tmp_path / "adapter.json").write_text(card)
+    with pytest.raises(CheckpointError, match=r"adapter.json: not the card of an adapter$"):
+        backbone.load_adapter("other", tmp_path)
