@@ -114,23 +114,25 @@ def inspect(
 def finetune(
     recipe: Annotated[str, typer.Argument(help="A recipe's name (`persist recipes`) or a YAML file.")],
     overrides: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Data set folder.")] = None,
+    data: Annotated[list[Path] | None, typer.Option(help="Data set folder; may be given again.")] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on from the run's last checkpoint.")] = False,
     cache: Annotated[
         Path | None, typer.Option(help="Folder for latents and memory tokens; set data.clips_per_trajectory too.")
     ] = None,
-    cache_gigabytes: Annotated[float, typer.Option(min=0, help="Most that the cache may hold.")] = 20,
+    cache_gigabytes: Annotated[float | None, typer.Option(min=0, help="Most that the cache may hold; 20.")] = None,
 ) -> None:
     """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
 
     persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
     """
-    from persist_cli.training.cache import CachePlace
-    from persist_cli.training.finetune import run_finetune
+    from persist_cli.training.cache import CacheSettings
+    from persist_cli.training.finetune import FinetunePlan, run_finetune
 
-    place = None if cache is None else CachePlace(cache, cache_gigabytes)
-    run_finetune(recipe, overrides or [], data, out, resume, place)
+    if cache is None and cache_gigabytes is not None:
+        raise PersistError("--cache-gigabytes bounds a cache; give --cache DIR too")
+    bounded = None if cache is None else CacheSettings(cache, 20 if cache_gigabytes is None else cache_gigabytes)
+    run_finetune(FinetunePlan(recipe, overrides or [], data or [], out, resume, bounded))
 
 
 @app.command()
@@ -159,7 +161,9 @@ def export(
 def memorize(
     data: Annotated[list[str] | None, typer.Argument(metavar="DATA[#trajectory[:frames]]")] = None,
     out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
-    memory: Annotated[str, typer.Option(help="A memory; `persist plugins` lists them.")] = "voxel",
+    memory: Annotated[
+        str | None, typer.Option(help="A memory (`persist plugins`); the checkpoint's, else voxel.")
+    ] = None,
     encoder: Annotated[str | None, typer.Option(help="An encoder; `persist plugins` lists them.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="As in memory.cell=[0.25,1,0.25].")] = None,
     checkpoint: Annotated[
@@ -176,6 +180,10 @@ def memorize(
     from persist_cli.memorizing.memorize import run_memorize, run_merge
 
     if merge:
+        if checkpoint or memory or encoder or settings:
+            raise PersistError(
+                "--merge joins memories as they are; leave out --checkpoint, --memory, --encoder and --set"
+            )
         run_merge([*merge, *(Path(name) for name in data or [])], out, json)
     else:
         run_memorize(data or [], MemorizePlan(memory, encoder, settings or [], checkpoint), out, json)
@@ -254,7 +262,7 @@ def evaluate(
     if not data:
         raise PersistError("give --data DATA (--data sample comes with persist), or --compare A.json B.json")
     from persist_cli.evaluation.command import run_eval
-    from persist_cli.evaluation.run import EvalPlan
+    from persist_cli.evaluation.plan import EvalPlan
 
     plan = EvalPlan(
         data=tuple(data), protocol=protocol, memories=names_in(memories), controls=names_in(controls),

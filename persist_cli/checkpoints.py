@@ -9,20 +9,23 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.recipe import MemoryChoice
+from persist_cli.trajectories.scenes import TrainingScenes
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import file_sha256, read_json, write_json
 from persist_cli.world.settings import parse_settings
 
 if TYPE_CHECKING:
-    from persist_cli.world.backbone import Backbone
+    from persist_cli.world.backbone import Backbone, Sampling
 
 CARD = "persist.json"
 VERSION = 1
+STEP = "step-"  # what the folders of a run's checkpoints begin with
+PLAIN = "stage1"  # what evaluations call the base without any adapter
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,8 @@ class Checkpoint:
         fingerprint: of the base's weights.
         adapters: folders of the memory adapters by name.
         default: which of several adapters is meant when none is named.
-        sampling: ``steps`` and ``sampler`` that are meant when none are named, as far as the card says.
+        sampling: steps and sampler that are meant when none are named; ``None`` when the card names none.
+        training_scenes: of base and adapters; ``None`` for a card of a version that did not write them down.
     """
 
     folder: Path
@@ -49,7 +53,8 @@ class Checkpoint:
     fingerprint: str
     adapters: dict[str, Path]
     default: str | None = None
-    sampling: dict[str, Any] = field(default_factory=dict)
+    sampling: Sampling | None = None
+    training_scenes: TrainingScenes | None = None
 
     def memory_choice(self, adapter: str) -> MemoryChoice:
         """What the adapter's memory is made of."""
@@ -74,7 +79,7 @@ class Checkpoint:
 
 def step_folders(run: Path) -> list[Path]:
     """Whole checkpoints of a run, the newest last."""
-    return sorted(folder for folder in run.glob("step-*") if folder.is_dir())
+    return sorted(folder for folder in run.glob(f"{STEP}*") if folder.is_dir())
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
@@ -84,7 +89,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
         CheckpointError: when there is none, it is damaged, or its base is gone or another.
     """
     folder = _model_folder(path)
-    card = _read_card(folder)
+    own = card = _read_card(folder)
     base_folder, fingerprint = folder, str(card.get("fingerprint", ""))
     if card.get("base"):
         base_folder = _model_folder((folder / card["base"]).resolve())
@@ -94,35 +99,41 @@ def find_checkpoint(path: Path) -> Checkpoint:
         card = base_card
     return Checkpoint(
         folder=folder,
-        name=folder.parent.parent.name if folder.name == "model" else folder.name,
+        name=_home(folder).name,
         base_folder=base_folder,
         backbone=card["backbone"],
         settings=card["settings"],
         fingerprint=fingerprint,
         adapters={each.name: each for each in sorted((folder / "adapters").glob("*")) if each.is_dir()},
         default=card.get("default_adapter"),
-        sampling=card.get("sampling", {}),
+        sampling=_sampling(own, folder / CARD),
+        training_scenes=_training_scenes(own, folder / CARD),
     )
 
 
 def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
     """The base's backbone without adapters, with changed settings where given."""
-    import torch
-
-    from persist_cli.registry import make_backbone
-
-    with torch.device("meta"):  # the weights come from the files
-        backbone = make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
+    backbone = empty_backbone(checkpoint, settings)
     backbone.load_base(checkpoint.base_folder)
     return backbone
 
 
-def sampling_of(checkpoint: Checkpoint, steps: int | None, sampler: str | None) -> tuple[int, str]:
+def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
+    """The base's backbone on the meta device: weights come from the files, where they are needed."""
+    import torch
+
+    from persist_cli.registry import make_backbone
+
+    with torch.device("meta"):
+        return make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
+
+
+def sampling_of(checkpoint: Checkpoint, steps: int | None, sampler: str | None) -> Sampling:
     """Steps and sampler: those asked for, else the checkpoint's, else 50 steps of DDIM."""
     from persist_cli.world.backbone import Sampling
 
-    own: dict[str, Any] = {"steps": Sampling.steps, "sampler": Sampling.sampler} | checkpoint.sampling
-    return steps or int(own["steps"]), sampler or str(own["sampler"])
+    own = checkpoint.sampling or Sampling()
+    return dataclasses.replace(own, steps=own.steps if steps is None else steps, sampler=sampler or own.sampler)
 
 
 def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:
@@ -133,19 +144,27 @@ def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None
         backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
 
 
-def save_base(backbone: Backbone, folder: Path) -> None:
+def save_base(backbone: Backbone, folder: Path, scenes: TrainingScenes | None = None) -> None:
     """Write the backbone's own files and its card into an existing folder."""
     backbone.save_base(folder)
-    settings = backbone.checkpoint_settings()
-    write_card(folder, {"backbone": backbone.name, "settings": settings, "fingerprint": fingerprint(folder)})
+    card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(folder)}
+    write_card(folder, card, scenes)
 
 
-def write_card(folder: Path, card: dict[str, Any]) -> None:
+def write_card(folder: Path, card: dict[str, Any], scenes: TrainingScenes | None) -> None:
     """Write ``persist.json``, which makes a folder a checkpoint."""
-    write_json(folder / CARD, {"format": "persist-checkpoint", "version": VERSION} | card)
+    known = {} if scenes is None else {"training_scenes": scenes.to_json()}
+    write_json(folder / CARD, {"format": "persist-checkpoint", "version": VERSION} | card | known)
 
 
-def save_adapter(backbone: Backbone, base: Checkpoint, choice: MemoryChoice, folder: Path, home: Path) -> None:
+def save_adapter(
+    backbone: Backbone,
+    base: Checkpoint,
+    choice: MemoryChoice,
+    folder: Path,
+    home: Path,
+    scenes: TrainingScenes | None = None,
+) -> None:
     """Write the adapter in use and a card that points to its base.
 
     Args:
@@ -154,14 +173,14 @@ def save_adapter(backbone: Backbone, base: Checkpoint, choice: MemoryChoice, fol
         choice: its memory.
         folder: to write into.
         home: where the folder will stand in the end; the way to the base is relative to it.
+        scenes: that base and adapter were trained on, where they are known.
     """
     adapter = folder / "adapters" / choice.name
     adapter.mkdir(parents=True)
     backbone.save_adapter(adapter)
     write_json(adapter / "memory.json", dataclasses.asdict(choice))
-    run = base.base_folder.parent.parent if base.base_folder.name == "model" else base.base_folder
-    way = os.path.relpath(run.resolve(), home.resolve())
-    write_card(folder, {"base": way, "fingerprint": base.fingerprint})
+    way = os.path.relpath(_home(base.base_folder).resolve(), home.resolve())
+    write_card(folder, {"base": way, "fingerprint": base.fingerprint}, scenes)
 
 
 def base_files(folder: Path, pattern: str) -> list[Path]:
@@ -188,6 +207,11 @@ def _model_folder(path: Path) -> Path:
     return steps[-1] / "model"
 
 
+def _home(folder: Path) -> Path:
+    """The run whose checkpoint a folder is, else the folder itself."""
+    return folder.parent.parent if folder.parent.name.startswith(STEP) else folder
+
+
 def _read_card(folder: Path) -> dict[str, Any]:
     path = folder / CARD
     card = read_json(path)
@@ -197,11 +221,26 @@ def _read_card(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: checkpoint version {card.get('version')}, this persist reads {VERSION}")
     if not card.get("fingerprint") or not (card.get("base") or {"backbone", "settings"} <= set(card)):
         raise CheckpointError(f"{path}: the card is incomplete")
-    if not _is_sampling(card.get("sampling", {})):
-        raise CheckpointError(f"{path}: its sampling must hold a number of steps and the name of a sampler")
     return card
 
 
-def _is_sampling(value: Any) -> bool:
+def _sampling(card: dict[str, Any], path: Path) -> Sampling | None:
+    from persist_cli.world.backbone import Sampling
+
+    value = card.get("sampling")
+    if value is None or value == {}:
+        return None
     kinds = {"steps": int, "sampler": str}
-    return isinstance(value, dict) and all(isinstance(value[key], kinds[key]) for key in value.keys() & kinds.keys())
+    known = isinstance(value, dict) and all(type(each) is kinds.get(key) for key, each in value.items())
+    if not known or value.get("steps", 1) < 1:
+        raise CheckpointError(f"{path}: its sampling is {value}; it holds steps, at least 1, and the name of a sampler")
+    return Sampling(**value)
+
+
+def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:
+    if "training_scenes" not in card:
+        return None
+    try:
+        return TrainingScenes.from_json(card["training_scenes"])
+    except ValueError as error:
+        raise CheckpointError(f"{path}: its training scenes cannot be read ({error})") from error

@@ -7,13 +7,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
+from pydantic import BeforeValidator, Field
 
 from persist_cli.world.backbone import Stage
 from persist_cli.world.errors import RecipeError, hint
 from persist_cli.world.settings import parse_settings
+
+EXTENDS = "extends"
+MERGED = {"backbone", "data", "training"}  # settings of a memory or adapter mean nothing to one of another kind
+
+Count = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(ge=1)]
+PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -46,12 +55,19 @@ class MemoryChoice:
     encoder_settings: dict[str, Any] = field(default_factory=dict)
 
 
+def _several(value: Any) -> Any:
+    """A list of paths, also of one that stands alone."""
+    if isinstance(value, str):
+        return [value] if value else []
+    return value
+
+
 @dataclass(frozen=True)
 class DataSettings:
     """Which clips.
 
     Args:
-        path: data set folder; ``--data`` sets it.
+        path: data set folders, or one; ``--data`` sets them.
         strides: every n-th frame; one of these is drawn for each clip. A negative one plays the clip backwards, with
             what was seen on the way there as its context.
         context_frames: most earlier frames that a clip's memory is made of (stage 2).
@@ -59,10 +75,10 @@ class DataSettings:
             again and can be cached; 0 draws from all that there are.
     """
 
-    path: str = ""
+    path: Annotated[tuple[str, ...], BeforeValidator(_several)] = ()
     strides: tuple[int, ...] = (1, 2, 3)
-    context_frames: int = 48
-    clips_per_trajectory: int = 0
+    context_frames: Count = 48
+    clips_per_trajectory: Count = 0
 
 
 @dataclass(frozen=True)
@@ -88,21 +104,21 @@ class TrainingSettings:
         tracker: ``none`` or ``tensorboard``.
     """
 
-    steps: int = 1000
-    batch: int = 16
-    accumulation: int = 1
-    learning_rate: float = 1e-4
-    warmup: int = 50
-    cooldown: int = 0
-    weight_decay: float = 1e-4
-    clip: float = 1.0
-    ema: float = 0.999
+    steps: Positive = 1000
+    batch: Positive = 16
+    accumulation: Positive = 1
+    learning_rate: PositiveNumber = 1e-4
+    warmup: Count = 50
+    cooldown: Count = 0
+    weight_decay: Amount = 1e-4
+    clip: PositiveNumber = 1.0
+    ema: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
     precision: Literal["no", "bf16"] = "bf16"
-    seed: int = 0
-    checkpoint_every: int = 500
-    checkpoint_minutes: float = 5.0
-    workers: int = 1
-    threads: int = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # what numpy takes
+    checkpoint_every: Positive = 500
+    checkpoint_minutes: Amount = 5.0
+    workers: Count = 1
+    threads: Count = 0
     tracker: Literal["none", "tensorboard"] = "none"
 
 
@@ -138,21 +154,46 @@ def recipe_names() -> list[str]:
 
 
 def read_recipe(name: str) -> dict[str, Any]:
-    """Plain values of a recipe by name, or of a YAML file.
+    """Plain values of a recipe by name, or of a YAML file, with those of the recipe that it ``extends``.
+
+    Of ``backbone``, ``data`` and ``training`` it need only say what is different; every other key stands for itself.
 
     Raises:
-        RecipeError: when it is unknown or no YAML mapping.
+        RecipeError: when one of them is unknown or no YAML mapping, and when they extend each other.
     """
-    path = Path(name)
-    if path.suffix in {".yaml", ".yml"}:
-        if not path.is_file():
-            raise RecipeError(f"{path}: no such recipe file")
-        text = path.read_text(encoding="utf-8")
-    elif name in recipe_names():
-        text = (resources.files("persist_recipes") / f"{name}.yaml").read_text(encoding="utf-8")
-    else:
+    return _read_extended(name, ())
+
+
+def _read_extended(name: str, readers: tuple[str, ...]) -> dict[str, Any]:
+    if name in readers:
+        raise RecipeError(f"{name}: extends itself ({' -> '.join([*readers, name])})")
+    values = parse_yaml_mapping(_recipe_text(name), name)
+    extended = values.pop(EXTENDS, None)
+    if extended is None:
+        return values
+    if not isinstance(extended, str):
+        raise RecipeError(f"{name}: {EXTENDS} is the name of a recipe or a YAML file, not {extended!r}")
+    if _is_file(name) and _is_file(extended):
+        extended = str(Path(name).parent / extended)
+    merged = _read_extended(extended, (*readers, name))
+    for key, value in values.items():
+        both = key in MERGED and isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merged[key] | value if both else value
+    return merged
+
+
+def _recipe_text(name: str) -> str:
+    if _is_file(name):
+        if not Path(name).is_file():
+            raise RecipeError(f"{name}: no such recipe file")
+        return Path(name).read_text(encoding="utf-8")
+    if name not in recipe_names():
         raise RecipeError(f"unknown recipe {name!r}; {hint(name, recipe_names())} (a file of your own ends in .yaml)")
-    return parse_yaml_mapping(text, name)
+    return (resources.files("persist_recipes") / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def _is_file(name: str) -> bool:
+    return Path(name).suffix in {".yaml", ".yml"}
 
 
 def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
@@ -206,17 +247,19 @@ def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
 def _inconsistencies(recipe: Recipe) -> list[str]:
     """What is well-formed but makes no sense."""
     training = recipe.training
-    positive = {"steps": training.steps, "batch": training.batch, "accumulation": training.accumulation}
-    problems = [f"training.{name} must be at least 1, not {value}" for name, value in positive.items() if value < 1]
+    problems = []
+    if training.cooldown > training.steps:
+        problems.append(
+            f"training.cooldown {training.cooldown} is more than training.steps {training.steps}; set both, as in "
+            f"training.steps={training.steps} training.cooldown={training.steps // 3}"
+        )
     if (recipe.stage == "2") != (recipe.memory is not None):
         problems.append("stage 2 needs a memory, the other stages take none")
     if recipe.stage == "2" and recipe.base is None:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
     if not recipe.data.strides or 0 in recipe.data.strides:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")
-    if recipe.data.clips_per_trajectory < 0:
-        problems.append(f"data.clips_per_trajectory must be at least 0, not {recipe.data.clips_per_trajectory}")
-    if training.batch % max(1, training.accumulation):
+    if training.batch % training.accumulation:
         problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
     return problems
 

@@ -60,11 +60,11 @@ def list_plugins(kind: str) -> list[Plugin]:
     return sorted(plugins, key=lambda plugin: (plugin.name, plugin.package))
 
 
-def load_plugin(kind: str, name: str) -> type[Any]:
-    """The class of a plugin.
+def find_plugin(kind: str, name: str) -> Plugin:
+    """A plugin by name, not imported yet.
 
     Raises:
-        PluginError: when the name is unknown, claimed by two packages, or the plugin is broken.
+        PluginError: when the name is unknown or claimed by two packages.
     """
     named: dict[str, list[Plugin]] = defaultdict(list)
     for plugin in list_plugins(kind):
@@ -74,7 +74,16 @@ def load_plugin(kind: str, name: str) -> type[Any]:
     if len(named[name]) > 1:
         packages = " and ".join(plugin.package for plugin in named[name])
         raise PluginError(f"{kind} {name!r} is claimed by {packages}; uninstall one of them")
-    return import_plugin(named[name][0])
+    return named[name][0]
+
+
+def load_plugin(kind: str, name: str) -> type[Any]:
+    """The class of a plugin.
+
+    Raises:
+        PluginError: when the name is unknown, claimed by two packages, or the plugin is broken.
+    """
+    return import_plugin(find_plugin(kind, name))
 
 
 def import_plugin(plugin: Plugin) -> type[Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.walking import MICRO_SETTINGS, stage, train, write_walks
+from tests.walking import MICRO_SETTINGS, stage, train_here, write_walks
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ["PERSIST_REFERENCE"] = os.devnull  # tests bring their own model; those of the packaged one say so
@@ -55,19 +55,19 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def codec(walks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A codec run of four steps of the micro model."""
     run = tmp_path_factory.mktemp("runs") / "codec"
-    train(*stage("codec", walks, run, *MICRO_SETTINGS))
+    train_here(*stage("codec", walks, run, *MICRO_SETTINGS))
     return run
 
 
 @pytest.fixture(scope="session")
 def stage1(walks: Path, codec: Path) -> Path:
     """A stage-1 run of four steps on it."""
-    train(*stage("stage1", walks, codec.parent / "stage1", f"base={codec}"))
+    train_here(*stage("stage1", walks, codec.parent / "stage1", f"base={codec}"))
     return codec.parent / "stage1"
 
 
 @pytest.fixture(scope="session")
 def voxel(walks: Path, stage1: Path) -> Path:
     """A stage-2 run with a voxel memory on that."""
-    train(*stage("stage2-voxel", walks, stage1.parent / "voxel", f"base={stage1}"))
+    train_here(*stage("stage2-voxel", walks, stage1.parent / "voxel", f"base={stage1}"))
     return stage1.parent / "voxel"

@@ -57,20 +57,8 @@ def test_a_third_partys_memory_of_ten_lines_works_in_every_command_by_name(persi
     options = ["--start", f"{walks}#0:4", "--actions", "left", "--steps", 1]
     memory = ["--memory", tmp_path / "m.safetensors"]
     assert persist("rollout", tmp_path / "run", *options, *memory, "--out", tmp_path / "rollout").code == 0
-    evaluated = persist(
-        "eval",
-        tmp_path / "run",
-        "--data",
-        walks,
-        "--memories",
-        "last",
-        "--seeds",
-        1,
-        "--steps",
-        1,
-        "--out",
-        tmp_path / "e",
-    )
+    few = ["--metrics", "psnr", "--controls", "copy", "--seeds", 1, "--clips", 1, "--steps", 1]
+    evaluated = persist("eval", tmp_path / "run", "--data", walks, "--memories", "last", *few, "--out", tmp_path / "e")
     assert (evaluated.code, "last" in evaluated.out) == (0, True)
 
 

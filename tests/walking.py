@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
+from persist_cli.app import main
 from persist_cli.trajectories.store import Store, write_trajectory
 from persist_cli.world.actions import walking_actions
+from persist_cli.world.files import read_tensors
 from persist_cli.world.observations import Frame
 from tests.rooms import UP, Room, look
 
@@ -50,12 +56,37 @@ def train(*arguments: str) -> None:
     subprocess.run([*PERSIST, *arguments], check=True, capture_output=True)
 
 
-def together(*arguments: str) -> None:
-    """Run ``persist`` as two processes with gloo; ``--multi_gpu`` is accelerate's word for several on one machine."""
+def train_here(*arguments: str) -> None:
+    """Run ``persist`` in this process."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), pytest.raises(SystemExit) as ended:
+        main(list(arguments))
+    assert not ended.value.code, said.getvalue()
+
+
+def in_two(*arguments: str) -> dict[str, Any]:
+    """How to start ``persist`` as two processes with gloo; ``--multi_gpu`` is accelerate's word for several."""
     launch = ["--multi_gpu", "--num_machines", "1", "--num_processes", "2", "--mixed_precision", "no"]
     command = [sys.executable, "-m", "accelerate.commands.launch", *launch, "--dynamo_backend", "no", "--module"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
-    subprocess.run([*command, "persist_cli", *arguments], check=True, capture_output=True, env=environment)
+    return {"args": [*command, "persist_cli", *arguments], "env": environment}
+
+
+def together(*arguments: str) -> None:
+    """Run ``persist`` as two processes."""
+    subprocess.run(**in_two(*arguments), check=True, capture_output=True)
+
+
+def end_of(run: Path) -> tuple[dict[str, torch.Tensor], str]:
+    """All that a run came to: its newest training state and its log."""
+    return read_tensors(max(run.glob("step-*")) / "training.safetensors")[0], (run / "log.jsonl").read_text()
+
+
+def ended_alike(one: Path, two: Path) -> bool:
+    """Whether two runs came to the same, to the bit."""
+    (weights, log), (others, other_log) = end_of(one), end_of(two)
+    same = weights.keys() == others.keys() and all(torch.equal(weights[name], others[name]) for name in weights)
+    return same and log == other_log
 
 
 def write_walks(folder: Path) -> Path:

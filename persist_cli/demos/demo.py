@@ -11,11 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import typer
+
 from persist_cli.app import app
+from persist_cli.evaluation.journal import Journal
 from persist_cli.viewing.console import say
 from persist_cli.world.errors import PersistError
 
 HALF: Final = 32  # frames of the way out, after the first; the way back begins at the last of them
+INTERRUPTED: Final = 130  # exit code after Ctrl-C
 ROWS: Final = ("with-memory", "without-memory")  # folders of the two rollouts
 
 
@@ -40,22 +44,32 @@ class Demo:
 
 
 def run_lines(lines: Sequence[str]) -> None:
-    """Run the commands one after the other, each said first."""
+    """Run the commands one after the other, each said first; one that fails ends all with its exit code."""
     for line in lines:
         say(f"\n$ persist {line}")
-        app(shlex.split(line), standalone_mode=False)
+        code = app(shlex.split(line), standalone_mode=False)
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
+        if code:
+            sys.exit(code)
 
 
 def run_demo(demo: Demo, out: Path) -> None:
     """Run every command, then put the videos side by side."""
     began = time.monotonic()
     say(demo.title)
-    shutil.rmtree(out / "eval", ignore_errors=True)  # of another model, it could not go on
+    remove_evaluation(out / "eval")
     run_lines(demo.commands(out))
     gather(out, demo.walk(out))
     say(f"\nDone in {(time.monotonic() - began) / 60:.1f} minutes. {demo.closing(out)}")
     say(f"Look at {out / 'rollout.mp4'} (ground truth, with memory, without), {out / 'sheet.png'}, {out / 'map.png'}")
     say(f"and {out / 'report' / 'report.html'}.")
+
+
+def remove_evaluation(folder: Path) -> None:
+    """Delete what an earlier demo measured, of another model perhaps, so that it could not go on; nothing else."""
+    if Journal(folder).begun:
+        shutil.rmtree(folder)
 
 
 def gather(out: Path, walk: str) -> None:
@@ -76,9 +90,12 @@ def gather(out: Path, walk: str) -> None:
 
 
 def main(demo: Demo) -> None:
-    """Run the demo; one line and exit code 1 for what the user can mend."""
+    """Run the demo; one line and exit code 1 for what the user can mend, 130 after Ctrl-C."""
     try:
         run_demo(demo, Path(sys.argv[1] if len(sys.argv) > 1 else demo.folder))
     except PersistError as error:
         say(f"error: {error}")
         sys.exit(1)
+    except (KeyboardInterrupt, typer.Abort):  # what an interrupted command becomes depends on the version of typer
+        say("stopped")
+        sys.exit(INTERRUPTED)

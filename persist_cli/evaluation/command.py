@@ -7,14 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from persist_cli.evaluation.cases import cases_json, data_files
+from persist_cli.evaluation.cases import cases_json
 from persist_cli.evaluation.columns import column_json, make_columns
 from persist_cli.evaluation.pictures import make_pictures
+from persist_cli.evaluation.plan import EvalPlan, Evaluation, prepare
 from persist_cli.evaluation.processes import Processes
 from persist_cli.evaluation.provenance import checkpoint_json, command, environment, metric_json
 from persist_cli.evaluation.results import RowResults, Table
-from persist_cli.evaluation.run import EvalPlan, Evaluation, measure_rows, prepare
-from persist_cli.reference import reference_checkpoint
+from persist_cli.evaluation.run import measure_rows
+from persist_cli.packaged import reference_checkpoint
 from persist_cli.reporting.report import write_report
 from persist_cli.reporting.text import print_tables
 from persist_cli.trajectories.reference import data_folder
@@ -65,28 +66,27 @@ def describe(run: Evaluation, processes: int) -> dict[str, Any]:
         "title": run.protocol.title,
         "definition": run.protocol.definition,
         "frames": run.cases[0].frames,
-        "options": {},
     }
     return {
         "format": "persist-evaluation",
         "version": 1,
         "measured": {
             "protocol": protocol,
-            "data": data_files(run.cases),
+            "data": run.journal.data(),
             "image_size": [info.height, info.width],
             "clips": cases_json(run.cases),
-            "metrics": metric_json(run.measurer.metrics),
+            "metrics": metric_json(run.metrics),
         },
         "sampling": {
-            "steps": run.plan.steps,
-            "sampler": run.plan.sampler,
+            "steps": run.sampling.steps,
+            "sampler": run.sampling.sampler,
             "seeds": list(range(run.plan.seeds)),
             "batch": run.plan.batch,
         },
         "environment": environment(processes),
         "command": command(),
         "checkpoints": [checkpoint_json(each) for each in run.checkpoints],
-        "columns": column_json(make_columns(run.measurer.metrics, run.protocol)),
+        "columns": column_json(make_columns(run.metrics, run.protocol)),
         "tables": tables(run),
         "first_row": run.rows[0].name,
     }
@@ -94,12 +94,8 @@ def describe(run: Evaluation, processes: int) -> dict[str, Any]:
 
 def tables(run: Evaluation) -> list[dict[str, Any]]:
     """One table of all clips, or one for each data set where the protocol says so."""
-    columns = make_columns(run.measurer.metrics, run.protocol)
-    rows = [RowResults(row, number, run.seeds(row), run.batches, run.journal) for number, row in enumerate(run.rows)]
-    return [
-        Table(name, clips, run.cases, run.measurer, columns, run.journal).to_json(rows)
-        for name, clips in domains(run).items()
-    ]
+    rows = [RowResults(run, number) for number in range(len(run.rows))]
+    return [Table(run, name, clips).to_json(rows) for name, clips in domains(run).items()]
 
 
 def domains(run: Evaluation) -> dict[str, list[int]]:

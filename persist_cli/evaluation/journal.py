@@ -11,11 +11,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from persist_cli.evaluation.cases import Case
-from persist_cli.world.errors import PersistError
-from persist_cli.world.files import read_json, read_tensors, remove_leftovers, write_json, write_tensors
+from persist_cli.evaluation.cases import Case, data_files
+from persist_cli.trajectories.store import SUFFIX
+from persist_cli.world.errors import DataError, PersistError
+from persist_cli.world.files import (
+    file_sha256,
+    read_json,
+    read_tensors,
+    remove_leftovers,
+    write_json,
+    write_tensors,
+)
 
 FOLDER = "parts"
+PLAN, CASES, DATA = "plan.json", "cases.json", "data.json"
+TRUTH = -1  # in the place of a row's number: the true videos
 
 
 @dataclass(frozen=True)
@@ -23,7 +33,7 @@ class Unit:
     """One batch of one row at one seed.
 
     Args:
-        row: its number.
+        row: its number, or ``TRUTH``.
         seed: of the sampling noise.
         batch: its number.
     """
@@ -35,7 +45,26 @@ class Unit:
     @property
     def file(self) -> str:
         """Where it is kept."""
-        return f"row-{self.row:03d}-seed-{self.seed:03d}-batch-{self.batch:05d}.safetensors"
+        row = "truth" if self.row == TRUTH else f"row-{self.row:03d}"
+        return f"{row}-seed-{self.seed:03d}-batch-{self.batch:05d}.safetensors"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One clip of a row that the report shows.
+
+    Args:
+        row: its number.
+        clip: its number.
+    """
+
+    row: int
+    clip: int
+
+    @property
+    def file(self) -> str:
+        """Where it is kept."""
+        return f"shown-{self.row:03d}-clip-{self.clip:05d}.safetensors"
 
 
 class Journal:
@@ -48,10 +77,14 @@ class Journal:
     def __init__(self, out: Path) -> None:
         self.folder = out / FOLDER
 
+    @property
+    def begun(self) -> bool:
+        """Whether the folder holds an evaluation."""
+        return (self.folder / PLAN).is_file()
+
     def check(self, plan: dict[str, Any]) -> None:
         """Raise ``PersistError`` when the folder holds another evaluation than this one."""
-        path = self.folder / "plan.json"
-        there = read_json(path) if path.is_file() else plan
+        there = read_json(self.folder / PLAN) if self.begun else plan
         if there != plan:
             raise PersistError(
                 f"{self.folder.parent}: holds another evaluation ({different(there, plan)}); choose another --out or "
@@ -60,27 +93,44 @@ class Journal:
         remove_leftovers(self.folder)
 
     def begin(self, plan: dict[str, Any], cases: Sequence[Case]) -> None:
-        """Keep what is measured, and on which clips."""
+        """Keep what is measured, on which clips of which files."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_json(self.folder / "plan.json", plan)
-        write_json(self.folder / "cases.json", [dataclasses.asdict(case) for case in cases])
+        write_json(self.folder / PLAN, plan)
+        write_json(self.folder / DATA, data_files(cases))
+        write_json(self.folder / CASES, [dataclasses.asdict(case) for case in cases])
 
     def cases(self) -> list[Case] | None:
         """The cases, when they were found before."""
-        path = self.folder / "cases.json"
-        return [Case.from_json(each) for each in read_json(path)] if path.is_file() else None
+        if not ((self.folder / CASES).is_file() and (self.folder / DATA).is_file()):
+            return None
+        return [Case.from_json(each) for each in read_json(self.folder / CASES)]
 
-    def has(self, unit: Unit) -> bool:
-        """Whether a batch was measured."""
-        return (self.folder / unit.file).is_file()
+    def data(self) -> list[dict[str, Any]]:
+        """The data sets with the hashes of the trajectories, as ``data_files`` gave them at the beginning."""
+        return list(read_json(self.folder / DATA))
 
-    def write(self, unit: Unit, tensors: dict[str, Tensor]) -> None:
-        """Keep a batch's figures ``[clip, frame, metric]`` and features, whole or not at all."""
-        write_tensors(self.folder / unit.file, tensors)
+    def check_data(self) -> None:
+        """Raise ``DataError`` when a trajectory is no longer what it was when the evaluation began."""
+        for folder in self.data():
+            for name, digest in folder["trajectories"].items():
+                path = Path(folder["path"]) / f"{name}{SUFFIX}"
+                if not path.is_file() or file_sha256(path) != digest:
+                    raise DataError(
+                        f"{path}: not what it was when the evaluation in {self.folder.parent} began; choose another "
+                        "--out or delete that one"
+                    )
 
-    def read(self, unit: Unit) -> dict[str, Tensor]:
+    def has(self, part: Unit | Shown) -> bool:
+        """Whether a batch was measured, or a clip predicted to be shown."""
+        return (self.folder / part.file).is_file()
+
+    def write(self, part: Unit | Shown, tensors: dict[str, Tensor]) -> None:
+        """Keep a batch's figures ``[clip, frame, metric]`` and features, or a clip's video, whole or not at all."""
+        write_tensors(self.folder / part.file, tensors)
+
+    def read(self, part: Unit | Shown) -> dict[str, Tensor]:
         """What ``write`` kept."""
-        return read_tensors(self.folder / unit.file)[0]
+        return read_tensors(self.folder / part.file)[0]
 
     def gather(self, row: int, seed: int, batches: int, name: str) -> Tensor:
         """A tensor of every clip of a measured row at a seed."""

@@ -17,7 +17,7 @@ VIDEO = "video"
 
 
 def choose_metrics(names: Sequence[str], known: Mapping[str, Metric]) -> dict[str, Metric]:
-    """The metrics of these names, or ``all``.
+    """The metrics of these names with those that guard them, or ``all``.
 
     Raises:
         PersistError: for an unknown name.
@@ -28,11 +28,12 @@ def choose_metrics(names: Sequence[str], known: Mapping[str, Metric]) -> dict[st
             raise PersistError(f"unknown metric {name!r}; {hint(name, known)}")
     if not asked:
         raise PersistError("name at least one metric, as in --metrics psnr,lpips-alex")
+    asked += [guard for name in asked for guard in known[name].guards]
     return {name: known[name] for name in known if name in asked}
 
 
-def make_setup(cases: Sequence[Case]) -> Setup:
-    """What the cases let a metric measure; the given first frames are not counted."""
+def make_setup(cases: Sequence[Case], generated_depth: bool = True) -> Setup:
+    """What the cases, and a row that gives depth or does not, let a metric measure; given first frames do not count."""
     info = cases[0].file.info
     return Setup(
         clips=len(cases),
@@ -40,6 +41,7 @@ def make_setup(cases: Sequence[Case]) -> Setup:
         height=info.height,
         width=info.width,
         depth=any(share is not None for case in cases for share in case.seen_before),
+        generated_depth=generated_depth,
         returns=any(visit >= 0 for case in cases for visit in case.first_visits),
     )
 

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.evaluation.backbones import Backbones
 from persist_cli.evaluation.cases import read_case
-from persist_cli.evaluation.journal import Unit
+from persist_cli.evaluation.journal import Shown, Unit
 from persist_cli.evaluation.measuring import FIGURES, VIDEO
-from persist_cli.evaluation.run import SHOWN, Backbones, Evaluation, predict
+from persist_cli.evaluation.plan import Evaluation
+from persist_cli.evaluation.run import SHOWN, predict
 from persist_cli.metrics.metric import Metric
 from persist_cli.reporting.pictures import ClipPicture, Pictures, RowPictures, Sheet
 from persist_cli.viewing.console import add_task, progress
-from persist_cli.world.backbone import Backbone
 
 
 def make_pictures(run: Evaluation, domains: dict[str, list[int]], backbones: Backbones) -> Pictures:
@@ -43,26 +44,23 @@ def sheets(run: Evaluation) -> list[Sheet]:
 def row_pictures(run: Evaluation, domains: dict[str, list[int]], backbones: Backbones) -> list[RowPictures]:
     """Best, median and worst clip of every row in every table, at the first seed.
 
-    They are predicted again, one by one and from the noise they had, because keeping every video would take more room
-    than anybody has; the last bits may differ from what was measured in a batch.
+    They are predicted once more, one by one and from the noise they had, and then kept, because keeping every video
+    would take more room than anybody has; the last bits may differ from what was measured in a batch.
     """
-    metric = next(iter(run.measurer.by_frame.values()), None)
-    if metric is None:
-        return []
     found = []
     with progress() as bar:
         task = add_task(bar, "pictures", len(run.rows), "row")
         for number, row in enumerate(run.rows):
-            backbone = backbones.ready(row)
-            figures = first_figures(run, number)
-            for name, clips in domains.items():
-                shown = []
-                for clip in pick_clips(figures, clips, metric):
-                    caption = f"{metric.title} {float(figures[clip]):.2f}"
-                    shown.append(clip_picture(run, backbone, (number, clip), caption))
+            for name, clips in domains.items() if run.measurer(row).by_frame else ():
+                shown = [clip_picture(run, backbones, Shown(number, clip)) for clip in pick_clips(run, number, clips)]
                 found.append(RowPictures(name, row.name, *shown))
             bar.advance(task)
     return found
+
+
+def first_metric(run: Evaluation, row: int) -> Metric:
+    """The metric that says which clips of a row are good."""
+    return next(iter(run.measurer(run.rows[row]).by_frame.values()))
 
 
 def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
@@ -70,25 +68,27 @@ def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
     return run.journal.gather(row, 0, run.batches, FIGURES)[:, 1:, 0].nanmean(dim=1)
 
 
-def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Metric) -> list[int]:
-    """Numbers of the best, the median and the worst of some clips."""
-    sign = -1.0 if metric.better == "higher" else 1.0
+def pick_clips(run: Evaluation, row: int, clips: Sequence[int]) -> list[int]:
+    """Numbers of a row's best, median and worst of some clips."""
+    figures, sign = first_figures(run, row), -1.0 if first_metric(run, row).better == "higher" else 1.0
     known = [clip for clip in clips if figures[clip].isfinite()] or list(clips)
     ordered = sorted(known, key=lambda clip: sign * float(figures[clip]))
     return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
 
 
-def clip_picture(run: Evaluation, backbone: Backbone, where: tuple[int, int], caption: str) -> ClipPicture:
-    """What a row predicts for a clip, by their numbers, at the first seed."""
-    row, clip = where
-    frames = read_case(run.cases[clip])
-    rgb, depth = predict(run.rows[row], backbone, [frames], 0, clip)
-    truth = frames.observations
+def clip_picture(run: Evaluation, backbones: Backbones, part: Shown) -> ClipPicture:
+    """What a row predicts for a clip at the first seed, beside the truth."""
+    row, frames = run.rows[part.row], read_case(run.cases[part.clip])
+    if not run.journal.has(part):
+        rgb, depth = predict(row, backbones.ready(row), [frames], 0, part.clip)
+        run.journal.write(part, {"rgb": rgb[0], "depth": depth[0]})
+    kept, truth = run.journal.read(part), frames.observations
+    both = row.gives_depth and bool((truth.depth > 0).any())
     return ClipPicture(
-        clip=clip,
-        figure=caption,
-        generated=rgb[0].cpu(),
+        clip=part.clip,
+        figure=f"{first_metric(run, part.row).title} {float(first_figures(run, part.row)[part.clip]):.2f}",
+        generated=kept["rgb"],
         truth=truth.rgb,
-        depth=depth[0].cpu(),
-        true_depth=truth.depth if bool((truth.depth > 0).any()) else None,
+        depth=kept["depth"] if both else None,
+        true_depth=truth.depth if both else None,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,11 +12,10 @@ from typing import Any
 
 import torch
 
-from persist_cli import __version__
+from persist_cli import __version__, lineage
 from persist_cli.checkpoints import Checkpoint
 from persist_cli.metrics.metric import Metric
-from persist_cli.recipe import parse_yaml_mapping
-from persist_cli.trajectories.store import Store
+from persist_cli.viewing.console import warn
 from persist_cli.world.files import file_sha256, read_json
 from persist_cli.world.weights import cached_weight
 
@@ -42,30 +42,43 @@ def command() -> list[str]:
 
 
 def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A checkpoint with the hashes of its base, recipe and adapters, JSON values."""
-    recipe = recipe_path(checkpoint.folder)
+    """A checkpoint with the hashes of its base, recipes and adapters, JSON values."""
     adapters = {name: file_sha256(folder / "adapter.safetensors") for name, folder in checkpoint.adapters.items()}
+    scenes = lineage.training_scenes(checkpoint)
     return {
         "name": checkpoint.name,
         "path": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
-        "recipe_sha256": file_sha256(recipe) if recipe else None,
+        "recipe_sha256": recipe_sha256(checkpoint.folder),
+        "training_scenes": {"known": len(scenes.names), "complete": scenes.complete},
         "adapters": adapters,
     }
 
 
-def recipe_path(folder: Path) -> Path | None:
-    """The recipe that a run kept in its checkpoint."""
-    path = folder / "recipe.yaml"
-    return path if path.is_file() else None
+def recipe_sha256(folder: Path) -> str | None:
+    """SHA-256 of the recipe that a run kept in its checkpoint, or over the names and texts of all those of an export.
+
+    ``None`` when there is none.
+    """
+    if (folder / lineage.RECIPE).is_file():
+        return file_sha256(folder / lineage.RECIPE)
+    home = folder / lineage.RECIPES
+    texts = {path.relative_to(home).as_posix(): path.read_bytes() for path in home.rglob("*.yaml")}
+    digest = hashlib.sha256()
+    for name, text in sorted(texts.items()):
+        digest.update(name.encode() + b"\0" + hashlib.sha256(text).digest())
+    return digest.hexdigest() if texts else None
 
 
 def training_scenes(checkpoints: Sequence[Checkpoint]) -> frozenset[str]:
-    """Scenes of the data sets that the checkpoints' recipes name, as far as these are still there."""
-    folders = {folder for each in checkpoints for folder in (each.folder, each.base_folder)}
-    recipes = [path for path in map(recipe_path, sorted(folders)) if path]
-    data = {Path(parse_yaml_mapping(path.read_text("utf-8"), str(path))["data"]["path"]) for path in recipes}
-    return frozenset(file.info.scene for folder in data if folder.is_dir() for file in Store(folder))
+    """Names of the scenes that the checkpoints are known to have been trained on; a line says where some are not."""
+    found: frozenset[str] = frozenset()
+    for each in checkpoints:
+        scenes = lineage.training_scenes(each)
+        found |= scenes.names
+        if not scenes.complete:
+            warn(f"{each.folder}: training scenes unknown, but for {len(scenes.names)}")
+    return found
 
 
 def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:

@@ -11,16 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from persist_cli.evaluation.cases import Case
-from persist_cli.evaluation.columns import Column, chosen_frames
-from persist_cli.evaluation.journal import Journal
+from persist_cli.evaluation.columns import Column, chosen_frames, make_columns
+from persist_cli.evaluation.journal import TRUTH
 from persist_cli.evaluation.measuring import FIGURES, Measurer
+from persist_cli.evaluation.plan import Evaluation
 from persist_cli.evaluation.rows.row import Row
 from persist_cli.evaluation.statistics import Figure, difference, mean, mean_figure, number, set_figure
 from persist_cli.metrics.metric import FrameMetric
 
 BINS = 10  # of the share of a view that was seen before
-TRUTH = 999  # number in the journal of the true videos' features
 
 
 @dataclass(frozen=True)
@@ -28,18 +27,22 @@ class RowResults:
     """What was measured of one row.
 
     Args:
-        row: which.
-        number: in the journal.
-        seeds: how many.
-        batches: how many a seed.
-        journal: that holds them.
+        run: the evaluation.
+        number: of the row.
     """
 
-    row: Row
+    run: Evaluation
     number: int
-    seeds: int
-    batches: int
-    journal: Journal
+
+    @property
+    def row(self) -> Row:
+        """Which."""
+        return self.run.rows[self.number]
+
+    @property
+    def measurer(self) -> Measurer:
+        """What measured it."""
+        return self.run.measurer(self.row)
 
     @cached_property
     def figures(self) -> Tensor:
@@ -48,7 +51,8 @@ class RowResults:
 
     def gather(self, name: str) -> Tensor:
         """A tensor of every seed and clip."""
-        return torch.stack([self.journal.gather(self.number, seed, self.batches, name) for seed in range(self.seeds)])
+        seeds, batches = range(self.run.seeds(self.row)), self.run.batches
+        return torch.stack([self.run.journal.gather(self.number, seed, batches, name) for seed in seeds])
 
 
 @dataclass(frozen=True)
@@ -56,27 +60,26 @@ class Table:
     """The rows over the clips of one domain.
 
     Args:
+        run: the evaluation.
         name: of the domain.
         clips: numbers of its cases.
-        cases: all of the evaluation.
-        measurer: what was measured.
-        columns: of the table.
-        journal: that holds the figures.
     """
 
+    run: Evaluation
     name: str
     clips: Sequence[int]
-    cases: Sequence[Case]
-    measurer: Measurer
-    columns: Sequence[Column]
-    journal: Journal
+
+    @cached_property
+    def columns(self) -> list[Column]:
+        """Those of the protocol."""
+        return make_columns(self.run.metrics, self.run.protocol)
 
     def to_json(self, rows: Sequence[RowResults]) -> dict[str, Any]:
         """Every row with its columns and curves; differences are to the first row, and to every other one."""
         figures = {each.row.name: self.figures(each) for each in rows}
         table: dict[str, Any] = {}
         for each in rows:
-            cells = {column.name: self.cell(column, each.row.name, figures) for column in self.columns}
+            cells = {column.name: self.cell(column, each, figures) for column in self.columns}
             table[each.row.name] = self.describe(each) | {"columns": cells, "curves": self.curves(each)}
         return {"name": self.name, "clips": list(self.clips), "rows": table}
 
@@ -89,57 +92,53 @@ class Table:
             "kind": each.row.kind, "definition": each.row.definition, "checkpoint": checkpoint, "memory": adapter,
         }  # fmt: skip
 
-    def cell(self, column: Column, row: str, figures: Mapping[str, Mapping[str, Figure]]) -> dict[str, Any]:
+    def cell(self, column: Column, each: RowResults, figures: Mapping[str, Mapping[str, Figure]]) -> dict[str, Any]:
         """One figure as JSON values, or why there is none."""
-        if column.metric in self.measurer.obstacles:
-            return {"na": self.measurer.obstacles[column.metric]}
-        figure = figures[row][column.name]
+        if column.metric in each.measurer.obstacles:
+            return {"na": each.measurer.obstacles[column.metric]}
+        figure = figures[each.row.name][column.name]
         if not np.isfinite(figure.mean):
             return {"na": "not defined for any of these clips"}
-        others = [name for name in figures if name != row]
-        differences = {name: difference(figure, figures[name][column.name]) for name in others}
+        others = {name: of.get(column.name) for name, of in figures.items() if name != each.row.name}
+        differences = {name: other and difference(figure, other) for name, other in others.items()}
         first = differences.get(next(iter(figures)))
         return figure.to_json() | {"difference": first, "differences": differences}
 
     def figures(self, each: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""
-        values = each.figures[:, list(self.clips)]
+        values, cases = each.figures[:, list(self.clips)], [self.run.cases[clip] for clip in self.clips]
         found = {}
         for column in self.columns:
-            if column.metric in self.measurer.by_frame:
-                place = list(self.measurer.by_frame).index(column.metric)
-                chosen = chosen_frames([self.cases[clip] for clip in self.clips], column.frames)
-                shown = torch.where(chosen, values[..., place], torch.nan).numpy()
+            if column.metric in each.measurer.by_frame:
+                place = list(each.measurer.by_frame).index(column.metric)
+                shown = torch.where(chosen_frames(cases, column.frames), values[..., place], torch.nan).numpy()
                 found[column.name] = mean_figure(mean(shown, axis=2))
-            elif column.metric in self.measurer.by_set:
+            elif column.metric in each.measurer.by_set:
                 found[column.name] = self.set_figure(column.metric, each)
         return found
 
     def set_figure(self, metric: str, each: RowResults) -> Figure:
         """The distance of the row's videos from the true ones."""
         generated = each.gather(f"features/{metric}")[:, list(self.clips)]
-        truth = self.true_features[metric]
-        measured = self.measurer.by_set[metric]
+        truth = self.true_features(metric)
+        measured = each.measurer.by_set[metric]
 
         def distance(numbers: np.ndarray[Any, np.dtype[np.int64]], seed: int) -> float:
             chosen = torch.from_numpy(numbers)
             return measured.distance(generated[seed][chosen], truth[chosen])
 
-        return set_figure(distance, len(self.clips), each.seeds)
+        return set_figure(distance, len(self.clips), self.run.seeds(each.row))
 
-    @cached_property
-    def true_features(self) -> dict[str, Tensor]:
-        """Features of the true videos of this domain."""
-        batches = len(list(self.journal.folder.glob(f"row-{TRUTH:03d}-*")))
-        found = {name: self.journal.gather(TRUTH, 0, batches, f"features/{name}") for name in self.measurer.by_set}
-        return {name: features[list(self.clips)] for name, features in found.items()}
+    def true_features(self, metric: str) -> Tensor:
+        """Features of the true videos of this domain, ``[clip, channel]``."""
+        return self.run.journal.gather(TRUTH, 0, self.run.batches, f"features/{metric}")[list(self.clips)]
 
     def curves(self, each: RowResults) -> dict[str, Any]:
         """Each metric against frame number and against the share of the view seen before."""
         values = each.figures[:, list(self.clips), 1:].numpy()
-        shares = np.array([self.cases[clip].seen_before[1:] for clip in self.clips], dtype=np.float64)
+        shares = np.array([self.run.cases[clip].seen_before[1:] for clip in self.clips], dtype=np.float64)
         curves = {}
-        for place, (name, metric) in enumerate(self.measurer.by_frame.items()):
+        for place, (name, metric) in enumerate(each.measurer.by_frame.items()):
             assert isinstance(metric, FrameMetric)
             by_frame = mean(values[..., place], axis=0)
             curves[name] = {

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +11,25 @@ from typing import Any
 import torch
 
 from persist_cli import __version__
-from persist_cli.checkpoints import CARD, Checkpoint, base_files, find_checkpoint, fingerprint, write_card
+from persist_cli.checkpoints import (
+    CARD,
+    Checkpoint,
+    base_files,
+    empty_backbone,
+    find_checkpoint,
+    fingerprint,
+    sampling_of,
+    write_card,
+)
 from persist_cli.exporting.parts import Part, adapter_parts, known_recipes
+from persist_cli.lineage import RECIPE, RECIPES, training_scenes, write_recipes
 from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import CheckpointError, PersistError, hint
-from persist_cli.world.files import ASIDE, file_sha256, read_tensors, remove_leftovers, write_tensors, write_text
+from persist_cli.world.files import file_sha256, folder_aside, read_tensors, write_tensors, write_text
 
 PRECISIONS = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
 SUMS = "SHA256SUMS"
-OF_RUNS = {CARD, "recipe.yaml", SUMS}  # at the top of a checkpoint folder; an export makes its own
+OF_RUNS = {CARD, RECIPE, SUMS}  # at the top of a checkpoint folder; an export makes its own
 
 
 @dataclass(frozen=True)
@@ -49,14 +57,16 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     base = find_checkpoint(plan.checkpoint)
     parts = adapter_parts(base, plan.runs)
     default = default_of(base, parts, plan.default)
-    named = {"steps": plan.steps, "sampler": plan.sampler}
-    sampling = base.sampling | {key: value for key, value in named.items() if value is not None}
+    sampling = chosen_sampling(base, plan)
+    scenes = training_scenes(base)
+    for part in parts.values():
+        scenes |= training_scenes(part.checkpoint)
+    said = {"dtype": plan.dtype, "default_adapter": default, "sampling": sampling}
     with folder_aside(out) as folder:
         card = write_checkpoint(folder, base, parts, PRECISIONS[plan.dtype])
-        meant = {"dtype": plan.dtype, "default_adapter": default, "sampling": sampling}
-        write_card(folder, card | meant | {"exported_by": __version__})
+        write_card(folder, card | said | {"exported_by": __version__}, scenes)
         files = write_sums(folder)
-    show(out, {"fingerprint": card["fingerprint"]} | meant, files, json)
+    show(out, {"fingerprint": card["fingerprint"]} | said, files, json)
 
 
 def default_of(base: Checkpoint, parts: dict[str, Part], asked: str | None) -> str | None:
@@ -68,25 +78,24 @@ def default_of(base: Checkpoint, parts: dict[str, Part], asked: str | None) -> s
     return asked
 
 
-@contextlib.contextmanager
-def folder_aside(out: Path) -> Iterator[Path]:
-    """A temporary folder beside ``out`` that becomes it when the block ends well."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    remove_leftovers(out.parent, out.name)
-    aside = out.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{out.name}"
-    aside.mkdir()
-    try:
-        yield aside
-        aside.rename(out)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+def chosen_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, Any] | None:
+    """Steps and sampler for the card: those asked for, else the checkpoint's; ``None`` when neither names any.
+
+    Raises:
+        PersistError: when the backbone cannot sample so.
+    """
+    if base.sampling is None and plan.steps is None and plan.sampler is None:
+        return None
+    sampling = sampling_of(base, plan.steps, plan.sampler)
+    empty_backbone(base).check_sampling(sampling)
+    return {"steps": sampling.steps, "sampler": sampling.sampler}
 
 
 def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dtype: torch.dtype) -> dict[str, Any]:
     """Write base, adapters and recipes into the folder, weights in this precision; returns what the card must say."""
     home = base.base_folder
-    mine = [path for path in base_files(home, "*") if belongs(path.relative_to(home))]
-    jobs = [(path, folder / path.relative_to(home)) for path in mine]
+    own = [path for path in base_files(home, "*") if belongs(path.relative_to(home))]
+    jobs = [(path, folder / path.relative_to(home)) for path in own]
     for name, part in parts.items():
         files = sorted(path for path in part.folder.glob("[!.]*") if path.is_file())
         jobs += [(path, folder / "adapters" / name / path.name) for path in files]
@@ -95,17 +104,15 @@ def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dty
         try:
             convert(source, target, dtype) if source.suffix == ".safetensors" else shutil.copyfile(source, target)
         except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
-            raise CheckpointError(f"{source}: cannot be exported ({error.strerror})") from error
-    for name, text in known_recipes(base, parts).items():
-        (folder / "recipes").mkdir(exist_ok=True)
-        write_text(folder / "recipes" / name, text)
+            raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
+    write_recipes(folder, known_recipes(base, parts))
     return {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(folder)}
 
 
 def belongs(path: Path) -> bool:
     """Whether a file of a base is the backbone's, by its path in the folder: not one that every export makes anew."""
     hidden = any(part.startswith(".") for part in path.parts)
-    return str(path) not in OF_RUNS and path.parts[0] != "recipes" and not hidden
+    return str(path) not in OF_RUNS and path.parts[0] != RECIPES and not hidden
 
 
 def convert(source: Path, target: Path, dtype: torch.dtype) -> None:

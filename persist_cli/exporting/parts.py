@@ -10,12 +10,13 @@ from typing import Any
 
 import yaml
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint
+from persist_cli.checkpoints import PLAIN, Checkpoint, find_checkpoint
+from persist_cli.lineage import RECIPE, RECIPES, stage_recipes
 from persist_cli.recipe import parse_yaml_mapping
-from persist_cli.world.errors import CheckpointError, PersistError
+from persist_cli.world.errors import CheckpointError
 
+ADAPTERS = "adapters"  # the folder of their recipes
 NAMED = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9_-]*)=(?P<run>.+)")
-PLAIN = "stage1"  # what evaluations call the base without any adapter
 
 
 @dataclass(frozen=True)
@@ -75,38 +76,18 @@ def _parts_of_run(text: str) -> dict[str, Part]:
 
 
 def known_recipes(base: Checkpoint, parts: dict[str, Part]) -> dict[str, str]:
-    """Texts of the recipes behind an export by file name: ``codec.yaml``, ``stage1.yaml`` and one for each adapter.
+    """Texts of the recipes behind an export by file name: those of the base's stages and ``adapters/NAME.yaml``.
 
     Absolute paths are cut to their last part: they say nothing elsewhere.
     """
-    recipes = _base_recipes(base.base_folder)
+    recipes = stage_recipes(base.base_folder)
     for name, part in parts.items():
         folder = part.checkpoint.folder
-        for path in (folder / "recipes" / f"{part.adapter}.yaml", folder / "recipe.yaml"):
+        for path in (folder / RECIPES / ADAPTERS / f"{part.adapter}.yaml", folder / RECIPE):
             if path.is_file():
-                recipes[f"{name}.yaml"] = path.read_text(encoding="utf-8")
+                recipes[f"{ADAPTERS}/{name}.yaml"] = path.read_text(encoding="utf-8")
                 break
     return {name: _without_places(text, name) for name, text in recipes.items()}
-
-
-def _base_recipes(folder: Path) -> dict[str, str]:
-    """The recipe of the base's last stage, and those of the stages before as far as their runs are still there."""
-    if (folder / "recipes").is_dir():
-        names = ("codec.yaml", "stage1.yaml")
-        kept = (folder / "recipes" / name for name in names)
-        return {path.name: path.read_text(encoding="utf-8") for path in kept if path.is_file()}
-    path = folder / "recipe.yaml"
-    if not path.is_file():
-        return {}
-    text = path.read_text(encoding="utf-8")
-    values = parse_yaml_mapping(text, str(path))
-    before: dict[str, str] = {}
-    if values.get("base"):
-        try:
-            before = _base_recipes(find_checkpoint(Path(values["base"])).base_folder)
-        except PersistError:
-            before = {}  # the run before is not there any more, so its recipe is not known
-    return before | {"codec.yaml" if values.get("stage") == "codec" else "stage1.yaml": text}
 
 
 def _without_places(text: str, where: str) -> str:
@@ -114,6 +95,11 @@ def _without_places(text: str, where: str) -> str:
     data: dict[str, Any] = values.get("data") or {}
     settings: dict[str, Any] = (values.get("backbone") or {}).get("settings") or {}
     for owner, key in ((values, "base"), (data, "path"), (settings, "pretrained")):
-        if Path(str(owner.get(key) or "")).is_absolute():
-            owner[key] = Path(str(owner[key])).name
+        owner |= {key: _without_place(owner[key])} if key in owner else {}
     return yaml.safe_dump(values, sort_keys=False)
+
+
+def _without_place(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_without_place(each) for each in value]
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value

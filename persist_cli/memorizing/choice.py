@@ -10,9 +10,11 @@ from typing import Any
 import yaml
 
 from persist_cli.checkpoints import Checkpoint, find_checkpoint
+from persist_cli.packaged import reference_checkpoint
 from persist_cli.recipe import MemoryChoice
-from persist_cli.reference import reference_checkpoint
 from persist_cli.world.errors import CheckpointError, PersistError, RecipeError
+
+USUAL = "voxel"  # the memory that is meant when neither a user nor a checkpoint names one
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,13 @@ class MemorizePlan:
     """The options of ``persist memorize`` that say which memory.
 
     Args:
-        memory: name of the memory.
+        memory: name of the memory, ``None`` when none is named.
         encoder: name of its encoder, ``None`` when none is named.
         settings: ``memory.KEY=VALUE`` and ``encoder.KEY=VALUE``, values as in YAML.
         checkpoint: whose adapter shall read it, ``None`` when none is named.
     """
 
-    memory: str = "voxel"
+    memory: str | None = None
     encoder: str | None = None
     settings: Sequence[str] = ()
     checkpoint: Path | None = None
@@ -42,28 +44,42 @@ def choose_memory(plan: MemorizePlan) -> tuple[MemoryChoice, str | None]:
     if own and plan.checkpoint is not None:
         raise PersistError("--checkpoint brings memory settings and encoder along; leave out --encoder and --set")
     if plan.checkpoint is not None:
-        checkpoint = find_checkpoint(plan.checkpoint)
-        adapter = adapter_of(checkpoint, plan.memory)
-        if adapter is None:
-            known = ", ".join(checkpoint.adapters) or "none"
-            raise CheckpointError(f"{checkpoint.folder}: no adapter reads a memory {plan.memory!r}; it has {known}")
-        return adapter
+        return adapter_of(find_checkpoint(plan.checkpoint), plan.memory)
     reference = None if own else _reference()
-    adapter = adapter_of(reference, plan.memory) if reference else None
-    if adapter is not None:
-        return adapter
+    memories = set(_memories(reference).values()) if reference else set()
+    if reference and memories and (plan.memory is None or plan.memory in memories):
+        return adapter_of(reference, plan.memory)
     chosen = plugin_settings(plan.settings)
-    return MemoryChoice(plan.memory, chosen["memory"], plan.encoder or "patches", chosen["encoder"]), None
+    return MemoryChoice(plan.memory or USUAL, chosen["memory"], plan.encoder or "patches", chosen["encoder"]), None
 
 
-def adapter_of(checkpoint: Checkpoint, memory: str) -> tuple[MemoryChoice, str] | None:
-    """What the adapter for a memory reads, and that adapter in words; the one of its name before the default one."""
-    first = [name for name in (memory, checkpoint.default) if name in checkpoint.adapters]
-    for name in dict.fromkeys([*first, *checkpoint.adapters]):
-        choice = checkpoint.memory_choice(str(name))
-        if choice.name == memory:
-            return choice, f"adapter {name!r} of {checkpoint.folder}"
-    return None
+def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryChoice, str]:
+    """What the adapter for a memory reads, and that adapter in words.
+
+    Args:
+        checkpoint: that has the adapter.
+        memory: that the adapter reads; of several the one of its name goes before the default one. ``None`` is what
+            the default or the only adapter reads.
+
+    Raises:
+        CheckpointError: when there is no such adapter, or one must be chosen.
+    """
+    memories = _memories(checkpoint)
+    if memory is None and checkpoint.default is None and len(memories) > 1:
+        known = ", ".join(dict.fromkeys(memories.values()))
+        raise CheckpointError(f"{checkpoint.folder}: choose a memory of {known} with --memory")
+    wanted = [name for name, each in memories.items() if memory in (None, each)]
+    first = [name for name in (memory, checkpoint.default) if name in wanted]
+    if not wanted:
+        asked = "a memory" if memory is None else f"a memory {memory!r}"
+        raise CheckpointError(f"{checkpoint.folder}: no adapter reads {asked}; it has {', '.join(memories) or 'none'}")
+    name = str([*first, *wanted][0])
+    return checkpoint.memory_choice(name), f"adapter {name!r} of {checkpoint.folder}"
+
+
+def _memories(checkpoint: Checkpoint) -> dict[str, str]:
+    """The memory that each adapter reads."""
+    return {name: checkpoint.memory_choice(name).name for name in checkpoint.adapters}
 
 
 def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:

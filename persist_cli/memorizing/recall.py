@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from persist_cli.recipe import MemoryChoice
 from persist_cli.registry import load_plugin, make_encoder
@@ -16,6 +16,9 @@ from persist_cli.world.memory import FrameOfReference, Memory
 from persist_cli.world.observations import TrajectoryInfo
 from persist_cli.world.settings import parse_settings
 from persist_cli.world.tokens import MemoryTokens
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -44,38 +47,32 @@ class MemoryMaker:
         return self.kind(self.settings, self.encoder, FrameOfReference(info.scene, info.world_up))
 
 
-def collate(samples: Sequence[ClipSample], maker: MemoryMaker | None, budget: int) -> Clips:
-    """A batch of clips; with a maker, each with the tokens that a memory of its context gives its cameras.
-
-    Latents and tokens that samples bring along are taken; either all samples bring latents or none.
-    """
+def collate(samples: Sequence[ClipSample], tokens: MemoryTokens | None = None, latents: Tensor | None = None) -> Clips:
+    """A batch of clips, with the batch's memory tokens and latents where there are any."""
     import torch
 
-    tokens = None
-    if maker is not None:
-        known = [sample.tokens for sample in samples]
-        tokens = MemoryTokens.stack(
-            [
-                recall(sample, maker, budget) if each is None else each
-                for sample, each in zip(samples, known, strict=True)
-            ]
-        )
-    latents = [sample.latents for sample in samples if sample.latents is not None]
-    first = samples[0].observations.cameras
+    cameras = [sample.observations.cameras for sample in samples]
     return Clips(
         rgb=torch.stack([sample.observations.rgb for sample in samples]),
         depth=torch.stack([sample.observations.depth for sample in samples]),
         cameras=Cameras(
-            torch.stack([sample.observations.cameras.world_from_camera for sample in samples]),
-            torch.stack([sample.observations.cameras.intrinsics for sample in samples]),
-            first.height,
-            first.width,
+            torch.stack([each.world_from_camera for each in cameras]),
+            torch.stack([each.intrinsics for each in cameras]),
+            cameras[0].height,
+            cameras[0].width,
         ),
         interactions=[sample.interactions for sample in samples],
         tokens=tokens,
         seeds=[sample.seed for sample in samples],
-        latents=torch.stack(latents) if latents else None,
+        latents=latents,
     )
+
+
+def recall_all(samples: Sequence[ClipSample], maker: MemoryMaker | None, budget: int) -> MemoryTokens | None:
+    """What each sample's own memory says to its clip, as a batch; ``None`` without a maker."""
+    if maker is None:
+        return None
+    return MemoryTokens.stack([recall(sample, maker, budget) for sample in samples])
 
 
 def recall(sample: ClipSample, maker: MemoryMaker, budget: int) -> MemoryTokens:

@@ -14,8 +14,10 @@ class DepthMetric(FrameMetric):
     """A figure for each frame that compares generated with true depth."""
 
     def obstacle(self, setup: Setup) -> str | None:
-        """It needs true depth."""
-        return None if setup.depth else "the data has no depth"
+        """It needs true and generated depth."""
+        if not setup.depth:
+            return "the data has no depth"
+        return None if setup.generated_depth else "the model gives no depth"
 
 
 class AbsRel(DepthMetric):
@@ -27,7 +29,7 @@ class AbsRel(DepthMetric):
     definition = f"mean |z - z*| / z* {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Error of each frame, NaN without any true or generated depth."""
+        """Error of each frame, NaN without any true depth."""
         depth, truth, known = _depths(prediction)
         return _mean((depth - truth).abs() / truth.clamp_min(1e-6), known)
 
@@ -41,7 +43,7 @@ class Rmse(DepthMetric):
     definition = f"metres, root of the mean (z - z*)² of a frame {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Metres for each frame, NaN without any true or generated depth."""
+        """Metres for each frame, NaN without any true depth."""
         depth, truth, known = _depths(prediction)
         return _mean((depth - truth).square(), known).sqrt()
 
@@ -55,15 +57,14 @@ class Delta1(DepthMetric):
     definition = f"share of pixels with max(z / z*, z* / z) < 1.25 {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Share for each frame between 0 and 1, NaN without any true or generated depth."""
+        """Share for each frame between 0 and 1, NaN without any true depth."""
         depth, truth, known = _depths(prediction)
         return _mean(((depth < 1.25 * truth) & (truth < 1.25 * depth)).double(), known)
 
 
 def _depths(prediction: Prediction) -> tuple[Tensor, Tensor, Bool[Tensor, "frame height width"]]:
     truth = prediction.truth.depth.double()
-    given = prediction.depth[1:].any()  # a model of RGB alone gives none after the given frame
-    return prediction.depth.double(), truth, (truth > 0) & given
+    return prediction.depth.double(), truth, truth > 0
 
 
 def _mean(values: Float[Tensor, "frame height width"], known: Bool[Tensor, "frame height width"]) -> Tensor:

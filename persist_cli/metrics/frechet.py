@@ -35,17 +35,6 @@ def frechet_distance(features: Float[Tensor, "sample channel"], other: Float[Ten
     return _distance(means[0] - means[1], factors[0], factors[1])
 
 
-def frechet_gaussians(
-    mean: Float[Tensor, " channel"],
-    covariance: Float[Tensor, "channel channel"],
-    other_mean: Float[Tensor, " channel"],
-    other_covariance: Float[Tensor, "channel channel"],
-) -> float:
-    """The squared distance of two Gaussians; rounding errors below zero among the eigenvalues count as zero."""
-    factors = [_square_root(each.double()) for each in (covariance, other_covariance)]
-    return _distance(mean.double() - other_mean.double(), factors[0], factors[1])
-
-
 def _distance(shift: Tensor, factor: Tensor, other: Tensor) -> float:
     """From the difference of means and F with FᵀF = Σ of either."""
     common = torch.linalg.svdvals(factor @ other.T).sum()
@@ -58,9 +47,3 @@ def _factor(centred: Float[Tensor, "sample channel"]) -> Tensor:
     samples, channels = centred.shape
     factor = torch.linalg.qr(centred, mode="r").R if samples > channels else centred
     return factor / math.sqrt(samples - 1)
-
-
-def _square_root(covariance: Float[Tensor, "channel channel"]) -> Tensor:
-    values, vectors = torch.linalg.eigh((covariance + covariance.T) / 2)
-    root: Tensor = values.clamp_min(0).sqrt()[:, None] * vectors.T
-    return root

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -57,6 +56,7 @@ class Setup:
         height: pixels.
         width: pixels.
         depth: whether the data has true depth.
+        generated_depth: whether what is measured gives depth.
         returns: whether clips return to poses they had before.
     """
 
@@ -65,15 +65,20 @@ class Setup:
     height: int
     width: int
     depth: bool
+    generated_depth: bool
     returns: bool
 
 
 class Metric(ABC):
-    """A figure. ``definition`` is printed beside it; ``better`` says which way is good, ``None`` that neither is."""
+    """A figure. ``definition`` is printed beside it; ``better`` says which way is good, ``None`` that neither is.
+
+    ``guards`` are the names of metrics without which its figure could be misread: they are measured with it.
+    """
 
     name: ClassVar[str]
     title: ClassVar[str]
     better: ClassVar[Literal["higher", "lower"] | None]
+    guards: ClassVar[tuple[str, ...]] = ()
 
     @property
     @abstractmethod
@@ -110,6 +115,3 @@ class SetMetric(Metric):
         self, features: Float[Tensor, "video channel"], true_features: Float[Tensor, "video channel"]
     ) -> float:
         """The distance between generated and true videos."""
-
-
-Metrics = Mapping[str, Metric]

@@ -85,6 +85,7 @@ class Src(Likeness):
     name = "src"
     title = "SRC"
     better = "higher"
+    guards = ("src-away",)
     pairing = "each frame that returns to an earlier pose against what the video shows at its first visit there"
 
     def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:

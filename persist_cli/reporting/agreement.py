@@ -54,7 +54,6 @@ def _protocol(one: Measured, two: Measured) -> list[str]:
     return [
         *_unequal(f"definition of the protocol {p.name}", p.definition, q.definition),
         *_unequal("frames a clip", p.frames, q.frames),
-        *_unequal_items("", p.options, q.options),
     ]
 
 

@@ -93,7 +93,7 @@ def _float(view: TableView, groups: Groups, text: Texts, caption: str, label: st
     """A float; columns that do not fit the page's width go into further ones."""
     rows = [row for _, group in groups for row in group]
     plain = [[row.name, *(_widest(cell, text) for cell in row.cells)] for row in rows]
-    heads = ["", *(f"{column.heading}\n{column.part}" for column in view.columns)]
+    heads = ["", *(column.heading for column in view.columns)]
     blocks = [[number - 1 for number in chosen[1:]] for chosen in fitting(heads, plain, PAGE)]
     form = "table" if next(fitting(heads, plain, HALF_PAGE)) == list(range(len(heads))) else "table*"
     head = f"\\begin{{{form}}}\n\\centering\n\\footnotesize\n\\setlength{{\\tabcolsep}}{{4pt}}\n"
@@ -109,8 +109,6 @@ def _tabular(view: TableView, groups: Groups, text: Texts, columns: Sequence[int
     heads = [view.columns[number] for number in columns]
     lines = [f"\\begin{{tabular}}{{@{{}}l{'r' * len(columns)}@{{}}}}", "\\toprule"]
     lines.append(" & ".join(["", *(escape(head.heading) for head in heads)]) + END)
-    if any(head.part for head in heads):
-        lines.append(" & ".join(["", *(f"\\scriptsize {escape(head.part)}" for head in heads)]) + END)
     for _, rows in groups:
         lines.append("\\midrule")
         for row in rows:  # the braces keep a name that begins with [ from being the argument of the line before

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from persist_cli.reporting.curves import COLORS, DARK_COLORS, HEIGHT, WIDTH, Plot, Style, plots, row_styles
 from persist_cli.reporting.latex import latex_tables
 from persist_cli.reporting.pictures import Pictures, ShownRow, file_name, show_rows, show_sheets
-from persist_cli.reporting.results import FILE, Evaluation, check_results, plain
+from persist_cli.reporting.results import FILE, Evaluation, check_results
 from persist_cli.reporting.tables import TableView, view_tables
 from persist_cli.reporting.text import table_text
 from persist_cli.world.errors import PersistError
-from persist_cli.world.files import ASIDE, remove_leftovers, write_json, write_text
+from persist_cli.world.files import empty_folder_aside, remove_leftovers, write_json, write_text
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -48,20 +47,17 @@ def write_report(results: Mapping[str, Any], pictures: Pictures, folder: Path) -
         PersistError: when the folder cannot be written.
     """
     checked = check_results(results, "results")
-    aside = folder / f"{ASIDE}{uuid.uuid4().hex[:8]}-report"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder, "report")
-        aside.mkdir()
-        write_json(aside / FILE, plain(results))
-        write_text(aside / "table.md", table_text(checked))
-        write_text(aside / "table.tex", latex_tables(checked))
-        write_text(aside / PAGE, _page(checked, pictures, aside))
-        _move_in(aside, folder)
+        with empty_folder_aside(folder / "report") as aside:
+            write_json(aside / FILE, results)
+            write_text(aside / "table.md", table_text(checked))
+            write_text(aside / "table.tex", latex_tables(checked))
+            write_text(aside / PAGE, _page(checked, pictures, aside))
+            _move_in(aside, folder)
     except OSError as error:
         raise PersistError(f"{folder}: the report cannot be written there ({error})") from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _page(results: Evaluation, pictures: Pictures, folder: Path) -> str:

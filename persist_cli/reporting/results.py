@@ -39,7 +39,6 @@ class Protocol(Part):
     title: str = ""
     definition: str = ""
     frames: int
-    options: dict[str, Any] = {}
 
 
 class DataSet(Part):
@@ -83,7 +82,7 @@ class Measured(Part):
 
 
 class Column(Part):
-    """A column of the table: a metric over all frames, the last one, or the returns."""
+    """A column of the table: a metric over all frames, the last one, the returns, or the views that are new."""
 
     metric: str
     title: str
@@ -154,6 +153,13 @@ class Table(Part):
     rows: dict[str, Row]
 
 
+class KnownScenes(Part):
+    """How many scenes a checkpoint is known to have been trained on, and whether these are all."""
+
+    known: int
+    complete: bool
+
+
 class CheckpointFacts(Part):
     """A checkpoint by what is in it."""
 
@@ -161,6 +167,7 @@ class CheckpointFacts(Part):
     path: str = ""
     fingerprint: str = ""
     recipe_sha256: str | None = None
+    training_scenes: KnownScenes | None = None
     adapters: dict[str, str] = {}
 
 
@@ -227,12 +234,3 @@ def check_results(value: Mapping[str, Any], where: str) -> Evaluation:
                         f"figures for {len(table.clips)} clips"
                     )
     return results
-
-
-def plain(value: Any) -> Any:
-    """JSON values without NaN and infinity, which JSON does not have: they become null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    return _defined(value)

@@ -17,7 +17,6 @@ from persist_cli.reporting.figures import (
 )
 from persist_cli.reporting.results import Cell, Column, Evaluation, Row, Table
 
-PARTS = {"all": "", "last": "last frame", "return": "at the return"}
 KINDS = {
     "model": "models",
     "memory control": "memory controls: a model with another memory than its own",
@@ -53,10 +52,9 @@ class CellView:
 
 @dataclass(frozen=True)
 class ColumnView:
-    """A column's heading, which frames it is over, its definition, and how many clips or videos it counts."""
+    """A column's heading, its definition, and how many clips or videos it counts."""
 
     heading: str
-    part: str
     definition: str
     count: str
 
@@ -172,10 +170,7 @@ def _column_head(results: Evaluation, key: str, table: Table) -> ColumnView:
     column = results.columns[key]
     metric = results.measured.metrics.get(column.metric)
     counts = sorted({cell.count for row in table.rows.values() if (cell := row.columns.get(key)) and cell.count})
-    part = PARTS.get(column.frames, column.frames)
-    if column.frames in column.title:
-        part = ""
     return ColumnView(
-        heading(column), part, column.definition or (metric.definition if metric else ""),
+        heading(column), column.definition or (metric.definition if metric else ""),
         " to ".join(str(count) for count in dict.fromkeys([*counts[:1], *counts[-1:]])),
     )  # fmt: skip

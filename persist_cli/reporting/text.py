@@ -33,7 +33,7 @@ def console_tables(results: Mapping[str, Any] | Evaluation, width: int | None = 
         cells = [
             ["\n".join(wrap(row.name, NAME)) + _kind(row), *(cell_text(cell) for cell in row.cells)] for row in rows
         ]
-        heads = ["row", *(f"{column.heading}\n{column.part}".rstrip() for column in columns)]
+        heads = ["row", *(column.heading for column in columns)]
         for chosen in fitting(heads, cells, width or OUT.width):
             title = name if chosen[1] == 1 else f"{name} (goes on)"
             tables.append(
@@ -60,7 +60,7 @@ def table_text(results: Mapping[str, Any] | Evaluation) -> str:
     checked = _checked(results)
     blocks = [f"# {_plain(checked.measured.protocol.title or checked.measured.protocol.name)}", LEGEND]
     for name, rows, columns, cell_text in _parts(checked):
-        heads = ["row", *(f"{column.heading}\n{column.part}".rstrip() for column in columns)]
+        heads = ["row", *(column.heading for column in columns)]
         cells = [[row.name + _kind(row), *map(cell_text, row.cells)] for row in rows]
         blocks.append(markdown_table(name, heads, cells, _best(rows) if cell_text is _figure else ()))
     blocks.append("\n".join(f"- {_plain(line)}" for line in remark_lines(checked)))
@@ -83,11 +83,7 @@ def remark_lines(results: Evaluation) -> list[str]:
     tables = compact_tables(results)
     views = [table.view for table in tables]
     notes = {number: note for view in views for number, note in view.notes.items()}
-    columns = {
-        f"{column.heading}{f', {column.part}' if column.part else ''}": column
-        for view in reversed(views)
-        for column in view.columns
-    }
+    columns = {column.heading: column for view in reversed(views) for column in view.columns}
     counts = {name: f" (n = {column.count})" if column.count else "" for name, column in columns.items()}
     rows = {row.name: row.definition for view in views for row in view.rows if row.definition}
     return [

@@ -19,9 +19,13 @@ from persist_cli.world.files import write_json
 from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations
 
+SOMETIMES = ("compare.mp4", "map-before.png", "map-after.png", "memory.safetensors")  # what not every rollout leaves
+
 
 def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[str, Any]:
-    """Write everything into ``out``; returns the figures with those against ground truth added."""
+    """Write everything into ``out`` in the place of an earlier rollout; gives the figures with those against truth."""
+    for name in SOMETIMES:
+        (out / name).unlink(missing_ok=True)
     start, seen, truth = rollout.walk.start, rollout.seen, rollout.walk.truth
     rgb = torch.cat([start.rgb, seen.rgb])
     depth = torch.cat([start.depth, seen.depth])
@@ -32,7 +36,7 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
         true_rgb = torch.cat([start.rgb, truth.rgb])
         write_video(out / "compare.mp4", beside([true_rgb, rgb]))
         rows.insert(0, ("ground truth", true_rgb))
-        figures = figures | {"against_ground_truth": compare(seen, truth)}
+        figures = figures | {"against_ground_truth": compare(start, seen, truth, rollout.gives_depth)}
     write_sheet(out / "sheet.png", rows)
     write_poses(out / "poses.txt", [float(number) for number in range(len(rgb))], path_of(rollout))
     write_maps(rollout, out)
@@ -40,14 +44,26 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
     return figures
 
 
-def compare(seen: Observations, truth: Observations) -> dict[str, list[float]]:
-    """Every metric of single frames that can be measured here, for each frame."""
-    frames, height, width = truth.depth.shape
-    setup = Setup(1, frames, height, width, depth=bool((truth.depth > 0).any()), returns=False)
-    prediction = Prediction(seen.rgb, seen.depth, truth, torch.full((frames,), -1))
+def compare(
+    start: Observations, seen: Observations, truth: Observations, gives_depth: bool = True
+) -> dict[str, list[float]]:
+    """Every metric of single frames that can be measured here, for each imagined frame.
+
+    Args:
+        start: the given frame.
+        seen: the frames imagined after it.
+        truth: what is really seen there.
+        gives_depth: whether the depth of the imagined frames is one.
+    """
+    known = Observations.concatenate([start, truth])
+    frames, height, width = known.depth.shape
+    depth = bool((truth.depth > 0).any())
+    setup = Setup(1, frames - 1, height, width, depth, gives_depth, returns=False)
+    generated = (torch.cat([start.rgb, seen.rgb]), torch.cat([start.depth, seen.depth]))
+    prediction = Prediction(*generated, known, torch.full((frames,), -1))
     prediction.check("rollout")
     return {
-        name: metric.measure(prediction).tolist()
+        name: metric.measure(prediction)[1:].tolist()
         for name, metric in METRICS.items()
         if isinstance(metric, FrameMetric) and metric.obstacle(setup) is None
     }

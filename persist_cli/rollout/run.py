@@ -12,13 +12,12 @@ import torch
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone, sampling_of
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.recall import MemoryMaker
-from persist_cli.reference import reference_checkpoint
+from persist_cli.packaged import reference_checkpoint
 from persist_cli.rollout.outputs import write_outputs
 from persist_cli.rollout.walk import Rollout, RolloutPlan, Walk, plan_walk
 from persist_cli.rollout.world_model import WorldModel
 from persist_cli.trajectories.clips import check_size
 from persist_cli.viewing.console import add_task, print_json, progress, say
-from persist_cli.world.backbone import Backbone, Sampling
 from persist_cli.world.errors import CheckpointError, PersistError
 from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations, TrajectoryInfo
@@ -33,13 +32,14 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     walk = plan_walk(plan)
     backbone = load_backbone(checkpoint)
     check_size(walk.info, backbone.image_size, plan.start)
-    steps, sampler = sampling_of(checkpoint, plan.steps, plan.sampler)
-    plan = dataclasses.replace(plan, steps=steps, sampler=sampler)
-    if sampler not in backbone.samplers:
-        raise PersistError(f"unknown sampler {sampler!r}; this backbone has {', '.join(backbone.samplers)}")
+    sampling = sampling_of(checkpoint, plan.steps, plan.sampler)
+    backbone.check_sampling(sampling)
+    plan = dataclasses.replace(plan, steps=sampling.steps, sampler=sampling.sampler)
     load_adapter(backbone, checkpoint, adapter)
     backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    rollout = roll(backbone, open_memory(checkpoint, adapter, plan, walk.info), walk, plan)
+    sampling = dataclasses.replace(sampling, memory_guidance=plan.guidance)
+    model = WorldModel(backbone, open_memory(checkpoint, adapter, plan, walk.info), sampling, plan.seed, plan.write)
+    rollout = roll(model, walk)
     figures = write_outputs(rollout, out, describe(checkpoint, adapter, plan, rollout))
     if json:
         print_json(figures)
@@ -70,12 +70,9 @@ def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
             raise CheckpointError(f"{path}: its {key.replace('_', ' ')} is {has[key]!r}, wanted here is {wants[key]!r}")
 
 
-def roll(backbone: Backbone, memory: Memory | None, walk: Walk, plan: RolloutPlan) -> Rollout:
+def roll(model: WorldModel, walk: Walk) -> Rollout:
     """Imagine the walk, clip by clip, with a progress bar."""
-    sampling = Sampling(plan.steps or Sampling.steps, plan.sampler or Sampling.sampler, plan.guidance)
-    before = copy_of(memory)
-    model = WorldModel(backbone, memory, sampling, plan.seed, plan.write)
-    began = time.monotonic()
+    before, began = copy_of(model.memory), time.monotonic()
     model.reset(walk.start, walk.info)
     parts = []
     with progress() as bar:
@@ -83,7 +80,8 @@ def roll(backbone: Backbone, memory: Memory | None, walk: Walk, plan: RolloutPla
         for part in model.imagine(walk.cameras, walk.interactions):
             parts.append(part)
             bar.advance(task, len(part))
-    return Rollout(walk, Observations.concatenate(parts), before, memory, time.monotonic() - began)
+    seconds, seen = time.monotonic() - began, Observations.concatenate(parts)
+    return Rollout(walk, seen, before, model.memory, seconds, model.backbone.gives_depth)
 
 
 def copy_of(memory: Memory | None) -> Memory | None:

@@ -64,6 +64,7 @@ class Rollout:
         before: the memory as it was, ``None`` without one.
         memory: the memory as it is now.
         seconds: that it took, without loading.
+        gives_depth: whether the depth of the imagined frames is one.
     """
 
     walk: Walk
@@ -71,6 +72,7 @@ class Rollout:
     before: Memory | None
     memory: Memory | None
     seconds: float
+    gives_depth: bool
 
 
 def plan_walk(plan: RolloutPlan) -> Walk:

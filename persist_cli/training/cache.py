@@ -1,8 +1,9 @@
 """What training keeps of clips between steps and runs: latents and memory tokens in a folder that processes share.
 
-An entry is a safetensors file named by a hash of everything that its content depends on, so another recipe asks for
-other names and never gets what is not its own. Entries are written aside and renamed: two writers of one name write
-the same. What does not fit any more is not stored; nothing is ever pushed out.
+An entry is a safetensors file named by its key, a hash of what its content depends on as far as that can be named:
+data, weights, settings, versions of packages. Code that changed and kept its version is not told apart; then the folder
+must be removed. Entries are written aside and renamed: two writers of one key write the same. What does not fit any
+more is not stored; nothing is ever pushed out.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ STALE = 3600.0  # seconds after which what lies aside was left by a killed write
 
 
 @dataclass(frozen=True)
-class CachePlace:
+class CacheSettings:
     """Where and how much.
 
     Args:
@@ -42,27 +43,29 @@ class CachePlace:
     gigabytes: float
 
 
-def name_of(values: Mapping[str, Any]) -> str:
-    """The name of an entry: a hash of what it depends on, JSON values."""
+def cache_key(values: Mapping[str, Any]) -> str:
+    """The key of an entry: a hash of what it depends on, JSON values."""
     text = json.dumps(dict(values) | {"format": FORMAT}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:40]
 
 
 class Cache:
-    """Tensors by name in a folder, bounded in bytes.
+    """Tensors by key in a folder, bounded in bytes.
 
     Its size is measured when it is opened and whenever this process has added a 64th of the bound since: other
     writers can pass the bound by as much each.
 
     Args:
-        place: folder and bound.
+        settings: folder and bound.
 
     Raises:
-        PersistError: when the folder cannot be made.
+        PersistError: when the folder cannot be made or the bound is no number.
     """
 
-    def __init__(self, place: CachePlace) -> None:
-        self.folder, self.limit = place.folder, int(place.gigabytes * 1e9)
+    def __init__(self, settings: CacheSettings) -> None:
+        self.folder, self.limit = settings.folder, settings.gigabytes * 1e9
+        if not self.limit >= 0:
+            raise PersistError(f"--cache-gigabytes is {settings.gigabytes}; it must be a number of at least 0")
         self.full = False
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -77,13 +80,13 @@ class Cache:
         self.used = sum(_size(path) for path in self.folder.glob("*/*.safetensors"))
         self.added = 0
 
-    def path(self, name: str) -> Path:
+    def path(self, key: str) -> Path:
         """Where the entry is or would be; 256 folders share them."""
-        return self.folder / name[:2] / f"{name}.safetensors"
+        return self.folder / key[:2] / f"{key}.safetensors"
 
-    def get(self, name: str) -> dict[str, Tensor] | None:
+    def get(self, key: str) -> dict[str, Tensor] | None:
         """The entry, ``None`` when there is none; a damaged one is removed with one line."""
-        path = self.path(name)
+        path = self.path(key)
         if not path.is_file():
             return None
         try:
@@ -96,22 +99,24 @@ class Cache:
             return None
         return tensors
 
-    def put(self, name: str, tensors: Mapping[str, Tensor]) -> None:
+    def put(self, key: str, tensors: Mapping[str, Tensor]) -> None:
         """Store an entry while there is room; a folder that cannot be written ends the storing, not the run."""
         if self.full:
             return
-        path = self.path(name)
+        path = self.path(key)
         size = sum(tensor.nbytes for tensor in tensors.values())
         if self.added + size > self.limit / SCANS:
             self.measure()
         if self.used + size > self.limit:
             return self._stop(f"full ({self.used / 1e9:.3g} GB)")
+        before = _size(path)  # of the same entry, when another process was faster
         try:
             path.parent.mkdir(exist_ok=True)
             write_tensors(path, tensors, {"crc32": _checksum(tensors)})
         except OSError as error:
             return self._stop(f"not writable ({error})")
-        self.used, self.added = self.used + size, self.added + size
+        grown = _size(path) - before
+        self.used, self.added = self.used + grown, self.added + grown
 
     def _stop(self, cause: str) -> None:
         self.full = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,16 @@ import torch
 from diffusers.training_utils import EMAModel
 from torch import Tensor, nn
 
-from persist_cli.checkpoints import step_folders
+from persist_cli.checkpoints import STEP, step_folders
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
+from persist_cli.world.files import (
+    folder_aside,
+    read_json,
+    read_tensors,
+    remove_leftovers,
+    write_json,
+    write_tensors,
+)
 
 
 @dataclass
@@ -67,7 +73,12 @@ class TrainingState:
         torch.set_rng_state(tensors["random/torch"])
 
 
-def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], None]) -> Path:
+def model_folder(run: Path, step: int) -> Path:
+    """Where the model of a run's checkpoint is, which others load."""
+    return run / f"{STEP}{step:08d}" / "model"
+
+
+def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], None]) -> None:
     """Write a checkpoint aside, rename it to ``step-…`` and remove the older ones.
 
     Args:
@@ -75,28 +86,20 @@ def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], Non
         state: of the training.
         save_model: writes the model that others load into a folder.
     """
-    target = run / f"step-{state.step:08d}"
-    aside = run / f".partial-{uuid.uuid4().hex[:8]}"
-    try:
-        (aside / "model").mkdir(parents=True)
-        save_model(aside / "model")
+    model = model_folder(run, state.step)
+    with folder_aside(model.parent) as aside:
+        (aside / model.name).mkdir()
+        save_model(aside / model.name)
         write_tensors(aside / "training.safetensors", state.tensors())
         ema_steps = state.average.optimization_step if state.average else 0
         write_json(aside / "training.json", {"step": state.step, "ema_steps": ema_steps})
-        if target.exists():
-            shutil.rmtree(target)
-        aside.rename(target)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
     for older in step_folders(run)[:-1]:
         shutil.rmtree(older)
-    return target
 
 
 def load_state(run: Path, state: TrainingState) -> None:
     """Restore the newest checkpoint of a run, if there is one."""
-    for leftover in run.glob(".partial-*"):
-        shutil.rmtree(leftover, ignore_errors=True)
+    remove_leftovers(run)
     folders = step_folders(run)
     if not folders:
         return

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -16,16 +15,18 @@ from accelerate import Accelerator
 from diffusers.training_utils import EMAModel
 from torch.utils.data import DataLoader, Dataset
 
-from persist_cli.memorizing.recall import MemoryMaker, collate
-from persist_cli.recipe import Recipe
-from persist_cli.training.cache import Cache
-from persist_cli.training.keeping import Dependencies, Keeper, KeptClips
+from persist_cli.memorizing.recall import MemoryMaker, collate, recall_all
+from persist_cli.recipe import Recipe, TrainingSettings
+from persist_cli.training.cache import Cache, CacheSettings
+from persist_cli.training.cached_clips import CachedClips, ClipCache, ClipEncoder
+from persist_cli.training.keys import CacheKeys
 from persist_cli.training.log import StepLog
 from persist_cli.training.state import TrainingState
-from persist_cli.trajectories.clips import ClipDataset, ClipPlan, ClipSample, SharedBatches
+from persist_cli.trajectories.clips import ClipDataset, ClipPlan, SharedBatches
+from persist_cli.trajectories.reference import data_folder
 from persist_cli.viewing.console import add_task, progress
 from persist_cli.world.backbone import Backbone, Clips
-from persist_cli.world.errors import PersistError
+from persist_cli.world.errors import PersistError, RecipeError
 
 
 @dataclass
@@ -57,6 +58,9 @@ class Trainer:
         maker: of the memories that the adapter reads, in stage 2.
         accelerator: one process or many.
         cache: of latents and tokens, for clips that come again.
+
+    Raises:
+        PersistError: when there are no clips, or a cache would never be read.
     """
 
     def __init__(
@@ -65,11 +69,16 @@ class Trainer:
         backbone: Backbone,
         maker: MemoryMaker | None,
         accelerator: Accelerator,
-        cache: Cache | None = None,
+        cache: CacheSettings | None = None,
     ) -> None:
         self.recipe, self.backbone, self.accelerator = recipe, backbone, accelerator
         self.maker = maker
-        self.clips = self.clip_source(cache)
+        clips = self.all_clips()
+        self.scenes = frozenset(file.info.scene for file in clips.files)
+        self.clips: Dataset[Any] = clips
+        self.encoder = self.clip_encoder(cache)
+        if self.encoder is not None:
+            self.clips = CachedClips(clips, self.encoder.cache)
         parameters = backbone.trained_parameters(recipe.stage)
         settings = recipe.training
         optimizer = torch.optim.AdamW(
@@ -80,10 +89,9 @@ class Trainer:
         if average is not None:
             average.to(accelerator.device)
         self.state = TrainingState(parameters, optimizer, average)
-        self.keeper = Keeper.of(recipe, backbone, maker, accelerator, cache)
 
-    def clip_source(self, cache: Cache | None) -> Dataset[ClipSample]:
-        """The recipe's clips, with what a cache has of them."""
+    def all_clips(self) -> ClipDataset:
+        """The recipe's clips."""
         recipe, backbone = self.recipe, self.backbone
         plan = ClipPlan(
             frames=backbone.frames_per_clip,
@@ -93,11 +101,28 @@ class Trainer:
             image_size=backbone.image_size,
             clips_per_trajectory=recipe.data.clips_per_trajectory,
         )
-        clips = ClipDataset(Path(recipe.data.path), plan)
-        if cache is None:
-            return clips
-        given = Dependencies.of(recipe, backbone, self.maker, self.accelerator.device)
-        return KeptClips(clips, cache, given, whole=backbone.frames_alone)
+        return ClipDataset([data_folder(each) for each in recipe.data.path], plan)
+
+    def clip_encoder(self, settings: CacheSettings | None) -> ClipEncoder | None:
+        """What encodes clips that come again, with a cache where there is one; ``None`` when none comes again."""
+        recipe, backbone = self.recipe, self.backbone
+        again = recipe.data.clips_per_trajectory > 0
+        if settings is None and not again:
+            return None
+        encoding = backbone.encoding(recipe.stage)
+        if settings is None:
+            return None if encoding is None else ClipEncoder(backbone, self.maker, self.accelerator, None)
+        if encoding is None:
+            raise RecipeError(
+                f"--cache: in stage {recipe.stage} backbone {backbone.name!r} keeps nothing of a clip; leave it out"
+            )
+        if not again and (recipe.stage == "2" or not backbone.frames_alone):
+            raise RecipeError(
+                "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
+                "data.clips_per_trajectory=32, or leave --cache out"
+            )
+        keys = CacheKeys.of(recipe, backbone, self.maker, encoding, self.accelerator.device.type)
+        return ClipEncoder(backbone, self.maker, self.accelerator, ClipCache(Cache(settings), keys))
 
     def loader(self) -> Iterator[Clips]:
         """Batches of this process from the state's step to the last."""
@@ -106,7 +131,7 @@ class Trainer:
             self.state.step, settings.steps, settings.batch, settings.accumulation,
             self.accelerator.process_index, self.accelerator.num_processes,
         )  # fmt: skip
-        loader: DataLoader[ClipSample] = DataLoader(
+        loader: DataLoader[Any] = DataLoader(
             self.clips,
             batch_sampler=batches,
             num_workers=settings.workers,
@@ -116,12 +141,13 @@ class Trainer:
         for samples in loader:
             yield self.to_batch(samples)
 
-    def to_batch(self, samples: list[ClipSample]) -> Clips:
-        """Samples as a batch with memory tokens, on the training device."""
+    def to_batch(self, samples: list[Any]) -> Clips:
+        """Samples of ``clips`` as a batch with memory tokens, on the training device."""
         device = self.accelerator.device
-        if self.keeper is not None:
-            samples = [self.keeper.complete(sample) for sample in samples]
-        clips = collate(samples, self.maker, self.backbone.token_budget)
+        if self.encoder is not None:
+            clips = self.encoder.batch(samples)
+        else:
+            clips = collate(samples, recall_all(samples, self.maker, self.backbone.token_budget))
         return Clips(
             rgb=clips.rgb.to(device),
             depth=clips.depth.to(device),
@@ -132,20 +158,13 @@ class Trainer:
             latents=None if clips.latents is None else clips.latents.to(device),
         )
 
-    def learning_rate(self, step: int) -> float:
-        """The recipe's rate after a linear warm-up, until a linear cool-down to zero."""
-        settings = self.recipe.training
-        rising = (step + 1) / max(1, settings.warmup)
-        falling = (settings.steps - step) / (settings.cooldown + 1)
-        return settings.learning_rate * min(1.0, rising, falling)
-
     def steps(self) -> Iterator[dict[str, float]]:
         """Train; after each optimizer step its logged values."""
         settings = self.recipe.training
         batches = self.loader()
         while self.state.step < settings.steps:
             for group in self.optimizer.param_groups:
-                group["lr"] = self.learning_rate(self.state.step)
+                group["lr"] = learning_rate(settings, self.state.step)
             values = self.accumulate(batches)
             self.accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
             self.optimizer.step()
@@ -172,8 +191,16 @@ class Trainer:
             )
         return values
 
-    def train(self, log: StepLog, save: Any, stop: Stop) -> None:
-        """Run to the last step, to a signal, saving now and then."""
+    def agreed(self, due: bool, signal: int | None) -> tuple[bool, int | None]:
+        """What one process finds due, or what signal it got, as all of them see it: they save and stop together."""
+        if self.accelerator.num_processes == 1:
+            return due, signal
+        found = torch.tensor([[int(due), signal or 0]], device=self.accelerator.device)
+        all_due, all_signal = self.accelerator.gather(found).amax(0).tolist()
+        return bool(all_due), all_signal or None
+
+    def train(self, log: StepLog, save: Callable[[], None], stop: Stop) -> int | None:
+        """Run to the last step or to a signal, saving now and then; returns the signal that a process got."""
         settings = self.recipe.training
         saved = time.monotonic()
         with progress() as bar:
@@ -183,11 +210,20 @@ class Trainer:
             for values in self.steps():
                 bar.update(task, advance=settings.batch, note=f"loss {values['loss']:.4f}")
                 if self.accelerator.is_main_process:
-                    log.add(self.state.step, values | {"learning_rate": self.learning_rate(self.state.step - 1)})
+                    log.add(self.state.step, values | {"learning_rate": learning_rate(settings, self.state.step - 1)})
                 self.accelerator.log(values, step=self.state.step)
-                due = time.monotonic() - saved > 60 * settings.checkpoint_minutes
-                if stop.signal is not None or due or self.state.step % settings.checkpoint_every == 0:
+                late = time.monotonic() - saved > 60 * settings.checkpoint_minutes
+                due, signal = self.agreed(late, stop.signal)
+                if signal is not None:
+                    return signal
+                if due or self.state.step % settings.checkpoint_every == 0:
                     save()
                     saved = time.monotonic()
-                if stop.signal is not None:
-                    return
+        return None
+
+
+def learning_rate(settings: TrainingSettings, step: int) -> float:
+    """The rate of a step: a linear warm-up, then a constant, at the end a linear cool-down to zero."""
+    rising = (step + 1) / max(1, settings.warmup)
+    falling = (settings.steps - step) / (settings.cooldown + 1)
+    return settings.learning_rate * min(1.0, rising, falling)

@@ -8,16 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset
 
 from persist_cli.trajectories.store import Store, TrajectoryFile
 from persist_cli.world.actions import ActionVocabulary
 from persist_cli.world.backbone import Interactions
-from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import DataError
 from persist_cli.world.observations import Observations, TrajectoryInfo
-from persist_cli.world.tokens import MemoryTokens
 
 
 @dataclass(frozen=True)
@@ -42,15 +39,11 @@ class ClipSample:
     """One clip with what came before it.
 
     Args:
-        observations: the clip's frames; no images where ``latents`` stand for them, the cameras always.
+        observations: the clip's frames; no images where none were asked for, the cameras always.
         interactions: what the agent did to the world in each step of the clip.
         context: earlier frames of the same trajectory, the clip's first one included; ``None`` when not asked for.
         info: of the trajectory.
         seed: for everything random about the sample.
-        latents: what ``Backbone.encode`` gives of this clip alone, without a batch axis, where it is known.
-        tokens: what a memory of the context says to the clip's cameras, where it is known.
-        keys: names of the latents and of the tokens in a cache, if there is one.
-        choice: which frames it is made of, for those who keep more than this clip.
     """
 
     observations: Observations
@@ -58,10 +51,6 @@ class ClipSample:
     context: Observations | None
     info: TrajectoryInfo
     seed: int
-    latents: Tensor | None = None
-    tokens: MemoryTokens | None = None
-    keys: tuple[str, str] | None = None
-    choice: ClipChoice | None = None
 
 
 @dataclass(frozen=True)
@@ -86,24 +75,25 @@ class ClipPlan:
 
 
 class ClipDataset(Dataset[ClipSample]):
-    """Endless clips of a data set; item n depends on the seed and n only.
+    """Endless clips of some data sets; item n depends on the seed and n only.
 
     Args:
-        folder: of the data set.
+        folders: of the data sets, in this order.
         plan: which clips.
     """
 
-    def __init__(self, folder: Path, plan: ClipPlan) -> None:
+    def __init__(self, folders: Sequence[Path], plan: ClipPlan) -> None:
         self.plan = plan
-        store = Store(folder)
+        store = [file for folder in folders for file in Store(folder)]
         shortest = min(map(abs, plan.strides))
         self.files = [file for file in store if len(file) > (plan.frames - 1) * shortest]
         if not self.files:
             longest = max(len(file) for file in store)
             needed = (plan.frames - 1) * shortest + 1
-            raise DataError(f"{folder}: a clip needs {needed} frames, the longest trajectory has {longest}")
+            where = " and ".join(map(str, folders))
+            raise DataError(f"{where}: a clip needs {needed} frames, the longest trajectory has {longest}")
         for file in self.files:
-            check_size(file.info, plan.image_size, f"{folder}#{file.name}")
+            check_size(file.info, plan.image_size, f"{file.path.parent}#{file.name}")
 
     def __getitem__(self, number: int) -> ClipSample:
         return self.read(self.choose(number))
@@ -139,7 +129,6 @@ class ClipDataset(Dataset[ClipSample]):
             context=file.read(wanted).observations if wanted else None,
             info=file.info,
             seed=choice.seed,
-            choice=choice,
         )
 
     def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:
@@ -200,9 +189,8 @@ def strided_interactions(actions: Sequence[str | None], stride: int, vocabulary:
 def unseen(file: TrajectoryFile, frames: Sequence[int]) -> Observations:
     """The cameras of some frames, without their images: rgb and depth have no frames."""
     height, width = file.info.height, file.info.width
-    intrinsics = torch.from_numpy(file.info.intrinsics).expand(len(frames), 3, 3).clone()
-    cameras = Cameras(file.poses()[list(frames)], intrinsics, height, width)
-    return Observations(torch.zeros(0, height, width, 3, dtype=torch.uint8), torch.zeros(0, height, width), cameras)
+    images = torch.zeros(0, height, width, 3, dtype=torch.uint8), torch.zeros(0, height, width)
+    return Observations(*images, file.cameras(frames))
 
 
 def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:

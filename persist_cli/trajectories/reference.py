@@ -119,7 +119,7 @@ def data_folder(text: str) -> Path:
     """
     folder = Path(text)
     if text == SAMPLE and not folder.is_dir():
-        from persist_cli.reference import sample_data
+        from persist_cli.packaged import sample_data
 
         return sample_data()
     return folder

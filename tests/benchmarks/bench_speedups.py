@@ -20,11 +20,11 @@ from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXCaus
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_backbones.conditioning import camera_latents, fold_frames
-from persist_backbones.still import StillConv
+from persist_backbones.framewise import FramewiseConv
 from persist_cli.memorizing.recall import MemoryMaker, collate, recall
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.registry import make_backbone
-from persist_cli.training.cache import Cache, CachePlace
+from persist_cli.training.cache import Cache, CacheSettings
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan, ClipSample
 from persist_cli.viewing.console import print_table
 from persist_cli.world.backbone import Backbone, Clips
@@ -62,7 +62,7 @@ def codec_pairs(clips: Clips) -> list[Pair]:
     """What the codec gained."""
     still, plain = reference(), reference()
     for module in plain.modules():
-        if type(module) is StillConv:
+        if type(module) is FramewiseConv:
             module.__class__ = CogVideoXCausalConv3d
     few = dataclasses.replace(clips, rgb=clips.rgb[:4], depth=clips.depth[:4], seeds=clips.seeds[:4])
     tall = reference(vae=FULL_SIZE)
@@ -120,7 +120,7 @@ def memory_pairs(sample: ClipSample, folder: Path) -> list[Pair]:
     recipe = make_recipe(read_recipe("houses-64-stage2-voxel"), "voxel")
     assert recipe.memory is not None
     maker, budget = MemoryMaker.of(recipe.memory), int(recipe.adapter["token_budget"])
-    tokens, cache = recall(sample, maker, budget), Cache(CachePlace(folder, 1))
+    tokens, cache = recall(sample, maker, budget), Cache(CacheSettings(folder, 1))
     cache.put("tokens", {"features": tokens.features, "positions": tokens.positions, "mask": tokens.mask})
     return [("tokens kept: memory alone", partial(recall, sample, maker, budget), partial(cache.get, "tokens"), 1)]
 
@@ -130,9 +130,9 @@ def main() -> None:
     say_conditions(f"the reference model with fresh weights, 64×64, batches of {BATCH}")
     with TemporaryDirectory() as folder:
         data = write_walks(Path(folder), 64, frames=100)
-        samples = ClipDataset(data, ClipPlan(9, (1,), 96, 0, (64, 64)))
+        samples = ClipDataset([data], ClipPlan(9, (1,), 96, 0, (64, 64)))
         batch = [samples[number] for number in range(BATCH)]
-        clips = collate(batch, None, 0)
+        clips = collate(batch)
         deepest = max(batch, key=lambda each: len(each.context or ()))
         pairs = [*codec_pairs(clips), *model_pairs(clips), *memory_pairs(deepest, Path(folder) / "cache")]
         rows = []

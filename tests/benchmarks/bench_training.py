@@ -21,10 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
-from persist_cli.training.cache import Cache, CachePlace
+from persist_cli.training.cache import CacheSettings
 from persist_cli.training.finetune import prepare_backbone
 from persist_cli.training.trainer import Trainer
-from persist_cli.trajectories.clips import ClipSample
 from persist_cli.viewing.console import print_table
 from persist_cli.world.backbone import Clips
 from tests.benchmarks.timing import Times, alternate, say_conditions, write_walks
@@ -43,7 +42,7 @@ CACHED = {"1, cached": "tiny-stage1", "2, voxel, cached": "tiny-stage2-voxel"}
 class FixedBatchTrainer(Trainer):
     """The training loop on one batch over and over."""
 
-    def samples(self) -> list[ClipSample]:
+    def samples(self) -> list[Any]:
         """The first samples, read from the store."""
         return [self.clips[number] for number in range(BATCH)]
 
@@ -51,7 +50,7 @@ class FixedBatchTrainer(Trainer):
         return repeat(self.to_batch(self.samples()))
 
 
-def make_trainer(words: str, data: Path, cache: Cache | None = None) -> FixedBatchTrainer:
+def make_trainer(words: str, data: Path, cache: CacheSettings | None = None) -> FixedBatchTrainer:
     """The trainer of a recipe and changes to it, with fresh weights; with a cache, its batch's clips are in it."""
     name, *changes = words.split()
     given = [f"data.path={data}", f"data.clips_per_trajectory={0 if cache is None else 8}", *changes]
@@ -67,7 +66,7 @@ def make_trainer(words: str, data: Path, cache: Cache | None = None) -> FixedBat
 def measure(data: Path) -> tuple[Times, Times, Times]:
     """Steps, reading of samples, and making a batch of them, for each recipe."""
     trainers = {stage: make_trainer(name, data) for stage, name in RECIPES.items()}
-    cache = Cache(CachePlace(data / "cache", 1))
+    cache = CacheSettings(data / "cache", 1)
     trainers |= {stage: make_trainer(name, data, cache) for stage, name in CACHED.items()}
     steps: dict[str, Callable[[], Any]] = {}
     batches: dict[str, Callable[[], Any]] = {}

@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from persist_cli.app import main
 from persist_cli.world.files import read_json, write_json
 from tests.walking import PERSIST, together, without_depth
 
@@ -22,12 +23,20 @@ def figures(folder):
     return results(folder)["tables"]
 
 
+def run(*arguments):
+    """A command in this process, as if it had been typed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["persist", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    assert not ended.value.code
+
+
 @pytest.fixture(scope="module")
 def whole(voxel, walks, tmp_path_factory):
     """An evaluation without interruption."""
     out = tmp_path_factory.mktemp("eval") / "whole"
-    command = [*PERSIST, "eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out, "--report", out / "report"]
-    subprocess.run([str(part) for part in command], check=True, capture_output=True)
+    run("eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out, "--report", out / "report")
     return out
 
 
@@ -84,7 +93,7 @@ def test_a_killed_eval_goes_on_to_the_same_figures(whole, voxel, walks, tmp_path
     before = {path: path.stat().st_mtime_ns for path in out.glob("parts/row-*")}
     assert len(before) >= 3
     assert not (out / "metrics.json").exists()
-    subprocess.run(command, check=True, capture_output=True)
+    run("eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert figures(out) == figures(whole)
 
@@ -160,6 +169,7 @@ def test_a_checkpoint_and_a_memory_that_do_not_fit_are_one_line(persist, voxel, 
         (["--memories", "snapshots"], "no checkpoint has a memory adapter 'snapshots'; there are: voxel"),
         (["--memories", ","], "name at least one memory"),
         (["--sampler", "euler"], "unknown sampler 'euler'"),
+        (["--steps", "1001"], "1001 denoising steps; it must be 1 to 1000"),
         (["--protocol", "revist"], "unknown protocol 'revist'; did you mean 'revisit'?"),
         (["--metrics", "psrn"], "unknown metric 'psrn'; did you mean 'psnr'?"),
         (["--metrics", ","], "name at least one metric"),

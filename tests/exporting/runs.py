@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from persist_cli.checkpoints import find_checkpoint, save_adapter, save_base
 from persist_cli.recipe import MemoryChoice
@@ -10,12 +11,12 @@ from persist_cli.world.backbone import Backbone
 from tests.backbones.micro import CHANNELS, micro, shaken
 
 ENCODER = {"channels": CHANNELS}
-SMALL = {"width": 16, "heads": 2, "dropout": 0.0}
+SMALL = {"width": 16, "dropout": 0.0}
 
 
-def write_base(folder: Path, scale: float = 0.1) -> Backbone:
+def write_base(folder: Path, scale: float = 0.1, **settings: Any) -> Backbone:
     """A base with weights that ``scale`` tells apart from another."""
-    backbone = micro()
+    backbone = micro(**settings)
     shaken(backbone, scale)
     folder.mkdir(parents=True)
     save_base(backbone, folder)

@@ -10,7 +10,9 @@ from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
 from tests.backbones.micro import random_clips, random_tokens
+from tests.disk import file_limit
 from tests.exporting.runs import write_adapter, write_base, write_runs
+from tests.walking import stage
 
 
 @pytest.fixture(scope="module")
@@ -98,12 +100,19 @@ def test_a_stage_2_run_stands_for_its_base_and_adapter(persist, export, runs, tm
 def test_steps_and_sampler_of_the_card_are_meant_where_none_are_named(export, runs, tmp_path):
     export(tmp_path / "m", "--steps", "7", "--sampler", "unipc")
     exported, run = find_checkpoint(tmp_path / "m"), find_checkpoint(runs / "stage1")
-    assert sampling_of(exported, None, None) == (7, "unipc")
-    assert sampling_of(exported, 3, "ddim") == (3, "ddim")
-    assert sampling_of(run, None, None) == (50, "ddim")
-    card = json.loads((tmp_path / "m" / "persist.json").read_text())
-    (tmp_path / "m" / "persist.json").write_text(json.dumps(card | {"sampling": {"steps": "many"}}))
-    with pytest.raises(CheckpointError, match="its sampling must hold a number of steps"):
+    assert sampling_of(exported, None, None) == Sampling(7, "unipc")
+    assert sampling_of(exported, 3, "ddim") == Sampling(3, "ddim")
+    assert (run.sampling, sampling_of(run, None, None)) == (None, Sampling(50, "ddim"))
+
+
+@pytest.mark.parametrize(
+    "value", [{"steps": "many"}, {"steps": 0}, {"steps": True}, {"stpes": 7}, {"sampler": 1}, True]
+)
+def test_a_card_with_a_sampling_that_is_none_is_refused(export, tmp_path, value):
+    export(tmp_path / "m")
+    card = json.loads((tmp_path / "m/persist.json").read_text())
+    (tmp_path / "m/persist.json").write_text(json.dumps(card | {"sampling": value}))
+    with pytest.raises(CheckpointError, match=r"persist\.json: its sampling is"):
         find_checkpoint(tmp_path / "m")
 
 
@@ -134,13 +143,32 @@ def test_an_adapter_trained_on_the_export_joins_it(export, persist, runs, tmp_pa
 
 
 def test_recipes_of_all_stages_are_kept_without_places_of_this_machine(persist, codec, stage1, voxel, tmp_path):
-    assert persist("export", stage1, f"mine={voxel}", "--out", tmp_path / "m").code == 0
-    kept = {path.name: path.read_text() for path in (tmp_path / "m/recipes").iterdir()}
-    assert sorted(kept) == ["codec.yaml", "mine.yaml", "stage1.yaml"]
-    assert "base: stage1" in kept["mine.yaml"]
+    assert persist("export", stage1, f"codec={voxel}", "--out", tmp_path / "m").code == 0
+    home = tmp_path / "m/recipes"
+    kept = {path.relative_to(home).as_posix(): path.read_text() for path in home.rglob("*.yaml")}
+    assert sorted(kept) == ["adapters/codec.yaml", "codec.yaml", "stage1.yaml"]
+    assert "base: stage1" in kept["adapters/codec.yaml"]
+    assert "stage: codec" in kept["codec.yaml"]
     assert not any(str(codec.parent) in text for text in kept.values())
     assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
     assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
+
+
+def test_an_export_may_be_called_model(persist, walks, stage1, tmp_path):
+    model = tmp_path / "runs/model"
+    assert persist("export", stage1, "--out", model).code == 0
+    assert find_checkpoint(model).name == "model"
+    run = persist(*stage("stage2-none", walks, tmp_path / "runs/none", f"base={model}", "training.steps=1"))
+    assert run.code == 0, run.err
+    assert find_checkpoint(tmp_path / "runs/none").base_folder == model
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
+    with file_limit(5000):
+        ended = persist("export", runs / "stage1", "--out", tmp_path / "m")
+    assert (ended.code, "cannot be exported" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
@@ -157,6 +185,8 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(persist, runs, t
         ((base, "--out", tmp_path / "here"), "exists already"),
         ((base, "--dtype", "float61", "--out", out), "did you mean 'float16'"),
         ((base, voxel, "--default", "voxels", "--out", out), "did you mean 'voxel'"),
+        ((base, "--sampler", "nonsense", "--out", out), "unknown sampler 'nonsense'"),
+        ((base, "--steps", "1001", "--out", out), "1001"),
     ):
         ended = persist("export", *arguments)
         assert (ended.code, cause in ended.err) == (1, True), ended.err
@@ -178,5 +208,5 @@ def test_a_value_beyond_float16_is_refused_by_name_and_bfloat16_takes_it(persist
 
 def test_several_adapters_without_a_default_must_be_chosen_from(export, runs, tmp_path):
     export(tmp_path / "m", runs / "voxel", runs / "none")
-    with pytest.raises(Exception, match="choose an adapter of none, voxel with --adapter"):
+    with pytest.raises(CheckpointError, match="choose an adapter of none, voxel with --adapter"):
         find_checkpoint(tmp_path / "m").default_adapter()

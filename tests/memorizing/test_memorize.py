@@ -110,6 +110,8 @@ def test_what_cannot_be_merged_ends_in_one_line(data, tmp_path, capsys):
     assert "room and cellar" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "c", *out)
     assert "not a whole memory file" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "broken", *out)
     assert "two memory files" in failure(capsys, "--merge", tmp_path / "a", *out)
+    for option in (("--checkpoint", tmp_path), ("--memory", "voxel"), ("--set", "memory.cell=1")):
+        assert "leave out" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "a", *option, *out)
     assert not (tmp_path / "merged").exists()
 
 

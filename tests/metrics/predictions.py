@@ -15,7 +15,7 @@ from persist_cli.world.files import write_json, write_tensors
 from persist_cli.world.observations import Observations
 from tests.rooms import Room, look
 
-SETUP = Setup(clips=20, frames=49, height=64, width=64, depth=True, returns=True)
+SETUP = Setup(clips=20, frames=49, height=64, width=64, depth=True, generated_depth=True, returns=True)
 
 
 def noise(seed: int, frames: int = 2, size: int = 32) -> tuple[torch.Tensor, torch.Tensor]:

@@ -56,14 +56,15 @@ def test_missing_generated_depth_counts_as_an_error(name, figure):
     assert measured(name, holes, flat) == pytest.approx([figure] * 2, abs=0.03)
 
 
-@pytest.mark.parametrize("name", ["absrel", "rmse", "delta1"])
-def test_a_model_that_gives_no_depth_after_the_first_frame_is_not_measured(name):
-    _, depth = noise(0)
-    given = torch.cat([depth[:1], torch.zeros_like(depth[1:])])
-    assert all(map(math.isnan, measured(name, given, depth)))
+@pytest.mark.parametrize(("name", "figure"), [("absrel", 1.0), ("rmse", 2.0), ("delta1", 0.0), ("drift", 2.0)])
+def test_depth_that_collapsed_to_zero_is_an_error_and_not_left_out(name, figure):
+    flat = torch.full((2, 32, 32), 2.0)
+    given = torch.cat([flat[:1], torch.zeros_like(flat[1:])])
+    assert measured(name, given, flat)[1] == pytest.approx(figure, abs=0.05)
 
 
 @pytest.mark.parametrize("name", PERFECT)
-def test_data_without_depth_is_not_measured(name):
+def test_what_has_no_depth_is_not_measured(name):
     assert METRICS[name].obstacle(setup(depth=False)) == "the data has no depth"
+    assert METRICS[name].obstacle(setup(generated_depth=False)) == "the model gives no depth"
     assert METRICS[name].obstacle(setup()) is None

@@ -61,9 +61,19 @@ def test_a_video_that_does_not_match_the_truth_is_one_line():
 
 def test_a_rollout_is_compared_by_what_can_be_measured_of_single_frames(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
-    truth = there_and_back().truth
-    figures = compare(replace(truth, depth=truth.depth * 1.1), truth)
+    start, truth = there_and_back().truth[:1], there_and_back().truth[1:]
+    figures = compare(start, replace(truth, depth=truth.depth * 1.1), truth)
     assert list(figures) == ["psnr", "ssim", "absrel", "rmse", "delta1", "drift"]
-    assert figures["psnr"] == [100.0] * 7
-    assert figures["absrel"] == pytest.approx([0.1] * 7, rel=1e-5)
-    assert "drift" not in compare(truth, replace(truth, depth=torch.zeros_like(truth.depth)))
+    assert figures["psnr"] == [100.0] * 6
+    assert figures["absrel"] == pytest.approx([0.1] * 6, rel=1e-5)
+    assert "drift" not in compare(start, truth, replace(truth, depth=torch.zeros_like(truth.depth)))
+    assert list(compare(start, truth, truth, gives_depth=False)) == ["psnr", "ssim"]
+
+
+def test_a_single_imagined_frame_is_compared_too(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    truth = there_and_back().truth
+    figures = compare(truth[:1], truth[1:2], truth[1:2])
+    assert {name: figures[name] for name in ("psnr", "absrel", "delta1")} == {
+        "psnr": [100.0], "absrel": [0.0], "delta1": [1.0],
+    }  # fmt: skip

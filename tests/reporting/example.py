@@ -17,7 +17,7 @@ METRICS = {
 }
 COLUMNS = {
     "psnr": ("psnr", "PSNR", "all"), "psnr-last": ("psnr", "PSNR last", "last"), "ssim": ("ssim", "SSIM", "all"),
-    "lpips-alex": ("lpips-alex", "LPIPS", "all"), "src": ("src", "SRC", "return"),
+    "lpips-alex": ("lpips-alex", "LPIPS", "all"), "src": ("src", "SRC", "all"),
 }  # fmt: skip
 ROWS = {
     "none": "model",
@@ -99,7 +99,7 @@ def measured(clips: int, frames: int, metrics: dict[str, Any]) -> dict[str, Any]
     """What two runs must share."""
     return {
         "protocol": {"name": "revisit", "title": "Revisit", "definition": "Clips that look at places visited before.",
-                     "frames": frames, "options": {"least_seen": 0.5}},
+                     "frames": frames},
         "data": [{"path": "runs/houses-test", "trajectories": {f"house-{each}": f"{each:064x}" for each in range(3)}}],
         "image_size": [64, 64],
         "clips": [

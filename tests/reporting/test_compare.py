@@ -75,7 +75,6 @@ def test_the_interval_covers_the_true_difference_and_excludes_zero_only_when_it_
 DIFFERENT = {
     "protocol: revisit and return": lambda each: each["measured"]["protocol"].update(name="return"),
     "frames a clip: 9 and 112": lambda each: each["measured"]["protocol"].update(frames=112),
-    "least_seen: 0.5 and 0.7": lambda each: each["measured"]["protocol"]["options"].update(least_seen=0.7),
     "image size: 64×64 and 128×64": lambda each: each["measured"].update(image_size=[128, 64]),
     "clip 2: 0/house-2:24+9 and 0/house-2:25+9": lambda each: each["measured"]["clips"][2].update(start=25),
     "trajectory house-1 of data set 0: 000000000000 and abababababab": lambda each: each["measured"]["data"][0][

@@ -47,6 +47,22 @@ def test_following_a_trajectory_compares_with_what_is_really_there(persist, voxe
     assert (tmp_path / "compare.mp4").is_file()
 
 
+def test_one_frame_that_follows_is_compared_in_depth_too(persist, voxel, walks, tmp_path):
+    assert roll(persist, voxel, walks, tmp_path, "--follow", "--frames", 1).code == 0
+    figures = json.loads((tmp_path / "rollout.json").read_text())["against_ground_truth"]
+    assert {"psnr", "absrel", "drift"} <= set(figures)
+    assert all(len(figure) == 1 and figure[0] is not None for figure in figures.values())
+
+
+def test_a_rollout_into_the_folder_of_another_leaves_nothing_of_it(persist, voxel, stage1, walks, tmp_path):
+    out, memory = tmp_path / "o", tmp_path / "m.safetensors"
+    assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
+    assert roll(persist, voxel, walks, out, "--follow", "--frames", 1, "--memory", memory).code == 0
+    assert {"compare.mp4", "map-before.png", "map-after.png", "memory.safetensors"} <= {p.name for p in out.iterdir()}
+    assert roll(persist, stage1, walks, out, "--actions", "left").code == 0
+    assert {p.name for p in out.iterdir()} == {"rgb.mp4", "depth.mp4", "sheet.png", "poses.txt", "rollout.json"}
+
+
 def test_a_memory_file_is_read_and_kept_as_it_was_when_nothing_may_be_written(persist, voxel, walks, tmp_path):
     memory = tmp_path / "m.safetensors"
     assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
@@ -75,6 +91,7 @@ def test_what_cannot_be_rolled_out_is_one_line(persist, voxel, stage1, walks, tm
         (stage1, (*left, "--memory", other), "no memory adapter that could read"),
         (voxel, (*left, "--adapter", "map2d"), "no memory adapter 'map2d' in it; it has voxel"),
         (voxel, (*left, "--sampler", "euler"), "unknown sampler 'euler'"),
+        (voxel, (*left, "--steps", 1001), "1001 denoising steps; it must be 1 to 1000"),
         (tmp_path / "gone", left, "no checkpoint there"),
     ):
         ended = roll(persist, run, walks, tmp_path / "o", *options)

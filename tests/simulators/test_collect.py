@@ -18,7 +18,8 @@ from persist_cli.world.errors import DataError, PersistError
 from .conftest import make_world
 
 SMALL = CollectPlan("miniworld", "0:3", frames=6, size="16x24")
-COMMAND = "collect miniworld --scenes 0:4 --frames 40 --size 32x32 --workers 2"
+EIGHT = CollectPlan("miniworld", "0:8", frames=12, size="32x32")
+COMMAND = "collect miniworld --scenes 0:8 --frames 12 --size 32x32 --workers"
 
 
 def persist(arguments: str, out: Path) -> subprocess.Popen[str]:
@@ -28,8 +29,8 @@ def persist(arguments: str, out: Path) -> subprocess.Popen[str]:
 
 
 def persist_at_work(out: Path) -> subprocess.Popen[str]:
-    """A run of forty scenes that has finished its first."""
-    process = persist(COMMAND.replace("0:4", "0:40"), out)
+    """A run of sixty scenes that has finished its first."""
+    process = persist(COMMAND.replace("0:8", "0:60") + " 1", out)
     while process.poll() is None and not list(out.glob("house-*.parquet")):
         time.sleep(0.05)
     assert process.poll() is None, process.communicate()
@@ -123,19 +124,17 @@ def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, change: dict[s
     assert not out.exists()
 
 
-def test_killed_runs_go_on_and_end_as_an_uninterrupted_one(tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_and_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
     make_world()
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    assert persist(COMMAND, whole).wait() == 0
-    for first_files in (0, 2):
-        process = persist(COMMAND, killed)
-        while process.poll() is None and len(list(killed.glob("house-*.parquet"))) < first_files:
-            time.sleep(0.05)
-        time.sleep(0.05 * first_files)
-        if process.poll() is None:
-            os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    assert persist(COMMAND, killed).wait() == 0
+    run_collect(EIGHT, whole, 1, json=True)
+    process = persist(f"{COMMAND} 2", killed)
+    while process.poll() is None and not (len(list(killed.glob("house-*"))) > 1 and list(killed.glob(".partial-*"))):
+        time.sleep(0.005)
+    process.kill()  # some are whole, another is not
+    assert process.wait() == -signal.SIGKILL
+    assert 1 < len(list(killed.glob("house-*"))) < 8
+    run_collect(EIGHT, killed, 1, json=True)
     assert contents(killed) == contents(whole)
 
 
@@ -162,5 +161,5 @@ def test_an_interrupt_ends_quietly_and_leaves_whole_files(tmp_path: Path) -> Non
     _, told = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in told
-    assert all(trajectory.length == 40 for trajectory in Store(tmp_path))
+    assert all(trajectory.length == 12 for trajectory in Store(tmp_path))
     assert not list(tmp_path.glob(".partial-*"))

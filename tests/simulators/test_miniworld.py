@@ -32,12 +32,13 @@ OPEN = """
 import sys
 from persist_cli.registry import make_simulator
 from persist_cli.world.errors import PersistError
-if len(sys.argv) > 1:
-    sys.modules[sys.argv[1]] = None
-try:
-    make_simulator("miniworld", {})
-except PersistError as error:
-    print(error)
+for missing in sys.argv[1:] or [""]:
+    sys.modules[missing] = None
+    try:
+        make_simulator("miniworld", {})
+    except PersistError as error:
+        print(error)
+    del sys.modules[missing]
 """
 
 
@@ -231,9 +232,7 @@ def test_a_missing_driver_is_told_with_the_packages_to_install() -> None:
     assert len(line.splitlines()) == 1
 
 
-def test_a_missing_egl_library_is_told_with_the_packages_to_install() -> None:
-    assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in run_python(OPEN, "pyglet.libs.egl")
-
-
-def test_a_missing_miniworld_is_told_with_the_extra_to_install() -> None:
-    assert "pip install 'persist-cli[miniworld]'" in run_python(OPEN, "miniworld")
+def test_a_missing_library_or_package_is_told_with_what_to_install() -> None:
+    package, library = run_python(OPEN, "miniworld", "pyglet.libs.egl").splitlines()
+    assert "pip install 'persist-cli[miniworld]'" in package
+    assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in library

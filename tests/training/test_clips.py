@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 import torch
 
@@ -13,15 +15,24 @@ def plan(**changes) -> ClipPlan:
 
 
 def test_sample_n_is_the_same_whoever_asks(walks):
-    one, two = ClipDataset(walks, plan())[11], ClipDataset(walks, plan())[11]
+    one, two = ClipDataset([walks], plan())[11], ClipDataset([walks], plan())[11]
     assert torch.equal(one.observations.rgb, two.observations.rgb)
     assert torch.equal(one.context.depth, two.context.depth)
     assert one.seed == two.seed
-    assert one.seed != ClipDataset(walks, plan(seed=4))[11].seed
+    assert one.seed != ClipDataset([walks], plan(seed=4))[11].seed
+
+
+def test_several_data_sets_are_one_after_the_other(walks, tmp_path):
+    for number in (0, 1):
+        (tmp_path / str(number)).mkdir()
+        shutil.copy(walks / f"walk-{number}.parquet", tmp_path / str(number))
+    one, two = ClipDataset([walks], plan()), ClipDataset([tmp_path / "0", tmp_path / "1"], plan())
+    for number in range(20):
+        assert torch.equal(one[number].observations.rgb, two[number].observations.rgb)
 
 
 def test_the_context_ends_with_the_clips_first_frame_and_holds_no_later_one(walks):
-    clips = ClipDataset(walks, plan())
+    clips = ClipDataset([walks], plan())
     for number in range(20):
         sample = clips[number]
         assert 1 <= len(sample.context) <= 5
@@ -29,14 +40,14 @@ def test_the_context_ends_with_the_clips_first_frame_and_holds_no_later_one(walk
 
 
 def test_interactions_of_skipped_frames_are_kept(walks):
-    clips = ClipDataset(walks, plan(strides=(2,)))
+    clips = ClipDataset([walks], plan(strides=(2,)))
     found = [clips[number].interactions for number in range(40)]
     assert any("pick_up" in each for each in found)
     assert all(len(each) == 8 for each in found)
 
 
 def test_a_negative_stride_plays_backwards_with_what_was_seen_on_the_way_there(walks):
-    clips = ClipDataset(walks, plan(strides=(-2,), context_frames=100))
+    clips = ClipDataset([walks], plan(strides=(-2,), context_frames=100))
     for number in range(10):
         choice, sample = clips.choose(number), clips[number]
         assert choice.frames.step == -2
@@ -48,14 +59,14 @@ def test_a_negative_stride_plays_backwards_with_what_was_seen_on_the_way_there(w
 
 
 def test_few_clips_a_trajectory_come_again_with_their_context_and_with_new_noise(walks):
-    clips = ClipDataset(walks, plan(clips_per_trajectory=2))
+    clips = ClipDataset([walks], plan(clips_per_trajectory=2))
     drawn = [clips.choose(number) for number in range(60)]
     assert len({(str(each.file.path), each.frames, each.context) for each in drawn}) == 2 * len(clips.files)
     assert len({each.seed for each in drawn}) == 60
 
 
 def test_the_few_clips_are_the_same_with_and_without_context(walks):
-    one, two = (ClipDataset(walks, plan(clips_per_trajectory=5, context_frames=frames)) for frames in (0, 5))
+    one, two = (ClipDataset([walks], plan(clips_per_trajectory=5, context_frames=frames)) for frames in (0, 5))
     for number in range(20):
         assert one.choose(number).frames == two.choose(number).frames
 
@@ -71,8 +82,8 @@ def test_processes_and_micro_batches_share_the_same_samples_of_each_step(process
 
 def test_what_cannot_be_drawn_is_one_line(walks):
     with pytest.raises(DataError, match="a clip needs 65 frames, the longest trajectory has 24"):
-        ClipDataset(walks, plan(frames=65))
+        ClipDataset([walks], plan(frames=65))
     with pytest.raises(DataError, match="images are 32x32, the model takes 64x64"):
-        ClipDataset(walks, plan(image_size=(64, 64)))
+        ClipDataset([walks], plan(image_size=(64, 64)))
     with pytest.raises(DataError, match="cannot be shared by 3 processes"):
         SharedBatches(0, 1, 8, 1, 0, 3)

@@ -1,25 +1,18 @@
 import json
+import os
 import random
+import shutil
 import signal
 import subprocess
 import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from persist_cli.checkpoints import find_checkpoint
-from persist_cli.world.files import read_tensors
-from tests.walking import MICRO_SETTINGS, PERSIST, stage, together, train
-
-
-def weights(run: Path) -> dict[str, torch.Tensor]:
-    """Everything in the newest training state of a run."""
-    return read_tensors(max(run.glob("step-*")) / "training.safetensors")[0]
-
-
-def same(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> bool:
-    return set(one) == set(two) and all(torch.equal(one[name], two[name]) for name in one)
+from persist_cli.training.trainer import Trainer
+from tests.disk import file_limit
+from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, in_two, stage, together, train, train_here
 
 
 def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
@@ -38,8 +31,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, co
     assert persist(*stage(number, walks, tmp_path / "halves", *base, "training.steps=1")).code == 0
     assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base, "training.steps=2")).code == 0
     assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base)).code == 0
-    assert same(weights(tmp_path / "whole"), weights(tmp_path / "halves"))
-    assert (tmp_path / "whole/log.jsonl").read_text() == (tmp_path / "halves/log.jsonl").read_text()
+    assert ended_alike(tmp_path / "whole", tmp_path / "halves")
 
 
 def test_a_run_of_a_version_without_a_setting_resumes(persist, walks, codec, tmp_path):
@@ -52,7 +44,7 @@ def test_a_run_of_a_version_without_a_setting_resumes(persist, walks, codec, tmp
 def test_stage_two_leaves_every_stage_one_weight_untouched_to_the_bit(persist, walks, stage1, tmp_path):
     before = find_checkpoint(stage1).fingerprint
     assert persist(*stage("stage2-voxel", walks, tmp_path / "voxel", f"base={stage1}")).code == 0
-    assert all(name.split("/")[-1].startswith(("adapters.", "torch")) for name in weights(tmp_path / "voxel"))
+    assert all(name.split("/")[-1].startswith(("adapters.", "torch")) for name in end_of(tmp_path / "voxel")[0])
     assert find_checkpoint(tmp_path / "voxel").fingerprint == before
     assert find_checkpoint(stage1).fingerprint == before
 
@@ -75,22 +67,86 @@ def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
     assert sum(losses[-10:]) < 0.9 * sum(losses[:10])
 
 
+SIX = ["training.checkpoint_every=1", "training.steps=6"]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(walks, codec, tmp_path_factory):
+    run = tmp_path_factory.mktemp("whole") / "run"
+    train_here(*stage("stage1", walks, run, f"base={codec}", *SIX))
+    return run
+
+
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_run_killed_at_a_random_moment_goes_on_and_ends_like_one_that_was_not(walks, codec, tmp_path, seed):
-    base = [f"base={codec}", "training.checkpoint_every=1", "training.steps=6"]
-    arguments = [*PERSIST, *stage("stage1", walks, tmp_path / "killed", "--resume", *base)]
-    child = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def test_a_run_killed_at_a_random_moment_goes_on_and_ends_like_one_that_was_not(
+    persist, uninterrupted, walks, codec, tmp_path, seed
+):
+    run = tmp_path / "killed"
+    arguments = stage("stage1", walks, run, "--resume", f"base={codec}", *SIX)
+    child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while not list((tmp_path / "killed").glob("step-*")) and time.monotonic() < deadline and child.poll() is None:
+    while not list(run.glob("step-*")) and time.monotonic() < deadline and child.poll() is None:
         time.sleep(0.02)
     time.sleep(random.Random(seed).random() * 0.3)
     child.send_signal(signal.SIGKILL)
     child.wait()
-    find_checkpoint(tmp_path / "killed")
-    subprocess.run(arguments, check=True, capture_output=True)
-    train(*stage("stage1", walks, tmp_path / "whole", *base))
-    assert same(weights(tmp_path / "killed"), weights(tmp_path / "whole"))
-    assert not list((tmp_path / "killed").glob(".partial-*"))
+    find_checkpoint(run)
+    assert persist(*arguments).code == 0
+    assert ended_alike(run, uninterrupted)
+    assert not list(run.glob(".partial-*"))
+
+
+def test_each_step_is_saved_once_and_no_speed_is_that_of_nothing(persist, walks, codec, tmp_path):
+    changes = [f"base={codec}", "training.checkpoint_minutes=0", "training.steps=3"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
+    rows = [json.loads(line) for line in (tmp_path / "run/speed.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3]
+    assert all(row["samples_per_second"] > 0 for row in rows)
+
+
+@pytest.mark.parametrize("step", [3, 5])
+def test_a_signal_that_comes_after_the_look_at_it_loses_no_step(persist, walks, codec, tmp_path, monkeypatch, step):
+    look = Trainer.agreed
+
+    def look_too_early(trainer, *found):
+        agreed = look(trainer, *found)
+        if trainer.state.step == step:
+            signal.raise_signal(signal.SIGTERM)
+        return agreed
+
+    monkeypatch.setattr(Trainer, "agreed", look_too_early)
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=5"))
+    told = {3: "stopped at step 4 of 5", 5: "trained 5 steps"}[step]
+    assert (ended.code, told in ended.out) == (0, True)
+    assert [path.name for path in (tmp_path / "run").glob("step-*")] == [f"step-0000000{min(step + 1, 5)}"]
+
+
+def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(persist, walks, codec, tmp_path):
+    changes = ["--resume", f"base={codec}"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes, "training.steps=1")).code == 0
+    with file_limit(20_000):
+        ended = persist(*stage("stage1", walks, tmp_path / "run", *changes))
+    assert (ended.code, "a checkpoint cannot be written there" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+    assert [path.name for path in (tmp_path / "run").glob("*step*")] == ["step-00000001"]
+
+
+def test_several_data_sets_train_like_one_of_all_their_trajectories(persist, walks, codec, tmp_path):
+    for number in (0, 1):
+        (tmp_path / str(number)).mkdir()
+        shutil.copy(walks / f"walk-{number}.parquet", tmp_path / str(number))
+    changes = [f"base={codec}", "training.steps=2"]
+    assert persist(*stage("stage1", walks, tmp_path / "one", *changes)).code == 0
+    assert persist(*stage("stage1", tmp_path / "0", tmp_path / "two", "--data", tmp_path / "1", *changes)).code == 0
+    assert ended_alike(tmp_path / "one", tmp_path / "two")
+
+
+def test_the_packaged_sample_is_data_to_train_on(persist, walks, codec, tmp_path, monkeypatch):
+    shutil.copytree(walks, tmp_path / "home/sample")
+    monkeypatch.setenv("PERSIST_REFERENCE", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    ended = persist(*stage("stage1", "sample", "run", f"base={codec}", "training.steps=1"))
+    assert ended.code == 0, ended.err
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(walks, codec, tmp_path):
@@ -145,6 +201,23 @@ def test_a_damaged_checkpoint_or_another_base_is_one_line(persist, walks, codec,
     (model / "persist.json").write_text("{}")
     ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     assert (ended.code, "not the card of a persist checkpoint" in ended.err) == (1, True)
+
+
+@pytest.mark.slow
+def test_two_processes_stop_together_when_one_of_them_is_told_to(walks, codec, tmp_path):
+    changes = [f"base={codec}", "training.steps=100000", "training.checkpoint_minutes=0"]
+    child = subprocess.Popen(
+        **in_two(*stage("stage1", walks, tmp_path / "run", *changes)), stdout=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 120
+    while not list((tmp_path / "run").glob("step-*")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    last = Path(f"/proc/{child.pid}/task/{child.pid}/children").read_text().split()[-1]
+    os.kill(int(last), signal.SIGTERM)
+    out, _ = child.communicate(timeout=60)
+    assert child.returncode == 0
+    assert out.count("go on with --resume") == 1
+    find_checkpoint(tmp_path / "run")
 
 
 @pytest.mark.slow

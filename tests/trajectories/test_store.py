@@ -91,14 +91,19 @@ def test_a_store_lists_its_trajectories_by_name_and_number(tmp_path: Path) -> No
     assert store[1] is store["b"]
 
 
-def test_a_folder_of_data_sets_is_all_of_them_together(tmp_path: Path) -> None:
-    for name in ("z/a", "y/b", "z/c"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+def test_a_folder_of_data_sets_is_none_and_they_are_named(tmp_path: Path) -> None:
+    (tmp_path / "cache").mkdir()
+    for name in ("train/a", "test/b"):
         write_trajectory(tmp_path / f"{name}.parquet", INFO, make_frames(2))
-    assert Store(tmp_path).names == ["a", "b", "c"]
-    write_trajectory(tmp_path / "y" / "a.parquet", INFO, make_frames(2))
-    with pytest.raises(DataError, match=r"a\.parquet has the same name"):
+    with pytest.raises(DataError, match=rf"no trajectory in it .*; name {tmp_path}/test and {tmp_path}/train$"):
         Store(tmp_path)
+
+
+def test_cameras_are_those_of_the_frames_that_are_read(path: Path) -> None:
+    file = TrajectoryFile(path)
+    frames, cameras = [7, 3, 3], file.read([7, 3, 3]).observations.cameras
+    assert torch.equal(file.cameras(frames).world_from_camera, cameras.world_from_camera)
+    assert torch.equal(file.cameras(frames).intrinsics, cameras.intrinsics)
 
 
 @pytest.mark.parametrize("frames", [slice(0, 21), [20], [-1], [], slice(4, 4)])

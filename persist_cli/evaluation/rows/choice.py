@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from persist_cli.checkpoints import Checkpoint
+from persist_cli.checkpoints import PLAIN, Checkpoint
 from persist_cli.evaluation.cases import Case
 from persist_cli.evaluation.protocols import Protocol
 from persist_cli.evaluation.rows.controls import Codec, Copy, Nearest, Truth, Warp
@@ -16,7 +16,6 @@ from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import CheckpointError, DataError, PersistError, hint
 
-PLAIN = "stage1"  # the row of the base without any adapter
 FORGETFUL = "none"  # the memory that never reads a token, which no disturbance can reach
 CONTROLS: dict[str, Callable[[str, Checkpoint, Protocol], Row]] = {
     "copy": lambda name, base, protocol: Copy(name, base),
@@ -44,12 +43,14 @@ class RowChoice:
         controls: names of ``CONTROLS`` and ``RECALLS``.
         sampling: how clips are drawn.
         noise: centimetres and degrees of the control ``noisy``.
+        depthless: fingerprints of the bases that give no depth.
     """
 
     memories: Sequence[str]
     controls: Sequence[str]
     sampling: Sampling
     noise: tuple[float, float] = (5.0, 2.0)
+    depthless: frozenset[str] = frozenset()
 
 
 def check_choice(choice: RowChoice) -> None:
@@ -105,7 +106,9 @@ def model_rows(checkpoints: Sequence[Checkpoint], memory: str, choice: RowChoice
         adapter = None if memory == PLAIN else memory
         maker = MemoryMaker.of(owner.memory_choice(memory)) if adapter else None
         name = memory if len(owners) == 1 else f"{memory} ({label})"
-        rows.append(ModelRow(name, owner, adapter, choice.sampling, Remembering(maker, Faithful(), protocol.writes)))
+        remembering = Remembering(maker, Faithful(), protocol.writes)
+        gives_depth = owner.fingerprint not in choice.depthless
+        rows.append(ModelRow(name, owner, adapter, choice.sampling, remembering, gives_depth))
     return rows
 
 
@@ -118,7 +121,8 @@ def labels(checkpoints: Sequence[Checkpoint]) -> list[str]:
 def disturbed_row(row: ModelRow, recall: Recall) -> ModelRow:
     """The same row with another memory."""
     remembering = Remembering(row.remembering.maker, recall, row.remembering.writes)
-    return ModelRow(f"{row.name}, {recall.name}", row.checkpoint, row.adapter, row.sampling, remembering)
+    name = f"{row.name}, {recall.name}"
+    return ModelRow(name, row.checkpoint, row.adapter, row.sampling, remembering, row.gives_depth)
 
 
 def recalls(choice: RowChoice, cases: Sequence[Case]) -> list[Recall]:

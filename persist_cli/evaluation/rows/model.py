@@ -44,15 +44,23 @@ class ModelRow(Row):
         adapter: its name; ``None`` is plain stage 1.
         sampling: how clips are drawn.
         remembering: with which memory.
+        gives_depth: whether the model does.
     """
 
     random = True
 
     def __init__(
-        self, name: str, checkpoint: Checkpoint, adapter: str | None, sampling: Sampling, remembering: Remembering
+        self,
+        name: str,
+        checkpoint: Checkpoint,
+        adapter: str | None,
+        sampling: Sampling,
+        remembering: Remembering,
+        gives_depth: bool = True,
     ) -> None:
         super().__init__(name, checkpoint)
         self.checkpoint, self.adapter, self.sampling, self.remembering = checkpoint, adapter, sampling, remembering
+        self.gives_depth = gives_depth
         self.kind = "model" if isinstance(remembering.recall, Faithful) else "memory control"
 
     @property

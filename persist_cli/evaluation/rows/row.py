@@ -19,7 +19,7 @@ Kind = Literal["model", "control", "memory control"]
 class Row(ABC):
     """What one line of the table gives for a clip.
 
-    ``random`` says whether another sampling seed gives another result.
+    ``random`` says whether another sampling seed gives another result, ``gives_depth`` whether its depth is one.
 
     Args:
         name: in the table.
@@ -28,6 +28,7 @@ class Row(ABC):
 
     kind: Kind = "control"
     random: ClassVar[bool] = False
+    gives_depth: bool = True
 
     def __init__(self, name: str, base: Checkpoint) -> None:
         self.name, self.base = name, base

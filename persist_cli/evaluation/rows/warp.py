@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
 from persist_cli.world.cameras import Cameras, invert_rigid
-from persist_cli.world.geometry import unproject
+from persist_cli.world.geometry import nearest_at, unproject
 from persist_cli.world.observations import Observations
 
 SAME = 0.05  # relative depth within which two points show the same surface
@@ -54,7 +54,7 @@ def warp(
     """
     height, width = camera.height, camera.width
     points, cells, depth = in_image(seen, camera, ranks.isfinite())
-    nearest = torch.full((height * width,), torch.inf, dtype=torch.float64).scatter_reduce(0, cells, depth, "amin")
+    nearest = nearest_at(cells, depth, height * width)
     front = depth <= nearest[cells] * (1 + SAME)
     points, cells, depth = points[front], cells[front], depth[front]
     order = torch.argsort(depth, stable=True, descending=True)

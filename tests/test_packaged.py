@@ -1,14 +1,17 @@
 """The reference model and the sample data: what commands use when none is named."""
 
+import contextlib
 import json
 import shutil
+from importlib import resources
+from pathlib import Path
 
 import pytest
 
 from persist_cli.memorizing.memory_file import load_memory
-from persist_cli.reference import reference_checkpoint, sample_data
+from persist_cli.packaged import reference_checkpoint, sample_data
 from persist_cli.trajectories.reference import parse_reference
-from persist_cli.world.errors import CheckpointError, DataError
+from persist_cli.world.errors import CheckpointError
 from tests.exporting.runs import write_runs
 
 
@@ -66,6 +69,18 @@ def test_settings_or_an_encoder_of_ones_own_leave_the_reference_model_aside(pers
     assert json.loads(persist("memorize", "sample#0:0-2", "--memory", "map2d", "--json").out)["settings_of"] is None
 
 
+def test_a_memory_is_the_one_that_the_named_checkpoint_reads(persist, home, reference, walks, here):
+    out = ("--out", "m.safetensors")
+    assert persist("memorize", f"{walks}#0:0-2", "--checkpoint", home / "runs/none", *out).code == 0
+    assert load_memory(here / "m.safetensors").name == "none"
+    assert persist("memorize", f"{walks}#0:0-2", "--checkpoint", reference, *out).code == 0
+    assert load_memory(here / "m.safetensors").name == "voxel"
+    assert persist("export", home / "runs/stage1", home / "runs/none", home / "runs/voxel", "--out", "two").code == 0
+    for checkpoint, cause in (("two", "choose a memory of none, voxel"), (home / "runs/stage1", "no adapter reads")):
+        ended = persist("memorize", f"{walks}#0:0-2", "--checkpoint", checkpoint, *out)
+        assert (ended.code, cause in ended.err) == (1, True), ended.err
+
+
 def test_a_memory_is_made_for_the_checkpoint_that_is_named(persist, home, walks, here):
     out = ("--out", "m.safetensors")
     ended = persist("memorize", f"{walks}#0:0-2", "--checkpoint", home / "runs/voxel", *out)
@@ -117,12 +132,10 @@ def test_an_installation_without_them_says_so_in_one_line(persist, here, walks):
 
 def test_without_the_variable_both_are_sought_in_the_package(monkeypatch):
     monkeypatch.delenv("PERSIST_REFERENCE")
-    for find, name in ((reference_checkpoint, "reference"), (sample_data, "sample")):
-        try:
-            place = str(find())
-        except (CheckpointError, DataError) as error:
-            place = str(error).split(":")[0].split(" in ")[1]
-        assert place.endswith(f"persist_recipes/{name}")
+    package = Path(str(resources.files("persist_recipes")))
+    assert sample_data() == package / "sample"
+    with contextlib.suppress(CheckpointError):  # the model comes once it is trained
+        assert reference_checkpoint() == package / "reference"
 
 
 def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monkeypatch, capsys):
@@ -132,6 +145,8 @@ def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monk
     monkeypatch.setattr(demo, "HALF", 11)
     monkeypatch.setattr(shown, "HALF", 11)
     monkeypatch.setattr(shown, "STEPS", 1)
+    monkeypatch.setattr(shown, "CLIPS", 1)
+    monkeypatch.setenv("PERSIST_CACHE", str(here / "cache"))
     demo.run_demo(shown.DEMO, here / "demo")
     names = {path.name for path in (here / "demo").iterdir()}
     assert {"rollout.mp4", "rollout.gif", "sheet.png", "map.png", "metrics.json", "report"} <= names

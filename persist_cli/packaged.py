@@ -10,6 +10,8 @@ import os
 from importlib import resources
 from pathlib import Path
 
+from persist_cli.checkpoints import CARD
+from persist_cli.trajectories.store import SUFFIX
 from persist_cli.world.errors import CheckpointError, DataError
 
 ENVIRONMENT = "PERSIST_REFERENCE"
@@ -22,7 +24,7 @@ def reference_checkpoint() -> Path:
         CheckpointError: when this installation has none.
     """
     folder = _home() / "reference"
-    if not (folder / "persist.json").is_file():
+    if not (folder / CARD).is_file():
         raise CheckpointError(f"no reference model in {folder}: it comes with the package; give a CHECKPOINT")
     return folder
 
@@ -34,7 +36,7 @@ def sample_data() -> Path:
         DataError: when this installation has none.
     """
     folder = _home() / "sample"
-    if not any(folder.glob("*.parquet")):
+    if not any(folder.glob(f"*{SUFFIX}")):
         raise DataError(f"no sample data in {folder}: it comes with the package; give the folder of a data set")
     return folder
 
