@@ -9,12 +9,13 @@ from typing import Annotated
 import typer
 
 from persist_cli import __version__
-from persist_cli.options import JsonOption
+from persist_cli.options import Commands, JsonOption
 from persist_cli.weights.app import weights_app
 from persist_cli.world.errors import PersistError
 
 app = typer.Typer(
     name="persist",
+    cls=Commands,
     help="Persistent embodied world models: a video diffusion model with a memory of the scene.",
     no_args_is_help=True,
     rich_markup_mode="rich",
@@ -29,9 +30,6 @@ def main(arguments: list[str] | None = None) -> None:
     except PersistError as error:
         typer.secho(f"error: {error}", fg=typer.colors.RED, err=True)
         sys.exit(1)
-    except KeyboardInterrupt:
-        typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
-        sys.exit(130)
 
 
 def names_in(text: str) -> tuple[str, ...]:

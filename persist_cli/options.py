@@ -1,7 +1,22 @@
-"""Options that several commands share."""
+"""What several commands share: options, and how they end."""
 
-from typing import Annotated
+from __future__ import annotations
+
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+
+
+class Commands(TyperGroup):
+    """Commands that Ctrl-C ends in one line, with exit code 130."""
+
+    def invoke(self, ctx: typer.Context) -> Any:
+        """Run the command that was asked for."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
+            raise typer.Exit(130) from None

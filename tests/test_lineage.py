@@ -73,7 +73,7 @@ def test_what_no_card_says_is_what_the_recipes_data_hold_as_far_as_they_are_ther
     shutil.rmtree(tmp_path / "codec")
     assert training_scenes(checkpoint) == TrainingScenes(ROOMS.names, complete=False)
     assert scenes_to_avoid([checkpoint]) == ROOMS.names
-    assert "training scenes unknown" in capsys.readouterr().err
+    assert "not all scenes that it was trained on are known" in capsys.readouterr().err
     shutil.rmtree(tmp_path / "walks")
     assert training_scenes(checkpoint) == TrainingScenes(complete=False)
     assert checkpoint_json(checkpoint)["training_scenes"] == {"known": 0, "complete": False}

@@ -77,7 +77,8 @@ def training_scenes(checkpoints: Sequence[Checkpoint]) -> frozenset[str]:
         scenes = lineage.training_scenes(each)
         found |= scenes.names
         if not scenes.complete:
-            warn(f"{each.folder}: training scenes unknown, but for {len(scenes.names)}")
+            some = f" ({len(scenes.names)} are)" if scenes.names else ""
+            warn(f"{each.folder}: not all scenes that it was trained on are known{some}")
     return found
 
 

@@ -160,6 +160,7 @@ def test_an_interrupt_ends_quietly_and_leaves_whole_files(tmp_path: Path) -> Non
     os.killpg(process.pid, signal.SIGINT)
     _, told = process.communicate(timeout=60)
     assert process.returncode == 130
+    assert told.strip().splitlines()[-1].startswith("stopped; what is written is whole")
     assert "Traceback" not in told
     assert all(trajectory.length == 12 for trajectory in Store(tmp_path))
     assert not list(tmp_path.glob(".partial-*"))
