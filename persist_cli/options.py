@@ -1,11 +1,13 @@
-"""What several commands share: options, and how they end."""
+"""What several commands share: options, and how Ctrl-C ends them."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
+
+INTERRUPTED: Final = 130  # exit code after Ctrl-C
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
@@ -19,4 +21,4 @@ class Commands(TyperGroup):
             return super().invoke(ctx)
         except KeyboardInterrupt:
             typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None

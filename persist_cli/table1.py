@@ -12,13 +12,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from persist_cli.options import INTERRUPTED
 from persist_cli.viewing.console import say
 
 MEMORIES = ("none", "voxel", "map2d", "snapshots")
 FORMS = ("cross", "projected")
 METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
 WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of all metrics that can be fetched
-INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def commands(out: Path) -> list[str]:

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from persist_cli.checkpoints import find_checkpoint
-from persist_cli.evaluation.provenance import checkpoint_json
+from persist_cli.evaluation.provenance import checkpoint_json, scenes_json
 from persist_cli.evaluation.provenance import training_scenes as scenes_to_avoid
 from persist_cli.lineage import stage_recipes, training_scenes
 from persist_cli.trajectories.scenes import TrainingScenes
@@ -76,7 +76,7 @@ def test_what_no_card_says_is_what_the_recipes_data_hold_as_far_as_they_are_ther
     assert "not all scenes that it was trained on are known" in capsys.readouterr().err
     shutil.rmtree(tmp_path / "walks")
     assert training_scenes(checkpoint) == TrainingScenes(complete=False)
-    assert checkpoint_json(checkpoint)["training_scenes"] == {"known": 0, "complete": False}
+    assert scenes_json(checkpoint)["training_scenes"] == {"known": 0, "complete": False}
 
 
 def test_an_exports_recipes_have_a_hash_that_depends_on_each(persist, stage1, voxel, tmp_path):

@@ -14,9 +14,9 @@ import typer.main
 
 from persist_cli.app import app
 from persist_cli.metrics import METRICS
+from persist_cli.options import INTERRUPTED
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
 from persist_cli.table1 import (
-    INTERRUPTED,
     MEMORIES,
     collect_commands,
     commands,

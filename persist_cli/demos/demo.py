@@ -15,11 +15,11 @@ import typer
 
 from persist_cli.app import app
 from persist_cli.evaluation.journal import Journal
+from persist_cli.options import INTERRUPTED
 from persist_cli.viewing.console import say
 from persist_cli.world.errors import PersistError
 
 HALF: Final = 32  # frames of the way out, after the first; the way back begins at the last of them
-INTERRUPTED: Final = 130  # exit code after Ctrl-C
 ROWS: Final = ("with-memory", "without-memory")  # folders of the two rollouts
 
 

@@ -12,7 +12,7 @@ from persist_cli.evaluation.columns import column_json, make_columns
 from persist_cli.evaluation.pictures import make_pictures
 from persist_cli.evaluation.plan import EvalPlan, Evaluation, prepare
 from persist_cli.evaluation.processes import Processes
-from persist_cli.evaluation.provenance import checkpoint_json, command, environment, metric_json
+from persist_cli.evaluation.provenance import checkpoint_json, command, environment, metric_json, scenes_json
 from persist_cli.evaluation.results import RowResults, Table
 from persist_cli.evaluation.run import measure_rows
 from persist_cli.packaged import reference_checkpoint
@@ -85,7 +85,7 @@ def describe(run: Evaluation, processes: int) -> dict[str, Any]:
         },
         "environment": environment(processes),
         "command": command(),
-        "checkpoints": [checkpoint_json(each) for each in run.checkpoints],
+        "checkpoints": [checkpoint_json(each) | scenes_json(each) for each in run.checkpoints],
         "columns": column_json(make_columns(run.metrics, run.protocol)),
         "tables": tables(run),
         "first_row": run.rows[0].name,

@@ -51,16 +51,18 @@ def row_pictures(run: Evaluation, domains: dict[str, list[int]], backbones: Back
     with progress() as bar:
         task = add_task(bar, "pictures", len(run.rows), "row")
         for number, row in enumerate(run.rows):
-            for name, clips in domains.items() if run.measurer(row).by_frame else ():
-                shown = [clip_picture(run, backbones, Shown(number, clip)) for clip in pick_clips(run, number, clips)]
-                found.append(RowPictures(name, row.name, *shown))
             bar.advance(task)
+            metric = next(iter(run.measurer(row).by_frame.values()), None)
+            if metric is None:
+                continue
+            figures = first_figures(run, number)
+            for name, clips in domains.items():
+                shown = []
+                for clip in pick_clips(figures, clips, metric):
+                    caption = f"{metric.title} {float(figures[clip]):.2f}"
+                    shown.append(clip_picture(run, backbones, Shown(number, clip), caption))
+                found.append(RowPictures(name, row.name, *shown))
     return found
-
-
-def first_metric(run: Evaluation, row: int) -> Metric:
-    """The metric that says which clips of a row are good."""
-    return next(iter(run.measurer(run.rows[row]).by_frame.values()))
 
 
 def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
@@ -68,15 +70,15 @@ def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
     return run.journal.gather(row, 0, run.batches, FIGURES)[:, 1:, 0].nanmean(dim=1)
 
 
-def pick_clips(run: Evaluation, row: int, clips: Sequence[int]) -> list[int]:
-    """Numbers of a row's best, median and worst of some clips."""
-    figures, sign = first_figures(run, row), -1.0 if first_metric(run, row).better == "higher" else 1.0
+def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Metric) -> list[int]:
+    """Numbers of the best, the median and the worst of some clips."""
+    sign = -1.0 if metric.better == "higher" else 1.0
     known = [clip for clip in clips if figures[clip].isfinite()] or list(clips)
     ordered = sorted(known, key=lambda clip: sign * float(figures[clip]))
     return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
 
 
-def clip_picture(run: Evaluation, backbones: Backbones, part: Shown) -> ClipPicture:
+def clip_picture(run: Evaluation, backbones: Backbones, part: Shown, caption: str) -> ClipPicture:
     """What a row predicts for a clip at the first seed, beside the truth."""
     row, frames = run.rows[part.row], read_case(run.cases[part.clip])
     if not run.journal.has(part):
@@ -86,7 +88,7 @@ def clip_picture(run: Evaluation, backbones: Backbones, part: Shown) -> ClipPict
     both = row.gives_depth and bool((truth.depth > 0).any())
     return ClipPicture(
         clip=part.clip,
-        figure=f"{first_metric(run, part.row).title} {float(first_figures(run, part.row)[part.clip]):.2f}",
+        figure=caption,
         generated=kept["rgb"],
         truth=truth.rgb,
         depth=kept["depth"] if both else None,

@@ -144,7 +144,5 @@ def what_is_measured(
     options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
     options |= {"steps": sampling.steps, "sampler": sampling.sampler}
     models = [checkpoint_json(each) for each in checkpoints]
-    for model in models:
-        del model["training_scenes"]  # how many are known may change with what lies about
     values = options | {"checkpoints": models, "metric definitions": metric_json(metrics)}
     return dict(json.loads(json.dumps(values)))  # as a file gives it back

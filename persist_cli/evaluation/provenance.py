@@ -44,15 +44,19 @@ def command() -> list[str]:
 def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
     """A checkpoint with the hashes of its base, recipes and adapters, JSON values."""
     adapters = {name: file_sha256(folder / "adapter.safetensors") for name, folder in checkpoint.adapters.items()}
-    scenes = lineage.training_scenes(checkpoint)
     return {
         "name": checkpoint.name,
         "path": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
         "recipe_sha256": recipe_sha256(checkpoint.folder),
-        "training_scenes": {"known": len(scenes.names), "complete": scenes.complete},
         "adapters": adapters,
     }
+
+
+def scenes_json(checkpoint: Checkpoint) -> dict[str, Any]:
+    """How many scenes it is known to have been trained on, which may change with what lies about; JSON values."""
+    scenes = lineage.training_scenes(checkpoint)
+    return {"training_scenes": {"known": len(scenes.names), "complete": scenes.complete}}
 
 
 def recipe_sha256(folder: Path) -> str | None:

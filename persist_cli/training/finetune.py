@@ -18,6 +18,7 @@ from accelerate.utils import set_seed
 
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone, step_folders
 from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.options import INTERRUPTED
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, parse_yaml_mapping, read_recipe, to_plain
 from persist_cli.registry import make_backbone
 from persist_cli.training.cache import CacheSettings
@@ -65,7 +66,7 @@ def run_finetune(plan: FinetunePlan) -> None:
     with Stop() as stop, limited_threads(recipe.training.threads):
         ended_by = finetune(recipe, run, stop, plan.cache)
     if ended_by is not None:
-        sys.exit(130 if ended_by == signal.SIGINT else 0)
+        sys.exit(INTERRUPTED if ended_by == signal.SIGINT else 0)
 
 
 @contextlib.contextmanager
