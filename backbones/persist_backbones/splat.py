@@ -65,7 +65,7 @@ def rasterize(
     token_size: float,
     most: int,
 ) -> Splats:
-    """Where tokens fall in views: on the pixel of their middle, and on those whose middle their square covers.
+    """Where tokens fall in views: on the pixel of their middle, and on the columns and rows their square covers.
 
     Args:
         positions: world metres.
@@ -74,41 +74,43 @@ def rasterize(
         token_size: edge of the square in metres, facing the camera.
         most: pixels along the edge of a square at most.
     """
-    frames = views.world_from_camera.shape[1]
-    middles, depth = project(positions[:, None].expand(-1, frames, -1, -1), views)
-    size, reach = middles.new_tensor([views.width, views.height]), most // 2
-    close = ((middles + SNAP >= -reach) & (middles + SNAP < size + reach)).all(-1)
-    sample, frame, token = (close & mask[:, None] & (depth > NEAR)).nonzero(as_tuple=True)
-    middle, depth = middles[sample, frame, token], depth[sample, frame, token]
-    focal = views.intrinsics.double().diagonal(dim1=-2, dim2=-1)[sample, frame, :2]
-    half = 0.5 * token_size * focal / depth[:, None]
-    spans = (half.amax(-1) + 0.5 + SNAP).floor().clamp(max=reach).long()  # pixels reached on each side
+    samples, frames = views.world_from_camera.shape[:2]
+    pixels = frames * views.height * views.width
     parts = []
-    for span in range(reach + 1):
-        alike = (spans == span).nonzero()[:, 0]
-        pixel, number = _squares(middle[alike], half[alike], span, (views.height, views.width))
-        entry = alike[number]
-        parts.append(((sample * frames + frame)[entry] * (views.height * views.width) + pixel, entry))
-    pixel, entry = (torch.cat(each) for each in zip(*parts, strict=True))
-    return Splats(pixel, (sample * positions.shape[1] + token)[entry], depth[entry])
+    for sample in range(samples):  # one at a time: what a clip takes stays in the processor's cache
+        own = Cameras(views.world_from_camera[sample], views.intrinsics[sample], views.height, views.width)
+        present = mask[sample].nonzero()[:, 0]
+        fallen = _rasterize_clip(positions[sample, present], own, token_size, most // 2)
+        token = sample * positions.shape[1] + present[fallen.token]
+        parts.append(Splats(sample * pixels + fallen.pixel, token, fallen.depth))
+    return Splats(*(torch.cat(each) for each in zip(*parts, strict=True)))
 
 
-def _squares(
-    middle: Float[Tensor, "entry 2"], half: Float[Tensor, "entry 2"], reach: int, size: tuple[int, int]
-) -> tuple[Int[Tensor, " splat"], Int[Tensor, " splat"]]:
-    """Pixels, counted along rows, whose middle a square covers, and that of its own middle; and whose they are.
+def _rasterize_clip(positions: Float[Tensor, "token 3"], views: Cameras, token_size: float, reach: int) -> Splats:
+    """The splats of one clip's views, of tokens that are all there; a square reaches so far to each side at most."""
+    middles, depth = project(positions.expand(len(views.world_from_camera), -1, -1), views)
+    size = middles.new_tensor([views.width, views.height])
+    close = ((middles + SNAP >= -reach) & (middles + SNAP < size + reach)).all(-1) & (depth > NEAR)
+    frame, token = close.nonzero(as_tuple=True)
+    middle, depth = middles[frame, token], depth[frame, token]
+    focal = views.intrinsics.double().diagonal(dim1=-2, dim2=-1)[frame, :2]
+    half = 0.5 * token_size * focal / depth[:, None]
+    own = (middle + SNAP).floor()
+    first = (middle - half - 0.5 + SNAP).ceil().minimum(own).maximum(own - reach).clamp_min(0)
+    last = (middle + half - 0.5 - SNAP).floor().maximum(own).minimum(own + reach).minimum(size - 1)
+    entry, column, row = _pixels_between(first.long(), last.long())
+    return Splats((frame[entry] * views.height + row) * views.width + column, token[entry], depth[entry])
+
+
+def _pixels_between(first: Int[Tensor, "square 2"], last: Int[Tensor, "square 2"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Every pixel of rectangles, along their rows: whose it is, its column and its row.
 
     Args:
-        middle: column and row of each square.
-        half: of its edges, in columns and rows.
-        reach: pixels that any of them reaches on each side.
-        size: height and width of the image.
+        first: column and row of the first pixel of each.
+        last: those of the last one; before the first for none.
     """
-    line = torch.arange(-reach, reach + 1, device=middle.device)
-    steps = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).flatten(0, 1)
-    corner = (middle + SNAP).floor()[:, None] + steps  # column and row of each pixel that the square may cover
-    covered = ((corner + 0.5 - middle[:, None]).abs() + SNAP <= half[:, None]).all(-1) | (steps == 0).all(-1)
-    inside = ((corner >= 0) & (corner < corner.new_tensor([size[1], size[0]]))).all(-1)
-    entry, number = (covered & inside).nonzero(as_tuple=True)
-    column, row = corner[entry, number].long().unbind(-1)
-    return row * size[1] + column, entry
+    width, height = (last - first + 1).clamp_min(0).unbind(-1)
+    count = width * height
+    entry = torch.arange(len(count), device=count.device).repeat_interleave(count)
+    place = torch.arange(len(entry), device=count.device) - (count.cumsum(0) - count)[entry]
+    return entry, first[entry, 0] + place % width[entry], first[entry, 1] + place // width[entry]
