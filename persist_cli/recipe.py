@@ -17,7 +17,8 @@ from persist_cli.world.errors import RecipeError, hint
 from persist_cli.world.settings import parse_settings
 
 EXTENDS = "extends"
-MERGED = {"backbone", "data", "training"}  # settings of a memory or adapter mean nothing to one of another kind
+MERGED = {"backbone", "data", "training"}
+KINDS = {"memory": "name", "adapter": "form"}  # merged too, unless this is given: settings mean nothing to another kind
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
@@ -156,7 +157,8 @@ def recipe_names() -> list[str]:
 def read_recipe(name: str) -> dict[str, Any]:
     """Plain values of a recipe by name, or of a YAML file, with those of the recipe that it ``extends``.
 
-    Of ``backbone``, ``data`` and ``training`` it need only say what is different; every other key stands for itself.
+    Of ``backbone``, ``data`` and ``training`` it need only say what is different, and of a ``memory`` or ``adapter`` of
+    which it gives no ``name`` or ``form``; every other key stands for itself.
 
     Raises:
         RecipeError: when one of them is unknown or no YAML mapping, and when they extend each other.
@@ -177,9 +179,13 @@ def _read_extended(name: str, readers: tuple[str, ...]) -> dict[str, Any]:
         extended = str(Path(name).parent / extended)
     merged = _read_extended(extended, (*readers, name))
     for key, value in values.items():
-        both = key in MERGED and isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = merged[key] | value if both else value
+        mappings = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merged[key] | value if mappings and _adds_to(key, value) else value
     return merged
+
+
+def _adds_to(key: str, value: dict[str, Any]) -> bool:
+    return key in MERGED or (key in KINDS and KINDS[key] not in value)
 
 
 def _recipe_text(name: str) -> str:

@@ -77,6 +77,13 @@ def test_a_recipe_says_only_what_differs_from_the_one_it_extends(tmp_path):
     assert "extends" not in to_yaml(make_recipe(found, "a.yaml"))
 
 
+def test_a_recipe_changes_the_memory_and_adapter_it_extends_unless_it_names_another(tmp_path):
+    (tmp_path / "a.yaml").write_text("extends: tiny-stage2-voxel\nadapter: {every: 2}\nmemory: {encoder: dinov2}\n")
+    found, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
+    assert found["adapter"] == extended["adapter"] | {"every": 2}
+    assert found["memory"] == extended["memory"] | {"encoder": "dinov2"}
+
+
 def test_a_recipe_cannot_extend_itself_nor_what_there_is_not(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: b.yaml")
     (tmp_path / "b.yaml").write_text("extends: a.yaml")
