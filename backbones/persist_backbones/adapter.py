@@ -1,6 +1,7 @@
 """Memory adapters: how tokens reach the video, one class a form (see ``forms``).
 
-A form prepares the batch's tokens once and changes the hidden states before or after the blocks where it stands.
+A form prepares the batch's tokens once, changes the hidden states before or after the blocks where it stands, and may
+correct the prediction.
 """
 
 from __future__ import annotations
@@ -55,6 +56,8 @@ class VideoShape:
         patch: latent pixels along the edge of a video token.
         spatial: compression of the codec in height and width.
         temporal: compression of the codec in time.
+        inputs: channels of all that the model sees at a latent pixel.
+        outputs: channels of its prediction.
     """
 
     channels: int
@@ -64,6 +67,8 @@ class VideoShape:
     patch: int
     spatial: int
     temporal: int
+    inputs: int
+    outputs: int
 
 
 @dataclass(frozen=True)
@@ -140,3 +145,13 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
     def change_after(self, block: nn.Module, video: Tensor, memory: Prepared, camera: Tensor, time: Tensor) -> Tensor:
         """What a block of the adapter makes of the hidden states after its transformer block; the same by default."""
         return video
+
+    def correct(
+        self,
+        predicted: Float[Tensor, "batch frame out height width"],
+        inputs: Float[Tensor, "batch frame in height width"],
+        memory: Prepared,
+        time: Float[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch frame out height width"]:
+        """What the adapter makes of the model's prediction; the same by default."""
+        return predicted

@@ -1,4 +1,4 @@
-"""``canvas``: tokens drawn into each target view and added to the hidden states."""
+"""``canvas``: tokens drawn into each target view and added to the hidden states, and to the prediction."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from pydantic import NonNegativeFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
+from persist_backbones.canvas_head import CanvasHead
 from persist_backbones.conditioning import fold_frames, tokens_of
 from persist_backbones.splat import rasterize, splat
 from persist_cli.world.cameras import Cameras
@@ -64,6 +65,7 @@ class CanvasSettings(AdapterSettings):
         canvas_scale: pixels of the canvas along the edge of a latent pixel.
         token_size: edge in metres of what a token stands for; 0 draws points.
         splat_pixels: most canvas pixels along the edge of a drawn token, odd; 1 draws points.
+        head_width: channels of what corrects the prediction at each latent pixel; 0 leaves it out.
     """
 
     form: Literal["canvas"] = "canvas"
@@ -71,15 +73,27 @@ class CanvasSettings(AdapterSettings):
     canvas_scale: PositiveInt = 1
     token_size: NonNegativeFloat = 0.25
     splat_pixels: PositiveInt = 5
+    head_width: NonNegativeInt = 0
 
 
-class CanvasAdapter(Adapter[PreparedMemory]):
+@dataclass(frozen=True)
+class PreparedCanvas(PreparedMemory):
+    """The canvas's patches, one for each video token.
+
+    Args:
+        seen: the canvas as the head sees it, at the latents' size; ``None`` without a head.
+    """
+
+    seen: Float[Tensor, "batch frame channel height width"] | None = None
+
+
+class CanvasAdapter(Adapter[PreparedCanvas]):
     """Tokens splatted with a z-buffer into the view of each frame, embedded like patches and added.
 
     The views have the latents' size times ``canvas_scale``; frames are folded into channels as the camera latents
-    are. Nothing after the drawing has a bias and every activation keeps zero, so to a video token on whose pixels no
-    memory token falls nothing is added, before and after training alike; a clip on whose views none falls at all is
-    that of stage 1 to the bit.
+    are. Nothing between the drawing and the blocks has a bias and every activation keeps zero, and what the head adds
+    is masked: to a video token on whose pixels no memory token falls nothing is added, before and after training
+    alike; a clip on whose views none falls at all is that of stage 1 to the bit.
     """
 
     settings_type = CanvasSettings
@@ -97,12 +111,16 @@ class CanvasAdapter(Adapter[PreparedMemory]):
         self.blocks = nn.ModuleDict(
             {str(layer): CanvasBlock(video.channels, settings.width, settings.ff_factor) for layer in layers}
         )
+        pixel = (drawn + 2) * video.temporal * settings.canvas_scale**2
+        sizes = (pixel, video.inputs, video.outputs, video.time_channels, settings.head_width)
+        self.head = CanvasHead(*sizes) if settings.head_width else None
 
-    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
+    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedCanvas:
         """Draw the tokens, fold frames, and embed the patch of each video token; the mask says where one fell."""
         folded = fold_frames(self.draw(tokens, cameras), self.video.temporal)
         patches = tokens_of(F.pixel_unshuffle(folded, self.patch))
-        return PreparedMemory(F.gelu(self.patches(patches)), patches.detach().ne(0).any(dim=-1))
+        seen = self.head.look(F.pixel_unshuffle(folded, self.settings.canvas_scale)) if self.head else None
+        return PreparedCanvas(F.gelu(self.patches(patches)), patches.detach().ne(0).any(dim=-1), seen)
 
     def draw(self, tokens: MemoryTokens, cameras: Cameras) -> Float[Tensor, "batch frame channel height width"]:
         """What each frame's camera sees of the memory: embedded features, coverage and log depth."""
@@ -113,7 +131,18 @@ class CanvasAdapter(Adapter[PreparedMemory]):
         features = self.embed(tokens.features.to(self.patches.weight.dtype))
         return splat(features, splats, (batch, frames, views.height, views.width))
 
-    def change_before(self, block: nn.Module, video: Tensor, memory: PreparedMemory) -> Tensor:
+    def change_before(self, block: nn.Module, video: Tensor, memory: PreparedCanvas) -> Tensor:
         """The video with the canvas added."""
         changed: Tensor = block(video, memory.tokens, memory.mask)
         return changed
+
+    def correct(self, predicted: Tensor, inputs: Tensor, memory: PreparedCanvas, time: Tensor) -> Tensor:
+        """The prediction with what the head adds, on the pixels of video tokens on which a memory token fell."""
+        if self.head is None or memory.seen is None:
+            return predicted
+        batch, frames, _, height, width = predicted.shape
+        side = self.video.patch
+        mask = memory.mask.reshape(batch, frames, 1, height // side, width // side)
+        mask = mask.repeat_interleave(side, -2).repeat_interleave(side, -1)
+        added: Tensor = self.head(predicted, inputs, memory.seen, time) * mask
+        return predicted + added.to(predicted.dtype)

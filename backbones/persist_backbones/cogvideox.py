@@ -101,6 +101,8 @@ class CogVideoX(Backbone):
             patch=config.patch_size,
             spatial=self.codec.spatial,
             temporal=self.codec.temporal,
+            inputs=self.transformer.in_channels,
+            outputs=self.transformer.out_channels,
         )
 
     @property

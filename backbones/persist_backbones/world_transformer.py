@@ -68,6 +68,7 @@ class WorldTransformer(nn.Module):
         self.extra_out = nn.Linear(inner, patch * patch * (out_channels - config.out_channels))
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
         self.camera_channels = camera_channels
+        self.in_channels, self.out_channels = in_channels, out_channels
         for module in (self.extra_in, self.extra_out, self.interactions):
             for parameter in module.parameters():
                 nn.init.zeros_(parameter)
@@ -89,7 +90,10 @@ class WorldTransformer(nn.Module):
                 video = adapter.after_block(layer, video, given.memory, given.camera, time)
         video = self.base.norm_out(self.base.norm_final(video), temb=time)
         parts = (self.unpatchify(self.base.proj_out(video), latents), self.unpatchify(self.extra_out(video), latents))
-        return torch.cat(parts, dim=2)
+        predicted = torch.cat(parts, dim=2)
+        if adapter is None or given.memory is None:
+            return predicted
+        return adapter.correct(predicted, latents, given.memory, time)
 
     def embed_time(self, given: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
         """The time embedding with the interactions of the clip added."""
