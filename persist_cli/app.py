@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from persist_cli import __version__
-from persist_cli.options import Commands, JsonOption
+from persist_cli.options import Commands, GuidanceOption, JsonOption, SamplerOption, StepsOption
+from persist_cli.sampling import AskedSampling
 from persist_cli.weights.app import weights_app
 from persist_cli.world.errors import PersistError
 
@@ -144,6 +145,7 @@ def export(
     default: Annotated[str | None, typer.Option(help="Adapter that is meant when none is named.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps when none are named.")] = None,
     sampler: Annotated[str | None, typer.Option(help="Sampler when none is named.")] = None,
+    guidance: Annotated[float | None, typer.Option(min=0, help="Guidance over memory when none is named.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Write a base and memory adapters as one checkpoint folder that stands alone.
@@ -152,7 +154,8 @@ def export(
     """
     from persist_cli.exporting.export import ExportPlan, run_export
 
-    run_export(ExportPlan(checkpoint, runs or [], dtype, default, steps, sampler), out, json)
+    sampling = AskedSampling(steps, sampler, guidance)
+    run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling), out, json)
 
 
 @app.command()
@@ -201,9 +204,9 @@ def rollout(
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
     write: Annotated[bool, typer.Option(help="Write what is generated into the memory.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
-    steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps; the checkpoint's, else 50.")] = None,
-    sampler: Annotated[str | None, typer.Option(help="ddim, dpm, unipc or dpm++; the checkpoint's, else ddim.")] = None,
-    guidance: Annotated[float, typer.Option(help="Weight of guidance over memory; 1 is none.")] = 1.0,
+    steps: StepsOption = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
     json: JsonOption = False,
 ) -> None:
     """Roll out a world model from a start frame along actions, clip by clip.
@@ -215,7 +218,7 @@ def rollout(
 
     plan = RolloutPlan(
         start=start, actions=actions, follow=follow, frames=frames, memory=memory, adapter=adapter, write=write,
-        seed=seed, steps=steps, sampler=sampler, guidance=guidance,
+        seed=seed, sampling=AskedSampling(steps, sampler, guidance),
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 
@@ -235,8 +238,9 @@ def evaluate(
     frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
     clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
     seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
-    steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps; the checkpoint's, else 50.")] = None,
-    sampler: Annotated[str | None, typer.Option(help="ddim, dpm, unipc or dpm++; the checkpoint's, else ddim.")] = None,
+    steps: StepsOption = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
     out: Annotated[Path, typer.Option(help="Folder for metrics.json; a stopped run goes on.")] = Path("runs/eval"),
@@ -264,8 +268,8 @@ def evaluate(
 
     plan = EvalPlan(
         data=tuple(data), protocol=protocol, memories=names_in(memories), controls=names_in(controls),
-        metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds, steps=steps, sampler=sampler, batch=batch,
-        noise=pose_noise,
+        metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds,
+        sampling=AskedSampling(steps, sampler, guidance), batch=batch, noise=pose_noise,
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

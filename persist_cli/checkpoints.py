@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.recipe import MemoryChoice
+from persist_cli.sampling import read_sampling
 from persist_cli.trajectories.scenes import TrainingScenes
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import file_sha256, read_json, write_json
@@ -41,7 +42,7 @@ class Checkpoint:
         fingerprint: of the base's weights.
         adapters: folders of the memory adapters by name.
         default: which of several adapters is meant when none is named.
-        sampling: steps and sampler that are meant when none are named; ``None`` when the card names none.
+        sampling: what is meant when nothing is asked for; ``None`` when the card says nothing.
         training_scenes: of base and adapters; ``None`` for a card of a version that did not write them down.
     """
 
@@ -106,7 +107,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
         fingerprint=fingerprint,
         adapters={each.name: each for each in sorted((folder / "adapters").glob("*")) if each.is_dir()},
         default=card.get("default_adapter"),
-        sampling=_sampling(own, folder / CARD),
+        sampling=read_sampling(own, folder / CARD),
         training_scenes=_training_scenes(own, folder / CARD),
     )
 
@@ -126,14 +127,6 @@ def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = Non
 
     with torch.device("meta"):
         return make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
-
-
-def sampling_of(checkpoint: Checkpoint, steps: int | None, sampler: str | None) -> Sampling:
-    """Steps and sampler: those asked for, else the checkpoint's, else 50 steps of DDIM."""
-    from persist_cli.world.backbone import Sampling
-
-    own = checkpoint.sampling or Sampling()
-    return dataclasses.replace(own, steps=own.steps if steps is None else steps, sampler=sampler or own.sampler)
 
 
 def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:
@@ -222,19 +215,6 @@ def _read_card(folder: Path) -> dict[str, Any]:
     if not card.get("fingerprint") or not (card.get("base") or {"backbone", "settings"} <= set(card)):
         raise CheckpointError(f"{path}: the card is incomplete")
     return card
-
-
-def _sampling(card: dict[str, Any], path: Path) -> Sampling | None:
-    from persist_cli.world.backbone import Sampling
-
-    value = card.get("sampling")
-    if value is None or value == {}:
-        return None
-    kinds = {"steps": int, "sampler": str}
-    known = isinstance(value, dict) and all(type(each) is kinds.get(key) for key, each in value.items())
-    if not known or value.get("steps", 1) < 1:
-        raise CheckpointError(f"{path}: its sampling is {value}; it holds steps, at least 1, and the name of a sampler")
-    return Sampling(**value)
 
 
 def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:

@@ -10,6 +10,14 @@ from typer.core import TyperGroup
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
+SamplerOption = Annotated[
+    str | None, typer.Option("--sampler", help="ddim, dpm, unipc or dpm++; the checkpoint's, else ddim.")
+]
+GuidanceOption = Annotated[
+    float | None,
+    typer.Option("--guidance", min=0, help="Of guidance over memory; the checkpoint's, else 1: none."),
+]
 
 
 class Commands(TyperGroup):

@@ -17,6 +17,7 @@ from persist_cli.viewing.console import say
 
 MEMORIES = ("none", "voxel", "map2d", "snapshots")
 FORMS = ("cross", "projected")
+SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # the best of tests/benchmarks/bench_sampling.py
 METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
 WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of all metrics that can be fetched
 
@@ -62,7 +63,7 @@ def evaluate_commands(out: Path) -> list[str]:
     forms = " ".join(f"{home}/voxel{form}" for form in ("", *(f"-{form}" for form in FORMS), "-rgb"))
 
     def evaluation(name: str, checkpoints: str, given: str) -> str:
-        return f"eval {checkpoints} {given} --out {home}/eval-{name} --report {home}/report-{name}"
+        return f"eval {checkpoints} {given} {SAMPLING} --out {home}/eval-{name} --report {home}/report-{name}"
 
     revisit = f"--data {home}/test/path --data {home}/test/explore --protocol revisit --frames 17 --clips 200"
     both, back = f"--memories {','.join(MEMORIES)}", f"--data {home}/there-and-back"

@@ -10,6 +10,7 @@ import pytest
 
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.packaged import reference_checkpoint, sample_data
+from persist_cli.sampling import AskedSampling
 from persist_cli.trajectories.reference import parse_reference
 from persist_cli.world.errors import CheckpointError
 from tests.exporting.runs import write_runs
@@ -22,7 +23,7 @@ def home(tmp_path_factory, walks):
 
     folder = tmp_path_factory.mktemp("home")
     runs = write_runs(folder / "runs")
-    plan = ExportPlan(runs / "stage1", [str(runs / "none"), str(runs / "voxel")], "float16", "voxel")
+    plan = ExportPlan(runs / "stage1", [str(runs / "none"), str(runs / "voxel")], "float16", "voxel", AskedSampling())
     run_export(plan, folder / "reference", False)
     shutil.copytree(walks, folder / "sample")
     return folder

@@ -76,7 +76,8 @@ class CogVideoX(Backbone):
         return tuple(SAMPLERS)
 
     def check_sampling(self, sampling: Sampling) -> None:
-        """Raise ``PersistError`` for an unknown sampler, and for more steps than the training has noise levels."""
+        """Raise ``PersistError`` also for more steps than the training has noise levels."""
+        super().check_sampling(sampling)
         check_sampling(self.scheduler, sampling.sampler, sampling.steps)
 
     @property

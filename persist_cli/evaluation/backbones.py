@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from persist_cli.checkpoints import Checkpoint, load_backbone, sampling_of
+from persist_cli.checkpoints import Checkpoint, load_backbone
 from persist_cli.evaluation.rows.row import Row
+from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.trajectories.clips import check_size
 from persist_cli.trajectories.store import Store
 from persist_cli.world.backbone import Backbone, Sampling
@@ -71,14 +72,17 @@ def check_bases(
     return Bases(next(iter(lengths)), frozenset(depthless))
 
 
-def common_sampling(checkpoints: Sequence[Checkpoint], steps: int | None, sampler: str | None) -> Sampling:
+def common_sampling(checkpoints: Sequence[Checkpoint], asked: AskedSampling) -> Sampling:
     """The sampling of all rows: that asked for, else the one that every checkpoint's card means.
 
     Raises:
         CheckpointError: when cards mean different ones, because rows of one table are sampled alike.
     """
-    meant = {sampling_of(each, steps, sampler): each for each in checkpoints}
+    meant = {sampling_of(each, asked): each for each in checkpoints}
     if len(meant) > 1:
-        told = " and ".join(f"{each.folder} means {way.steps} steps of {way.sampler}" for way, each in meant.items())
-        raise CheckpointError(f"{told}; name --steps and --sampler")
+        told = " and ".join(
+            f"{each.folder} means {way.steps} steps of {way.sampler} with guidance {way.memory_guidance:g}"
+            for way, each in meant.items()
+        )
+        raise CheckpointError(f"{told}; name --steps, --sampler and --guidance")
     return next(iter(meant))

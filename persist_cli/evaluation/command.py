@@ -80,6 +80,7 @@ def describe(run: Evaluation, processes: int) -> dict[str, Any]:
         "sampling": {
             "steps": run.sampling.steps,
             "sampler": run.sampling.sampler,
+            "memory_guidance": run.sampling.memory_guidance,
             "seeds": list(range(run.plan.seeds)),
             "batch": run.plan.batch,
         },

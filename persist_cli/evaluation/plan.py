@@ -21,6 +21,7 @@ from persist_cli.evaluation.rows.choice import RowChoice, check_choice, make_row
 from persist_cli.evaluation.rows.row import Row
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
+from persist_cli.sampling import AskedSampling
 from persist_cli.viewing.console import say
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import PersistError, hint
@@ -38,8 +39,7 @@ class EvalPlan:
     frames: int
     clips: int
     seeds: int
-    steps: int | None
-    sampler: str | None
+    sampling: AskedSampling
     batch: int
     noise: tuple[float, float]
 
@@ -107,7 +107,7 @@ def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Process
     """
     plan, backbones = plan.once(), Backbones()
     checkpoints = list({each.folder.resolve(): each for each in map(find_checkpoint, paths)}.values())
-    sampling = common_sampling(checkpoints, plan.steps, plan.sampler)
+    sampling = common_sampling(checkpoints, plan.sampling)
     choice = RowChoice(plan.memories, plan.controls, sampling, plan.noise)
     check_choice(choice)
     if plan.protocol not in PROTOCOLS:
@@ -142,7 +142,7 @@ def what_is_measured(
 ) -> dict[str, Any]:
     """All that changes a figure but the data, JSON values: the same evaluation goes on where it stopped."""
     options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
-    options |= {"steps": sampling.steps, "sampler": sampling.sampler}
+    options |= {"sampling": asdict(sampling)}
     models = [checkpoint_json(each) for each in checkpoints]
     values = options | {"checkpoints": models, "metric definitions": metric_json(metrics)}
     return dict(json.loads(json.dumps(values)))  # as a file gives it back

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,11 @@ from persist_cli.checkpoints import (
     empty_backbone,
     find_checkpoint,
     fingerprint,
-    sampling_of,
     write_card,
 )
 from persist_cli.exporting.parts import Part, adapter_parts, known_recipes
 from persist_cli.lineage import RECIPE, RECIPES, training_scenes, write_recipes
+from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import CheckpointError, PersistError, hint
 from persist_cli.world.files import file_sha256, folder_aside, read_tensors, write_tensors, write_text
@@ -40,8 +40,7 @@ class ExportPlan:
     runs: Sequence[str]
     dtype: str
     default: str | None
-    steps: int | None = None
-    sampler: str | None = None
+    sampling: AskedSampling
 
 
 def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
@@ -79,16 +78,16 @@ def default_of(base: Checkpoint, parts: dict[str, Part], asked: str | None) -> s
 
 
 def chosen_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, Any] | None:
-    """Steps and sampler for the card: those asked for, else the checkpoint's; ``None`` when neither names any.
+    """How the card says to sample: as asked for, else as the checkpoint's; ``None`` when neither says anything.
 
     Raises:
         PersistError: when the backbone cannot sample so.
     """
-    if base.sampling is None and plan.steps is None and plan.sampler is None:
+    if base.sampling is None and not plan.sampling.given():
         return None
-    sampling = sampling_of(base, plan.steps, plan.sampler)
+    sampling = sampling_of(base, plan.sampling)
     empty_backbone(base).check_sampling(sampling)
-    return {"steps": sampling.steps, "sampler": sampling.sampler}
+    return asdict(sampling)
 
 
 def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dtype: torch.dtype) -> dict[str, Any]:

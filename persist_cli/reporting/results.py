@@ -176,6 +176,7 @@ class Sampling(Part):
 
     steps: int | None = None
     sampler: str | None = None
+    memory_guidance: float | None = None
     seeds: list[int] = []
     batch: int | None = None
 

@@ -9,13 +9,14 @@ from typing import Any
 
 import torch
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone, sampling_of
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.packaged import reference_checkpoint
 from persist_cli.rollout.outputs import write_outputs
 from persist_cli.rollout.walk import Rollout, RolloutPlan, Walk, plan_walk
 from persist_cli.rollout.world_model import WorldModel
+from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.trajectories.clips import check_size
 from persist_cli.viewing.console import add_task, print_json, progress, say
 from persist_cli.world.errors import CheckpointError, PersistError
@@ -32,12 +33,11 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     walk = plan_walk(plan)
     backbone = load_backbone(checkpoint)
     check_size(walk.info, backbone.image_size, plan.start)
-    sampling = sampling_of(checkpoint, plan.steps, plan.sampler)
+    sampling = sampling_of(checkpoint, plan.sampling)
     backbone.check_sampling(sampling)
-    plan = dataclasses.replace(plan, steps=sampling.steps, sampler=sampling.sampler)
+    plan = dataclasses.replace(plan, sampling=AskedSampling(**dataclasses.asdict(sampling)))
     load_adapter(backbone, checkpoint, adapter)
     backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    sampling = dataclasses.replace(sampling, memory_guidance=plan.guidance)
     model = WorldModel(backbone, open_memory(checkpoint, adapter, plan, walk.info), sampling, plan.seed, plan.write)
     rollout = roll(model, walk)
     figures = write_outputs(rollout, out, describe(checkpoint, adapter, plan, rollout))
@@ -96,6 +96,7 @@ def copy_of(memory: Memory | None) -> Memory | None:
 def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
     """What is needed to roll out again, JSON values."""
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
+    options |= {"sampling": plan.sampling.given()}
     memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
     return {
         "checkpoint": str(checkpoint.folder),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from persist_cli.sampling import AskedSampling
 from persist_cli.trajectories.clips import interactions_of
 from persist_cli.trajectories.reference import parse_reference
 from persist_cli.trajectories.store import TrajectoryFile
@@ -28,9 +29,7 @@ class RolloutPlan:
     adapter: str | None
     write: bool
     seed: int
-    steps: int | None
-    sampler: str | None
-    guidance: float
+    sampling: AskedSampling
 
 
 @dataclass(frozen=True)

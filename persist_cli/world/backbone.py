@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -96,6 +97,8 @@ class Backbone(nn.Module, ABC):
             raise PersistError(f"unknown sampler {sampling.sampler!r}; known: {', '.join(self.samplers)}")
         if sampling.steps < 1:
             raise PersistError(f"{sampling.steps} denoising steps; it must be at least 1")
+        if not 0 <= sampling.memory_guidance < math.inf:
+            raise PersistError(f"guidance over memory of {sampling.memory_guidance}; it must be a number of at least 0")
 
     @property
     def gives_depth(self) -> bool:

@@ -122,7 +122,9 @@ def test_the_printed_rays_are_another_model_input():
     ("sampling", "cause"),
     [
         (Sampling(4, "euler"), r"^unknown sampler 'euler'; known: ddim, dpm, unipc, dpm\+\+$"),
-        (Sampling(0), "^0 denoising steps; it must be 1 to 1000$"),
+        (Sampling(0), "^0 denoising steps; it must be at least 1$"),
+        (Sampling(memory_guidance=-1.0), "^guidance over memory of -1.0; it must be a number of at least 0$"),
+        (Sampling(memory_guidance=float("inf")), "^guidance over memory of inf; it must be"),
         (Sampling(1001), "^1001 denoising steps; it must be 1 to 1000$"),
     ],
 )

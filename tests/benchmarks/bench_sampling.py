@@ -102,6 +102,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--adapter", help="memory that the samplers are compared with; voxel when there is one")
     parser.add_argument("--samplers", default="", help="separated by commas; all, ddim first, when not given")
     parser.add_argument("--steps", default="50,20,10,4", help="separated by commas")
+    parser.add_argument("--guidance", type=float, default=1.0, help="weight of guidance over memory, of all")
     parser.add_argument("--out", type=Path, help="folder for sampling.json and sampling.png")
     options = parser.parse_args(arguments)
     if bool(options.checkpoint) != bool(options.data):
@@ -139,7 +140,8 @@ def make_bench(options: argparse.Namespace) -> Bench:
     backbones = Backbones()
     backbone = backbones.of(checkpoints[0])
     samplers = options.samplers.split(",") if options.samplers else backbone.samplers
-    samplings = [Sampling(int(steps), sampler) for sampler in samplers for steps in options.steps.split(",")]
+    counts = [int(steps) for steps in options.steps.split(",")]
+    samplings = [Sampling(steps, sampler, options.guidance) for sampler in samplers for steps in counts]
     cases = PROTOCOL.find(Selected(options.data, 0, options.clips, backbone.frames_per_clip - 1))
     adapters = sorted({name for each in checkpoints for name in each.adapters})
     rows = make_rows(checkpoints, RowChoice([PLAIN, *adapters], (), samplings[0]), PROTOCOL, cases)
@@ -177,7 +179,8 @@ def compare_samplers(bench: Bench) -> list[dict[str, Any]]:
             figures[name].append(bench.measurer.figures(seen.rgb, seen.depth, clip, name)[1:].mean(0).numpy())
     times = Times({name: np.array(values) for name, values in seconds.items()})
     return [
-        {"sampler": each.sampler, "steps": each.steps, "seconds": times.median(name)}
+        {"sampler": each.sampler, "steps": each.steps, "memory_guidance": each.memory_guidance}
+        | {"seconds": times.median(name)}
         | {"ratio": times.ratio(name, names[0])}
         | dict(zip(bench.measurer.by_frame, np.mean(figures[name], axis=0).tolist(), strict=True))
         for name, each in zip(names, bench.samplings, strict=True)
@@ -210,7 +213,8 @@ def show(bench: Bench, samplers: Sequence[dict[str, Any]], memories: Sequence[di
     for name, why in bench.measurer.obstacles.items():
         say(f"{name}: n/a ({why})")
     first = bench.samplings[0]
-    title = f"samplers, memory {bench.row.name}, clips of {bench.cases[0].frames - 1} frames: {len(bench.cases)}"
+    clips = f"clips of {bench.cases[0].frames - 1} frames: {len(bench.cases)}"
+    title = f"samplers, memory {bench.row.name}, guidance {first.memory_guidance:g}, {clips}"
     columns = ["sampler", "steps", "s a clip", f"time to {first.sampler} {first.steps}"]
     rows = [
         [each["sampler"], str(each["steps"]), f"{each['seconds']:.2f}", f"{each['ratio']:.3f}×"]

@@ -26,6 +26,8 @@ def test_samplers_and_memories_are_compared_on_clips_that_return(model, walks, t
             "2",
             "--steps",
             "3,1",
+            "--guidance",
+            "1.5",
             "--out",
             str(tmp_path),
         ]
@@ -34,6 +36,7 @@ def test_samplers_and_memories_are_compared_on_clips_that_return(model, walks, t
     assert [(each["sampler"], each["steps"]) for each in found["samplers"]] == [
         (s, k) for s in SAMPLERS for k in (3, 1)
     ]
+    assert {each["memory_guidance"] for each in found["samplers"]} == {1.5}
     assert found["samplers"][0]["ratio"] == 1.0
     single = [each["psnr"] for each in found["samplers"] if each["steps"] == 1]
     assert single == pytest.approx([single[0]] * len(SAMPLERS), abs=0.01)  # one step is one prediction for all of them

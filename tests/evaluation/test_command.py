@@ -67,7 +67,9 @@ def test_an_emptied_memory_is_not_the_memory(whole):
 def test_the_results_tell_all_that_is_needed_to_measure_again(whole, voxel):
     found = results(whole)
     assert found["command"][:2] == ["persist", "eval"]
-    assert found["sampling"] == {"steps": 2, "sampler": "ddim", "seeds": [0, 1], "batch": 1}
+    assert found["sampling"] == {
+        "steps": 2, "sampler": "ddim", "memory_guidance": 1.0, "seeds": [0, 1], "batch": 1,
+    }  # fmt: skip
     assert len(found["measured"]["data"][0]["trajectories"]["walk-0"]) == 64
     assert found["measured"]["metrics"]["psnr"]["definition"].startswith("dB")
     assert found["checkpoints"][0]["name"] == voxel.name

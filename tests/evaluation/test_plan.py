@@ -34,18 +34,18 @@ def refused(persist, *command):
 
 def test_checkpoints_whose_cards_mean_different_samplings_want_a_word(persist, walks, tmp_path):
     a = write_model(tmp_path / "a", 0.1, {"steps": 1, "sampler": "ddim"})
-    b = write_model(tmp_path / "b", 0.2, {"steps": 2, "sampler": "unipc"})
+    b = write_model(tmp_path / "b", 0.2, {"steps": 2, "sampler": "unipc", "memory_guidance": 1.5})
     for pair in ((a, b), (b, a)):
         told = refused(persist, "eval", *pair, "--data", walks, *ONE, "--out", tmp_path / "o")
-        assert "a/voxel means 1 steps of ddim" in told
-        assert "b/voxel means 2 steps of unipc" in told
-        assert told.endswith("; name --steps and --sampler")
+        assert "a/voxel means 1 steps of ddim with guidance 1" in told
+        assert "b/voxel means 2 steps of unipc with guidance 1.5" in told
+        assert told.endswith("; name --steps, --sampler and --guidance")
     assert not (tmp_path / "o").exists()
-    named = ["--steps", 1, "--sampler", "unipc"]
+    named = ["--steps", 1, "--sampler", "unipc", "--guidance", 1]
     assert persist("eval", a, b, "--data", walks, *ONE, *named, "--out", tmp_path / "o").code == 0
     assert persist("eval", b, "--data", walks, *ONE, "--out", tmp_path / "p").code == 0
     sampled = read_json(tmp_path / "p/metrics.json")["sampling"]
-    assert (sampled["steps"], sampled["sampler"]) == (2, "unipc")
+    assert (sampled["steps"], sampled["sampler"], sampled["memory_guidance"]) == (2, "unipc", 1.5)
 
 
 @pytest.mark.parametrize(

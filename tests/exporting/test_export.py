@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from persist_backbones.parts import load_exactly
-from persist_cli.checkpoints import find_checkpoint, load_adapter, load_backbone, sampling_of
+from persist_cli.checkpoints import find_checkpoint, load_adapter, load_backbone
+from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
@@ -97,16 +98,28 @@ def test_a_stage_2_run_stands_for_its_base_and_adapter(persist, export, runs, tm
     assert (tmp_path / "a/SHA256SUMS").read_bytes() == (tmp_path / "b/SHA256SUMS").read_bytes()
 
 
-def test_steps_and_sampler_of_the_card_are_meant_where_none_are_named(export, runs, tmp_path):
-    export(tmp_path / "m", "--steps", "7", "--sampler", "unipc")
+def test_the_sampling_of_the_card_is_meant_where_nothing_is_asked_for(export, runs, tmp_path):
+    export(tmp_path / "m", "--steps", "7", "--sampler", "unipc", "--guidance", "1.5")
     exported, run = find_checkpoint(tmp_path / "m"), find_checkpoint(runs / "stage1")
-    assert sampling_of(exported, None, None) == Sampling(7, "unipc")
-    assert sampling_of(exported, 3, "ddim") == Sampling(3, "ddim")
-    assert (run.sampling, sampling_of(run, None, None)) == (None, Sampling(50, "ddim"))
+    assert sampling_of(exported, AskedSampling()) == Sampling(7, "unipc", 1.5)
+    assert sampling_of(exported, AskedSampling(3, "ddim")) == Sampling(3, "ddim", 1.5)
+    assert sampling_of(exported, AskedSampling(memory_guidance=1.0)) == Sampling(7, "unipc", 1.0)
+    assert (run.sampling, sampling_of(run, AskedSampling())) == (None, Sampling(50, "ddim", 1.0))
 
 
 @pytest.mark.parametrize(
-    "value", [{"steps": "many"}, {"steps": 0}, {"steps": True}, {"stpes": 7}, {"sampler": 1}, True]
+    "value",
+    [
+        {"steps": "many"},
+        {"steps": 0},
+        {"steps": True},
+        {"stpes": 7},
+        {"sampler": 1},
+        True,
+        {"memory_guidance": -1},
+        {"memory_guidance": float("nan")},
+        {"memory_guidance": "1"},
+    ],
 )
 def test_a_card_with_a_sampling_that_is_none_is_refused(export, tmp_path, value):
     export(tmp_path / "m")
