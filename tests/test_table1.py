@@ -96,6 +96,7 @@ def test_models_are_trained_on_collected_training_houses_and_evaluated_on_held_o
 
 def test_all_memories_are_trained_alike() -> None:
     recipes = [make_recipe(read_recipe(f"houses-64-stage2-{memory}"), memory) for memory in MEMORIES]
-    assert len({repr(sorted(recipe.adapter.items())) for recipe in recipes}) == 1
+    adapters = [recipe.adapter | {"token_size": None} for recipe in recipes]  # what a token stands for is the memory's
+    assert len({repr(sorted(adapter.items())) for adapter in adapters}) == 1
     assert len({repr(recipe.memory.encoder_settings) for recipe in recipes if recipe.memory}) == 1
     assert len({recipe.training.steps for recipe in recipes if recipe.memory and recipe.memory.name != "none"}) == 1

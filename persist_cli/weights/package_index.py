@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import shutil
@@ -48,9 +49,9 @@ def download_archive(archive: Archive, folder: Path, size: int) -> Path:
     (around / "temporary").mkdir(parents=True)
     try:
         _run_pip(archive, around, size)
+        if not (around / archive.file).is_file():
+            raise SourceError(f"{archive.project} {archive.version}: pip brought no {archive.file}")
         (around / archive.file).replace(target)
-    except FileNotFoundError as error:
-        raise SourceError(f"{archive.project} {archive.version}: pip brought no {archive.file}") from error
     finally:
         shutil.rmtree(around, ignore_errors=True)
     return target
@@ -85,14 +86,14 @@ def _watch(pip: subprocess.Popen[bytes], archive: Archive, around: Path, size: i
         task = add_task(bar, f"{archive.project} {archive.version}", max(1, size // MEGABYTE), "MB")
         while pip.poll() is None:
             time.sleep(POLL)
-            bar.update(task, completed=min(size, _bytes_below(around)) // MEGABYTE)
+            bar.update(task, completed=min(size, bytes_below(around)) // MEGABYTE)
 
 
-def _bytes_below(folder: Path) -> int:
+def bytes_below(folder: Path) -> int:
+    """Of all files in a folder that something else changes meanwhile."""
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            total += path.stat().st_size if path.is_file() else 0
-        except OSError:  # pip moved it away in this moment
-            continue
+    for parent, _, names in os.walk(folder):  # passes over folders that pip takes away in this moment; rglob does not
+        for name in names:
+            with contextlib.suppress(OSError):
+                total += Path(parent, name).stat().st_size
     return total

