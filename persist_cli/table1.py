@@ -7,6 +7,7 @@ was stopped, and what is done is neither trained nor predicted again, so this ma
 from __future__ import annotations
 
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -79,12 +80,13 @@ def evaluate_commands(out: Path) -> list[str]:
 
 def run_command(command: Sequence[str]) -> int:
     """The exit code of a command; one that is interrupted with us is given the time to end."""
-    process = subprocess.Popen(command)
+    interrupts: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))  # a child begins without it
     try:
-        return process.wait()
-    except KeyboardInterrupt:
-        process.wait()
-        return INTERRUPTED
+        code = subprocess.run(command, check=False).returncode
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return INTERRUPTED if interrupts else code
 
 
 def main() -> None:
