@@ -90,15 +90,15 @@ def locate(
     Int64[Tensor, "snapshot view patch"], Float[Tensor, "snapshot view patch"], Bool[Tensor, "snapshot view patch"]
 ]:
     """Where points fall in images: the cell of a grid over the image, the planar depth, whether inside at all."""
-    local = torch.einsum(
-        "vji,svpj->svpi", world_from_camera[:, :3, :3], points[:, None] - world_from_camera[:, None, :3, 3]
-    )
-    image = torch.einsum("vij,svpj->svpi", intrinsics, local)
-    depth = local[..., 2]
+    scale = torch.stack([grid[1] / size[:, 1].double(), grid[0] / size[:, 0].double()], dim=-1)[..., None]
+    ahead = intrinsics.new_tensor([[[0.0, 0.0, 1.0]]]).expand(len(intrinsics), -1, -1)
+    onto = torch.cat([intrinsics[:, :2] * scale, ahead], dim=1) @ world_from_camera[:, :3, :3].mT
+    origins = (onto @ world_from_camera[:, :3, 3:])[..., 0]
+    places = (onto.transpose(0, 1).flatten(0, 1) @ points.flatten(0, 1).mT).unflatten(0, (3, -1))  # axis, view, point
+    column, row, depth = places.sub_(origins.T[..., None]).unbind(0)
     safe = depth.clamp(min=1e-9)
-    height, width = size.double().unbind(-1)
-    row = torch.floor(image[..., 1] / safe * (grid[0] / height)[:, None] + ROUNDING)
-    column = torch.floor(image[..., 0] / safe * (grid[1] / width)[:, None] + ROUNDING)
+    row, column = (each.div_(safe).add_(ROUNDING).floor_() for each in (row, column))
     inside = (depth > 0) & (row >= 0) & (row < grid[0]) & (column >= 0) & (column < grid[1])
-    cell = torch.where(inside, row * grid[1] + column, 0.0).long()
+    cell = row.mul_(grid[1]).add_(column).mul_(inside).long()
+    cell, depth, inside = (each.unflatten(1, points.shape[:2]).transpose(0, 1) for each in (cell, depth, inside))
     return cell, depth, inside
