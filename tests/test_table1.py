@@ -98,5 +98,9 @@ def test_all_memories_are_trained_alike() -> None:
     recipes = [make_recipe(read_recipe(f"houses-64-stage2-{memory}"), memory) for memory in MEMORIES]
     adapters = [recipe.adapter | {"token_size": None} for recipe in recipes]  # what a token stands for is the memory's
     assert len({repr(sorted(adapter.items())) for adapter in adapters}) == 1
+    assert (
+        len({recipe.adapter["token_size"] for recipe in recipes if recipe.memory and recipe.memory.name != "snapshots"})
+        == 1
+    )
     assert len({repr(recipe.memory.encoder_settings) for recipe in recipes if recipe.memory}) == 1
     assert len({recipe.training.steps for recipe in recipes if recipe.memory and recipe.memory.name != "none"}) == 1

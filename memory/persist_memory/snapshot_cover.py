@@ -99,6 +99,6 @@ def locate(
     safe = depth.clamp(min=1e-9)
     row, column = (each.div_(safe).add_(ROUNDING).floor_() for each in (row, column))
     inside = (depth > 0) & (row >= 0) & (row < grid[0]) & (column >= 0) & (column < grid[1])
-    cell = row.mul_(grid[1]).add_(column).mul_(inside).long()
+    cell = torch.where(inside, row.mul_(grid[1]).add_(column), 0.0).long()
     cell, depth, inside = (each.unflatten(1, points.shape[:2]).transpose(0, 1) for each in (cell, depth, inside))
     return cell, depth, inside
