@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
@@ -16,7 +17,8 @@ from persist_cli.world.weights import cached_weight
 
 Shapes = Mapping[str, tuple[int, ...]]
 
-CUDA_CHUNK = 16  # frames at once on a GPU; on a CPU one by one, so that no frame's figure depends on its neighbours
+CHUNK = 16  # frames at once
+CPU_PIXELS = 65536  # and at most so many on a CPU: small frames are faster together, of large ones the memory counts
 
 
 def missing_weights(*names: str) -> str | None:
@@ -79,7 +81,7 @@ def run_network(network: Callable[..., Tensor], *images: Tensor) -> Tensor:
         images: the frame first, all with equally many.
     """
     device = network_device()
-    chunk = CUDA_CHUNK if device.type == "cuda" else 1
+    chunk = CHUNK if device.type == "cuda" else max(1, min(CHUNK, CPU_PIXELS // math.prod(images[0].shape[1:-1])))
     with exact_inference():
         parts = [
             network(*(part.to(device) for part in chunks)).double().cpu()
