@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 .PHONY: demo demo-train table1 test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.demos.training runs/demo
+	$(VENV)/bin/python -m persist_cli.demos.reference runs/demo
 
 demo-train: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.demos.training runs/demo-train

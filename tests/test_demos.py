@@ -51,6 +51,13 @@ def test_only_an_evaluation_of_ours_is_deleted(tmp_path):
     assert not (tmp_path / "eval").exists()
 
 
+def test_make_demo_shows_the_reference_model_and_make_demo_train_trains_one():
+    targets = (Path(__file__).parents[1] / "Makefile").read_text().split("\n\n")
+    for target, module in (("demo", reference), ("demo-train", training)):
+        (recipe,) = (each for each in targets if each.startswith(f"{target}:"))
+        assert f"-m {module.__name__} " in recipe
+
+
 @pytest.mark.parametrize("shown", [reference.DEMO, training.DEMO])
 def test_every_command_is_one_that_persist_takes_whatever_the_folder_is_called(shown):
     for line in shown.commands(Path("my demo")):

@@ -1,6 +1,5 @@
 """The reference model and the sample data: what commands use when none is named."""
 
-import contextlib
 import json
 import shutil
 from importlib import resources
@@ -12,7 +11,6 @@ from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.packaged import reference_checkpoint, sample_data
 from persist_cli.sampling import AskedSampling
 from persist_cli.trajectories.reference import parse_reference
-from persist_cli.world.errors import CheckpointError
 from tests.exporting.runs import write_runs
 
 
@@ -23,7 +21,9 @@ def home(tmp_path_factory, walks):
 
     folder = tmp_path_factory.mktemp("home")
     runs = write_runs(folder / "runs")
-    plan = ExportPlan(runs / "stage1", [str(runs / "none"), str(runs / "voxel")], "float16", "voxel", AskedSampling())
+    plan = ExportPlan(
+        runs / "stage1", [str(runs / "none"), str(runs / "voxel")], "float16", "voxel", AskedSampling(steps=1)
+    )
     run_export(plan, folder / "reference", False)
     shutil.copytree(walks, folder / "sample")
     return folder
@@ -135,8 +135,7 @@ def test_without_the_variable_both_are_sought_in_the_package(monkeypatch):
     monkeypatch.delenv("PERSIST_REFERENCE")
     package = Path(str(resources.files("persist_recipes")))
     assert sample_data() == package / "sample"
-    with contextlib.suppress(CheckpointError):  # the model comes once it is trained
-        assert reference_checkpoint() == package / "reference"
+    assert reference_checkpoint() == package / "reference"
 
 
 def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monkeypatch, capsys):
@@ -145,7 +144,6 @@ def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monk
 
     monkeypatch.setattr(demo, "HALF", 11)
     monkeypatch.setattr(shown, "HALF", 11)
-    monkeypatch.setattr(shown, "STEPS", 1)
     monkeypatch.setattr(shown, "CLIPS", 1)
     monkeypatch.setenv("PERSIST_CACHE", str(here / "cache"))
     demo.run_demo(shown.DEMO, here / "demo")

@@ -14,7 +14,6 @@ from persist_cli.demos.demo import HALF, ROWS, Demo, main
 from persist_cli.world.files import read_json
 from persist_cli.world.weights import cached_weight
 
-STEPS: Final = 10  # denoising steps
 CLIPS: Final = 6  # that are evaluated
 
 
@@ -22,14 +21,14 @@ def commands(out: Path) -> list[str]:
     """The command lines, in order, writing into ``out``."""
     home = shlex.quote(str(out))
     memory = f"{home}/house.safetensors"
-    back = f"--start sample#0:{HALF} --follow --steps {STEPS} --seed 0"
+    back = f"--start sample#0:{HALF} --follow --seed 0"
     metrics = "psnr,ssim" + (",lpips-alex" if cached_weight("lpips-alex") else "")
     return [
         "inspect sample",
         f"memorize sample#0:0-{HALF + 1} --memory voxel --out {memory}",
         f"rollout {back} --adapter voxel --memory {memory} --out {home}/with-memory",
         f"rollout {back} --adapter none --out {home}/without-memory",
-        f"eval --data sample --memories none,voxel --controls copy,codec --metrics {metrics} --seeds 1 --steps {STEPS} "
+        f"eval --data sample --memories none,voxel --controls copy,codec --metrics {metrics} --seeds 1 "
         f"--clips {CLIPS} --out {home}/eval --report {home}/report",
     ]
 
