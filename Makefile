@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo demo-train table1 test test-slow lint bench clean
+.PHONY: demo demo-train table1 table1-reference test test-slow lint bench clean
 
 demo: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.demos.reference runs/demo
@@ -13,6 +13,9 @@ demo-train: $(STAMP)
 
 table1: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.table1 runs/table1
+
+table1-reference: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.table1 runs/table1-reference --reference
 
 test: $(STAMP) lint
 	$(VENV)/bin/python -m pytest -m "not slow and not gpu"

@@ -1,7 +1,8 @@
 """``make table1``: the reference model from nothing to its tables, by the commands that a user would type.
 
-``python -m persist_cli.table1 [OUT]`` runs them in order, each in a process of its own. Every command goes on where it
-was stopped, and what is done is neither trained nor predicted again, so this may be stopped and started at any time.
+``python -m persist_cli.table1 [OUT]`` runs them in order, each in a process of its own; with ``--reference`` it trains
+nothing and measures the model that comes with the package. Every command goes on where it was stopped, and what is done
+is neither trained nor predicted again, so this may be stopped and started at any time.
 """
 
 from __future__ import annotations
@@ -20,21 +21,39 @@ MEMORIES = ("none", "voxel", "map2d", "snapshots")
 FORMS = ("cross", "projected")
 SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # chosen in a trial on eight held-out clips
 METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
+REFERENCE = "--reference"
 WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of all metrics that can be fetched
 
 
 def commands(out: Path) -> list[str]:
     """All command lines in order; weights first, so that nothing is missing after days of training."""
-    fetch = f"weights fetch {' '.join(WEIGHTS)}"
-    return [fetch, *collect_commands(out), *train_commands(out), *evaluate_commands(out)]
+    return [fetch_command(), *collect_commands(out), *train_commands(out), *evaluate_commands(out)]
+
+
+def reference_commands(out: Path) -> list[str]:
+    """Those that measure the model of the package: all tables but that of the forms, which it has one of."""
+    return [fetch_command(), *collect_test_commands(out), *evaluate_commands(out, trained=False)]
+
+
+def fetch_command() -> str:
+    """Bring the weights of every metric."""
+    return f"weights fetch {' '.join(WEIGHTS)}"
 
 
 def collect_commands(out: Path) -> list[str]:
-    """2,400 training houses of 100 frames, and 100 held-out ones of 129, on paths of three kinds."""
+    """2,400 training houses of 100 frames, and the held-out ones."""
     home, collect = shlex.quote(str(out)), "collect miniworld --size 64x64"
     return [
         f"{collect} --out {home}/houses/path --scenes 0:1600 --frames 100 --policy path",
         f"{collect} --out {home}/houses/explore --scenes 1600:2400 --frames 100 --policy explore",
+        *collect_test_commands(out),
+    ]
+
+
+def collect_test_commands(out: Path) -> list[str]:
+    """100 held-out houses of 129 frames, on paths of three kinds."""
+    home, collect = shlex.quote(str(out)), "collect miniworld --size 64x64"
+    return [
         f"{collect} --out {home}/test/path --scenes 0:50 --frames 129 --policy path --split test",
         f"{collect} --out {home}/test/explore --scenes 50:100 --frames 129 --policy explore --split test",
         f"{collect} --out {home}/there-and-back --scenes 0:100 --frames 129 --policy there-and-back --split test",
@@ -57,25 +76,33 @@ def train_commands(out: Path) -> list[str]:
     ]
 
 
-def evaluate_commands(out: Path) -> list[str]:
-    """The tables: memories and controls on revisits, forms, there and back, and long rollouts."""
+def evaluate_commands(out: Path, trained: bool = True) -> list[str]:
+    """The tables: memories and controls on revisits, there and back, and long rollouts; forms.
+
+    Args:
+        out: the folder of everything.
+        trained: whether the runs there are measured, or the model that comes with the package.
+    """
     home = shlex.quote(str(out))
-    rows = " ".join(f"{home}/{memory}" for memory in MEMORIES)
+    rows, two = (" ".join(f"{home}/{memory}" for memory in memories) for memories in (MEMORIES, MEMORIES[:2]))
     forms = " ".join(f"{home}/voxel{form}" for form in ("", *(f"-{form}" for form in FORMS), "-rgb"))
 
     def evaluation(name: str, checkpoints: str, given: str) -> str:
-        return f"eval {checkpoints} {given} {SAMPLING} --out {home}/eval-{name} --report {home}/report-{name}"
+        named = f"{checkpoints} {given}" if trained else given
+        return f"eval {named} {SAMPLING} --out {home}/eval-{name} --report {home}/report-{name}"
 
     revisit = f"--data {home}/test/path --data {home}/test/explore --protocol revisit --frames 17 --clips 200"
     both, back = f"--memories {','.join(MEMORIES)}", f"--data {home}/there-and-back"
-    two, disturbed = f"{home}/none {home}/voxel", "--memories none,voxel --controls shuffled,emptied,oracle,noisy"
-    return [
+    disturbed = "--memories none,voxel --controls shuffled,emptied,oracle,noisy"
+    lines = [
         evaluation("revisit", rows, f"{revisit} {both} --controls copy,nearest,warp,codec"),
         evaluation("disturbed", two, f"{revisit} {disturbed} --metrics {METRICS}"),
-        evaluation("forms", forms, f"{revisit} --memories voxel --controls codec --metrics {METRICS}"),
         evaluation("return", rows, f"{back} --protocol return --clips 100 {both} --controls warp"),
         evaluation("long", two, f"{back} --protocol long --clips 16 --memories none,voxel --metrics {METRICS}"),
     ]
+    if trained:
+        lines.append(evaluation("forms", forms, f"{revisit} --memories voxel --controls codec --metrics {METRICS}"))
+    return lines
 
 
 def run_command(command: Sequence[str]) -> int:
@@ -91,8 +118,9 @@ def run_command(command: Sequence[str]) -> int:
 
 def main() -> None:
     """Run every command until one fails; its exit code is ours."""
-    out = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/table1")
-    for line in commands(out):
+    folders = [word for word in sys.argv[1:] if word != REFERENCE]
+    out = Path(folders[0] if folders else "runs/table1")
+    for line in reference_commands(out) if REFERENCE in sys.argv else commands(out):
         say(f"\n$ persist {line}")
         code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
         if code == INTERRUPTED:

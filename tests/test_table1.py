@@ -21,6 +21,7 @@ from persist_cli.table1 import (
     collect_commands,
     commands,
     evaluate_commands,
+    reference_commands,
     train_commands,
 )
 from persist_cli.world.files import write_json
@@ -37,7 +38,7 @@ sys.exit(run_command([sys.executable, "-c", child]))
 """
 
 
-@pytest.mark.parametrize("line", LINES)
+@pytest.mark.parametrize("line", [*LINES, *reference_commands(OUT)])
 def test_every_command_is_one_that_persist_takes(line: str) -> None:
     name, *arguments = shlex.split(line)
     command = typer.main.get_command(app).commands[name]
@@ -92,6 +93,14 @@ def test_models_are_trained_on_collected_training_houses_and_evaluated_on_held_o
     train = {folder for line in collect_commands(OUT) for folder in folders(line, "--out")} - test
     assert all(folders(line, "--data") == train for line in train_commands(OUT))
     assert {folder for line in evaluate_commands(OUT) for folder in folders(line, "--data")} == test
+
+
+def test_the_model_of_the_package_is_measured_as_a_trained_one_but_for_its_forms() -> None:
+    trained = {word for line in evaluate_commands(OUT) for word in shlex.split(line) if word.startswith("--")}
+    lines = [line for line in reference_commands(OUT) if line.startswith("eval")]
+    assert {word for line in lines for word in shlex.split(line) if word.startswith("--")} == trained
+    assert not [line for line in lines if shlex.split(line)[1].startswith(str(OUT))]
+    assert not [line for line in reference_commands(OUT) if line.startswith("finetune") or "/houses/" in line]
 
 
 def test_all_memories_are_trained_alike() -> None:
