@@ -25,10 +25,19 @@ from persist_cli.lineage import RECIPE, RECIPES, training_scenes, write_recipes
 from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import CheckpointError, PersistError, hint
-from persist_cli.world.files import file_sha256, folder_aside, read_tensors, write_tensors, write_text
+from persist_cli.world.files import (
+    file_sha256,
+    folder_aside,
+    read_json,
+    read_tensors,
+    write_json,
+    write_tensors,
+    write_text,
+)
 
 PRECISIONS = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
 SUMS = "SHA256SUMS"
+PLACE = "_name_or_path"  # where diffusers once loaded a part from
 OF_RUNS = {CARD, RECIPE, SUMS}  # at the top of a checkpoint folder; an export makes its own
 
 
@@ -101,7 +110,7 @@ def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dty
     for source, target in watched(jobs, "export", "file"):
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            convert(source, target, dtype) if source.suffix == ".safetensors" else shutil.copyfile(source, target)
+            convert(source, target, dtype) if source.suffix == ".safetensors" else copy(source, target)
         except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
             raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
     write_recipes(folder, known_recipes(base, parts))
@@ -112,6 +121,15 @@ def belongs(path: Path) -> bool:
     """Whether a file of a base is the backbone's, by its path in the folder: not one that every export makes anew."""
     hidden = any(part.startswith(".") for part in path.parts)
     return str(path) not in OF_RUNS and path.parts[0] != RECIPES and not hidden
+
+
+def copy(source: Path, target: Path) -> None:
+    """Copy a file; a configuration of diffusers without the folder that it was loaded from."""
+    values = read_json(source) if source.suffix == ".json" else None
+    if not isinstance(values, dict) or PLACE not in values:
+        shutil.copyfile(source, target)
+        return
+    write_json(target, {key: value for key, value in values.items() if key != PLACE})
 
 
 def convert(source: Path, target: Path, dtype: torch.dtype) -> None:

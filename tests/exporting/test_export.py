@@ -167,6 +167,15 @@ def test_recipes_of_all_stages_are_kept_without_places_of_this_machine(persist, 
     assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
 
 
+def test_no_configuration_tells_where_it_was_loaded_from(persist, walks, codec, tmp_path):
+    settings = ["training.steps=1", "training.ema=0"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *settings)).code == 0
+    run = tmp_path / "run"
+    assert "_name_or_path" in json.loads(next(run.glob("step-*/model/vae/config.json")).read_text())
+    assert persist("export", run, "--out", tmp_path / "out").code == 0
+    assert not [path for path in (tmp_path / "out").rglob("*.json") if str(codec) in path.read_text()]
+
+
 def test_an_export_may_be_called_model(persist, walks, stage1, tmp_path):
     model = tmp_path / "runs/model"
     assert persist("export", stage1, "--out", model).code == 0
