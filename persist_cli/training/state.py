@@ -18,7 +18,6 @@ from persist_cli.world.files import (
     folder_aside,
     read_json,
     read_tensors,
-    remove_leftovers,
     write_json,
     write_tensors,
 )
@@ -99,7 +98,6 @@ def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], Non
 
 def load_state(run: Path, state: TrainingState) -> None:
     """Restore the newest checkpoint of a run, if there is one."""
-    remove_leftovers(run)
     folders = step_folders(run)
     if not folders:
         return
