@@ -97,7 +97,7 @@ def evaluate_commands(out: Path, trained: bool = True) -> list[str]:
     lines = [
         evaluation("revisit", rows, f"{revisit} {both} --controls copy,nearest,warp,codec"),
         evaluation("disturbed", two, f"{revisit} {disturbed} --metrics {METRICS}"),
-        evaluation("return", rows, f"{back} --protocol return --clips 100 {both} --controls warp"),
+        evaluation("return", rows, f"{back} --protocol return --clips 32 {both} --controls warp"),
         evaluation("long", two, f"{back} --protocol long --clips 16 --memories none,voxel --metrics {METRICS}"),
     ]
     if trained:
