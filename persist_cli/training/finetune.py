@@ -28,7 +28,6 @@ from persist_cli.training.trainer import Stop, Trainer
 from persist_cli.viewing.console import say
 from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError, RecipeError
-from persist_cli.world.files import remove_leftovers
 
 CHANGEABLE = {
     "steps",
@@ -105,9 +104,6 @@ def finetune(recipe: Recipe, run: Path, stop: Stop, cache: CacheSettings | None 
     maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, maker)
     trainer = Trainer(recipe, backbone, maker, accelerator, cache)
-    if accelerator.is_main_process:
-        remove_leftovers(run)
-    accelerator.wait_for_everyone()  # or a process would remove what the main one is about to write
     load_state(run, trainer.state)
     if accelerator.log_with:
         accelerator.init_trackers("persist")

@@ -15,7 +15,7 @@ from persist_cli.training.state import model_folder, save_state
 from persist_cli.training.trainer import Trainer
 from persist_cli.trajectories.scenes import TrainingScenes
 from persist_cli.world.errors import PersistError
-from persist_cli.world.files import write_text
+from persist_cli.world.files import remove_leftovers, write_text
 
 CODEC_BATCHES = 4  # batches that the scale of the codec's latents is measured on
 
@@ -34,6 +34,7 @@ class RunFolder:
         self.saved = trainer.state.step
         self.scenes, self.recipes = TrainingScenes(trainer.scenes), dict[str, str]()
         if trainer.accelerator.is_main_process:
+            remove_leftovers(path)
             if base is not None:
                 self.scenes |= training_scenes(base)
                 self.recipes = stage_recipes(base.base_folder) if trainer.recipe.memory is None else {}
