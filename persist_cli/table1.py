@@ -7,6 +7,7 @@ is neither trained nor predicted again, so this may be stopped and started at an
 
 from __future__ import annotations
 
+import argparse
 import shlex
 import signal
 import subprocess
@@ -21,7 +22,7 @@ MEMORIES = ("none", "voxel", "map2d", "snapshots")
 FORMS = ("cross", "projected")
 SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # chosen in a trial on eight held-out clips
 METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
-REFERENCE = "--reference"
+COLLECT = "collect miniworld --size 64x64"
 WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of all metrics that can be fetched
 
 
@@ -42,21 +43,21 @@ def fetch_command() -> str:
 
 def collect_commands(out: Path) -> list[str]:
     """2,400 training houses of 100 frames, and the held-out ones."""
-    home, collect = shlex.quote(str(out)), "collect miniworld --size 64x64"
+    home = shlex.quote(str(out))
     return [
-        f"{collect} --out {home}/houses/path --scenes 0:1600 --frames 100 --policy path",
-        f"{collect} --out {home}/houses/explore --scenes 1600:2400 --frames 100 --policy explore",
+        f"{COLLECT} --out {home}/houses/path --scenes 0:1600 --frames 100 --policy path",
+        f"{COLLECT} --out {home}/houses/explore --scenes 1600:2400 --frames 100 --policy explore",
         *collect_test_commands(out),
     ]
 
 
 def collect_test_commands(out: Path) -> list[str]:
     """100 held-out houses of 129 frames, on paths of three kinds."""
-    home, collect = shlex.quote(str(out)), "collect miniworld --size 64x64"
+    home = shlex.quote(str(out))
     return [
-        f"{collect} --out {home}/test/path --scenes 0:50 --frames 129 --policy path --split test",
-        f"{collect} --out {home}/test/explore --scenes 50:100 --frames 129 --policy explore --split test",
-        f"{collect} --out {home}/there-and-back --scenes 0:100 --frames 129 --policy there-and-back --split test",
+        f"{COLLECT} --out {home}/test/path --scenes 0:50 --frames 129 --policy path --split test",
+        f"{COLLECT} --out {home}/test/explore --scenes 50:100 --frames 129 --policy explore --split test",
+        f"{COLLECT} --out {home}/there-and-back --scenes 0:100 --frames 129 --policy there-and-back --split test",
     ]
 
 
@@ -84,24 +85,25 @@ def evaluate_commands(out: Path, trained: bool = True) -> list[str]:
         trained: whether the runs there are measured, or the model that comes with the package.
     """
     home = shlex.quote(str(out))
-    rows, two = (" ".join(f"{home}/{memory}" for memory in memories) for memories in (MEMORIES, MEMORIES[:2]))
-    forms = " ".join(f"{home}/voxel{form}" for form in ("", *(f"-{form}" for form in FORMS), "-rgb"))
 
-    def evaluation(name: str, checkpoints: str, given: str) -> str:
-        named = f"{checkpoints} {given}" if trained else given
-        return f"eval {named} {SAMPLING} --out {home}/eval-{name} --report {home}/report-{name}"
+    def evaluation(name: str, memories: Sequence[str], given: str) -> str:
+        runs = [f"{home}/{memory}" for memory in memories] if trained else []
+        return table(name, runs, f"--memories {','.join(memories)} {given}")
 
+    def table(name: str, checkpoints: Sequence[str], given: str) -> str:
+        return f"eval {' '.join(checkpoints)} {given} {SAMPLING} --out {home}/eval-{name} --report {home}/report-{name}"
+
+    pair, back = MEMORIES[:2], f"--data {home}/there-and-back"
     revisit = f"--data {home}/test/path --data {home}/test/explore --protocol revisit --frames 17 --clips 200"
-    both, back = f"--memories {','.join(MEMORIES)}", f"--data {home}/there-and-back"
-    disturbed = "--memories none,voxel --controls shuffled,emptied,oracle,noisy"
     lines = [
-        evaluation("revisit", rows, f"{revisit} {both} --controls copy,nearest,warp,codec"),
-        evaluation("disturbed", two, f"{revisit} {disturbed} --metrics {METRICS}"),
-        evaluation("return", rows, f"{back} --protocol return --clips 32 {both} --controls warp"),
-        evaluation("long", two, f"{back} --protocol long --clips 16 --memories none,voxel --metrics {METRICS}"),
+        evaluation("revisit", MEMORIES, f"{revisit} --controls copy,nearest,warp,codec"),
+        evaluation("disturbed", pair, f"{revisit} --controls shuffled,emptied,oracle,noisy --metrics {METRICS}"),
+        evaluation("return", MEMORIES, f"{back} --protocol return --clips 32 --controls warp"),
+        evaluation("long", pair, f"{back} --protocol long --clips 16 --metrics {METRICS}"),
     ]
     if trained:
-        lines.append(evaluation("forms", forms, f"{revisit} --memories voxel --controls codec --metrics {METRICS}"))
+        forms = [f"{home}/voxel{form}" for form in ("", *(f"-{form}" for form in FORMS), "-rgb")]
+        lines.append(table("forms", forms, f"--memories voxel {revisit} --controls codec --metrics {METRICS}"))
     return lines
 
 
@@ -118,9 +120,11 @@ def run_command(command: Sequence[str]) -> int:
 
 def main() -> None:
     """Run every command until one fails; its exit code is ours."""
-    folders = [word for word in sys.argv[1:] if word != REFERENCE]
-    out = Path(folders[0] if folders else "runs/table1")
-    for line in reference_commands(out) if REFERENCE in sys.argv else commands(out):
+    parser = argparse.ArgumentParser(prog="python -m persist_cli.table1")
+    parser.add_argument("out", nargs="?", type=Path, default=Path("runs/table1"), help="folder of everything")
+    parser.add_argument("--reference", action="store_true", help="measure the model of the package, train none")
+    asked = parser.parse_args()
+    for line in reference_commands(asked.out) if asked.reference else commands(asked.out):
         say(f"\n$ persist {line}")
         code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
         if code == INTERRUPTED:
