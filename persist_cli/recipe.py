@@ -24,6 +24,9 @@ Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Precision = Annotated[  # YAML reads the word no as false
+    Literal["no", "bf16"], BeforeValidator(lambda given: "no" if given is False else given)
+]
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ class TrainingSettings:
     weight_decay: Amount = 1e-4
     clip: PositiveNumber = 1.0
     ema: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
-    precision: Literal["no", "bf16"] = "bf16"
+    precision: Precision = "bf16"
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # what numpy takes
     checkpoint_every: Positive = 500
     checkpoint_minutes: Amount = 5.0

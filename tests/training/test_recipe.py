@@ -29,6 +29,11 @@ def test_overrides_reach_nested_settings():
     assert recipe.backbone.settings["rays"] == "printed"
 
 
+def test_the_word_no_is_a_precision_though_yaml_reads_it_as_false():
+    values = apply_overrides(read_recipe("tiny-codec"), ["training.precision=no"])
+    assert make_recipe(values, "recipe").training.precision == "no"
+
+
 def test_one_data_folder_may_stand_alone():
     for text, folders in (("a", ("a",)), ("[a, b/c]", ("a", "b/c")), ("''", ()), ("[]", ())):
         values = apply_overrides(read_recipe("tiny-stage1"), [f"data.path={text}"])
