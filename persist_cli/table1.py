@@ -91,7 +91,8 @@ def evaluate_commands(out: Path, trained: bool = True) -> list[str]:
         return table(name, runs, f"--memories {','.join(memories)} {given}")
 
     def table(name: str, checkpoints: Sequence[str], given: str) -> str:
-        return f"eval {' '.join(checkpoints)} {given} {SAMPLING} --out {home}/eval-{name} --report {home}/report-{name}"
+        written = f"--out {home}/eval-{name} --report {home}/report-{name}"
+        return " ".join(["eval", *checkpoints, given, SAMPLING, written])
 
     pair, back = MEMORIES[:2], f"--data {home}/there-and-back"
     revisit = f"--data {home}/test/path --data {home}/test/explore --protocol revisit --frames 17 --clips 200"
