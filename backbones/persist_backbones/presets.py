@@ -1,4 +1,4 @@
-"""Configurations of diffusers' CogVideoX classes: a tiny one for laptops, and the published 2b and 5b."""
+"""Configurations of diffusers' CogVideoX classes: a tiny one for laptops, and those of the five published models."""
 
 from __future__ import annotations
 
@@ -38,6 +38,14 @@ SCHEDULER = {
     "set_alpha_to_one": True,
     "timestep_spacing": "trailing",
 }
+VAE_5B = VAE_8X | {"scaling_factor": 0.7}
+VAE_15 = VAE_5B | {"invert_scale_latents": True}
+SCHEDULER_5B = SCHEDULER | {"snr_shift_scale": 1.0}
+SIZE_2B = {"num_attention_heads": 30, "num_layers": 30}
+SIZE_5B = {"num_attention_heads": 48, "num_layers": 42, "use_rotary_positional_embeddings": True}
+TEXT_TO_VIDEO = {"in_channels": 16, "out_channels": 16}
+IMAGE_TO_VIDEO = {"in_channels": 32, "out_channels": 16}
+PATCHES_15 = {"patch_size_t": 2, "patch_bias": False}
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "tiny": {
         "vae": VAE_TINY,
@@ -52,24 +60,24 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
             "max_text_seq_length": 1,
             "spatial_interpolation_scale": 1.0,
         },
-        "scheduler": SCHEDULER | {"snr_shift_scale": 1.0},
+        "scheduler": SCHEDULER_5B,
     },
     "2b": {
         "vae": VAE_8X | {"scaling_factor": 1.15258426},
-        "transformer": {"num_attention_heads": 30, "num_layers": 30, "in_channels": 16, "out_channels": 16},
+        "transformer": SIZE_2B | TEXT_TO_VIDEO,
         "scheduler": SCHEDULER | {"snr_shift_scale": 3.0},
     },
-    "5b": {
-        "vae": VAE_8X | {"scaling_factor": 0.7, "invert_scale_latents": False},
-        "transformer": {
-            "num_attention_heads": 48,
-            "num_layers": 42,
-            "in_channels": 32,
-            "out_channels": 16,
-            "use_rotary_positional_embeddings": True,
-            "use_learned_positional_embeddings": True,
-        },
-        "scheduler": SCHEDULER | {"snr_shift_scale": 1.0},
+    "5b": {"vae": VAE_5B, "transformer": SIZE_5B | TEXT_TO_VIDEO, "scheduler": SCHEDULER_5B},
+    "5b-i2v": {
+        "vae": VAE_5B,
+        "transformer": SIZE_5B | IMAGE_TO_VIDEO | {"use_learned_positional_embeddings": True},
+        "scheduler": SCHEDULER_5B,
+    },
+    "1.5-5b": {"vae": VAE_15, "transformer": SIZE_5B | TEXT_TO_VIDEO | PATCHES_15, "scheduler": SCHEDULER_5B},
+    "1.5-5b-i2v": {
+        "vae": VAE_15,
+        "transformer": SIZE_5B | IMAGE_TO_VIDEO | PATCHES_15 | {"ofs_embed_dim": 512},
+        "scheduler": SCHEDULER_5B,
     },
 }
 
@@ -100,7 +108,7 @@ class CogVideoXSettings:
         vae: changes to the preset's VAE configuration.
     """
 
-    preset: Literal["tiny", "2b", "5b"] = "tiny"
+    preset: Literal["tiny", "2b", "5b", "5b-i2v", "1.5-5b", "1.5-5b-i2v"] = "tiny"
     pretrained: str | None = None
     height: int = 64
     width: int = 64

@@ -101,14 +101,7 @@ def test_sizes_that_cannot_work_are_refused(change, cause):
         make_backbone("cogvideox", {"transformer": {"num_layers": 1}} | change)
 
 
-@pytest.mark.parametrize(
-    ("preset", "base", "new"), [("tiny", 9.88e6, 1.0e5), ("2b", 1.694e9, 7e5), ("5b", 5.570e9, 9e5)]
-)
-def test_the_presets_have_the_published_sizes(preset, base, new):
-    side = 64 if preset == "tiny" else 512
+def test_the_tiny_preset_has_ten_million_parameters():
     with torch.device("meta"):
-        model = make_backbone("cogvideox", {"preset": preset, "height": side, "width": side})
-    count = sum(each.numel() for each in model.transformer.base.parameters())
-    extra = sum(each.numel() for each in model.transformer.parameters()) - count
-    assert count == pytest.approx(base, rel=0.01)
-    assert 0 < extra < 1.1 * new
+        model = make_backbone("cogvideox", {})
+    assert sum(each.numel() for each in model.transformer.base.parameters()) == pytest.approx(9.88e6, rel=0.01)

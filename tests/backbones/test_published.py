@@ -1,0 +1,67 @@
+"""The presets against the five published models: every parameter's name and shape, and how many each stage trains."""
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import pytest
+import torch
+from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
+
+from persist_backbones.cogvideox import CogVideoX
+from persist_cli.registry import make_backbone
+from persist_cli.world.backbone import STAGES
+from tests.backbones.published import SCHEDULERS, TRANSFORMERS, VAES
+
+MODELS = ("2b", "5b", "5b-i2v")
+SIZE = {"height": 480, "width": 720, "frames": 49}
+VAE_PARAMETERS = 215_583_907
+COUNTS = [  # of the published transformer, what widening adds, and the paper's memory block at its defaults
+    ("2b", 1_693_783_872, 750_144, 580_737_920),
+    ("5b", 5_570_283_072, 1_155_648, 1_891_102_592),
+    ("5b-i2v", 5_570_479_680, 959_040, 1_891_102_592),
+]
+SHOWN = {"sample_height", "sample_width", "sample_frames"}  # a preset's are those of the settings
+
+
+def on_meta(preset: str) -> CogVideoX:
+    with torch.device("meta"):
+        model = make_backbone("cogvideox", {"preset": preset} | SIZE)
+    assert isinstance(model, CogVideoX)
+    return model
+
+
+def shapes(module: torch.nn.Module) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in module.state_dict().items()}
+
+
+def written(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration as its file has it, without the sizes of clips."""
+    kept = {key: value for key, value in config.items() if key not in SHOWN and not key.startswith("_")}
+    return json.loads(json.dumps(kept))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_preset_has_the_parameters_and_the_configuration_of_the_published_model(name):
+    model = on_meta(name)
+    with torch.device("meta"):
+        transformer, vae = CogVideoXTransformer3DModel(**TRANSFORMERS[name]), AutoencoderKLCogVideoX(**VAES[name])
+    assert shapes(model.transformer.base) == shapes(transformer)
+    assert shapes(model.codec.vae) == shapes(vae)
+    for ours, published in ((model.transformer.base, transformer), (model.codec.vae, vae)):
+        assert written(ours.config) == written(published.config)
+    assert written(model.scheduler.config) == SCHEDULERS[name]
+
+
+def count(parameters: Iterable[torch.nn.Parameter]) -> int:
+    return sum(each.numel() for each in parameters)
+
+
+@pytest.mark.parametrize(("name", "published", "new", "memory"), COUNTS)
+def test_the_stages_of_a_preset_train_so_many_parameters(name, published, new, memory):
+    model = on_meta(name)
+    with torch.device("meta"):
+        model.add_adapter("voxel", 384, {})
+    assert count(model.transformer.base.parameters()) == published
+    trained = {stage: count(model.trained_parameters(stage).values()) for stage in STAGES}
+    assert trained == {"codec": VAE_PARAMETERS, "1": published + new, "2": memory}
