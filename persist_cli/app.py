@@ -120,11 +120,20 @@ def finetune(
         Path | None, typer.Option(help="Folder for latents and memory tokens; set data.clips_per_trajectory too.")
     ] = None,
     cache_gigabytes: Annotated[float | None, typer.Option(min=0, help="Most that the cache may hold; 20.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count parameters; no data, no weights.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
 
     persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
     """
+    if dry_run:
+        from persist_cli.doctor.dry_run import run_dry_run
+
+        run_dry_run(recipe, overrides or [], json)
+        return
+    if json:
+        raise PersistError("--json prints the table of --dry-run; give both, or read the run folder's log.jsonl")
     from persist_cli.training.cache import CacheSettings
     from persist_cli.training.finetune import FinetunePlan, run_finetune
 

@@ -15,22 +15,15 @@ from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape
 from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
 from persist_backbones.forms import load_adapter, make_adapter, save_adapter
+from persist_backbones.inventory import parts_of
 from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
-from persist_backbones.parts import (
-    DiffusersParts,
-    check_fit,
-    load_parts,
-    load_world,
-    make_parts,
-    save_world,
-    widen,
-)
+from persist_backbones.parts import DiffusersParts, check_fit, load_parts, load_world, save_world, starting_parts, widen
 from persist_backbones.presets import CogVideoXSettings
 from persist_backbones.rotary import rotary_positions
 from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
 from persist_backbones.world_transformer import Conditions
-from persist_cli.world.backbone import Backbone, Clips, Sampling, Stage
+from persist_cli.world.backbone import Backbone, Clips, Part, Sampling, Stage
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.tokens import MemoryTokens
 
@@ -49,7 +42,7 @@ class CogVideoX(Backbone):
         super().__init__(settings)
         self.adapters = nn.ModuleDict()
         self.adapter_name: str | None = None
-        self.set_parts(load_parts(Path(settings.pretrained)) if settings.pretrained else make_parts(settings))
+        self.set_parts(starting_parts(settings))
 
     def set_parts(self, parts: DiffusersParts) -> None:
         """Build the model around diffusers' parts; what is new starts at zero."""
@@ -110,6 +103,10 @@ class CogVideoX(Backbone):
     def token_budget(self) -> int:
         """Tokens that the adapter in use asks for; none without one."""
         return self.adapter.settings.token_budget if self.adapter else 0
+
+    def parts(self) -> list[Part]:
+        """VAE, transformer, what widens it, and memory adapters."""
+        return parts_of(self.named_parameters())
 
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """The VAE's, the transformer's, or the adapter's, everything else frozen."""
@@ -278,7 +275,8 @@ class CogVideoX(Backbone):
     def load_base(self, folder: Path) -> None:
         """Take diffusers' parts and ours from a folder that ``save_base`` wrote."""
         self.set_parts(load_parts(folder))
-        self.prompt = load_world(self.transformer, folder)
+        if not self.prompt.is_meta:
+            self.prompt = load_world(self.transformer, folder)
 
     def save_adapter(self, folder: Path) -> None:
         """Write the adapter in use."""

@@ -37,6 +37,18 @@ class DiffusersParts:
     scheduler: CogVideoXDDIMScheduler
 
 
+def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
+    """The parts that a model of these settings begins with; a plan of weights that are not here is the preset's."""
+    if settings.pretrained is None or (planning() and not Path(settings.pretrained).is_dir()):
+        return make_parts(settings)
+    return load_parts(Path(settings.pretrained))
+
+
+def planning() -> bool:
+    """Whether what is made now is a plan: torch's default device is the meta device, so no weights are read."""
+    return torch.empty(0).is_meta
+
+
 def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
     """Freshly initialised parts of the settings' preset and sizes."""
     preset = PRESETS[settings.preset]
@@ -65,7 +77,7 @@ def initialize(vae: AutoencoderKLCogVideoX) -> None:
 
 
 def load_parts(folder: Path) -> DiffusersParts:
-    """The parts of a diffusers directory with ``transformer/``, ``vae/`` and ``scheduler/``.
+    """The parts of a diffusers directory with ``transformer/``, ``vae/`` and ``scheduler/``; of a plan, their shapes.
 
     Raises:
         CheckpointError: one line when a part is missing, corrupt or does not fit its configuration.
@@ -78,11 +90,21 @@ def _load_part(folder: Path, name: str) -> Any:
         raise CheckpointError(
             f"{folder}: no {name}/ folder; a diffusers CogVideoX directory has {', '.join(SUBFOLDERS)}"
         )
+    if planning():
+        return _make_part(name, _read_config(folder, name))
     options = {} if name == "scheduler" else {"use_safetensors": True, "low_cpu_mem_usage": False}
     try:
         return SUBFOLDERS[name].from_pretrained(folder, subfolder=name, local_files_only=True, **options)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
         raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
+
+
+def _read_config(folder: Path, name: str) -> dict[str, Any]:
+    try:
+        config = SUBFOLDERS[name].load_config(folder, subfolder=name, local_files_only=True)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{folder / name}: its configuration cannot be read ({_cause(error)})") from error
+    return {key: value for key, value in config.items() if not key.startswith("_")}
 
 
 def _make_part(name: str, config: dict[str, Any]) -> Any:

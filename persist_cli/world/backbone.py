@@ -62,8 +62,25 @@ class Sampling:
     memory_guidance: float = 1.0
 
 
+@dataclass(frozen=True)
+class Part:
+    """Some of a backbone's parameters under a name that people know.
+
+    Args:
+        name: of the part.
+        parameters: by their names in the backbone.
+        new: whether they begin fresh even where the rest is pretrained.
+    """
+
+    name: str
+    parameters: Mapping[str, nn.Parameter]
+    new: bool = False
+
+
 class Backbone(nn.Module, ABC):
     """A video diffusion model over RGB-D clips; ``forward`` is the training loss of a stage.
+
+    Made on torch's meta device it is a plan: it has the shapes of its configuration and reads no weights.
 
     Args:
         settings: an instance of ``settings_type``.
@@ -104,6 +121,10 @@ class Backbone(nn.Module, ABC):
     def gives_depth(self) -> bool:
         """Whether clips have depth after their first frame."""
         return True
+
+    def parts(self) -> list[Part]:
+        """Every parameter, each in one part, in the order in which people think of them."""
+        return [Part(self.name, dict(self.named_parameters()))]
 
     @abstractmethod
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
@@ -176,7 +197,7 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def load_base(self, folder: Path) -> None:
-        """Take the weights that ``save_base`` wrote.
+        """Take the weights that ``save_base`` wrote; under torch's meta device only their shapes.
 
         Raises:
             CheckpointError: when a file is missing, corrupt or of another shape.

@@ -30,6 +30,11 @@ class Encoder(ABC):
     def channels(self) -> int:
         """Number of feature channels."""
 
+    @property
+    def planned_channels(self) -> int:
+        """The same for a plan, without the weights where their width is known by their name."""
+        return self.channels
+
     @abstractmethod
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
         """Features on a grid that covers the image evenly, float32."""

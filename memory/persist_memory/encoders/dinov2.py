@@ -21,6 +21,8 @@ from persist_cli.world.weights import cached_weight
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+WIDTHS = {"dinov2-small": 384, "dinov2-base": 768, "dinov2-s-derived": 384}  # of weights known by name
+PUBLISHER = "facebook/"  # of hub ids that these names have there
 _UNUSABLE = (OSError, ValueError, RuntimeError, SafetensorError)
 
 
@@ -64,6 +66,13 @@ class DinoV2(Encoder):
             CheckpointError: when its configuration is not to be had.
         """
         return int(self._config.hidden_size)
+
+    @property
+    def planned_channels(self) -> int:
+        """Width of the model, also of weights known by name that are not fetched yet."""
+        weights = self.settings.weights
+        known = None if Path(weights).is_dir() else WIDTHS.get(weights.removeprefix(PUBLISHER))
+        return self.channels if known is None else known
 
     def to(self, device: torch.device | str) -> DinoV2:
         """The encoder on ``device``."""

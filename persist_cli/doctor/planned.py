@@ -1,0 +1,65 @@
+"""A recipe's backbone as a plan: its shapes on the meta device, without data, download or weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from persist_cli.checkpoints import Checkpoint, find_checkpoint
+from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe
+from persist_cli.registry import make_backbone
+from persist_cli.viewing.console import warn
+from persist_cli.world.backbone import Backbone
+from persist_cli.world.errors import RecipeError
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A recipe and the backbone that it trains.
+
+    Args:
+        recipe: of the run.
+        backbone: on the meta device, with the adapter to train in use in stage 2.
+        channels: of the memory's features; ``None`` without a memory.
+        base: what the run starts from, where that is there.
+    """
+
+    recipe: Recipe
+    backbone: Backbone
+    channels: int | None
+    base: Checkpoint | None
+
+
+def plan_recipe(name: str, overrides: Sequence[str]) -> Planned:
+    """The plan of a recipe with KEY=VALUE changes.
+
+    A base that is not there yet stands for one of the recipe's own backbone settings; a line on standard error says so.
+
+    Raises:
+        PersistError: when the recipe is wrong or its parts do not go together.
+    """
+    recipe = make_recipe(apply_overrides(read_recipe(name), overrides), name)
+    base = find_checkpoint(Path(recipe.base)) if recipe.base and Path(recipe.base).exists() else None
+    if recipe.base and base is None:
+        warn(f"{recipe.base}: no base there yet; planned with the backbone settings of {name} and their defaults")
+    return plan(recipe, base)
+
+
+def plan(recipe: Recipe, base: Checkpoint | None) -> Planned:
+    """The plan of a recipe on its base, where there is one."""
+    if base is not None and base.backbone != recipe.backbone.name:
+        raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {recipe.backbone.name!r}")
+    settings = (base.settings if base else {}) | recipe.backbone.settings
+    channels = None
+    with torch.device("meta"):
+        backbone = make_backbone(recipe.backbone.name, settings)
+        if base is not None:
+            backbone.load_base(base.base_folder)
+        if recipe.memory is not None:
+            channels = MemoryMaker.of(recipe.memory).encoder.planned_channels
+            backbone.add_adapter(recipe.memory.name, channels, recipe.adapter)
+    return Planned(recipe, backbone, channels, base)
