@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from persist_cli import __version__
-from persist_cli.options import Commands, GuidanceOption, JsonOption, SamplerOption, StepsOption
+from persist_cli.options import ActionsOption, Commands, GuidanceOption, JsonOption, SamplerOption, StepsOption
 from persist_cli.sampling import AskedSampling
 from persist_cli.weights.app import weights_app
 from persist_cli.world.errors import PersistError
@@ -206,7 +206,7 @@ def rollout(
     checkpoint: Annotated[
         Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
     ] = None,
-    actions: Annotated[str | None, typer.Option(help='Actions, as in "left*4 forward*6".')] = None,
+    actions: ActionsOption = None,
     follow: Annotated[bool, typer.Option("--follow", help="Take the trajectory's own actions.")] = False,
     frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
     memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
@@ -220,14 +220,16 @@ def rollout(
 ) -> None:
     """Roll out a world model from a start frame along actions, clip by clip.
 
+    Several --actions are branches of one start, imagined together, each with its own memory: OUT/0, OUT/1, …
+
     persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
     """
     from persist_cli.rollout.run import run_rollout
     from persist_cli.rollout.walk import RolloutPlan
 
     plan = RolloutPlan(
-        start=start, actions=actions, follow=follow, frames=frames, memory=memory, adapter=adapter, write=write,
-        seed=seed, sampling=AskedSampling(steps, sampler, guidance),
+        start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
+        write=write, seed=seed, sampling=AskedSampling(steps, sampler, guidance),
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 

@@ -18,6 +18,9 @@ GuidanceOption = Annotated[
     float | None,
     typer.Option("--guidance", min=0, help="Of guidance over memory; the checkpoint's, else 1: none."),
 ]
+ActionsOption = Annotated[
+    list[str] | None, typer.Option("--actions", help='Actions, as in "left*4 forward*6"; given again, another branch.')
+]
 
 
 class Commands(TyperGroup):

@@ -160,7 +160,7 @@ class CogVideoX(Backbone):
         """Clips denoised from each sample's own noise; the first frame is the given one."""
         self.check_sampling(sampling)
         generators = generators_of(first.seeds)
-        image = self.encode_first(first)
+        image = self.encode_first(first).expand(len(generators), -1, -1, -1, -1)
         memory = self.prepare_memory(first)
         conditions = self.conditions(first, torch.zeros(len(first.seeds), dtype=torch.long), memory)
 

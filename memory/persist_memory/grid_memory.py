@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
@@ -18,10 +18,11 @@ from persist_cli.world.errors import CheckpointError
 from persist_cli.world.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
 from persist_cli.world.observations import Observations
 from persist_cli.world.tokens import MemoryTokens
+from persist_memory.askers import distinct_cameras, same_size
 from persist_memory.pixel_runs import Lattice, RunFeatures, Sampling, find_runs, max_pool, sum_pool
 from persist_memory.sparse_grid import LIMIT, Column, SparseGrid, pack, unpack
 from persist_memory.stored import check_mergeable, check_observations, check_tensors
-from persist_memory.views import Views, nearest_in_view
+from persist_memory.views import Views, nearest_in_each
 
 PIXELS_AT_ONCE = 640 * 480
 
@@ -96,14 +97,22 @@ class GridMemory(Memory):
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """At most ``budget`` cells that reach into the view of a camera, those nearest to such a camera first."""
-        cameras = cameras.to(self.grid.device)
-        found = nearest_in_view(self.grid, self.lattice, self.views(cameras), budget)
-        features = self.grid.values("features", found)
-        if self.settings.pooling == "mean":
-            features = features / self.grid.values("counts", found)[:, None]
-        positions = self._centers(self.grid.keys[found])
-        positions[:, 1] = self.heights(positions, cameras)
-        return MemoryTokens.of(features, self._in_world(positions))
+        return self.read_together([cameras], budget)[0]
+
+    def read_together(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
+        """What ``read`` gives each of several askers; the grid is looked through once for all of them."""
+        cameras = [each.to(self.grid.device) for each in cameras]
+        if not same_size(cameras):
+            return super().read_together(cameras, budget)
+        views, groups = distinct_cameras(cameras)
+        found = nearest_in_each(self.grid, self.lattice, self.views(views), groups, budget)
+        return [self._tokens(cells, each) for cells, each in zip(found, cameras, strict=True)]
+
+    def copy(self) -> Self:
+        """Another map of the same cells, shared until one of both is written."""
+        twin = type(self)(self.settings, self.encoder, self.reference)
+        twin._grid = None if self._grid is None else self._grid.copy()
+        return twin
 
     def tensors(self) -> dict[str, Tensor]:
         """Cells, features and colours in the order of the cells' keys."""
@@ -164,6 +173,14 @@ class GridMemory(Memory):
         else:
             values["features"], values["counts"] = sum_pool(runs, upsampled)
         self.grid.absorb(runs.keys, values)
+
+    def _tokens(self, found: Int64[Tensor, " token"], cameras: Cameras) -> MemoryTokens:
+        features = self.grid.values("features", found)
+        if self.settings.pooling == "mean":
+            features = features / self.grid.values("counts", found)[:, None]
+        positions = self._centers(self.grid.keys[found])
+        positions[:, 1] = self.heights(positions, cameras)
+        return MemoryTokens.of(features, self._in_world(positions))
 
     def _cell_extent(self) -> Float[Tensor, " 3"]:
         extent = self.lattice.size.clone()

@@ -6,9 +6,12 @@ axes or origin of the world.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import torch
+from jaxtyping import Bool
 from pydantic import PositiveInt
 from torch import Tensor
 
@@ -18,6 +21,7 @@ from persist_cli.world.errors import CheckpointError
 from persist_cli.world.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
 from persist_cli.world.observations import Observations
 from persist_cli.world.tokens import MemoryTokens
+from persist_memory.askers import distinct_cameras, same_size
 from persist_memory.snapshot_cover import covered_view, greedy_cover, most_redundant, seen_patches
 from persist_memory.snapshot_store import SnapshotStore
 from persist_memory.stored import check_mergeable, check_observations, check_tensors
@@ -83,18 +87,28 @@ class Snapshots(Memory):
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """At most ``budget`` tokens of at most ``count`` snapshots, the one that shows most of the view first."""
+        return self.read_together([cameras], budget)[0]
+
+    def read_together(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
+        """What ``read`` gives each of several askers; what the album shows is found once for all of them."""
         album = self.album
         if not len(album):
-            return MemoryTokens.empty(self.encoder.channels)
-        cameras = cameras.to(album.content.device)
-        poses, intrinsics = cameras.world_from_camera.double(), cameras.intrinsics.double()
-        size = torch.tensor([[cameras.height, cameras.width]], device=poses.device).expand(len(poses), 2)
-        covered = covered_view(album, poses, intrinsics, size)
-        distances = torch.cdist(album.world_from_camera[:, :3, 3], poses[:, :3, 3]).amin(1)
-        chosen = torch.tensor(greedy_cover(covered, distances, self.settings.count), dtype=torch.int64)
-        picked = album[chosen.to(poses.device)]
-        placed = picked.depth > 0
-        return MemoryTokens.of(picked.features[placed][:budget], picked.points[placed][:budget])
+            return [MemoryTokens.empty(self.encoder.channels) for _ in cameras]
+        cameras = [each.to(album.content.device) for each in cameras]
+        if not same_size(cameras):
+            return super().read_together(cameras, budget)
+        views, groups = distinct_cameras(cameras)
+        size = torch.tensor([[views.height, views.width]], device=album.content.device).expand(len(views), 2)
+        covered = covered_view(album, views.world_from_camera.double(), views.intrinsics.double(), size)
+        covered = covered.unflatten(1, (len(views), -1))
+        pairs = zip(groups, cameras, strict=True)
+        return [self._tokens(covered[:, group].flatten(1), each, budget) for group, each in pairs]
+
+    def copy(self) -> Self:
+        """Another album of the same snapshots, shared until one of both is written."""
+        twin = type(self)(self.settings, self.encoder, self.reference)
+        twin._album, twin._seen = self._album, self._seen
+        return twin
 
     def tensors(self) -> dict[str, Tensor]:
         """The album in the order of the images' contents."""
@@ -134,6 +148,15 @@ class Snapshots(Memory):
         """How many snapshots, their bytes, and the bounds of their patches."""
         figures = super().figures()
         return MemoryFigures(len(self.album), figures.bytes, figures.bounds)
+
+    def _tokens(self, covered: Bool[Tensor, "snapshot place"], cameras: Cameras, budget: int) -> MemoryTokens:
+        """Those of the snapshots that cover most of an asker's places."""
+        centers = cameras.centers.double()
+        distances = torch.cdist(self.album.world_from_camera[:, :3, 3], centers).amin(1)
+        chosen = torch.tensor(greedy_cover(covered, distances, self.settings.count), dtype=torch.int64)
+        picked = self.album[chosen.to(centers.device)]
+        placed = picked.depth > 0
+        return MemoryTokens.of(picked.features[placed][:budget], picked.points[placed][:budget])
 
     def _keep(self, snapshots: SnapshotStore) -> None:
         """Take in snapshots one by one, so that it does not matter how frames were grouped."""

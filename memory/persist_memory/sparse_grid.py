@@ -87,6 +87,7 @@ class SparseGrid:
         self._rows: Tensor
         self._buffers: dict[str, Tensor]
         self._blocks: tuple[Tensor, Tensor, Tensor] | None = None
+        self._shared: bool  # with a copy: buffers are written in place, all else is replaced
         self.clear()
 
     def __len__(self) -> int:
@@ -101,6 +102,13 @@ class SparseGrid:
         """Forget all cells."""
         self._start(torch.device("cpu"))
 
+    def copy(self) -> SparseGrid:
+        """A grid of the same cells; both go on with these tensors until they are written."""
+        twin = SparseGrid(self.columns)
+        twin.keys, twin._rows, twin._buffers, twin._blocks = self.keys, self._rows, dict(self._buffers), self._blocks
+        self._shared = twin._shared = True
+        return twin
+
     def absorb(self, keys: Int64[Tensor, " cell"], values: Mapping[str, Tensor]) -> None:
         """Merge the values of cells into the grid.
 
@@ -110,6 +118,9 @@ class SparseGrid:
         """
         if not len(self) and keys.device != self.device:
             self._start(keys.device)
+        if self._shared:
+            self._buffers = {name: buffer[: len(self)].clone() for name, buffer in self._buffers.items()}
+            self._shared = False
         keys, values = keys.to(self.device), {name: value.to(self.device) for name, value in values.items()}
         places = torch.searchsorted(self.keys, keys)
         known = self._holds(keys, places)
@@ -134,7 +145,7 @@ class SparseGrid:
         self.keys = torch.zeros(0, dtype=torch.int64, device=device)
         self._rows = torch.zeros(0, dtype=torch.int64, device=device)
         self._buffers = {name: column.rows(0, device) for name, column in self.columns.items()}
-        self._blocks = None
+        self._blocks, self._shared = None, False
 
     def _holds(self, keys: Tensor, places: Tensor) -> Bool[Tensor, " cell"]:
         if not len(self):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +17,7 @@ from persist_memory.sparse_grid import BLOCK, SparseGrid, unpack
 TOUCHING = 1e-6  # metres that a box must reach into a view: ties must not hang on the last bit
 MICRO = 1e6  # distances are compared in micrometres, for the same reason
 FIRST_LOOK = 1024  # cells examined before more are fetched
+VIEWS_AT_ONCE = 32  # bounds the numbers between
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,17 @@ class Views:
         """Metres from each apex to the nearest point of each box."""
         beyond = (centers[None] - self.apexes[:, None]).abs_().sub_(half).clamp_(min=0.0)
         return beyond.square_().sum(-1).sqrt_()
+
+    def look(
+        self, centers: Float[Tensor, "box 3"], half: Float[Tensor, " 3"], core: Float[Tensor, " 3"]
+    ) -> Float[Tensor, "view box"]:
+        """Metres from each apex to the core of each box that reaches into its view, infinite where it does not."""
+        found = centers.new_empty(len(self.apexes), len(centers))
+        for first in range(0, len(found), VIEWS_AT_ONCE):
+            part = slice(first, first + VIEWS_AT_ONCE)
+            some = Views(self.apexes[part], self.normals[part])
+            found[part] = torch.where(some.reached(centers, half), some.distances(centers, core), torch.inf)
+        return found
 
 
 def frustums(cameras: Cameras, lattice: Lattice) -> Views:
@@ -75,47 +89,60 @@ def horizontal_views(cameras: Cameras, lattice: Lattice) -> Views:
     return Views(_flat(_in_grid(cameras.centers.double(), lattice)), torch.where(narrow, normals, 0.0))
 
 
-def nearest_in_view(grid: SparseGrid, lattice: Lattice, views: Views, budget: int) -> Int64[Tensor, " token"]:
-    """Positions (in the order of keys) of the cells that reach into a view, nearest to such a camera first.
+def nearest_in_each(
+    grid: SparseGrid, lattice: Lattice, views: Views, groups: Sequence[Tensor], budget: int
+) -> list[Int64[Tensor, " token"]]:
+    """For each group of views, positions (in the order of keys) of the cells that reach into one, nearest first.
 
     Whole blocks are examined first, and cells only of the nearest blocks, as many as it takes: the time
-    grows with the budget and with the number of blocks, hardly with the number of cells.
+    grows with the budget and with the number of blocks, hardly with the number of cells. Blocks and cells are
+    examined once for all groups; what a group is given does not depend on the others.
+
+    Args:
+        grid: the cells.
+        lattice: where they lie.
+        views: of all groups, each once.
+        groups: for each its views, by number.
+        budget: most cells that a group is given.
     """
     size = _extent(lattice).to(grid.device)
     blocks, starts, counts = grid.blocks()
-    half = 0.5 * BLOCK * size
-    centers = (blocks * BLOCK + 0.5 * (BLOCK - 1)).double() * size
-    nearest, seen = _nearest(views, centers, half, half)
-    order = nearest[seen].argsort()
-    nearest, starts, counts = (values[seen][order] for values in (nearest, starts, counts))
-    total, wanted = counts.cumsum(0), max(FIRST_LOOK, 2 * budget)
-    while len(total):
-        last = min(int(torch.searchsorted(total, wanted)) + 1, len(total))
-        positions = _ranges(starts[:last], counts[:last])
-        positions, distances = _examine(grid, positions, size, views)
-        closer = distances < nearest[last] - 2 / MICRO if last < len(total) else torch.ones_like(distances).bool()
-        if last == len(total) or int(closer.sum()) >= budget:
-            return positions[:budget]
+    half, point = 0.5 * BLOCK * size, torch.zeros_like(size)
+    whole = views.look((blocks * BLOCK + 0.5 * (BLOCK - 1)).double() * size, half, half)
+    nearest = [whole[group].amin(0) for group in groups]
+    found: dict[int, Tensor] = {}
+    wanted = max(FIRST_LOOK, 2 * budget)
+    while left := [number for number in range(len(groups)) if number not in found]:
+        near = {number: _nearest_blocks(nearest[number], counts, wanted) for number in left}
+        chosen = torch.stack([block for block, _ in near.values()]).any(0)
+        positions = _ranges(starts[chosen], counts[chosen])
+        cells = unpack(grid.keys[positions])
+        distances = views.look(cells.double() * size, 0.5 * size, point)
+        for number, (_, complete) in near.items():
+            order, away = _nearest_cells(distances[groups[number]].amin(0), cells)
+            if complete == math.inf or int((away < complete - 2 / MICRO).sum()) >= budget:
+                found[number] = positions[order[:budget]]
         wanted *= 4
-    return starts[:0]
+    return [found[number] for number in range(len(groups))]
 
 
-def _examine(grid: SparseGrid, positions: Tensor, size: Tensor, views: Views) -> tuple[Tensor, Tensor]:
-    """Those of some cells that are in view, nearest first, and how near they are."""
-    cells = unpack(grid.keys[positions])
-    distances, seen = _nearest(views, cells.double() * size, 0.5 * size, torch.zeros_like(size))
-    positions, distances, cells = positions[seen], distances[seen], cells[seen]
+def _nearest_blocks(nearest: Tensor, counts: Tensor, wanted: int) -> tuple[Bool[Tensor, " block"], float]:
+    """The nearest blocks in view that hold so many cells, and the distance from which on others may come."""
+    order = nearest.argsort()[: int(nearest.isfinite().sum())]
+    last = min(int(torch.searchsorted(counts[order].cumsum(0), wanted)) + 1, len(order))
+    chosen = torch.zeros_like(nearest, dtype=torch.bool)
+    chosen[order[:last]] = True
+    return chosen, float(nearest[order[last]]) if last < len(order) else math.inf
+
+
+def _nearest_cells(distances: Tensor, cells: Tensor) -> tuple[Int64[Tensor, " cell"], Float[Tensor, " cell"]]:
+    """Which cells are in view, nearest first, and how near they are."""
+    seen = distances.isfinite().nonzero()[:, 0]
+    x, y, z = cells[seen].unbind(-1)
     # equally near cells in the order of their coordinates, which no move of the origin by whole cells changes
-    order = torch.argsort((cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2])
+    order = seen[torch.argsort((x << 42) + (y << 21) + z)]
     order = order[torch.argsort((distances[order] * MICRO).round(), stable=True)]
-    return positions[order], distances[order]
-
-
-def _nearest(views: Views, centers: Tensor, half: Tensor, core: Tensor) -> tuple[Tensor, Tensor]:
-    """Least distance from a camera that sees it to the core of each box, and whether any camera sees it."""
-    reached = views.reached(centers, half)
-    distances = torch.where(reached, views.distances(centers, core), torch.inf)
-    return distances.amin(0), reached.any(0)
+    return order, distances[order]
 
 
 def _ranges(starts: Tensor, counts: Tensor) -> Int64[Tensor, " position"]:

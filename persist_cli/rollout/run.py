@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.packaged import reference_checkpoint
 from persist_cli.rollout.outputs import write_outputs
-from persist_cli.rollout.walk import Rollout, RolloutPlan, Walk, plan_walk
-from persist_cli.rollout.world_model import WorldModel
+from persist_cli.rollout.walk import Rollout, RolloutPlan, Walk, plan_walks
+from persist_cli.rollout.world_model import WorldModel, imagine_together
 from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.trajectories.clips import check_size
 from persist_cli.viewing.console import add_task, print_json, progress, say
@@ -25,26 +26,48 @@ from persist_cli.world.observations import Observations, TrajectoryInfo
 
 
 def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> None:
-    """Roll out a checkpoint, or else the reference model, and leave a folder; see ``persist rollout --help``."""
-    if (plan.actions is None) == (not plan.follow):
+    """Roll out a checkpoint, or else the reference model, and leave a folder for each branch; see its help."""
+    if bool(plan.actions) == plan.follow:
         raise PersistError("give either --actions TEXT or --follow")
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = plan.adapter or checkpoint.default_adapter()
-    walk = plan_walk(plan)
+    walks = plan_walks(plan)
+    folders = check_folders(out, len(walks))
+    info = walks[0].info
     backbone = load_backbone(checkpoint)
-    check_size(walk.info, backbone.image_size, plan.start)
+    check_size(info, backbone.image_size, plan.start)
     sampling = sampling_of(checkpoint, plan.sampling)
     backbone.check_sampling(sampling)
     plan = dataclasses.replace(plan, sampling=AskedSampling(**dataclasses.asdict(sampling)))
     load_adapter(backbone, checkpoint, adapter)
     backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    model = WorldModel(backbone, open_memory(checkpoint, adapter, plan, walk.info), sampling, plan.seed, plan.write)
-    rollout = roll(model, walk)
-    figures = write_outputs(rollout, out, describe(checkpoint, adapter, plan, rollout))
+    model = WorldModel(backbone, open_memory(checkpoint, adapter, plan, info), sampling, plan.seed, plan.write)
+    rollouts = roll(model, walks)
+    pairs = list(zip(rollouts, folders, strict=True))
+    figures = [write_outputs(each, folder, describe(checkpoint, adapter, plan, each)) for each, folder in pairs]
     if json:
-        print_json(figures)
-    else:
-        say(f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {walk.actions!r}; written to {out}")
+        print_json(figures if len(figures) > 1 else figures[0])
+        return
+    for rollout, folder in pairs:
+        say(
+            f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {rollout.walk.actions!r}; written to {folder}"
+        )
+
+
+def check_folders(out: Path, branches: int) -> list[Path]:
+    """Where the branches go: ``out`` for one, 0, 1, … in it for several.
+
+    Raises:
+        PersistError: when several find rollouts there that they would not replace.
+    """
+    if branches == 1:
+        return [out]
+    folders = [out / str(number) for number in range(branches)]
+    found = [path.parent for path in (*out.glob("rollout.json"), *out.glob("*/rollout.json"))]
+    left = sorted(each for each in found if each not in folders and (each == out or each.name.isdigit()))
+    if left:
+        raise PersistError(f"{left[0]}: holds a rollout that these {branches} would not replace; take another --out")
+    return folders
 
 
 def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
@@ -70,27 +93,21 @@ def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
             raise CheckpointError(f"{path}: its {key.replace('_', ' ')} is {has[key]!r}, wanted here is {wants[key]!r}")
 
 
-def roll(model: WorldModel, walk: Walk) -> Rollout:
-    """Imagine the walk, clip by clip, with a progress bar."""
-    before, began = copy_of(model.memory), time.monotonic()
-    model.reset(walk.start, walk.info)
-    parts = []
+def roll(model: WorldModel, walks: Sequence[Walk]) -> list[Rollout]:
+    """Imagine walks from one start together, clip by clip, with a progress bar."""
+    before, began = None if model.memory is None else model.memory.copy(), time.monotonic()
+    model.reset(walks[0].start, walks[0].info)
+    models = model.branches(len(walks)) if len(walks) > 1 else [model]
+    cameras, parts = [walk.cameras for walk in walks], []
     with progress() as bar:
-        task = add_task(bar, "rollout", len(walk.cameras), "frame")
-        for part in model.imagine(walk.cameras, walk.interactions):
+        task = add_task(bar, "rollout", sum(len(path) for path in cameras), "frame")
+        for part in imagine_together(models, cameras, [walk.interactions for walk in walks]):
             parts.append(part)
-            bar.advance(task, len(part))
-    seconds, seen = time.monotonic() - began, Observations.concatenate(parts)
-    return Rollout(walk, seen, before, model.memory, seconds, model.backbone.gives_depth)
-
-
-def copy_of(memory: Memory | None) -> Memory | None:
-    """Another memory that holds the same."""
-    if memory is None:
-        return None
-    copy = type(memory)(memory.settings, memory.encoder, memory.reference)
-    copy.restore({name: tensor.clone() for name, tensor in memory.tensors().items()})
-    return copy
+            bar.advance(task, sum(len(seen) for seen in part))
+    seconds, depth = time.monotonic() - began, model.backbone.gives_depth
+    seen = [Observations.concatenate(each) for each in zip(*parts, strict=True)]
+    triples = zip(walks, seen, models, strict=True)
+    return [Rollout(walk, frames, before, each.memory, seconds, depth) for walk, frames, each in triples]
 
 
 def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
@@ -98,6 +115,7 @@ def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rol
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
     options |= {"sampling": plan.sampling.given()}
     memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
+    together = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
     return {
         "checkpoint": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
@@ -105,4 +123,4 @@ def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rol
         "frames": len(rollout.seen),
         "seconds": rollout.seconds,
         "memory": memory,
-    }
+    } | together

@@ -14,7 +14,7 @@ from persist_cli.world.backbone import Interactions
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import DataError
 from persist_cli.world.memory import Memory
-from persist_cli.world.observations import Observations, TrajectoryInfo
+from persist_cli.world.observations import Observations, Trajectory, TrajectoryInfo
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class RolloutPlan:
     """The options of ``persist rollout``; see its help."""
 
     start: str
-    actions: str | None
+    actions: tuple[str, ...]
     follow: bool
     frames: int
     memory: Path | None
@@ -62,7 +62,7 @@ class Rollout:
         seen: the frames imagined.
         before: the memory as it was, ``None`` without one.
         memory: the memory as it is now.
-        seconds: that it took, without loading.
+        seconds: that it took, without loading; all branches together.
         gives_depth: whether the depth of the imagined frames is one.
     """
 
@@ -74,19 +74,24 @@ class Rollout:
     gives_depth: bool
 
 
-def plan_walk(plan: RolloutPlan) -> Walk:
-    """The start frame and the cameras to come, by actions or by the trajectory's own poses."""
+def plan_walks(plan: RolloutPlan) -> list[Walk]:
+    """The start frame and the cameras to come: by each of the texts of actions, or by the trajectory's own poses."""
     reference = parse_reference(plan.start)
     file = reference.single()
-    start = file.read([reference.frame])
     if plan.follow:
-        return follow_trajectory(file, reference.frame, plan.frames)
-    names = file.info.vocabulary.parse(plan.actions or "")
-    camera = start.observations.cameras
-    poses = file.info.vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
+        return [follow_trajectory(file, reference.frame, plan.frames)]
+    start = file.read([reference.frame])
+    return [walk_by(start, text) for text in plan.actions]
+
+
+def walk_by(start: Trajectory, text: str) -> Walk:
+    """The way from a single frame along actions."""
+    vocabulary, camera = start.info.vocabulary, start.observations.cameras
+    names = vocabulary.parse(text)
+    poses = vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
     cameras = Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
-    interactions = interactions_of(names, file.info.vocabulary)
-    return Walk(start.observations, cameras, interactions, format_actions(names), None, file.info)
+    interactions = interactions_of(names, vocabulary)
+    return Walk(start.observations, cameras, interactions, format_actions(names), None, start.info)
 
 
 def follow_trajectory(file: TrajectoryFile, first: int, frames: int) -> Walk:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -51,6 +52,7 @@ class WorldModel:
         seed: of the sampling noise.
         write: whether what is seen and generated goes into the memory.
         disturb: changes frames before they are written, as an evaluation with noisy poses does.
+        shared: whether others read this memory too, so that it is copied before it is written.
     """
 
     backbone: Backbone
@@ -59,6 +61,7 @@ class WorldModel:
     seed: int = 0
     write: bool = True
     disturb: Callable[[Observations], Observations] = unchanged
+    shared: bool = False
 
     def reset(self, observation: Observations, info: TrajectoryInfo) -> None:
         """Begin at one observed frame of the world that ``info`` describes."""
@@ -68,11 +71,25 @@ class WorldModel:
 
     def step(self, actions: Sequence[str]) -> Observations:
         """The frames after each of the actions."""
-        poses = self.vocabulary.follow(self.now.cameras.world_from_camera[0], actions, self.world_up)
-        cameras = Cameras(
-            poses, self.now.cameras.intrinsics.expand(len(poses), 3, 3), self.now.cameras.height, self.now.cameras.width
-        )
-        return Observations.concatenate(list(self.imagine(cameras, interactions_of(actions, self.vocabulary))))
+        interactions = interactions_of(actions, self.vocabulary)
+        return Observations.concatenate(list(self.imagine(self.cameras_after(actions), interactions)))
+
+    def branches(self, count: int) -> list[WorldModel]:
+        """So many world models that go on from here, each on its own, with the same sampling noise.
+
+        Each imagines what this one would. They hold one present frame and one memory until they go on, each of them
+        copying the memory when it first writes; this one is not changed.
+
+        Raises:
+            PersistError: when none are asked for.
+        """
+        if count < 1:
+            raise PersistError(f"{count} branches of a rollout; it must be at least 1")
+        memory = None if self.memory is None else self.memory.copy()
+        made = [copy(self) for _ in range(count)]
+        for branch in made:
+            branch.memory, branch.shared = memory, memory is not None
+        return made
 
     def imagine(self, cameras: Cameras, interactions: Interactions) -> Iterator[Observations]:
         """The frames that the cameras will see, one clip after the other."""
@@ -89,9 +106,7 @@ class WorldModel:
 
     def recall(self, cameras: Cameras, interactions: Interactions) -> Question:
         """What the backbone is asked for the next clip, with what the memory says to its cameras."""
-        path = self.clip_path(cameras)
-        tokens = None if self.memory is None else self.memory.read(path, self.backbone.token_budget)
-        return Question(self.now, path, interactions, tokens, clip_seed(self.seed, self.clips))
+        return recall_together([self], [cameras], [interactions])[0]
 
     def denoise(self, question: Question) -> tuple[torch.Tensor, torch.Tensor]:
         """RGB and depth of the clip asked for, its present frame first."""
@@ -113,8 +128,17 @@ class WorldModel:
 
     def memorize(self, seen: Observations) -> None:
         """Write frames into the memory."""
-        if self.memory is not None and self.write:
-            self.memory.write(self.disturb(seen))
+        if self.memory is None or not self.write:
+            return
+        if self.shared:
+            self.memory, self.shared = self.memory.copy(), False
+        self.memory.write(self.disturb(seen))
+
+    def cameras_after(self, actions: Sequence[str]) -> Cameras:
+        """The cameras after each of the actions."""
+        now = self.now.cameras
+        poses = self.vocabulary.follow(now.world_from_camera[0], actions, self.world_up)
+        return Cameras(poses, now.intrinsics.expand(len(poses), 3, 3), now.height, now.width)
 
     def clip_path(self, cameras: Cameras) -> Cameras:
         """The present camera and the next ones, the last repeated to fill a clip."""
@@ -123,36 +147,79 @@ class WorldModel:
         return Cameras.concatenate(parts)
 
 
+def step_together(models: Sequence[WorldModel], actions: Sequence[Sequence[str]]) -> list[Observations]:
+    """The frames that each of several world models with one backbone sees after its actions; see ``imagine_together``.
+
+    Raises:
+        PersistError: when there is no world model, not a list of actions for each, or no action in one.
+    """
+    if not models or len(models) != len(actions) or not all(actions):
+        raise PersistError(
+            f"{len(models)} branches were given {len(actions)} lists of {[len(each) for each in actions]} actions; "
+            "each needs one of at least one action"
+        )
+    pairs = list(zip(models, actions, strict=True))
+    cameras = [model.cameras_after(each) for model, each in pairs]
+    clips = list(imagine_together(models, cameras, [interactions_of(each, model.vocabulary) for model, each in pairs]))
+    return [Observations.concatenate([clip[number] for clip in clips]) for number in range(len(models))]
+
+
 def imagine_together(
     models: Sequence[WorldModel], cameras: Sequence[Cameras], interactions: Sequence[Interactions]
 ) -> Iterator[list[Observations]]:
     """The next frames of several world models with one backbone, each clip of all of them denoised as one batch.
 
+    As long as they stand at one present frame and read one memory, as ``WorldModel.branches`` do at first, the frame
+    is encoded once and the memory is looked through once. A model that has reached the end of its way gives no more
+    frames, and its clips are no longer imagined.
+
     Args:
         models: with one backbone and one way of sampling.
-        cameras: of the frames to come, as many for each model.
+        cameras: of the frames to come, for each model.
         interactions: one for each of them.
     """
     backbone, sampling = models[0].backbone, models[0].sampling
     length = backbone.frames_per_clip - 1
-    for first in range(0, len(cameras[0]), length):
+    for first in range(0, max(len(path) for path in cameras), length):
         part = slice(first, first + length)
-        questions = [
-            model.recall(path[part], done[part])
-            for model, path, done in zip(models, cameras, interactions, strict=True)
-        ]
+        going = [number for number, path in enumerate(cameras) if len(path) > first]
+        movers, paths = [models[number] for number in going], [cameras[number][part] for number in going]
+        questions = recall_together(movers, paths, [interactions[number][part] for number in going])
         rgb, depth = backbone.generate(batch_of(questions), sampling)
-        answers = zip(models, rgb.cpu(), depth.cpu(), cameras, strict=True)
-        yield [model.observe(colors, metres, path[part]) for model, colors, metres, path in answers]
+        answers = zip(movers, rgb.cpu(), depth.cpu(), paths, strict=True)
+        seen = dict(zip(going, (model.observe(*answer) for model, *answer in answers), strict=True))
+        yield [seen.get(number, model.now[:0]) for number, model in enumerate(models)]
+
+
+def recall_together(
+    models: Sequence[WorldModel], cameras: Sequence[Cameras], interactions: Sequence[Interactions]
+) -> list[Question]:
+    """What the backbone is asked for the next clip of each model; a memory that several read is looked through once."""
+    paths = [model.clip_path(each) for model, each in zip(models, cameras, strict=True)]
+    readers: dict[int, list[int]] = {}
+    for number, model in enumerate(models):
+        readers.setdefault(id(model.memory), []).append(number)
+    tokens: dict[int, MemoryTokens] = {}
+    for numbers in readers.values():
+        memory, budget = models[numbers[0]].memory, models[numbers[0]].backbone.token_budget
+        if memory is not None:
+            told = memory.read_together([paths[number] for number in numbers], budget)
+            tokens |= dict(zip(numbers, told, strict=True))
+    return [
+        Question(model.now, path, done, tokens.get(number), clip_seed(model.seed, model.clips))
+        for number, (model, path, done) in enumerate(zip(models, paths, interactions, strict=True))
+    ]
 
 
 def batch_of(questions: Sequence[Question]) -> Clips:
-    """A batch for the backbone, the given frame of each question first."""
+    """A batch for the backbone, the given frame of each question first, or once for all that share one."""
     tokens = [question.tokens for question in questions if question.tokens is not None]
     first = questions[0].path
+    given = [question.now for question in questions]
+    given = given[:1] if all(now is given[0] for now in given) else given
     return Clips(
-        rgb=torch.stack([question.now.rgb for question in questions]),
-        depth=torch.stack([question.now.depth for question in questions]),
+        rgb=torch.stack([now.rgb for now in given]),
+        depth=torch.stack([now.depth for now in given]),
         cameras=Cameras(
             torch.stack([question.path.world_from_camera for question in questions]),
             torch.stack([question.path.intrinsics for question in questions]),

@@ -158,7 +158,8 @@ class Backbone(nn.Module, ABC):
         """Clips that begin with the given frames.
 
         Args:
-            first: clips whose rgb and depth hold the first frame only, whose cameras hold all frames.
+            first: clips whose rgb and depth hold the first frame only, whose cameras hold all frames. One that all
+                clips begin with may be given once, as a batch of one, and is then encoded once.
             sampling: steps, sampler and guidance.
 
         Returns:

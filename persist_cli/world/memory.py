@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from jaxtyping import Float, UInt8
@@ -91,6 +92,19 @@ class Memory(ABC):
     @abstractmethod
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """At most ``budget`` tokens of what the cameras will look at, the most relevant first."""
+
+    def read_together(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
+        """What ``read`` gives each of several askers, each with the whole budget of its own.
+
+        A memory that can look once for all of them overrides this; every asker gets what it would get alone.
+        """
+        return [self.read(each, budget) for each in cameras]
+
+    def copy(self) -> Self:
+        """Another memory that holds the same; what is written into one of both does not change the other."""
+        twin = type(self)(self.settings, self.encoder, self.reference)
+        twin.restore({name: tensor.clone() for name, tensor in self.tensors().items()})
+        return twin
 
     @abstractmethod
     def tensors(self) -> dict[str, Tensor]:

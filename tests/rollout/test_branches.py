@@ -1,0 +1,165 @@
+import json
+
+import pytest
+import torch
+
+from persist_cli.registry import make_encoder, make_memory
+from persist_cli.rollout.world_model import WorldModel, recall_together, step_together
+from persist_cli.trajectories.clips import interactions_of
+from persist_cli.trajectories.store import Store
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import PersistError
+from persist_cli.world.memory import FrameOfReference
+from persist_memory.views import Views
+from tests.backbones.micro import micro, shaken
+
+WAYS = (["left"] * 8, ["left"] * 4 + ["forward"] * 4, ["right"] * 8)
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    """A micro model with an adapter, none of whose parts says nothing."""
+    backbone = micro()
+    backbone.add_adapter("voxel", make_encoder("patches", {}).channels, {"width": 16, "heads": 2})
+    shaken(backbone)
+    return backbone
+
+
+@pytest.fixture
+def start(backbone, walks):
+    """How to begin at one frame of a walk, with a memory of the frames before it."""
+    whole = Store(walks)[0].read()
+
+    def begin(kind="voxel", **options):
+        memory = make_memory(kind, {}, make_encoder("patches", {}), FrameOfReference("room-0", whole.info.world_up))
+        memory.write(whole.observations[:8])
+        model = WorldModel(backbone, memory, Sampling(2), **options)
+        model.reset(whole.observations[8:9], whole.info)
+        return model
+
+    return begin
+
+
+def alike(one, other):
+    """Whether two videos differ by the rounding of a batch at most."""
+    colors = (one.rgb.int() - other.rgb.int()).abs().amax() <= 1
+    return bool(colors) and torch.allclose(one.depth, other.depth, rtol=1e-3, atol=1e-3)
+
+
+def counted(monkeypatch, owner, name):
+    """How many samples or views each call of a method was given, as it goes on."""
+    calls, method = [], getattr(owner, name)
+
+    def counting(*arguments):
+        calls.append(len(arguments[0].apexes if isinstance(arguments[0], Views) else arguments[0]))
+        return method(*arguments)
+
+    monkeypatch.setattr(owner, name, counting)
+    return calls
+
+
+def test_a_branch_imagines_what_a_rollout_alone_does(start):
+    together = step_together(start(seed=5).branches(3), WAYS)
+    alone = [start(seed=5).step(way) for way in WAYS]
+    assert all(alike(one, other) for one, other in zip(together, alone, strict=True))
+    assert not alike(together[0], together[1])
+
+
+@pytest.mark.parametrize("kind", ["voxel", "map2d", "snapshots"])
+def test_a_branch_is_told_by_the_memory_what_a_rollout_alone_is_told_to_the_bit(start, kind):
+    branches = start(kind).branches(3)
+    cameras = [model.cameras_after(way) for model, way in zip(branches, WAYS, strict=True)]
+    done = [interactions_of(way, branches[0].vocabulary) for way in WAYS]
+    for question, path, interactions in zip(recall_together(branches, cameras, done), cameras, done, strict=True):
+        alone = start(kind).recall(path, interactions)
+        assert torch.equal(question.tokens.features, alone.tokens.features)
+        assert torch.equal(question.tokens.positions, alone.tokens.positions)
+        assert question.seed == alone.seed
+
+
+def test_branches_encode_their_frame_once_and_look_through_the_memory_once(start, backbone, monkeypatch):
+    branches = start().branches(3)
+    encoded = counted(monkeypatch, backbone.codec, "encode")
+    looked = counted(monkeypatch, Views, "look")
+    step_together(branches, WAYS)
+    assert encoded == [1]
+    assert looked == [21, 21]  # blocks, then cells: the first camera and four turns to the left are the same for two
+    step_together(branches, WAYS)
+    assert encoded == [1, 3]  # each stands at a frame of its own by now
+
+
+def test_branches_write_into_memories_of_their_own(start):
+    model = start()
+    before = model.memory.tensors()
+    branches = model.branches(2)
+    step_together(branches, WAYS[:2])
+    held = [branch.memory.tensors() for branch in branches]
+    assert all(torch.equal(model.memory.tensors()[name], value) for name, value in before.items())
+    assert len(held[0]["cells"]) > len(before["cells"])
+    assert held[0]["cells"].shape != held[1]["cells"].shape or not torch.equal(held[0]["features"], held[1]["features"])
+    model.step(["forward"])
+    assert all(torch.equal(branches[0].memory.tensors()[name], value) for name, value in held[0].items())
+
+
+def test_branches_that_may_not_write_keep_one_memory(start):
+    branches = start(write=False).branches(2)
+    step_together(branches, WAYS[:2])
+    assert branches[0].memory is branches[1].memory
+
+
+def test_branches_of_different_lengths_each_go_as_far_as_asked(start):
+    ways = [["left"] * 3, ["right"] * 12]
+    together = step_together(start().branches(2), ways)
+    assert [len(seen) for seen in together] == [3, 12]
+    assert all(alike(seen, start().step(way)) for seen, way in zip(together, ways, strict=True))
+
+
+def test_a_branch_can_branch_again_and_the_first_goes_on_as_if_nothing_was(start):
+    model = start()
+    branch = model.branches(1)[0]
+    branch.step(["left"] * 8)
+    twigs = branch.branches(2)
+    again = step_together(twigs, [["left"] * 8, ["forward"] * 8])[0]
+    expected = start().step(["left"] * 16)
+    assert alike(again, expected[8:])
+    assert alike(model.step(["left"] * 8), expected[:8])
+
+
+def test_what_cannot_branch_is_one_line(start):
+    model = start()
+    with pytest.raises(PersistError, match="0 branches of a rollout; it must be at least 1"):
+        model.branches(0)
+    with pytest.raises(PersistError, match="2 branches were given 1 lists"):
+        step_together(model.branches(2), [["left"]])
+    with pytest.raises(PersistError, match=r"lists of \[1, 0\] actions"):
+        step_together(model.branches(2), [["left"], []])
+
+
+def test_several_actions_leave_a_folder_each_with_what_one_alone_leaves(persist, voxel, walks, tmp_path):
+    def roll(out, *options):
+        ended = persist("rollout", voxel, "--start", f"{walks}#0:2", "--out", out, "--steps", 1, *options, "--json")
+        assert ended.code == 0, ended.err
+        return json.loads(ended.out)
+
+    together = roll(tmp_path / "both", "--actions", "left*9", "--actions", "forward*2")
+    alone = [roll(tmp_path / "a", "--actions", "left*9"), roll(tmp_path / "b", "--actions", "forward*2")]
+    assert [figures["plan"]["actions"] for figures in together] == ["left*9", "forward*2"]
+    assert [figures["frames"] for figures in together] == [9, 2]
+    for number, one in enumerate("ab"):
+        files = {path.name for path in (tmp_path / one).iterdir()}
+        assert files == {path.name for path in (tmp_path / "both" / str(number)).iterdir()}
+        assert together[number]["memory"]["cells"] == alone[number]["memory"]["cells"]
+        assert set(together[number]) == set(alone[number]) | {"together"}
+
+
+def test_rollouts_that_several_would_not_replace_are_not_mixed_with_them(persist, tmp_path, voxel, walks):
+    def roll(*actions):
+        options = [part for text in actions for part in ("--actions", text)]
+        return persist("rollout", voxel, "--start", f"{walks}#0:2", "--out", tmp_path, "--steps", 1, *options)
+
+    (tmp_path / "2").mkdir()
+    (tmp_path / "2/rollout.json").write_text("{}")
+    ended = roll("left", "right")
+    assert (ended.code, "2: holds a rollout that these 2 would not replace" in ended.err) == (1, True)
+    assert not (tmp_path / "0").exists()
+    assert roll("left", "right", "forward").code == 0
