@@ -37,6 +37,7 @@ class CogVideoX(Backbone):
 
     settings_type = CogVideoXSettings
     settings: CogVideoXSettings
+    prompt: Tensor
 
     def __init__(self, settings: CogVideoXSettings) -> None:
         super().__init__(settings)
@@ -52,6 +53,11 @@ class CogVideoX(Backbone):
         self.scheduler = parts.scheduler
         config = parts.transformer.config
         self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the conditions are, wherever weights rest that are not in use."""
+        return self.prompt.device
 
     @property
     def frames_per_clip(self) -> int:

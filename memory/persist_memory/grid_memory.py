@@ -25,6 +25,7 @@ from persist_memory.stored import check_mergeable, check_observations, check_ten
 from persist_memory.views import Views, nearest_in_each
 
 PIXELS_AT_ONCE = 640 * 480
+PIXELS_AWAY = 1 << 24  # on other devices than a processor: some 2 GB between
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +158,8 @@ class GridMemory(Memory):
 
     def _parts(self, observations: Observations) -> Iterator[Observations]:
         pixels = observations.depth[0].numel() if len(observations) else 1
-        step = max(1, PIXELS_AT_ONCE // pixels)
+        at_once = PIXELS_AT_ONCE if observations.depth.device.type == "cpu" else PIXELS_AWAY
+        step = max(1, at_once // pixels)
         for begin in range(0, len(observations), step):
             yield observations[begin : begin + step]
 

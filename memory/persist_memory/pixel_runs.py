@@ -25,7 +25,8 @@ from persist_memory.sparse_grid import LIMIT, pack
 CENTERED = 0.5 + 1e-6
 AXIS_BITS = 21
 NOWHERE = torch.iinfo(torch.int64).min  # the cell of a pixel that falls into none
-CHUNK = 1 << 17  # numbers computed at once: they stay in the cache
+CHUNK = 1 << 17  # numbers computed at once: they stay in a processor's cache
+CHUNK_AWAY = 1 << 27  # on other devices, where a launch costs more than memory
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,8 @@ class RunFeatures:
 
     def chunks(self) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Pieces of the runs with the features of their first and last pixels, ``[run, channel]``."""
-        step = math.ceil(CHUNK / self.channels)
+        numbers = CHUNK if self._table.device.type == "cpu" else CHUNK_AWAY
+        step = math.ceil(numbers / self.channels)
         for begin in range(0, len(self._first), step):
             part = slice(begin, begin + step)
             a, b, c, d = (self._table.index_select(0, corner[part]) for corner in self._corners)

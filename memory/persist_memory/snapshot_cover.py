@@ -65,8 +65,8 @@ def greedy_cover(
     Among equals the nearest comes first. When all places are shown the cover starts anew with the snapshots that
     are left; those that show no place at all are never taken.
     """
-    order = torch.argsort((distances * MICRO).round(), stable=True).tolist()
-    useful = [index for index in order if bool(covered[index].any())]
+    order = torch.argsort((distances * MICRO).round(), stable=True)
+    useful = order[covered.any(1)[order]].tolist()
     missing = torch.ones_like(covered[0]) if len(covered) else covered
     chosen: list[int] = []
     while useful and len(chosen) < count:

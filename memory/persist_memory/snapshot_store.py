@@ -74,7 +74,7 @@ class SnapshotStore:
             cameras.world_from_camera.double(),
             cameras.intrinsics.double(),
             torch.tensor([[cameras.height, cameras.width]], device=device).expand(len(observations), 2),
-            torch.tensor([content_number(observations, frame) for frame in range(len(observations))], device=device),
+            torch.tensor(content_numbers(observations), dtype=torch.int64, device=device),
         )
 
     def joined(self, other: SnapshotStore) -> SnapshotStore:
@@ -115,8 +115,10 @@ def patch_depth(
     return torch.where(torch.isnan(median), 0.0, median)
 
 
-def content_number(observations: Observations, frame: int) -> int:
-    """63 bits that differ between images: an order that knows neither when nor where they were taken."""
-    digest = hashlib.blake2b(observations.rgb[frame].cpu().contiguous().numpy().tobytes(), digest_size=8)
-    digest.update(observations.depth[frame].float().cpu().contiguous().numpy().tobytes())
-    return int.from_bytes(digest.digest(), "little") >> 1
+def content_numbers(observations: Observations) -> list[int]:
+    """63 bits a frame that differ between images: an order that knows neither when nor where they were taken."""
+    rgb, depth = observations.rgb.cpu().contiguous().numpy(), observations.depth.float().cpu().contiguous().numpy()
+    digests = [hashlib.blake2b(image.tobytes(), digest_size=8) for image in rgb]
+    for digest, metres in zip(digests, depth, strict=True):
+        digest.update(metres.tobytes())
+    return [int.from_bytes(digest.digest(), "little") >> 1 for digest in digests]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int64
 from pydantic import PositiveInt
 from torch import Tensor
 
@@ -125,7 +125,7 @@ class Snapshots(Memory):
             where = f"memory {self.name!r}"
             shapes = {name: (tensor.dtype, (None, *tensor.shape[1:])) for name, tensor in album.tensors().items()}
             check_tensors(tensors, shapes, where)
-            check_poses(tensors["world_from_camera"], where)
+            check_poses(tensors["world_from_camera"].cpu(), where)
             for intrinsics in tensors["intrinsics"]:
                 check_intrinsics(intrinsics, where)
             if bool((tensors["size"] < 1).any()):
@@ -159,20 +159,24 @@ class Snapshots(Memory):
         return MemoryTokens.of(picked.features[placed][:budget], picked.points[placed][:budget])
 
     def _keep(self, snapshots: SnapshotStore) -> None:
-        """Take in snapshots one by one, so that it does not matter how frames were grouped."""
-        for frame in range(len(snapshots)):
+        """Take in snapshots: at once while there is room, then one by one; how frames were grouped leaves no trace."""
+        snapshots = snapshots[(snapshots.depth > 0).any(1)]
+        fresh = self._unknown(snapshots).nonzero()[: self.settings.capacity - len(self.album), 0]
+        if len(fresh):
+            self._album, self._seen = self.album.joined(snapshots[fresh]), None
+        if len(self.album) < self.settings.capacity:
+            return
+        for frame in range(int(fresh[-1]) + 1 if len(fresh) else 0, len(snapshots)):
             new = snapshots[torch.tensor([frame], device=snapshots.content.device)]
-            if not bool((new.depth > 0).any()) or self._is_kept(new):
-                continue
-            if len(self.album) >= self.settings.capacity:
+            if bool(self._unknown(new)):
                 self._replace(new)
-            else:
-                self._album, self._seen = self.album.joined(new), None
 
-    def _is_kept(self, new: SnapshotStore) -> bool:
-        same = (self.album.content == new.content.to(self.album.content.device)).nonzero()[:, 0]
-        poses = self.album.world_from_camera[same]
-        return bool((poses == new.world_from_camera.to(poses.device)).all(-1).all(-1).any())
+    def _unknown(self, snapshots: SnapshotStore) -> Bool[Tensor, " snapshot"]:
+        """Which snapshots are neither kept nor stand twice among these, the first of equal ones counting as new."""
+        album, device = self.album, snapshots.content.device
+        kept = _equal(snapshots, album.content.to(device), album.world_from_camera.to(device)).any(1)
+        before = _equal(snapshots, snapshots.content, snapshots.world_from_camera).tril(-1).any(1)
+        return ~(kept | before)
 
     def _replace(self, new: SnapshotStore) -> None:
         """Join a snapshot to a full album and drop the most redundant one."""
@@ -187,3 +191,11 @@ class Snapshots(Memory):
         grown[:, at] = seen_patches(joined, single)[:, 0]
         kept = torch.arange(len(joined), device=seen.device) != most_redundant(grown, joined)
         self._album, self._seen = joined[kept], grown[kept][:, kept]
+
+
+def _equal(
+    snapshots: SnapshotStore, content: Int64[Tensor, " other"], poses: Float[Tensor, "other 4 4"]
+) -> Bool[Tensor, "snapshot other"]:
+    """Which snapshots are the same images, taken from the same place, as others."""
+    same = (snapshots.world_from_camera[:, None] == poses).flatten(2).all(-1)
+    return same & (snapshots.content[:, None] == content)

@@ -41,7 +41,8 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     plan = dataclasses.replace(plan, sampling=AskedSampling(**dataclasses.asdict(sampling)))
     load_adapter(backbone, checkpoint, adapter)
     backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    model = WorldModel(backbone, open_memory(checkpoint, adapter, plan, info), sampling, plan.seed, plan.write)
+    memory = open_memory(checkpoint, adapter, plan, info)
+    model = WorldModel(backbone, memory and memory.to(backbone.device), sampling, plan.seed, plan.write)
     rollouts = roll(model, walks)
     pairs = list(zip(rollouts, folders, strict=True))
     figures = [write_outputs(each, folder, describe(checkpoint, adapter, plan, each)) for each, folder in pairs]

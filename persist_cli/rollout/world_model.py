@@ -127,12 +127,12 @@ class WorldModel:
         return seen
 
     def memorize(self, seen: Observations) -> None:
-        """Write frames into the memory."""
+        """Write frames into the memory, which is made where the backbone computes."""
         if self.memory is None or not self.write:
             return
         if self.shared:
             self.memory, self.shared = self.memory.copy(), False
-        self.memory.write(self.disturb(seen))
+        self.memory.write(self.disturb(seen).to(self.backbone.device))
 
     def cameras_after(self, actions: Sequence[str]) -> Cameras:
         """The cameras after each of the actions."""

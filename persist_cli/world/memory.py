@@ -114,6 +114,12 @@ class Memory(ABC):
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Replace what is stored by what ``tensors()`` gave; an empty dictionary empties the memory."""
 
+    def to(self, device: torch.device | str) -> Self:
+        """This memory, encoding and holding what it holds on ``device``; an empty one goes where it is written from."""
+        self.encoder = self.encoder.to(device)
+        self.restore({name: tensor.to(device) for name, tensor in self.tensors().items()})
+        return self
+
     def merge(self, other: Memory) -> None:
         """Take in another memory of the same kind and frame of reference."""
         raise CheckpointError(f"a memory of kind {self.name!r} cannot be merged")

@@ -1,0 +1,162 @@
+"""What must hold on an accelerator: ``pytest -m gpu``; PERSIST_TEST_DEVICE=cpu runs the same on a CPU."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+import torch
+from accelerate.state import AcceleratorState
+
+from persist_cli.app import main
+from persist_cli.memorizing.memory_file import load_memory
+from persist_cli.registry import make_encoder
+from persist_cli.rollout.world_model import WorldModel, step_together
+from persist_cli.trajectories.store import Store
+from persist_cli.world.backbone import Sampling
+from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
+from tests.memory.views_of_room import empty, same_bits, walked
+from tests.walking import MICRO_SETTINGS, stage, train_here
+
+DEVICE = os.environ.get("PERSIST_TEST_DEVICE", "cuda")
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(DEVICE == "cuda" and not torch.cuda.is_available(), reason="no CUDA device here"),
+]
+MAPS = ("voxel", "map2d", "snapshots")
+NEAR = {"rtol": 2e-3, "atol": 2e-4}  # float32 convolutions and matrix products of a GPU, which may use TF32
+
+
+def everywhere(tensors):
+    """Whether all tensors lie on the device that is tested."""
+    return {tensor.device.type for tensor in tensors} == {DEVICE}
+
+
+def close(one, other):
+    """Whether two tensors are the same but for the rounding of numbers that are no integers."""
+    one, other = one.cpu(), other.cpu()
+    return torch.allclose(one, other, atol=1e-5) if one.is_floating_point() else torch.equal(one, other)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_a_memory_is_built_and_read_where_its_frames_lie_and_is_that_of_the_cpu(name):
+    seen = walked(6)
+    here, there = empty(name), empty(name)
+    here.write(seen)
+    there.write(seen.to(DEVICE))
+    assert everywhere(there.tensors().values())
+    assert all(close(value, there.tensors()[key]) for key, value in here.tensors().items())
+    assert same_bits(there, there.copy())
+    mine, others = here.read(seen.cameras, 64), there.read(seen.cameras.to(DEVICE), 64)
+    assert everywhere([others.features, others.positions, others.mask])
+    assert close(mine.features, others.features)
+    assert close(mine.positions, others.positions)
+
+
+def test_a_map_of_means_is_that_of_the_cpu_but_for_the_order_of_sums():
+    seen = walked(6)
+    here, there = empty("voxel", pooling="mean"), empty("voxel", pooling="mean")
+    here.write(seen)
+    there.write(seen.to(DEVICE))
+    mine, others = here.tensors(), there.tensors()
+    assert torch.equal(mine["counts"], others["counts"].cpu())
+    assert torch.allclose(mine["features"], others["features"].cpu(), rtol=1e-4, atol=1e-3)
+
+
+def test_a_full_album_drops_the_same_snapshots_as_on_the_cpu():
+    seen = walked(12)
+    here, there = empty("snapshots", capacity=5), empty("snapshots", capacity=5)
+    here.write(seen)
+    there.write(seen.to(DEVICE))
+    assert torch.equal(here.tensors()["content"], there.tensors()["content"].cpu())
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_a_memory_file_is_read_where_the_model_computes(name, tmp_path):
+    memory = empty(name)
+    memory.write(walked(3))
+    memory.save(tmp_path / "m.safetensors")
+    loaded = load_memory(tmp_path / "m.safetensors").to(DEVICE)
+    assert everywhere(loaded.tensors().values())
+    assert len(loaded.read(walked(3).cameras, 16)) == 16
+
+
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+def test_losses_and_gradients_of_every_stage_are_those_of_the_cpu(form):
+    losses, gradients = [], []
+    for device in ("cpu", DEVICE):
+        backbone = with_adapter(micro(), form=form)
+        shaken(backbone, 0.02)
+        backbone.to(device)
+        clips = random_clips(2, random_tokens(2, 12))
+        for name in ("codec", "1", "2"):
+            parameters = backbone.trained_parameters(name)
+            loss = backbone(clips, name)["loss"]
+            loss.backward()
+            losses.append(loss.detach().cpu())
+            gradients.append(torch.stack([each.grad.norm().cpu() for each in parameters.values()]))
+    assert torch.allclose(torch.stack(losses[:3]), torch.stack(losses[3:]), **NEAR)
+    pairs = zip(gradients[:3], gradients[3:], strict=True)
+    assert all(torch.allclose(one, other, rtol=2e-2, atol=1e-3) for one, other in pairs)
+
+
+@pytest.fixture
+def world(walks):
+    """A world model with a memory of this kind, at the first frame of a walk."""
+
+    def make(name, device, precision=torch.float32, sampling=Sampling(2)):
+        first = Store(walks)[0].read([0])
+        backbone = micro()
+        backbone.add_adapter(name, make_encoder("patches", {}).channels, {"width": 16, "heads": 2})
+        shaken(backbone, 0.02)
+        memory = empty(name, up=first.info.world_up)
+        model = WorldModel(backbone.to(device, precision), memory, sampling)
+        model.reset(first.observations, first.info)
+        return model
+
+    return make
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_a_rollout_sees_what_it_sees_on_the_cpu_and_maps_it_where_it_computes(name, world):
+    here, there = world(name, "cpu"), world(name, DEVICE)
+    mine, others = here.step(["left"] * 12), there.step(["left"] * 12)
+    assert everywhere(there.memory.tensors().values())
+    assert (mine.rgb.int() - others.rgb.int()).abs().float().mean() < 1
+    assert torch.allclose(mine.depth, others.depth, rtol=0.05, atol=0.05)
+
+
+def test_branches_see_what_rollouts_alone_see(world):
+    ways = [["left"] * 8, ["forward"] * 8]
+    together = step_together(world("voxel", DEVICE).branches(2), ways)
+    for seen, way in zip(together, ways, strict=True):
+        alone = world("voxel", DEVICE).step(way)
+        assert (seen.rgb.int() - alone.rgb.int()).abs().float().mean() < 0.5
+
+
+@pytest.fixture
+def fresh_accelerator():
+    """accelerate keeps one precision a process."""
+    AcceleratorState._reset_state(True)
+    yield
+    AcceleratorState._reset_state(True)
+
+
+@pytest.mark.parametrize("precision", ["no", "bf16"])
+def test_all_stages_train_and_roll_out_by_the_command_line(precision, fresh_accelerator, walks, tmp_path, capsys):
+    changes = ["training.steps=2", f"training.precision={precision}"]
+    train_here(*stage("codec", walks, tmp_path / "codec", *MICRO_SETTINGS, *changes))
+    train_here(*stage("stage1", walks, tmp_path / "stage1", f"base={tmp_path / 'codec'}", *changes))
+    for name in MAPS:
+        run = tmp_path / name
+        train_here(*stage(f"stage2-{name}", walks, run, f"base={tmp_path / 'stage1'}", *changes))
+        losses = [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
+        assert len(losses) > 0
+        assert all(0 < loss < 10 for loss in losses)
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main(["rollout", str(run), "--start", f"{walks}#0:2", "--actions", "left*9", "--steps", "1",
+                  "--out", str(run / "rollout"), "--json"])  # fmt: skip
+        assert not ended.value.code
+        assert json.loads(capsys.readouterr().out)["frames"] == 9
