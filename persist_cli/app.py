@@ -11,6 +11,7 @@ import typer
 from persist_cli import __version__
 from persist_cli.options import ActionsOption, Commands, GuidanceOption, JsonOption, SamplerOption, StepsOption
 from persist_cli.sampling import AskedSampling
+from persist_cli.viewing.app import plugins, recipes
 from persist_cli.weights.app import weights_app
 from persist_cli.world.errors import PersistError
 
@@ -286,19 +287,5 @@ def evaluate(
 
 
 app.add_typer(weights_app, name="weights")
-
-
-@app.command()
-def plugins(json: JsonOption = False) -> None:
-    """List every backbone, memory, encoder, simulator and importer; a broken one shows its cause."""
-    from persist_cli.viewing.plugins import show_plugins
-
-    show_plugins(json)
-
-
-@app.command()
-def recipes(json: JsonOption = False) -> None:
-    """List the recipes that come with persist."""
-    from persist_cli.viewing.recipes import show_recipes
-
-    show_recipes(json)
+app.command()(plugins)
+app.command()(recipes)
