@@ -121,6 +121,7 @@ def finetune(
         Path | None, typer.Option(help="Folder for latents and memory tokens; set data.clips_per_trajectory too.")
     ] = None,
     cache_gigabytes: Annotated[float | None, typer.Option(min=0, help="Most that the cache may hold; 20.")] = None,
+    profile: Annotated[bool, typer.Option("--profile", help="Say where the time of a step goes.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count parameters; no data, no weights.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -141,7 +142,7 @@ def finetune(
     if cache is None and cache_gigabytes is not None:
         raise PersistError("--cache-gigabytes bounds a cache; give --cache DIR too")
     bounded = None if cache is None else CacheSettings(cache, 20 if cache_gigabytes is None else cache_gigabytes)
-    run_finetune(FinetunePlan(recipe, overrides or [], data or [], out, resume, bounded))
+    run_finetune(FinetunePlan(recipe, overrides or [], data or [], out, resume, bounded, profile))
 
 
 @app.command()

@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import yaml
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 
+from persist_cli.training.settings import Count, TrainingSettings
 from persist_cli.world.backbone import Stage
 from persist_cli.world.errors import RecipeError, hint
 from persist_cli.world.settings import parse_settings
@@ -19,14 +20,6 @@ from persist_cli.world.settings import parse_settings
 EXTENDS = "extends"
 MERGED = {"backbone", "data", "training"}
 KINDS = {"memory": "name", "adapter": "form"}  # merged too, unless this is given: settings mean nothing to another kind
-
-Count = Annotated[int, Field(ge=0)]
-Positive = Annotated[int, Field(ge=1)]
-PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Precision = Annotated[  # YAML reads the word no as false
-    Literal["no", "bf16"], BeforeValidator(lambda given: "no" if given is False else given)
-]
 
 
 @dataclass(frozen=True)
@@ -83,47 +76,6 @@ class DataSettings:
     strides: tuple[int, ...] = (1, 2, 3)
     context_frames: Count = 48
     clips_per_trajectory: Count = 0
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How long and how.
-
-    Args:
-        steps: optimizer steps.
-        batch: samples an optimizer step, over all processes and accumulated micro-batches.
-        accumulation: micro-batches that a step is split into.
-        learning_rate: of AdamW, after the warm-up.
-        warmup: steps of linear warm-up.
-        cooldown: steps at the end over which the learning rate falls linearly to zero.
-        weight_decay: of AdamW.
-        clip: largest gradient norm.
-        ema: decay of the averaged weights that are kept; 0 keeps the last ones.
-        precision: ``no`` or ``bf16``.
-        seed: of weights, samples and noise.
-        checkpoint_every: steps between checkpoints.
-        checkpoint_minutes: most minutes between checkpoints.
-        workers: processes that read data.
-        threads: of torch on the CPU; 0 leaves torch's choice.
-        tracker: ``none`` or ``tensorboard``.
-    """
-
-    steps: Positive = 1000
-    batch: Positive = 16
-    accumulation: Positive = 1
-    learning_rate: PositiveNumber = 1e-4
-    warmup: Count = 50
-    cooldown: Count = 0
-    weight_decay: Amount = 1e-4
-    clip: PositiveNumber = 1.0
-    ema: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
-    precision: Precision = "bf16"
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # what numpy takes
-    checkpoint_every: Positive = 500
-    checkpoint_minutes: Amount = 5.0
-    workers: Count = 1
-    threads: Count = 0
-    tracker: Literal["none", "tensorboard"] = "none"
 
 
 @dataclass(frozen=True)
@@ -268,6 +220,8 @@ def _inconsistencies(recipe: Recipe) -> list[str]:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
     if not recipe.data.strides or 0 in recipe.data.strides:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")
+    if training.frozen_precision == "bf16" and training.precision == "no":
+        problems.append("training.frozen_precision bf16 needs training.precision bf16")
     if training.batch % training.accumulation:
         problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
     return problems

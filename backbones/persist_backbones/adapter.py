@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
+from persist_cli.world.backbone import Clips
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.tokens import MemoryTokens
@@ -124,6 +125,13 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> Prepared:
         """Embed the tokens of a batch for the clip that the cameras look at."""
 
+    def dropped(self, memory: Prepared, generators: list[torch.Generator]) -> Prepared:
+        """Hide the memory of some training samples, for guidance over memory."""
+        if self.settings.dropout == 0:
+            return memory
+        draws = torch.cat([torch.rand(1, generator=each) for each in generators])
+        return memory.only((draws >= self.settings.dropout).to(memory.mask.device))
+
     def before_block(
         self, layer: int, video: Float[Tensor, "batch token channel"], memory: Prepared
     ) -> Float[Tensor, "batch token channel"]:
@@ -155,3 +163,24 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
     ) -> Float[Tensor, "batch frame out height width"]:
         """What the adapter makes of the model's prediction; the same by default."""
         return predicted
+
+
+def memory_of(adapter: Adapter[Prepared], name: str, clips: Clips, device: torch.device) -> Prepared:
+    """The clips' memory tokens embedded by an adapter.
+
+    Args:
+        adapter: embeds them.
+        name: what it is called in errors.
+        clips: without tokens, their memory is empty.
+        device: of the model.
+
+    Raises:
+        CheckpointError: when the tokens are of another encoder than the adapter was trained with.
+    """
+    tokens = clips.tokens or MemoryTokens.stack([MemoryTokens.empty(adapter.channels)] * len(clips.seeds))
+    if tokens.features.shape[-1] != adapter.channels:
+        raise CheckpointError(
+            f"the memory gives features of {tokens.features.shape[-1]} channels, {name} was trained with "
+            f"{adapter.channels}; use the encoder it was trained with"
+        )
+    return adapter.prepare(tokens.to(device), clips.cameras.to(device))

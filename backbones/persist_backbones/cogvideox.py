@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape, memory_of
 from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
+from persist_backbones.economy import FrozenWeights, economize
 from persist_backbones.forms import load_adapter, make_adapter, save_adapter
 from persist_backbones.inventory import parts_of
 from persist_backbones.noise import draw_timesteps, generators_of, noise_like
@@ -23,9 +24,8 @@ from persist_backbones.presets import CogVideoXSettings
 from persist_backbones.rotary import rotary_positions
 from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
 from persist_backbones.world_transformer import Conditions
-from persist_cli.world.backbone import Backbone, Clips, Part, Sampling, Stage
+from persist_cli.world.backbone import Backbone, Clips, Economy, Part, Sampling, Stage
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.tokens import MemoryTokens
 
 
 class CogVideoX(Backbone):
@@ -43,6 +43,7 @@ class CogVideoX(Backbone):
         super().__init__(settings)
         self.adapters = nn.ModuleDict()
         self.adapter_name: str | None = None
+        self.frozen = FrozenWeights(self, None)
         self.set_parts(starting_parts(settings))
 
     def set_parts(self, parts: DiffusersParts) -> None:
@@ -124,6 +125,10 @@ class CogVideoX(Backbone):
         module.requires_grad_(True)
         return {name: each for name, each in self.named_parameters() if each.requires_grad}
 
+    def economize(self, stage: Stage, economy: Economy) -> None:
+        """As asked; exact values of frozen weights are kept where the stage saves them."""
+        self.frozen = economize(self, stage, economy)
+
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
         """The codec's loss, or that of denoising RGB and depth latents."""
         generators = generators_of(clips.seeds)
@@ -139,7 +144,9 @@ class CogVideoX(Backbone):
         noise = noise_like(latents, generators)
         target = predicted_target(self.scheduler, latents, noise, timesteps)
         noisy = self.scheduler.add_noise(latents, noise, timesteps)
-        memory = self.drop_memory(self.prepare_memory(clips), generators)
+        memory = self.prepare_memory(clips)
+        if memory is not None and self.adapter is not None:
+            memory = self.adapter.dropped(memory, generators)
         predicted = self.predict(noisy, image, self.conditions(clips, timesteps, memory))
         weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
         return squared_error(predicted, target, weights, self.settings.depth)
@@ -202,23 +209,9 @@ class CogVideoX(Backbone):
         """The batch's tokens embedded by the adapter in use, ``None`` without adapter."""
         if self.adapter is None:
             return None
-        empty = [MemoryTokens.empty(self.adapter.channels)] * len(clips.seeds)
-        tokens = clips.tokens or MemoryTokens.stack(empty)
-        if tokens.features.shape[-1] != self.adapter.channels:
-            raise CheckpointError(
-                f"the memory gives features of {tokens.features.shape[-1]} channels, adapter {self.adapter_name!r} "
-                f"was trained with {self.adapter.channels}; use the encoder it was trained with"
-            )
-        device = self.prompt.device
-        prepared: PreparedMemory = self.adapter.prepare(tokens.to(device), clips.cameras.to(device))
+        name = f"adapter {self.adapter_name!r}"
+        prepared: PreparedMemory = memory_of(self.adapter, name, clips, self.prompt.device)
         return prepared
-
-    def drop_memory(self, memory: PreparedMemory | None, generators: list[torch.Generator]) -> PreparedMemory | None:
-        """Hide the memory of some training samples, for guidance over memory."""
-        if memory is None or self.adapter is None or self.adapter.settings.dropout == 0:
-            return memory
-        draws = torch.cat([torch.rand(1, generator=each) for each in generators])
-        return memory.only((draws >= self.adapter.settings.dropout).to(memory.mask.device))
 
     def conditions(self, clips: Clips, timesteps: Tensor, memory: PreparedMemory | None) -> Conditions:
         """Prompt, interactions, cameras and memory of a batch."""
@@ -273,16 +266,17 @@ class CogVideoX(Backbone):
 
     def save_base(self, folder: Path) -> None:
         """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
-        self.transformer.base.save_pretrained(folder / "transformer")
-        self.codec.vae.save_pretrained(folder / "vae")
-        self.scheduler.save_pretrained(folder / "scheduler")
-        save_world(self.transformer, self.prompt, folder)
+        with self.frozen.restored():
+            self.transformer.base.save_pretrained(folder / "transformer")
+            self.codec.vae.save_pretrained(folder / "vae")
+            self.scheduler.save_pretrained(folder / "scheduler")
+            save_world(self.transformer, self.prompt, folder)
 
     def load_base(self, folder: Path) -> None:
         """Take diffusers' parts and ours from a folder that ``save_base`` wrote."""
         self.set_parts(load_parts(folder))
         if not self.prompt.is_meta:
-            self.prompt = load_world(self.transformer, folder)
+            self.prompt: Tensor = load_world(self.transformer, folder)
 
     def save_adapter(self, folder: Path) -> None:
         """Write the adapter in use."""

@@ -7,6 +7,7 @@ embedding. Sums with exact zeros keep the widened model equal to the original to
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,12 +83,8 @@ class WorldTransformer(nn.Module):
         """Predictions of RGB and depth latents, concatenated on channels."""
         time = self.embed_time(given, latents.dtype)
         text, video = self.embed_patches(latents, given.text.to(latents.dtype))
-        for layer, block in enumerate(self.base.transformer_blocks):
-            if adapter is not None and given.memory is not None:
-                video = adapter.before_block(layer, video, given.memory)
-            video, text = self.run_block(block, video, text, time, given.rotary)
-            if adapter is not None and given.memory is not None:
-                video = adapter.after_block(layer, video, given.memory, given.camera, time)
+        for layer in range(len(self.base.transformer_blocks)):
+            video, text = self.recomputed(self.run_layer, layer, video, text, time, given, adapter)
         video = self.base.norm_out(self.base.norm_final(video), temb=time)
         parts = (self.unpatchify(self.base.proj_out(video), latents), self.unpatchify(self.extra_out(video), latents))
         predicted = torch.cat(parts, dim=2)
@@ -110,15 +107,25 @@ class WorldTransformer(nn.Module):
         video = tokens[:, words:] + tokens_of(extra)
         return tokens[:, :words], self.base.embedding_dropout(video)
 
-    def run_block(
-        self, block: nn.Module, video: Tensor, text: Tensor, time: Tensor, rotary: Any
-    ) -> tuple[Tensor, Tensor]:
-        """One of diffusers' blocks, recomputed in the backward pass when checkpointing is on."""
+    def recomputed(self, function: Callable[..., Any], *given: Any) -> Any:
+        """What the function gives, computed again in the backward pass when checkpointing is on."""
         if torch.is_grad_enabled() and self.base.gradient_checkpointing:
-            return self.base._gradient_checkpointing_func(block, video, text, time, rotary)  # type: ignore[no-any-return]
-        return block(  # type: ignore[no-any-return]
-            hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=rotary
+            return self.base._gradient_checkpointing_func(function, *given)
+        return function(*given)
+
+    def run_layer(
+        self, layer: int, video: Tensor, text: Tensor, time: Tensor, given: Conditions, adapter: Adapter[Any] | None
+    ) -> tuple[Tensor, Tensor]:
+        """One of diffusers' blocks, and what the adapter has before and after it."""
+        memory = None if adapter is None else given.memory
+        if adapter is not None and memory is not None:
+            video = adapter.before_block(layer, video, memory)
+        video, text = self.base.transformer_blocks[layer](
+            hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=given.rotary
         )
+        if adapter is not None and memory is not None:
+            video = adapter.after_block(layer, video, memory, given.camera, time)
+        return video, text
 
     def unpatchify(self, tokens: Tensor, like: Tensor) -> Tensor:
         """Tokens of ``patch × patch × channel`` values back to frames of the latents' size."""

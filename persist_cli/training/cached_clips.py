@@ -21,7 +21,7 @@ from persist_cli.memorizing.sources import Source
 from persist_cli.training.cache import Cache
 from persist_cli.training.keys import CacheKeys
 from persist_cli.trajectories.clips import ClipChoice, ClipDataset, ClipSample
-from persist_cli.world.backbone import Backbone, Clips
+from persist_cli.world.backbone import Backbone
 from persist_cli.world.observations import Observations
 from persist_cli.world.tokens import MemoryTokens
 
@@ -123,15 +123,20 @@ class ClipEncoder:
         self.backbone, self.maker, self.accelerator, self.cache = backbone, maker, accelerator, cache
         self.asked, self.found = 0, 0
 
-    def batch(self, samples: Sequence[CachedSample]) -> Clips:
-        """The clips with latents and tokens, without images."""
+    def all_latents(self, samples: Sequence[CachedSample]) -> Tensor:
+        """Latents of all the clips as a batch."""
         self.asked += len(samples)
         self.found += sum(sample.latents is not None for sample in samples)
-        latents = torch.stack([self.latents(sample) for sample in samples])
-        tokens = None
-        if self.maker is not None:
-            tokens = MemoryTokens.stack([self.tokens(sample, self.maker) for sample in samples])
-        return collate([_without_images(sample.clip) for sample in samples], tokens, latents)
+        return torch.stack([self.latents(sample) for sample in samples])
+
+    def all_tokens(self, samples: Sequence[CachedSample]) -> MemoryTokens | None:
+        """Memory tokens of all the clips as a batch; ``None`` without a memory."""
+        maker = self.maker
+        return None if maker is None else MemoryTokens.stack([self.tokens(sample, maker) for sample in samples])
+
+    def without_images(self, samples: Sequence[CachedSample]) -> list[ClipSample]:
+        """The clips without the images, which latents stand for."""
+        return [_without_images(sample.clip) for sample in samples]
 
     def figures(self) -> dict[str, float]:
         """How many of this process's clips came with latents since the start, as a share."""

@@ -24,6 +24,7 @@ from persist_cli.registry import make_backbone
 from persist_cli.training.cache import CacheSettings
 from persist_cli.training.run_folder import RunFolder
 from persist_cli.training.state import load_state
+from persist_cli.training.step_times import StepTimes
 from persist_cli.training.trainer import Stop, Trainer
 from persist_cli.viewing.console import say
 from persist_cli.world.backbone import Backbone
@@ -38,6 +39,10 @@ CHANGEABLE = {
     "tracker",
     "accumulation",
     "cooldown",
+    "gradient_checkpointing",
+    "compile",
+    "ema_device",
+    "vae_slicing",
 }
 
 
@@ -51,6 +56,7 @@ class FinetunePlan:
     out: Path | None = None
     resume: bool = False
     cache: CacheSettings | None = None
+    profile: bool = False
 
 
 def run_finetune(plan: FinetunePlan) -> None:
@@ -64,7 +70,7 @@ def run_finetune(plan: FinetunePlan) -> None:
     run = plan.out or Path("runs") / Path(plan.recipe).stem
     check_run(run, recipe, plan.resume)
     with Stop() as stop, limited_threads(recipe.training.threads):
-        ended_by = finetune(recipe, run, stop, plan.cache)
+        ended_by = finetune(recipe, run, stop, plan)
     if ended_by is not None:
         sys.exit(INTERRUPTED if ended_by == signal.SIGINT else 0)
 
@@ -93,8 +99,14 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
         raise RecipeError(f"{run}: cannot resume with another recipe; {', '.join(changed)} changed")
 
 
-def finetune(recipe: Recipe, run: Path, stop: Stop, cache: CacheSettings | None = None) -> int | None:
+def finetune(recipe: Recipe, run: Path, stop: Stop, plan: FinetunePlan) -> int | None:
     """Train to the recipe's last step or to a signal, from the run's last checkpoint where there is one.
+
+    Args:
+        recipe: resolved.
+        run: folder of the run.
+        stop: where signals are noted.
+        plan: says whether to cache and to take times.
 
     Returns:
         The signal that ended it before its last step.
@@ -103,7 +115,9 @@ def finetune(recipe: Recipe, run: Path, stop: Stop, cache: CacheSettings | None 
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
     maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, maker)
-    trainer = Trainer(recipe, backbone, maker, accelerator, cache)
+    trainer = Trainer(recipe, backbone, maker, accelerator, plan.cache)
+    if plan.profile:
+        trainer.times = StepTimes(accelerator.device, recipe.training.batch)
     load_state(run, trainer.state)
     if accelerator.log_with:
         accelerator.init_trackers("persist")
@@ -113,6 +127,8 @@ def finetune(recipe: Recipe, run: Path, stop: Stop, cache: CacheSettings | None 
     accelerator.end_training()
     ended_by = ended_by if trainer.state.step < recipe.training.steps else None
     if accelerator.is_main_process:
+        if trainer.times is not None:
+            trainer.times.report(run / "profile.json")
         report(recipe, run, trainer.state.step, folder.speed.rate())
     return ended_by
 

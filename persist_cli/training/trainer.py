@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import math
 import signal
 import time
@@ -12,16 +14,18 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
-from diffusers.training_utils import EMAModel
 from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.memorizing.recall import MemoryMaker, collate, recall_all
-from persist_cli.recipe import Recipe, TrainingSettings
+from persist_cli.recipe import Recipe
 from persist_cli.training.cache import Cache, CacheSettings
 from persist_cli.training.cached_clips import CachedClips, ClipCache, ClipEncoder
+from persist_cli.training.economy import economy_of, make_average, make_optimizer, update_average
 from persist_cli.training.keys import CacheKeys
 from persist_cli.training.log import StepLog
+from persist_cli.training.settings import TrainingSettings
 from persist_cli.training.state import TrainingState
+from persist_cli.training.step_times import StepTimes, timed
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan, SharedBatches
 from persist_cli.trajectories.reference import data_folder
 from persist_cli.viewing.console import add_task, progress
@@ -73,21 +77,18 @@ class Trainer:
     ) -> None:
         self.recipe, self.backbone, self.accelerator = recipe, backbone, accelerator
         self.maker = maker
+        self.times: StepTimes | None = None
+        parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
+        backbone.economize(recipe.stage, economy_of(settings, accelerator.device))
         clips = self.all_clips()
         self.scenes = frozenset(file.info.scene for file in clips.files)
         self.clips: Dataset[Any] = clips
         self.encoder = self.clip_encoder(cache)
         if self.encoder is not None:
             self.clips = CachedClips(clips, self.encoder.cache)
-        parameters = backbone.trained_parameters(recipe.stage)
-        settings = recipe.training
-        optimizer = torch.optim.AdamW(
-            parameters.values(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-        )
-        average = EMAModel(parameters.values(), decay=settings.ema, use_ema_warmup=True) if settings.ema else None
+        optimizer = make_optimizer(parameters.values(), settings)
+        average = make_average(parameters.values(), settings, accelerator.device) if settings.ema else None
         self.model, self.optimizer = accelerator.prepare(backbone, optimizer)
-        if average is not None:
-            average.to(accelerator.device)
         self.state = TrainingState(parameters, optimizer, average)
 
     def all_clips(self) -> ClipDataset:
@@ -138,16 +139,27 @@ class Trainer:
             collate_fn=list,
             generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
         )
-        for samples in loader:
+        found = iter(loader)
+        while True:
+            with timed(self.times, "data"):
+                samples = next(found, None)
+            if samples is None:
+                return
             yield self.to_batch(samples)
 
     def to_batch(self, samples: list[Any]) -> Clips:
         """Samples of ``clips`` as a batch with memory tokens, on the training device."""
         device = self.accelerator.device
         if self.encoder is not None:
-            clips = self.encoder.batch(samples)
+            with timed(self.times, "encode"):
+                latents = self.encoder.all_latents(samples)
+            with timed(self.times, "memory"):
+                tokens = self.encoder.all_tokens(samples)
+            clips = collate(self.encoder.without_images(samples), tokens, latents)
         else:
-            clips = collate(samples, recall_all(samples, self.maker, self.backbone.token_budget))
+            with timed(self.times, "memory"):
+                tokens = recall_all(samples, self.maker, self.backbone.token_budget)
+            clips = collate(samples, tokens)
         return Clips(
             rgb=clips.rgb.to(device),
             depth=clips.depth.to(device),
@@ -158,29 +170,45 @@ class Trainer:
             latents=None if clips.latents is None else clips.latents.to(device),
         )
 
+    def encoded(self, clips: Clips) -> Clips:
+        """The clips with their latents, which the model would make by itself, so that they are timed apart."""
+        if self.times is None or clips.latents is not None or self.recipe.stage == "codec":
+            return clips
+        with self.times.part("encode"), torch.no_grad(), self.accelerator.autocast():
+            return dataclasses.replace(clips, latents=self.backbone.encode(clips))
+
     def steps(self) -> Iterator[dict[str, float]]:
         """Train; after each optimizer step its logged values."""
         settings = self.recipe.training
         batches = self.loader()
         while self.state.step < settings.steps:
-            for group in self.optimizer.param_groups:
-                group["lr"] = learning_rate(settings, self.state.step)
-            values = self.accumulate(batches)
-            self.accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
-            self.optimizer.step()
-            self.optimizer.zero_grad(set_to_none=True)
-            if self.state.average is not None:
-                self.state.average.step(self.state.parameters.values())
+            with contextlib.nullcontext() if self.times is None else self.times.step():
+                for group in self.optimizer.param_groups:
+                    group["lr"] = learning_rate(settings, self.state.step)
+                values = self.accumulate(batches)
+                with timed(self.times, "optimizer"):
+                    self.optimize()
             self.state.step += 1
             yield values
+
+    def optimize(self) -> None:
+        """Change the parameters by their gradients, and their average by them."""
+        self.accelerator.clip_grad_norm_(self.state.parameters.values(), self.recipe.training.clip)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        if self.state.average is not None:
+            update_average(self.state.average, self.state.parameters.values())
 
     def accumulate(self, batches: Iterator[Clips]) -> dict[str, float]:
         """Gradients of one optimizer step; the mean of its logged values over micro-batches and processes."""
         parts = self.recipe.training.accumulation
         totals: dict[str, torch.Tensor] = {}
         for _ in range(parts):
-            losses = self.model(next(batches), self.recipe.stage)
-            self.accelerator.backward(losses["loss"] / parts)
+            clips = self.encoded(next(batches))
+            with timed(self.times, "forward"):
+                losses = self.model(clips, self.recipe.stage)
+            with timed(self.times, "backward"):
+                self.accelerator.backward(losses["loss"] / parts)
             for name, value in losses.items():
                 totals[name] = totals.get(name, torch.zeros_like(value)) + value.detach() / parts
         values = {name: float(self.accelerator.reduce(value, "mean")) for name, value in totals.items()}

@@ -78,6 +78,23 @@ class Part:
     new: bool = False
 
 
+@dataclass(frozen=True)
+class Economy:
+    """What makes a training step cheaper and changes nothing but rounding.
+
+    Args:
+        gradient_checkpointing: compute hidden states between blocks again in the backward pass.
+        compile: the blocks, by ``torch.compile``.
+        frozen: precision of the weights that the stage does not train; ``None`` leaves them theirs.
+        vae_slicing: encode clips one by one.
+    """
+
+    gradient_checkpointing: bool = False
+    compile: bool = False
+    frozen: torch.dtype | None = None
+    vae_slicing: bool = False
+
+
 class Backbone(nn.Module, ABC):
     """A video diffusion model over RGB-D clips; ``forward`` is the training loss of a stage.
 
@@ -135,6 +152,15 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Freeze all that the stage does not train and return the rest by name."""
+
+    def economize(self, stage: Stage, economy: Economy) -> None:
+        """Make the steps of a stage cheaper, once ``trained_parameters`` has frozen what it does not train.
+
+        Raises:
+            PersistError: when this backbone cannot.
+        """
+        if economy != Economy():
+            raise PersistError(f"backbone {self.name!r} has no cheaper steps; leave out what training.* asks of it")
 
     @abstractmethod
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:

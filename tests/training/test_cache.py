@@ -74,7 +74,7 @@ def test_a_long_trajectory_is_encoded_in_pieces_and_gives_the_same_latents(walks
     for pixels in (1 << 22, 7 * SIZE * SIZE):
         monkeypatch.setattr(sources, "PIXELS_AT_ONCE", pixels)
         cache = ClipCache(Cache(CacheSettings(tmp_path / str(pixels), 1)), CacheKeys({}, None, backbone.frames_alone))
-        ClipEncoder(backbone, None, Accelerator(cpu=True), cache).batch([CachedClips(clips, cache)[0]])
+        ClipEncoder(backbone, None, Accelerator(cpu=True), cache).all_latents([CachedClips(clips, cache)[0]])
         made.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["latents"])
     assert len(made[0]) == 24
     assert torch.equal(*made)

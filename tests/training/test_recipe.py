@@ -1,6 +1,7 @@
 import pytest
 
-from persist_cli.recipe import TrainingSettings, apply_overrides, make_recipe, read_recipe, recipe_names, to_yaml
+from persist_cli.recipe import apply_overrides, make_recipe, read_recipe, recipe_names, to_yaml
+from persist_cli.training.settings import TrainingSettings
 from persist_cli.training.trainer import learning_rate
 from persist_cli.world.errors import RecipeError
 

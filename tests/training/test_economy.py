@@ -1,0 +1,157 @@
+"""Settings that make a step cheaper: what they leave as it was, and what they cannot do."""
+
+import importlib.util
+import json
+import shutil
+
+import pytest
+import torch
+from accelerate.state import AcceleratorState
+from diffusers.training_utils import EMAModel
+from torch.autograd.graph import saved_tensors_hooks
+
+from persist_cli.training.economy import update_average
+from persist_cli.world.backbone import Economy
+from persist_cli.world.files import read_tensors
+from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
+from tests.walking import end_of, ended_alike, stage, train_here
+
+BASE = {"stage1": "codec", "stage2-voxel": "stage1"}
+
+
+def losses(run):
+    return [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+def saved(run, part):
+    return read_tensors(next(run.glob(f"step-*/model/{part}/*.safetensors")))[0]
+
+
+@pytest.fixture
+def usual(persist, walks, codec, stage1, tmp_path, request):
+    """A run without any of these settings, and the arguments of another that differs by them."""
+    number = request.param
+    base = f"base={ {'codec': codec, 'stage1': stage1}[BASE[number]] }"
+    assert persist(*stage(number, walks, tmp_path / "usual", base)).code == 0
+    return tmp_path / "usual", lambda *changes: stage(number, walks, tmp_path / "cheap", base, *changes)
+
+
+@pytest.mark.parametrize("usual", list(BASE), indirect=True)
+def test_checkpointed_steps_and_an_average_on_the_cpu_are_the_usual_ones_to_the_bit(persist, usual, tmp_path):
+    run, cheap = usual
+    assert persist(*cheap("training.gradient_checkpointing=true", "training.ema_device=cpu")).code == 0
+    assert ended_alike(run, tmp_path / "cheap")
+
+
+@pytest.mark.parametrize("usual", ["stage1"], indirect=True)
+def test_clips_encoded_one_by_one_train_the_same(persist, usual, tmp_path):
+    run, cheap = usual
+    assert persist(*cheap("training.vae_slicing=true")).code == 0
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=1e-4)
+
+
+@pytest.mark.parametrize("stage_", ["1", "2"])
+def test_checkpointing_keeps_little_of_the_forward_pass_memory_blocks_included(stage_):
+    held = {}
+    for checkpointing in (False, True):
+        backbone = with_adapter(micro()).train()
+        backbone.use_adapter("voxel" if stage_ == "2" else None)
+        backbone.trained_parameters(stage_)
+        backbone.economize(stage_, Economy(gradient_checkpointing=checkpointing))
+        sizes = []
+        with saved_tensors_hooks(lambda tensor, sizes=sizes: sizes.append(tensor.nbytes) or tensor, lambda each: each):
+            backbone(random_clips(tokens=random_tokens(2, 5)), stage_)
+        held[checkpointing] = sum(sizes)
+    assert held[True] < held[False] / 3
+
+
+@pytest.fixture
+def any_precision():
+    """Accelerate fixes the precision of its first accelerator for the process."""
+    AcceleratorState._reset_state(reset_partial_state=True)
+    yield
+    AcceleratorState._reset_state(reset_partial_state=True)
+
+
+@pytest.mark.usefixtures("any_precision")
+@pytest.mark.parametrize("number", BASE)
+def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, tmp_path, number):
+    base = [f"base={codec if number == 'stage1' else codec.parent / 'stage1'}", "training.precision=bf16"]
+    train_here(*stage(number, walks, tmp_path / "usual", *base))
+    train_here(*stage(number, walks, tmp_path / "cheap", *base, "training.frozen_precision=bf16"))
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(tmp_path / "usual"), rel=0.05)
+    assert all(weight.dtype != torch.bfloat16 for weight in end_of(tmp_path / "cheap")[0].values())
+    if list((tmp_path / "cheap").glob("step-*/model/vae")):
+        exact = saved(codec, "vae").items()
+        assert all(torch.equal(weight, saved(tmp_path / "cheap", "vae")[name]) for name, weight in exact)
+        assert all(weight.dtype == torch.float32 for weight in saved(tmp_path / "cheap", "transformer").values())
+
+
+def test_half_the_bytes_of_what_a_stage_does_not_train():
+    backbone = with_adapter(micro())
+    trained = backbone.trained_parameters("2")
+    backbone.economize("2", Economy(frozen=torch.bfloat16))
+    assert {each.dtype for each in trained.values()} == {torch.float32}
+    assert {each.dtype for each in backbone.parameters() if not each.requires_grad} == {torch.bfloat16}
+
+
+def test_an_average_moves_towards_copies_of_the_parameters_too():
+    trained = [torch.nn.Parameter(torch.ones(3))]
+    here, there = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
+    trained[0].data += 1
+    for _ in range(3):
+        here.step(trained)
+        update_average(there, trained)
+    assert torch.equal(here.shadow_params[0], there.shadow_params[0])
+
+
+@pytest.mark.gpu
+def test_an_average_on_the_cpu_follows_parameters_on_the_gpu():
+    trained = [torch.nn.Parameter(torch.ones(3, device="cuda"))]
+    here, there = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
+    there.to("cpu")
+    trained[0].data += 1
+    for average in (here, there):
+        update_average(average, trained)
+        update_average(average, trained)
+    assert torch.equal(here.shadow_params[0].cpu(), there.shadow_params[0])
+
+
+@pytest.mark.parametrize("usual", ["stage1"], indirect=True)
+def test_a_run_goes_on_with_other_settings_of_what_a_step_costs(persist, usual, tmp_path):
+    run, cheap = usual
+    assert persist(*cheap("training.steps=2")).code == 0
+    ended = persist(*cheap("--resume", "training.gradient_checkpointing=true", "training.ema_device=cpu"))
+    assert ended.code == 0, ended.err
+    assert ended_alike(run, tmp_path / "cheap")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("g++"), reason="no compiler")
+@pytest.mark.parametrize("usual", ["stage2-voxel"], indirect=True)
+def test_compiled_blocks_train_alike_and_keep_the_names_of_their_weights(persist, usual, tmp_path):
+    run, cheap = usual
+    ended = persist(*cheap("training.compile=true"))
+    assert ended.code == 0, ended.err
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=1e-3)
+    assert end_of(run)[0].keys() == end_of(tmp_path / "cheap")[0].keys()
+
+
+def test_what_cannot_be_made_cheaper_is_one_line(persist, walks, codec, tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    cases = [("training.compile=true", "training.compile needs a C++ compiler on a CPU (no-such-compiler)")]
+    cases += [("training.frozen_precision=bf16", "needs training.precision bf16")]
+    if importlib.util.find_spec("bitsandbytes") is None:
+        cases += [("training.optimizer=adamw-8bit", "needs the package bitsandbytes: pip install bitsandbytes")]
+    for change, cause in cases:
+        ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", change))
+        assert (ended.code, cause in ended.err, len(ended.err.strip().splitlines())) == (1, True, 1)
+
+
+def test_a_backbone_that_has_no_cheaper_steps_says_so():
+    from persist_cli.world.backbone import Backbone
+    from persist_cli.world.errors import PersistError
+
+    Backbone.economize(micro(), "1", Economy())
+    with pytest.raises(PersistError, match="backbone 'cogvideox' has no cheaper steps"):
+        Backbone.economize(micro(), "1", Economy(compile=True))
