@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Any
 from persist_cli.recipe import MemoryChoice
 from persist_cli.sampling import read_sampling
 from persist_cli.trajectories.scenes import TrainingScenes
+from persist_cli.world.checkpoint_folder import CARD as CARD  # the tool has these from here
+from persist_cli.world.checkpoint_folder import PLAIN as PLAIN
+from persist_cli.world.checkpoint_folder import STEP as STEP
+from persist_cli.world.checkpoint_folder import VERSION, adapter_folder, default_adapter, open_checkpoint
+from persist_cli.world.checkpoint_folder import step_folders as step_folders
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import file_sha256, read_json, write_json
 from persist_cli.world.settings import parse_settings
 
 if TYPE_CHECKING:
     from persist_cli.world.backbone import Backbone, Sampling
-
-CARD = "persist.json"
-VERSION = 1
-STEP = "step-"  # what the folders of a run's checkpoints begin with
-PLAIN = "stage1"  # what evaluations call the base without any adapter
 
 
 @dataclass(frozen=True)
@@ -64,23 +64,11 @@ class Checkpoint:
 
     def adapter_folder(self, adapter: str) -> Path:
         """The adapter's folder; a one-line error that names the others when there is none."""
-        if adapter not in self.adapters:
-            known = ", ".join(self.adapters) or "none"
-            raise CheckpointError(f"{self.folder}: no memory adapter {adapter!r} in it; it has {known}")
-        return self.adapters[adapter]
+        return adapter_folder(self.folder, self.adapters, adapter)
 
     def default_adapter(self) -> str | None:
         """The card's default or the only adapter, or none when there is none; an error when one must be chosen."""
-        if self.default in self.adapters:
-            return self.default
-        if len(self.adapters) > 1:
-            raise CheckpointError(f"{self.folder}: choose an adapter of {', '.join(self.adapters)} with --adapter")
-        return next(iter(self.adapters), None)
-
-
-def step_folders(run: Path) -> list[Path]:
-    """Whole checkpoints of a run, the newest last."""
-    return sorted(folder for folder in run.glob(f"{STEP}*") if folder.is_dir())
+        return default_adapter(self.folder, self.adapters, self.default)
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
@@ -89,26 +77,18 @@ def find_checkpoint(path: Path) -> Checkpoint:
     Raises:
         CheckpointError: when there is none, it is damaged, or its base is gone or another.
     """
-    folder = _model_folder(path)
-    own = card = _read_card(folder)
-    base_folder, fingerprint = folder, str(card.get("fingerprint", ""))
-    if card.get("base"):
-        base_folder = _model_folder((folder / card["base"]).resolve())
-        base_card = _read_card(base_folder)
-        if base_card["fingerprint"] != fingerprint:
-            raise CheckpointError(f"{folder}: was trained on another base than the one now at {base_folder}")
-        card = base_card
+    found = open_checkpoint(path)
     return Checkpoint(
-        folder=folder,
-        name=_home(folder).name,
-        base_folder=base_folder,
-        backbone=card["backbone"],
-        settings=card["settings"],
-        fingerprint=fingerprint,
-        adapters={each.name: each for each in sorted((folder / "adapters").glob("*")) if each.is_dir()},
-        default=card.get("default_adapter"),
-        sampling=read_sampling(own, folder / CARD),
-        training_scenes=_training_scenes(own, folder / CARD),
+        folder=found.folder,
+        name=_home(found.folder).name,
+        base_folder=found.base,
+        backbone=found.base_card["backbone"],
+        settings=found.base_card["settings"],
+        fingerprint=str(found.card.get("fingerprint", "")),
+        adapters=found.adapters,
+        default=found.base_card.get("default_adapter"),
+        sampling=read_sampling(dict(found.card), found.folder / CARD),
+        training_scenes=_training_scenes(dict(found.card), found.folder / CARD),
     )
 
 
@@ -191,30 +171,9 @@ def fingerprint(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _model_folder(path: Path) -> Path:
-    if (path / CARD).is_file():
-        return path
-    steps = step_folders(path)
-    if not steps:
-        raise CheckpointError(f"{path}: no checkpoint there (neither persist.json nor a finetune run's step-* folder)")
-    return steps[-1] / "model"
-
-
 def _home(folder: Path) -> Path:
     """The run whose checkpoint a folder is, else the folder itself."""
     return folder.parent.parent if folder.parent.name.startswith(STEP) else folder
-
-
-def _read_card(folder: Path) -> dict[str, Any]:
-    path = folder / CARD
-    card = read_json(path)
-    if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
-        raise CheckpointError(f"{path}: not the card of a persist checkpoint")
-    if card.get("version") != VERSION:
-        raise CheckpointError(f"{path}: checkpoint version {card.get('version')}, this persist reads {VERSION}")
-    if not card.get("fingerprint") or not (card.get("base") or {"backbone", "settings"} <= set(card)):
-        raise CheckpointError(f"{path}: the card is incomplete")
-    return card
 
 
 def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:

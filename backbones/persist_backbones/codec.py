@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
 from persist_backbones.framewise import batch_to_frames, code_frames_alone, frames_to_batch
+from persist_backbones.offloading import computing_device
 from persist_cli.world.errors import CheckpointError
 
 
@@ -101,6 +102,11 @@ class Codec(nn.Module):
         """Whether the latents of a frame depend on that frame only."""
         return self.temporal == 1
 
+    @property
+    def device(self) -> torch.device:
+        """Where it computes, wherever its weights rest."""
+        return computing_device(self.vae)
+
     def fingerprint(self) -> str:
         """SHA-256 of the VAE's weights and configuration: what ``encode`` depends on besides the clips.
 
@@ -121,7 +127,7 @@ class Codec(nn.Module):
         self, rgb: UInt8[Tensor, "batch frame height width 3"], depth: Float[Tensor, "batch frame height width"]
     ) -> Float[Tensor, "stacked 3 frame height width"]:
         """RGB clips, then depth clips, on the batch axis, in [-1, 1], on the codec's device."""
-        rgb, depth = rgb.to(self.vae.device), depth.to(self.vae.device)
+        rgb, depth = rgb.to(self.device), depth.to(self.device)
         color = rgb.permute(0, 4, 1, 2, 3).float() / 127.5 - 1
         filled = fill_missing(depth.float().flatten(0, 1)).unflatten(0, depth.shape[:2])
         grey = encode_depth(filled)[:, None].expand(-1, 3, -1, -1, -1)
@@ -137,15 +143,21 @@ class Codec(nn.Module):
         self, latents: Float[Tensor, "batch frame channel height width"], depth: bool = True
     ) -> tuple[UInt8[Tensor, "batch frame height width 3"], Float[Tensor, "batch frame height width"]]:
         """RGB and depth in metres of latents that ``encode`` gave; without ``depth`` none (0), and none is decoded."""
+        color, metres = self.decode_images(latents, depth)
+        return ((color.permute(0, 2, 3, 4, 1) + 1) * 127.5).round().clamp(0, 255).to(torch.uint8), metres
+
+    def decode_images(
+        self, latents: Float[Tensor, "batch frame channel height width"], depth: bool = True
+    ) -> tuple[Float[Tensor, "batch 3 frame height width"], Float[Tensor, "batch frame height width"]]:
+        """Colours, [-1, 1] and beyond, and depth in metres, as ``decode``."""
         parts = latents.chunk(2, dim=2)[: 2 if depth else 1]
         stacked = torch.cat(parts).transpose(1, 2) / self.vae.config.scaling_factor
         color, *grey = self.images_of(stacked).float().chunk(len(parts))
-        rgb = ((color.permute(0, 2, 3, 4, 1) + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
-        return rgb, decode_depth(grey[0].mean(dim=1)) if depth else color.new_zeros(rgb.shape[:-1])
+        return color, decode_depth(grey[0].mean(dim=1)) if depth else torch.zeros_like(color[:, 0])
 
     def posterior(self, images: Float[Tensor, "stacked 3 frame height width"]) -> DiagonalGaussianDistribution:
         """Distribution of the unscaled latents ``[stacked, channel, latent_frame, rows, columns]``."""
-        folded = fold_pixels(images, pixel_patch(self.vae))
+        folded = fold_pixels(images, pixel_patch(self.vae)).to(self.vae.dtype)
         if not self.frames_alone:
             return self.vae.encode(folded).latent_dist
         found = self.vae.encode(frames_to_batch(folded)).latent_dist
@@ -155,6 +167,7 @@ class Codec(nn.Module):
         self, latents: Float[Tensor, "stacked channel latent_frame rows columns"]
     ) -> Float[Tensor, "stacked 3 frame height width"]:
         """The images of unscaled latents."""
+        latents = latents.to(self.vae.dtype)
         if self.frames_alone:
             folded = batch_to_frames(self.vae.decode(frames_to_batch(latents)).sample, latents.shape[2])
         else:

@@ -16,6 +16,7 @@ from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
 from persist_backbones.economy import FrozenWeights, economize
 from persist_backbones.forms import load_adapter, make_adapter, save_adapter
+from persist_backbones.guidance import make_denoiser
 from persist_backbones.inventory import parts_of
 from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
@@ -174,17 +175,7 @@ class CogVideoX(Backbone):
         self.check_sampling(sampling)
         generators = generators_of(first.seeds)
         image = self.encode_first(first).expand(len(generators), -1, -1, -1, -1)
-        memory = self.prepare_memory(first)
-        conditions = self.conditions(first, torch.zeros(len(first.seeds), dtype=torch.long), memory)
-
-        def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
-            given = dataclasses.replace(conditions, timestep=timesteps)
-            predicted = self.predict(latents, image, given)
-            if sampling.memory_guidance == 1.0 or memory is None:
-                return predicted
-            blind = self.predict(latents, image, dataclasses.replace(given, memory=memory.emptied()))
-            return blind + sampling.memory_guidance * (predicted - blind)
-
+        predict = make_denoiser(self, first, image, lambda: sampling.memory_guidance)
         noise = noise_like(image, generators)
         latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
         rgb, depth = self.codec.decode(latents, self.settings.depth)
@@ -197,8 +188,8 @@ class CogVideoX(Backbone):
         return self.codec.decode(self.codec.encode(clips.rgb, clips.depth), self.settings.depth)
 
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
-        """The image condition of the clips' first frames."""
-        return self.image_condition(self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1]))
+        """The image condition of the clips' first frames, float32 whatever precision the model computes in."""
+        return self.image_condition(self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1]).float())
 
     def image_condition(self, first: Float[Tensor, "batch 1 channel height width"]) -> Tensor:
         """Latents of the first frame alone, followed by zeros, scaled like all latents."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,10 +23,25 @@ SAMPLERS = COGVIDEOX | MULTISTEP
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 
 
-def denoise(
+@dataclass
+class Step:
+    """One denoising step that was made.
+
+    Args:
+        number: from 0.
+        timestep: it began at.
+        latents: after it, of the last step the clean prediction; what they are set to, the next step begins with.
+    """
+
+    number: int
+    timestep: Tensor
+    latents: Tensor
+
+
+def denoising(
     predict: Denoiser, latents: Tensor, config: Any, sampler: str, steps: int, generators: list[torch.Generator]
-) -> Tensor:
-    """Latents after ``steps`` denoising steps from noise: the last clean prediction.
+) -> Iterator[Step]:
+    """Denoise step by step from noise.
 
     Args:
         predict: of (latents, timesteps) what the configuration's ``prediction_type`` says.
@@ -40,7 +56,7 @@ def denoise(
     """
     schedule = make_schedule(config, sampler, steps)
     before: tuple[Tensor | None, Tensor | None] = (None, None)  # the last clean prediction and its time step
-    for timestep in schedule.timesteps:
+    for number, timestep in enumerate(schedule.timesteps):
         predicted = predict(latents, timestep.expand(len(latents)).to(latents.device))
         if sampler == "dpm":
             latents, *clean = schedule.step(
@@ -49,7 +65,19 @@ def denoise(
             before = (clean[0], timestep)
         else:
             latents, *clean = schedule.step(predicted, timestep, latents, return_dict=False)
-    return clean[0] if clean else latents  # CogVideoX's leave noise when steps do not divide the training's levels
+        if number == len(schedule.timesteps) - 1 and clean:
+            latents = clean[0]  # CogVideoX's leave noise when steps do not divide the training's levels
+        step = Step(number, timestep, latents)
+        yield step
+        latents = step.latents
+
+
+def denoise(
+    predict: Denoiser, latents: Tensor, config: Any, sampler: str, steps: int, generators: list[torch.Generator]
+) -> Tensor:
+    """Latents after all steps of ``denoising``: the last clean prediction."""
+    *_, last = denoising(predict, latents, config, sampler, steps, generators)
+    return last.latents
 
 
 def make_schedule(config: Any, sampler: str, steps: int) -> Any:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from persist_backbones.adapter import Adapter, PreparedMemory
 from persist_backbones.conditioning import tokens_of
+from persist_backbones.offloading import bring
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ class WorldTransformer(nn.Module):
         adapter: Adapter[Any] | None,
     ) -> Float[Tensor, "batch frame out height width"]:
         """Predictions of RGB and depth latents, concatenated on channels."""
+        bring(self.base)
         time = self.embed_time(given, latents.dtype)
         text, video = self.embed_patches(latents, given.text.to(latents.dtype))
         for layer in range(len(self.base.transformer_blocks)):

@@ -1,0 +1,281 @@
+"""The pipeline of diffusers' kind: the same clips as the backbone's, whatever diffusers' users do to a pipeline."""
+
+from pathlib import Path
+
+import accelerate
+import numpy as np
+import pytest
+import torch
+from diffusers import (
+    AutoencoderKLCogVideoX,
+    CogVideoXDDIMScheduler,
+    CogVideoXDPMScheduler,
+    CogVideoXImageToVideoPipeline,
+    CogVideoXTransformer3DModel,
+    EulerDiscreteScheduler,
+)
+from PIL import Image
+
+import persist_backbones
+from persist_backbones.cogvideox import CogVideoX
+from persist_backbones.pipeline import WorldPipeline, WorldPipelineOutput
+from persist_backbones.tiling import enable_tiling
+from persist_cli.checkpoints import find_checkpoint, save_adapter, save_base
+from persist_cli.recipe import MemoryChoice
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import PersistError
+from persist_cli.world.tokens import MemoryTokens
+from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
+
+CLIPS = random_clips(2, random_tokens(2, 5))
+FORMS = pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+FRAMEWISE = {"vae": {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4,
+                     "temporal_compression_ratio": 1}}  # fmt: skip
+
+
+def trained(form: str = "cross", **settings: object) -> CogVideoX:
+    """A micro model with an adapter, both as training would leave them."""
+    backbone = with_adapter(micro(**settings), form=form, **({"head_width": 8} if form == "canvas" else {}))
+    shaken(backbone)
+    return backbone
+
+
+def call(pipeline: WorldPipeline, **changes: object) -> WorldPipelineOutput:
+    """The clips of ``CLIPS`` in three steps with guidance."""
+    pipeline.set_progress_bar_config(disable=True)
+    seeds = [torch.Generator().manual_seed(seed) for seed in CLIPS.seeds]
+    given = {"num_inference_steps": 3, "guidance_scale": 1.5, "generator": seeds, "output_type": "pt"}
+    given |= {"memory_tokens": CLIPS.tokens} | changes
+    return pipeline(CLIPS.rgb[:, 0], CLIPS.depth[:, 0], CLIPS.cameras, **given)
+
+
+def same(one: WorldPipelineOutput, two: WorldPipelineOutput) -> bool:
+    """Whether two answers are equal to the bit."""
+    return torch.equal(one.frames, two.frames) and torch.equal(one.depth, two.depth)
+
+
+@FORMS
+def test_a_pipeline_gives_the_clips_of_its_backbone(form):
+    backbone = trained(form)
+    rgb, depth = backbone.generate(CLIPS, Sampling(3, "ddim", 1.5))
+    found = call(WorldPipeline.of(backbone))
+    assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    assert torch.equal(found.depth, depth)
+
+
+@FORMS
+def test_a_saved_pipeline_is_the_same_to_the_bit_and_has_nothing_to_unpickle(form, tmp_path):
+    pipeline = WorldPipeline.of(trained(form))
+    pipeline.save_pretrained(tmp_path)
+    assert same(call(WorldPipeline.from_pretrained(tmp_path)), call(pipeline))
+    assert {path.suffix for path in tmp_path.rglob("*") if path.is_file()} == {".json", ".safetensors"}
+    with pytest.raises(PersistError, match="weights are saved as safetensors only"):
+        pipeline.save_pretrained(tmp_path, safe_serialization=False)
+
+
+def test_a_pipeline_without_an_adapter_is_stage_1_and_saves_without_one(tmp_path):
+    backbone = micro()
+    shaken(backbone)
+    WorldPipeline.of(backbone).save_pretrained(tmp_path)
+    loaded = WorldPipeline.from_pretrained(tmp_path)
+    assert loaded.adapter is None
+    rgb, _ = backbone.generate(CLIPS, Sampling(3))
+    assert torch.equal((call(loaded).frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+
+
+@FORMS
+def test_in_bfloat16_a_clip_comes_out_near_that_of_float32(form):
+    exact = call(WorldPipeline.of(trained(form)))
+    coarse = call(WorldPipeline.of(trained(form)).to(torch.bfloat16))
+    assert coarse.frames.dtype == torch.float32
+    assert 0 < (coarse.frames - exact.frames).abs().mean() < 0.05
+
+
+@pytest.mark.parametrize("settings", [{}, FRAMEWISE], ids=["4 frames a latent", "framewise"])
+@FORMS
+def test_weights_that_rest_elsewhere_change_nothing(form, settings):
+    exact = call(WorldPipeline.of(trained(form, **settings)))
+    whole, layers = (WorldPipeline.of(trained(form, **settings)) for _ in range(2))
+    whole.enable_model_cpu_offload(device="cpu")  # hooks and all; only the other device is missing here
+    assert same(call(whole), exact)
+    assert same(call(whole), exact)
+    for part in layers.components.values():
+        if isinstance(part, torch.nn.Module):
+            accelerate.cpu_offload(part, "cpu")  # what enable_sequential_cpu_offload does, which numbers the device
+    assert same(call(layers), exact)
+    assert layers.transformer.device.type == layers.vae.device.type == layers.adapter.device.type == "meta"
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+@pytest.mark.parametrize("offload", ["enable_model_cpu_offload", "enable_sequential_cpu_offload"])
+@FORMS
+def test_offloaded_weights_sample_on_the_gpu(form, offload):
+    exact = call(WorldPipeline.of(trained(form)).to("cuda"))
+    pipeline = WorldPipeline.of(trained(form))
+    getattr(pipeline, offload)()
+    found = call(pipeline)
+    assert found.frames.device.type == "cuda"
+    assert torch.allclose(found.frames, exact.frames, atol=1e-3)
+    assert torch.cuda.memory_allocated() < sum(each.nbytes for each in pipeline.transformer.parameters())
+
+
+def test_slicing_and_tiling_of_the_codec_change_next_to_nothing():
+    exact, sliced, tiled = (WorldPipeline.of(trained()) for _ in range(3))
+    sliced.vae.enable_slicing()
+    enable_tiling(tiled.vae, 32, 32)
+    assert torch.allclose(call(sliced).frames, call(exact).frames, atol=1e-4)
+    difference = (call(tiled).frames - call(exact).frames).abs()
+    assert 0 < difference.mean() < 0.1
+
+
+def tokens_of(sample: int) -> MemoryTokens:
+    """Those of one sample of ``CLIPS``."""
+    return MemoryTokens(*(getattr(CLIPS.tokens, name)[sample] for name in ("features", "positions", "mask")))
+
+
+def test_a_sample_does_not_depend_on_its_batch():
+    pipeline = WorldPipeline.of(trained())
+    whole = call(pipeline)
+    alone = pipeline(
+        CLIPS.rgb[1, 0], CLIPS.depth[1, 0], CLIPS.cameras[1], memory_tokens=tokens_of(1),
+        num_inference_steps=3, guidance_scale=1.5, generator=torch.Generator().manual_seed(1), output_type="pt",
+    )  # fmt: skip
+    assert torch.allclose(alone.frames[0], whole.frames[1], atol=1e-4)
+
+
+def test_samples_may_come_as_lists():
+    pipeline = WorldPipeline.of(trained())
+    whole = call(pipeline)
+    listed = pipeline(
+        list(CLIPS.rgb[:, 0]), list(CLIPS.depth[:, 0]), [CLIPS.cameras[0], CLIPS.cameras[1]],
+        memory_tokens=[tokens_of(0), tokens_of(1)], num_inference_steps=3, guidance_scale=1.5,
+        generator=[torch.Generator().manual_seed(seed) for seed in CLIPS.seeds], output_type="pt",
+    )  # fmt: skip
+    assert same(listed, whole)
+
+
+def test_a_callback_sees_every_step_and_what_it_changes_counts():
+    pipeline, seen = WorldPipeline.of(trained()), []
+
+    def watch(pipe, number, timestep, tensors):
+        seen.append((number, int(timestep), pipe.num_timesteps, float(tensors["latents"].std()) > 0))
+        return {"latents": torch.zeros_like(tensors["latents"])} if number == 2 else tensors
+
+    assert not call(pipeline, callback_on_step_end=watch, output_type="latent").frames.any()
+    assert seen == [(0, 999, 3, True), (1, 666, 3, True), (2, 332, 3, True)]
+    assert pipeline.current_timestep is None
+
+
+def test_an_interrupted_call_makes_no_further_step_and_the_next_makes_all():
+    pipeline, steps = WorldPipeline.of(trained()), []
+
+    def stop(pipe, number, timestep, tensors):
+        steps.append(number)
+        pipe._interrupt = True
+        return tensors
+
+    assert torch.isfinite(call(pipeline, callback_on_step_end=stop).frames).all()
+    assert steps == [0]
+    assert same(call(pipeline), call(WorldPipeline.of(trained())))
+
+
+def test_another_scheduler_is_another_sampler():
+    backbone = trained()
+    pipeline = WorldPipeline.of(backbone)
+    pipeline.scheduler = CogVideoXDPMScheduler.from_config(pipeline.scheduler.config)
+    found, (rgb, _) = call(pipeline), backbone.generate(CLIPS, Sampling(3, "dpm", 1.5))
+    assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    pipeline.scheduler = EulerDiscreteScheduler()
+    with pytest.raises(PersistError, match="unknown scheduler EulerDiscreteScheduler; known: CogVideoXDDIM"):
+        call(pipeline)
+
+
+def test_pictures_arrays_and_noise_of_ones_own_are_taken_and_given():
+    pipeline = WorldPipeline.of(trained())
+    pipeline.set_progress_bar_config(disable=True)
+    picture, way = Image.fromarray(CLIPS.rgb[0, 0].numpy()), CLIPS.cameras[0]
+    noise = torch.randn(1, 3, 8, 8, 8)
+    one = pipeline(picture, None, way, num_inference_steps=1, latents=noise)
+    two = pipeline(CLIPS.rgb[:1, 0].movedim(-1, 1) / 255, None, way, num_inference_steps=1, latents=noise,
+                   output_type="np", return_dict=False)  # fmt: skip
+    assert (one.frames[0][0].size, len(one.frames[0])) == ((32, 32), 9)
+    pixels = np.array(one.frames[0][5])
+    assert np.abs(two[0][0, 5] * 255 - pixels).max() <= 0.51
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"output_type": "gif"}, "^unknown output_type 'gif'; known: pil, np, pt, latent$"),
+        ({"num_inference_steps": 0}, "^0 denoising steps; it must be at least 1$"),
+        ({"guidance_scale": -1.0}, "^guidance over memory of -1.0"),
+        ({"generator": [torch.Generator()]}, "^1 generators for 2 images; give one, or one for each$"),
+        ({"memory_tokens": random_tokens(1, 5)}, "^memory_tokens of 1 samples, but 2 images$"),
+        ({"callback_on_step_end_tensor_inputs": ["prompt"]}, "tensor_inputs has prompt; known: latents$"),
+    ],
+)
+def test_what_cannot_be_sampled_is_one_line(changes, cause):
+    with pytest.raises(PersistError, match=cause):
+        call(WorldPipeline.of(trained()), **changes)
+
+
+def test_images_depth_and_cameras_of_other_sizes_are_one_line():
+    pipeline, rgb, depth = WorldPipeline.of(trained()), CLIPS.rgb[:, 0], CLIPS.depth[:, 0]
+    with pytest.raises(PersistError, match=r"^an image of 16x32 pixels; this model takes 32x32"):
+        pipeline(rgb[:, :16], depth, CLIPS.cameras)
+    with pytest.raises(PersistError, match=r"depth of 16x32 and cameras of 32x32; they must be one size$"):
+        pipeline(rgb, depth[:, :16], CLIPS.cameras)
+    with pytest.raises(PersistError, match=r"^cameras of 5 frames; a clip of this model has 9$"):
+        pipeline(rgb, depth, CLIPS.cameras[(slice(None), slice(5))])
+    with pytest.raises(PersistError, match=r"^an image of shape \[2, 32, 32, 1\]"):
+        pipeline(rgb[..., :1], depth, CLIPS.cameras)
+
+
+@pytest.fixture
+def checkpoints(tmp_path: Path) -> tuple[CogVideoX, Path, Path]:
+    """A backbone, its base's folder, and that of an adapter on it."""
+    backbone, base, stage2 = trained(), tmp_path / "base", tmp_path / "voxel"
+    base.mkdir()
+    stage2.mkdir()
+    save_base(backbone, base)
+    save_adapter(backbone, find_checkpoint(base), MemoryChoice("voxel"), stage2, stage2)
+    return backbone, base, stage2
+
+
+def test_a_checkpoint_is_a_pipeline_by_one_line(checkpoints):
+    backbone, base, stage2 = checkpoints
+    assert same(call(persist_backbones.load(stage2)), call(WorldPipeline.of(backbone)))
+    backbone.use_adapter(None)
+    plain = call(WorldPipeline.of(backbone))
+    assert same(call(persist_backbones.load(base)), plain)
+    assert same(call(persist_backbones.load(stage2, adapter="stage1")), plain)
+    assert persist_backbones.load(str(stage2), dtype="bfloat16").transformer.dtype == torch.bfloat16
+
+
+def test_a_checkpoint_that_cannot_be_loaded_is_one_line(checkpoints, tmp_path):
+    _, base, stage2 = checkpoints
+    with pytest.raises(PersistError, match=r"no memory adapter 'map2d' in it; it has voxel$"):
+        persist_backbones.load(stage2, adapter="map2d")
+    with pytest.raises(PersistError, match="unknown dtype 'bf16'; did you mean 'bfloat16'"):
+        persist_backbones.load(stage2, dtype="bf16")
+    with pytest.raises(PersistError, match="no checkpoint there"):
+        persist_backbones.load(tmp_path / "nowhere")
+    (base / "persist.json").write_text((base / "persist.json").read_text().replace('"cogvideox"', '"dreamer"'))
+    with pytest.raises(PersistError, match=r"a checkpoint of backbone 'dreamer', not of 'cogvideox'$"):
+        persist_backbones.load(base)
+
+
+def test_diffusers_own_pipeline_runs_the_parts_that_we_save(checkpoints):
+    _, base, _ = checkpoints
+    pipeline = CogVideoXImageToVideoPipeline(
+        tokenizer=None, text_encoder=None,
+        vae=AutoencoderKLCogVideoX.from_pretrained(base / "vae"),
+        transformer=CogVideoXTransformer3DModel.from_pretrained(base / "transformer"),
+        scheduler=CogVideoXDDIMScheduler.from_pretrained(base / "scheduler"),
+    )  # fmt: skip
+    pipeline.set_progress_bar_config(disable=True)
+    found = pipeline(Image.fromarray(CLIPS.rgb[0, 0].numpy()), prompt_embeds=torch.zeros(1, 1, 8), num_frames=9,
+                     height=32, width=32, num_inference_steps=2, guidance_scale=1.0, output_type="pt")  # fmt: skip
+    assert found.frames.shape == (1, 9, 3, 32, 32)
+    assert torch.isfinite(found.frames).all()
