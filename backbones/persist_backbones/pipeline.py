@@ -208,7 +208,7 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
         if name is None:
             known = ", ".join(kind.__name__ for kind in SAMPLERS.values())
             raise CheckpointError(
-                f"scheduler {type(self.scheduler).__name__} keeps not to training's noise; use {known}"
+                f"scheduler {type(self.scheduler).__name__} does not keep to training's noise; use {known}"
             )
         return name
 
