@@ -1,0 +1,150 @@
+"""Seconds and peak memory of works that take turns, and what a device can do at most."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+Work = Callable[[], Any]
+PEAKS = {  # dense bf16 FLOP/s by the vendors' datasheets, the most special name first
+    "H200": 989e12,
+    "H100 PCIe": 756e12,
+    "H100 NVL": 835e12,
+    "H100": 989e12,
+    "A100": 312e12,
+    "L40S": 362e12,
+    "RTX 4090": 165e12,
+    "RTX 3090": 71e12,
+}
+CLEAR, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
+RESET_PEAK = "5"  # what Linux takes as: forget the greatest resident size so far
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Runs of one work.
+
+    Args:
+        seconds: of each run.
+        peak: bytes of device memory, on a CPU of resident memory; ``None`` where nobody counts.
+    """
+
+    seconds: tuple[float, ...]
+    peak: int | None
+
+    @property
+    def least(self) -> float:
+        """Seconds of the fastest run."""
+        return min(self.seconds)
+
+    @property
+    def median(self) -> float:
+        """Seconds of the run in the middle."""
+        return float(np.median(self.seconds))
+
+    def ratio(self, to: Timing) -> float:
+        """How many times as long as another, round by round, so that a busy machine slows both."""
+        return float(np.median(np.array(self.seconds) / np.array(to.seconds)))
+
+
+@dataclass
+class Turns:
+    """Works that take turns; one that does not fit into the device's memory has no timing.
+
+    Args:
+        device: whose work is waited for.
+        rounds: runs of each work, after one that does not count.
+    """
+
+    device: torch.device
+    rounds: int
+    timings: dict[str, Timing | None] = field(default_factory=dict)
+
+    def measure(self, works: Mapping[str, Work]) -> dict[str, Timing | None]:
+        """Timings by name."""
+        seconds: dict[str, list[float]] = {name: [] for name in works}
+        peaks: dict[str, int | None] = {}
+        for number in range(self.rounds + 1):
+            for name, work in works.items():
+                if name not in seconds:
+                    continue
+                try:
+                    taken, peaks[name] = self.run(work)
+                except torch.OutOfMemoryError:
+                    del seconds[name]
+                    release(self.device)
+                    continue
+                if number:
+                    seconds[name].append(taken)
+        return {name: Timing(tuple(seconds[name]), peaks[name]) if name in seconds else None for name in works}
+
+    def run(self, work: Work) -> tuple[float, int | None]:
+        """Seconds of one run and the most memory that was held in it."""
+        forget_peak(self.device)
+        synchronize(self.device)
+        start = time.perf_counter()
+        work()
+        synchronize(self.device)
+        return time.perf_counter() - start, peak_memory(self.device)
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until the device has done what it was asked."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def release(device: torch.device) -> None:
+    """Give back memory that nothing holds any more."""
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+
+
+def forget_peak(device: torch.device) -> None:
+    """Begin to look for the most memory anew."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    elif CLEAR.exists():
+        CLEAR.write_text(RESET_PEAK)
+
+
+def peak_memory(device: torch.device) -> int | None:
+    """The most bytes held since ``forget_peak``; ``None`` where nobody counts."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    if not STATUS.exists():
+        return None
+    lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
+    return int(lines["VmHWM"].split()[0]) * 1024
+
+
+def device_name(device: torch.device) -> str:
+    """What the device calls itself."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {torch.get_num_threads()} thread(s)"
+
+
+def peak_flops(device: torch.device, precision: torch.dtype) -> tuple[float, str]:
+    """FLOP/s that the device can do at most, and where the figure is from."""
+    if device.type == "cuda" and precision == torch.bfloat16:
+        for name, peak in PEAKS.items():
+            if name in device_name(device):
+                return peak, f"datasheet of the {name}, dense bf16"
+    return matmul_flops(device, precision), "measured by a matrix product"
+
+
+def matmul_flops(device: torch.device, precision: torch.dtype) -> float:
+    """FLOP/s of large square matrix products, the fastest of ten."""
+    side = 8192 if device.type == "cuda" else 1024
+    one, other = (torch.randn(side, side, device=device, dtype=precision) for _ in range(2))
+    timing = Turns(device, 10).measure({"product": lambda: one @ other})["product"]
+    return 2 * side**3 / timing.least if timing else float("nan")

@@ -1,0 +1,52 @@
+"""The FLOPs that utilisation is counted with, against torch's own counter."""
+
+import dataclasses
+
+import pytest
+import torch
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
+
+from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
+from tests.benchmarks.at_size import flops
+
+TOKENS = 12
+
+
+@pytest.fixture(params=["absolute", "rotary"])
+def backbone(request):
+    """A micro model with positions as CogVideoX-2b, or as 5b; four layers."""
+    rotary = request.param == "rotary"
+    settings = {"num_layers": 4, "use_rotary_positional_embeddings": rotary}
+    model = micro()
+    return with_adapter(micro(transformer=model.settings.transformer | settings), every=2, positions="absolute")
+
+
+def counted(backbone, stage, tokens):
+    """FLOPs of the transformer's forward pass and of all of it with backward, by torch."""
+    clips = random_clips(2, tokens)
+    backbone.use_adapter("voxel" if tokens is not None else None)
+    backbone.trained_parameters(stage)
+    latents = backbone.codec.encode(clips.rgb, clips.depth)
+    given, image = backbone.conditions(clips, torch.full((2,), 500), None), backbone.encode_first(clips)
+    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        memory = backbone.prepare_memory(clips)
+        predicted = backbone.predict(latents, image, dataclasses.replace(given, memory=memory))
+        forward = counter.get_total_flops()
+        predicted.square().mean().backward()
+    return forward, counter.get_total_flops()
+
+
+def test_a_step_of_stage_one_counts_what_torch_counts(backbone):
+    video = flops.video_sizes(backbone, 2)
+    forward, step = counted(backbone, "1", None)
+    assert forward == flops.forward(video)
+    assert step == flops.stage1_step(video)
+
+
+def test_a_step_of_stage_two_counts_what_torch_counts(backbone):
+    video, memory = flops.video_sizes(backbone, 2), flops.memory_sizes(backbone, TOKENS)
+    forward, step = counted(backbone, "2", random_tokens(2, TOKENS))
+    assert memory.layers == (1, 3)
+    assert forward == flops.forward(video, memory)
+    assert step == flops.stage2_step(video, memory)
