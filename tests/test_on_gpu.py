@@ -127,6 +127,11 @@ def test_a_rollout_sees_what_it_sees_on_the_cpu_and_maps_it_where_it_computes(na
     assert torch.allclose(mine.depth, others.depth, rtol=0.05, atol=0.05)
 
 
+def test_a_rollout_in_bfloat16_sees_nearly_the_same(world):
+    mine, others = (world("voxel", DEVICE, kind).step(["left"] * 8) for kind in (torch.float32, torch.bfloat16))
+    assert (mine.rgb.int() - others.rgb.int()).abs().float().mean() < 8
+
+
 def test_branches_see_what_rollouts_alone_see(world):
     ways = [["left"] * 8, ["forward"] * 8]
     together = step_together(world("voxel", DEVICE).branches(2), ways)

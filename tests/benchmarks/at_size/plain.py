@@ -29,7 +29,8 @@ class Plain:
             "num_layers": 0, "in_channels": ours.in_channels, "out_channels": ours.out_channels,
         }  # fmt: skip
         with bench.made_here():
-            self.transformer = CogVideoXTransformer3DModel.from_config(config).to(bench.device, bench.precision)
+            self.transformer = CogVideoXTransformer3DModel.from_config(config)
+        torch.nn.Module.to(self.transformer, bench.device, bench.precision)  # buffers; diffusers' own warns of nothing
         self.transformer.transformer_blocks = ours.base.transformer_blocks
         self.vae = bench.backbone.codec.vae
         self.scheduler = CogVideoXDDIMScheduler.from_config(bench.backbone.scheduler.config)
@@ -69,7 +70,7 @@ class Plain:
         torch.nn.utils.clip_grad_norm_(self.transformer.parameters(), clip)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
-        return float(loss)
+        return float(loss.detach())
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> Tensor:

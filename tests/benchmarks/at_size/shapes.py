@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -108,14 +108,17 @@ class Bench:
         return settings.frames, settings.height, settings.width
 
     def walk(self) -> Observations:
-        """A clip of the furnished room: ahead by quarters of a metre, then turning."""
-        frames, height, width = self.size
+        """A clip of the furnished room: ahead, turning to the left."""
+        return self.observe([look((0.0, 1.4, 1.2 - 0.1 * step), 5.0 * step) for step in range(self.size[0])])
+
+    def observe(self, poses: Sequence[np.ndarray]) -> Observations:
+        """What the furnished room looks like from these world_from_camera."""
+        _, height, width = self.size
         room = Room(height, width)
-        poses = np.stack([look((0.0, 1.4, 1.2 - 0.1 * step), 5.0 * step) for step in range(frames)])
         seen = [room.see(pose) for pose in poses]
-        intrinsics = torch.from_numpy(room.intrinsics).expand(frames, 3, 3)
+        intrinsics = torch.from_numpy(room.intrinsics).expand(len(poses), 3, 3)
         rgb, depth = (torch.from_numpy(np.stack([getattr(each, name) for each in seen])) for name in ("rgb", "depth"))
-        return Observations(rgb, depth, Cameras(torch.from_numpy(poses), intrinsics, height, width))
+        return Observations(rgb, depth, Cameras(torch.from_numpy(np.stack(poses)), intrinsics, height, width))
 
     def info(self) -> TrajectoryInfo:
         """The room, whose agent walks by quarters of a metre and turns by 15°."""
@@ -125,17 +128,12 @@ class Bench:
     def clips(self, batch: int, frames: int, observations: Observations | None = None) -> Clips:
         """A batch of the same clip, of which the first frames are known."""
         seen = observations or self.walk()
-        cameras = seen.cameras
-        spread = [batch, *[-1] * 3]
+        spread, cameras = [batch, -1, -1, -1], seen.cameras
+        poses, intrinsics = cameras.world_from_camera.expand(spread), cameras.intrinsics.expand(spread)
         return Clips(
             rgb=seen.rgb[:frames].expand(batch, -1, -1, -1, -1).to(self.device),
             depth=seen.depth[:frames].expand(spread).to(self.device),
-            cameras=Cameras(
-                cameras.world_from_camera.expand(spread),
-                cameras.intrinsics.expand(spread),
-                cameras.height,
-                cameras.width,
-            ),
+            cameras=Cameras(poses, intrinsics, cameras.height, cameras.width),
             interactions=[(None,) * (len(cameras) - 1)] * batch,
             tokens=None,
             seeds=list(range(batch)),

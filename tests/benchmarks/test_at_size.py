@@ -1,0 +1,83 @@
+"""The benchmark at size runs from end to end, and what it compares is the same arithmetic."""
+
+import json
+
+import pytest
+import torch
+
+from tests.benchmarks import bench_at_size
+from tests.benchmarks.at_size import shapes
+from tests.benchmarks.at_size.measuring import Timing
+from tests.benchmarks.at_size.plain import Plain
+from tests.benchmarks.at_size.rows import Row, Target
+from tests.benchmarks.at_size.training import make_batch, plain_batch
+from tests.walking import MICRO
+
+
+@pytest.fixture
+def micro(monkeypatch):
+    """A model so small that all parts take seconds."""
+    model = shapes.Model("micro", MICRO, {"form": "cross", "every": 2, "width": 16}, 2, 8)
+    monkeypatch.setitem(shapes.MODELS, "micro", model)
+    monkeypatch.setattr("tests.benchmarks.at_size.sampling.STEPS", (2,))
+    return model
+
+
+def test_all_parts_run_on_whatever_device_is_there(micro, tmp_path, capsys):
+    file = tmp_path / "rows.json"
+    bench_at_size.main(["--quick", "--models", "micro", "--device", "cpu", "--json", str(file)])
+    found = json.loads(file.read_text())
+    assert [row["what"].split(",")[0] for row in found["rows"]] == [
+        "stage-1 step", "stage-2 step", "clip", "clip with voxel map", "VAE", "VAE", "map", "map",
+    ]  # fmt: skip
+    assert all(0 < row["utilisation"] < 1 for row in found["rows"][:4])
+    assert all(row["ratio"] > 0 for row in found["rows"] if row["beside"])
+    assert "stage-1" in capsys.readouterr().out
+
+
+def test_the_plain_model_says_what_ours_does_when_it_has_its_weights(micro):
+    bench = shapes.Bench(micro, torch.device("cpu"), torch.float32, 1, 1.0)
+    ours, plain = bench.backbone, Plain(bench)
+    ours.use_adapter(None)
+    theirs, base = plain.transformer, ours.transformer.base
+    weights = base.state_dict()
+    known, extra = base.patch_embed.proj.weight, ours.transformer.extra_in.weight
+    with torch.no_grad():
+        extra.normal_(std=0.1)
+        weights["patch_embed.proj.weight"] = torch.cat([known, extra], dim=1)
+        weights["proj_out.weight"] = theirs.proj_out.weight
+        weights["proj_out.bias"] = theirs.proj_out.bias.zero_()
+    theirs.load_state_dict(weights)
+    seen: list[torch.Tensor] = []
+    base.norm_out.register_forward_hook(lambda *parts: seen.append(parts[2]))
+    theirs.norm_out.register_forward_hook(lambda *parts: seen.append(parts[2]))
+    clips = make_batch(bench, 2, 0)
+    latents, image, camera = plain_batch(bench, clips)
+    timesteps = torch.tensor([10, 800])
+    with torch.no_grad():
+        ours.predict(latents, image, ours.conditions(clips, timesteps, None))
+        color, depth = latents.chunk(2, dim=2)
+        color_image, depth_image = image.chunk(2, dim=2)
+        joined = torch.cat([color, color_image, depth, depth_image, camera], dim=2)
+        plain.predict(joined, timesteps, plain.rotary(latents))
+    assert torch.allclose(seen[0], seen[1][:, -seen[0].shape[1] :], atol=1e-5)
+
+
+def test_an_unknown_model_or_part_is_a_usage_error(capsys):
+    for option, name in (("--models", "7b"), ("--only", "step")):
+        with pytest.raises(SystemExit) as ended:
+            bench_at_size.main([option, name])
+        assert ended.value.code == 2
+        assert name in capsys.readouterr().err
+
+
+def test_targets_are_reached_not_reached_or_not_measured():
+    assert Target("≤ 1 s", 0.9, 1.0).reached
+    assert not Target("≥ 45 %", 0.4, 0.45, at_most=False).reached
+    assert Target("≤ 1 s", None, 1.0).said() == "≤ 1 s: not measured"
+
+
+def test_a_work_that_does_not_fit_has_a_row_that_says_so():
+    row = Row("5b", "clip", None, "plain diffusers", Timing((2.0, 1.0, 3.0), 10**9))
+    assert row.ratio is None
+    assert {"does not fit", "plain diffusers", "2 (1)", "1.00"} <= set(row.cells())
