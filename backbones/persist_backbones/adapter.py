@@ -59,6 +59,7 @@ class VideoShape:
         temporal: compression of the codec in time.
         inputs: channels of all that the model sees at a latent pixel.
         outputs: channels of its prediction.
+        token_frames: latent frames that a video token stands for.
     """
 
     channels: int
@@ -70,6 +71,12 @@ class VideoShape:
     temporal: int
     inputs: int
     outputs: int
+    token_frames: int = 1
+
+    @property
+    def folded(self) -> int:
+        """Frames that a video token stands for."""
+        return self.temporal * self.token_frames
 
 
 @dataclass(frozen=True)

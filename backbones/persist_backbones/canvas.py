@@ -106,7 +106,7 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         drawn = settings.canvas_channels
         self.embed = nn.Linear(channels, drawn)
         self.patch = video.patch * settings.canvas_scale
-        self.patches = nn.Linear((drawn + 2) * video.temporal * self.patch**2, settings.width, bias=False)
+        self.patches = nn.Linear((drawn + 2) * video.folded * self.patch**2, settings.width, bias=False)
         layers = range(0, video.layers, settings.every)
         self.blocks = nn.ModuleDict(
             {str(layer): CanvasBlock(video.channels, settings.width, settings.ff_factor) for layer in layers}
@@ -117,9 +117,10 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
 
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedCanvas:
         """Draw the tokens, fold frames, and embed the patch of each video token; the mask says where one fell."""
-        folded = fold_frames(self.draw(tokens, cameras), self.video.temporal)
+        views = fold_frames(self.draw(tokens, cameras), self.video.temporal, self.video.token_frames)
+        folded = views.unflatten(1, (-1, self.video.token_frames)).flatten(2, 3)
         patches = tokens_of(F.pixel_unshuffle(folded, self.patch))
-        seen = self.head.look(F.pixel_unshuffle(folded, self.settings.canvas_scale)) if self.head else None
+        seen = self.head.look(F.pixel_unshuffle(views, self.settings.canvas_scale)) if self.head else None
         return PreparedCanvas(F.gelu(self.patches(patches)), patches.detach().ne(0).any(dim=-1), seen)
 
     def draw(self, tokens: MemoryTokens, cameras: Cameras) -> Float[Tensor, "batch frame channel height width"]:
@@ -141,8 +142,8 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         if self.head is None or memory.seen is None:
             return predicted
         batch, frames, _, height, width = predicted.shape
-        side = self.video.patch
-        mask = memory.mask.reshape(batch, frames, 1, height // side, width // side)
-        mask = mask.repeat_interleave(side, -2).repeat_interleave(side, -1)
+        side, token_frames = self.video.patch, self.video.token_frames
+        mask = memory.mask.reshape(batch, frames // token_frames, 1, height // side, width // side)
+        mask = mask.repeat_interleave(token_frames, 1).repeat_interleave(side, -2).repeat_interleave(side, -1)
         added: Tensor = self.head(predicted, inputs, memory.seen, time) * mask
         return predicted + added.to(predicted.dtype)

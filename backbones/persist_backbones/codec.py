@@ -66,7 +66,7 @@ class Codec(nn.Module):
     """The VAE with the conversions around it.
 
     Depth goes through the same VAE as a grey image of its code (see ``depth_code``). Latents are the posterior's
-    mean, times the scaling factor: in training, in the image condition and in sampling alike.
+    mean, times the scaling factor, in training and in sampling alike; in the image condition times ``image_scale`` too.
 
     A VAE that does not compress time (``temporal_compression_ratio`` 1) codes every frame alone. One of 3 p² input
     channels sees p×p pixels folded into channels, which costs a small codec far less than convolutions at full size.
@@ -96,6 +96,15 @@ class Codec(nn.Module):
     def temporal(self) -> int:
         """Compression in time."""
         return int(self.vae.config.temporal_compression_ratio)
+
+    @property
+    def image_scale(self) -> float:
+        """What latents are multiplied by where they are the image condition.
+
+        CogVideoX 1.5 was trained with image latents divided by the scaling factor (``invert_scale_latents``), all
+        others with image latents as any.
+        """
+        return float(self.vae.config.scaling_factor**-2) if self.vae.config.invert_scale_latents else 1.0
 
     @property
     def frames_alone(self) -> bool:

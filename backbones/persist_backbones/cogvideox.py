@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, PreparedMemory, VideoShape, memory_of
+from persist_backbones.adapter import Adapter, PreparedMemory, memory_of
+from persist_backbones.clip_shape import clip_shape
 from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
 from persist_backbones.economy import FrozenWeights, economize
@@ -20,7 +21,16 @@ from persist_backbones.guidance import make_denoiser
 from persist_backbones.inventory import parts_of
 from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
-from persist_backbones.parts import DiffusersParts, check_fit, load_parts, load_world, save_world, starting_parts, widen
+from persist_backbones.parts import (
+    DiffusersParts,
+    check_fit,
+    load_parts,
+    load_world,
+    save_world,
+    starting_parts,
+    video_shape,
+    widen,
+)
 from persist_backbones.presets import CogVideoXSettings
 from persist_backbones.rotary import rotary_positions
 from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
@@ -53,6 +63,7 @@ class CogVideoX(Backbone):
         self.codec = Codec(parts.vae)
         self.transformer = widen(parts, self.settings)
         self.scheduler = parts.scheduler
+        self.shape = clip_shape(parts.transformer, parts.vae, self.settings)
         config = parts.transformer.config
         self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
 
@@ -92,22 +103,6 @@ class CogVideoX(Backbone):
         return None if self.adapter_name is None else self.adapters[self.adapter_name]  # type: ignore[return-value]
 
     @property
-    def video_shape(self) -> VideoShape:
-        """What an adapter must know of the model."""
-        config = self.transformer.base.config
-        return VideoShape(
-            channels=config.num_attention_heads * config.attention_head_dim,
-            camera_channels=self.transformer.camera_channels,
-            time_channels=config.time_embed_dim,
-            layers=config.num_layers,
-            patch=config.patch_size,
-            spatial=self.codec.spatial,
-            temporal=self.codec.temporal,
-            inputs=self.transformer.in_channels,
-            outputs=self.transformer.out_channels,
-        )
-
-    @property
     def token_budget(self) -> int:
         """Tokens that the adapter in use asks for; none without one."""
         return self.adapter.settings.token_budget if self.adapter else 0
@@ -140,7 +135,7 @@ class CogVideoX(Backbone):
             return self.codec.loss(rgb, depth, self.settings.kl_weight, generators)
         kept = self.encode(clips) if clips.latents is None else clips.latents
         latents, first = (kept, kept[:, :1]) if self.frames_alone else (kept[:, :-1], kept[:, -1:])
-        image = self.image_condition(first)
+        latents, image = self.shape.pad(latents), self.image_condition(first)
         timesteps = draw_timesteps(self.scheduler, generators).to(latents.device)
         noise = noise_like(latents, generators)
         target = predicted_target(self.scheduler, latents, noise, timesteps)
@@ -178,7 +173,7 @@ class CogVideoX(Backbone):
         predict = make_denoiser(self, first, image, lambda: sampling.memory_guidance)
         noise = noise_like(image, generators)
         latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
-        rgb, depth = self.codec.decode(latents, self.settings.depth)
+        rgb, depth = self.codec.decode(self.shape.drop_padding(latents), self.settings.depth)
         rgb[:, 0], depth[:, 0] = first.rgb[:, 0], first.depth[:, 0]
         return rgb, depth
 
@@ -192,9 +187,8 @@ class CogVideoX(Backbone):
         return self.image_condition(self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1]).float())
 
     def image_condition(self, first: Float[Tensor, "batch 1 channel height width"]) -> Tensor:
-        """Latents of the first frame alone, followed by zeros, scaled like all latents."""
-        later = (self.settings.frames - 1) // self.codec.temporal
-        return torch.cat([first, first.new_zeros(first.shape[0], later, *first.shape[2:])], dim=1)
+        """Latents of the first frame alone as the model takes them, followed by zeros for all other latent frames."""
+        return self.shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
 
     def prepare_memory(self, clips: Clips) -> PreparedMemory | None:
         """The batch's tokens embedded by the adapter in use, ``None`` without adapter."""
@@ -206,14 +200,13 @@ class CogVideoX(Backbone):
 
     def conditions(self, clips: Clips, timesteps: Tensor, memory: PreparedMemory | None) -> Conditions:
         """Prompt, interactions, cameras and memory of a batch."""
-        device, config = self.prompt.device, self.transformer.base.config
-        steps = self.settings.frames - 1
+        device, steps = self.prompt.device, self.settings.frames - 1
         return Conditions(
             text=self.prompt.expand(len(clips.seeds), -1, -1),
             timestep=timesteps,
             interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(device),
             camera=self.camera_latents(clips),
-            rotary=rotary_positions(config, steps // self.codec.temporal + 1, device),
+            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, device),
             memory=memory,
         )
 
@@ -221,7 +214,7 @@ class CogVideoX(Backbone):
         """Plücker rays at the latents' size."""
         printed = self.settings.rays == "printed"
         cameras = clips.cameras.to(self.prompt.device)
-        return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed)
+        return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
 
     def predict(self, noisy: Tensor, image: Tensor, given: Conditions) -> Tensor:
         """What the objective asks for; channels are noisy RGB, RGB image, noisy depth, depth image and camera."""
@@ -230,8 +223,8 @@ class CogVideoX(Backbone):
         if not self.settings.depth:
             depth, depth_image = torch.zeros_like(depth), torch.zeros_like(depth_image)
         latents = torch.cat([color, color_image, depth, depth_image, given.camera.to(noisy.dtype)], dim=2)
-        patch = self.transformer.base.config.patch_size
-        given = dataclasses.replace(given, camera=camera_tokens(given.camera, patch))
+        seen = camera_tokens(given.camera, self.shape.patch, self.shape.token_frames)
+        given = dataclasses.replace(given, camera=seen)
         predicted: Tensor = self.transformer(latents, given, self.adapter)
         return predicted
 
@@ -243,7 +236,8 @@ class CogVideoX(Backbone):
 
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter and use it."""
-        self._take_adapter(name, make_adapter(channels, settings, self.video_shape, f"adapter {name!r}"))
+        shape = video_shape(self.transformer, self.codec)
+        self._take_adapter(name, make_adapter(channels, settings, shape, f"adapter {name!r}"))
 
     def use_adapter(self, name: str | None) -> None:
         """Use one of the adapters, or none: plain stage 1."""
@@ -277,7 +271,7 @@ class CogVideoX(Backbone):
 
     def load_adapter(self, name: str, folder: Path) -> None:
         """Add the adapter that ``save_adapter`` wrote, and use it."""
-        self._take_adapter(name, load_adapter(folder, self.video_shape))
+        self._take_adapter(name, load_adapter(folder, video_shape(self.transformer, self.codec)))
 
     def _take_adapter(self, name: str, adapter: Adapter[Any]) -> None:
         self.adapters[name] = adapter.to(self.prompt.device)

@@ -18,7 +18,7 @@ RAY_CHANNELS = 6
 
 
 def camera_latents(
-    cameras: Cameras, spatial: int, temporal: int, printed: bool
+    cameras: Cameras, spatial: int, temporal: int, printed: bool, multiple: int = 1
 ) -> Float[Tensor, "batch latent_frame channel height width"]:
     """Plücker rays relative to each clip's first camera, at the VAE's compression.
 
@@ -31,27 +31,33 @@ def camera_latents(
         spatial: compression in height and width.
         temporal: compression in time.
         printed: directions as the paper prints them.
+        multiple: what the number of latent frames is padded to in front, like the latents (see ``clip_shape``).
     """
     first = invert_rigid(cameras.world_from_camera[:, :1].double())
     local = Cameras(first @ cameras.world_from_camera.double(), cameras.intrinsics, cameras.height, cameras.width)
     rays = plucker(local.resized(local.height // spatial, local.width // spatial), printed)
-    return fold_frames(rays.permute(0, 1, 4, 2, 3).float(), temporal)
+    return fold_frames(rays.permute(0, 1, 4, 2, 3).float(), temporal, multiple)
 
 
 def fold_frames(
-    frames: Shaped[Tensor, "batch frame channel *rest"], temporal: int
+    frames: Shaped[Tensor, "batch frame channel *rest"], temporal: int, multiple: int = 1
 ) -> Shaped[Tensor, "batch latent_frame folded *rest"]:
-    """Frames folded into channels, the first one alone in the first latent frame and repeated to fill its channels."""
-    first = frames[:, :1].expand(-1, temporal - 1, *frames.shape[2:])
+    """Frames folded into channels, the first one alone in the first latent frame and repeated to fill its channels.
+
+    It also fills the latent frames in front of that one that make their number a multiple.
+    """
+    missing = -frames.shape[1] % (temporal * multiple)
+    first = frames[:, :1].expand(-1, missing, *frames.shape[2:])
     folded: Tensor = torch.cat([first, frames], dim=1).unflatten(1, (-1, temporal)).flatten(2, 3)
     return folded
 
 
 def camera_tokens(
-    latents: Float[Tensor, "batch frame channel height width"], patch: int
-) -> Float[Tensor, "batch token channel"]:
-    """The camera embedding at each video token: the mean over its patch."""
-    return tokens_of(F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, latents.shape[:2]))
+    latents: Float[Tensor, "batch frame channel height width"], patch: int, frames: int = 1
+) -> Float[Tensor, "batch token folded"]:
+    """The camera embedding at each video token: the mean over its patch, its latent frames folded into channels."""
+    means = F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, (len(latents), -1, frames))
+    return tokens_of(means.flatten(2, 3))
 
 
 def tokens_of(

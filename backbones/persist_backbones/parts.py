@@ -11,9 +11,13 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
 from torch import Tensor, nn
 
-from persist_backbones.codec import check_vae, spatial_compression
+from persist_backbones.adapter import VideoShape
+from persist_backbones.clip_shape import clip_shape
+from persist_backbones.codec import Codec, check_vae, spatial_compression
 from persist_backbones.conditioning import RAY_CHANNELS
 from persist_backbones.objective import check_prediction
+from persist_backbones.patches import frames_per_token
+from persist_backbones.position_tables import fit_positions
 from persist_backbones.presets import PRESETS, CogVideoXSettings
 from persist_backbones.world_transformer import WorldTransformer
 from persist_cli.world.errors import CheckpointError
@@ -125,21 +129,21 @@ def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
     check_prediction(parts.scheduler, settings.prediction)
     check_frames(int(parts.vae.config.temporal_compression_ratio), settings)
     config, vae = parts.transformer.config, parts.vae.config
-    spatial = spatial_compression(parts.vae)
-    unit = spatial * config.patch_size
-    if config.patch_size_t is not None or config.ofs_embed_dim:
-        raise CheckpointError("CogVideoX 1.5 (patch_size_t, ofs) is not supported yet; use a CogVideoX 1.0 checkpoint")
+    unit = spatial_compression(parts.vae) * config.patch_size
     if settings.height % unit or settings.width % unit:
         raise CheckpointError(f"image size {settings.height}x{settings.width} must be a multiple of {unit}")
     if config.in_channels not in (vae.latent_channels, 2 * vae.latent_channels):
         raise CheckpointError(
             f"a transformer of {config.in_channels} channels does not fit a VAE of {vae.latent_channels}"
         )
-    given = (config.sample_height * spatial, config.sample_width * spatial)
-    if config.use_learned_positional_embeddings and given != (settings.height, settings.width):
+    if config.ofs_embed_dim and config.ofs_embed_dim != config.time_embed_dim:
         raise CheckpointError(
-            f"learned positions are for {given[0]}x{given[1]} images, not {settings.height}x{settings.width}"
+            f"a transformer whose ofs_embed_dim {config.ofs_embed_dim} is not its time_embed_dim "
+            f"{config.time_embed_dim} cannot add one to the other"
         )
+    tables = config.use_learned_positional_embeddings or not config.use_rotary_positional_embeddings
+    if config.patch_size_t is not None and tables:
+        raise CheckpointError("patch_size_t needs rotary positions alone, as CogVideoX 1.5 has them")
 
 
 def check_frames(temporal: int, settings: CogVideoXSettings) -> None:
@@ -158,7 +162,27 @@ def widen(parts: DiffusersParts, settings: CogVideoXSettings) -> WorldTransforme
     latents = parts.vae.config.latent_channels
     camera = RAY_CHANNELS * int(parts.vae.config.temporal_compression_ratio)
     slots = (settings.frames - 1) * len(settings.interactions)
-    return WorldTransformer(parts.transformer, 4 * latents + camera, 2 * latents, slots, camera)
+    shape = clip_shape(parts.transformer, parts.vae, settings)
+    fit_positions(parts.transformer, (shape.padded_frames, shape.height, shape.width))
+    seen = camera * shape.token_frames
+    return WorldTransformer(parts.transformer, 4 * latents + camera, 2 * latents, slots, seen)
+
+
+def video_shape(transformer: WorldTransformer, codec: Codec) -> VideoShape:
+    """What an adapter must know of the model."""
+    config = transformer.base.config
+    return VideoShape(
+        channels=config.num_attention_heads * config.attention_head_dim,
+        camera_channels=transformer.camera_channels,
+        time_channels=config.time_embed_dim,
+        layers=config.num_layers,
+        patch=config.patch_size,
+        spatial=codec.spatial,
+        temporal=codec.temporal,
+        inputs=transformer.in_channels,
+        outputs=transformer.out_channels,
+        token_frames=frames_per_token(config),
+    )
 
 
 def save_world(transformer: WorldTransformer, prompt: Tensor, folder: Path) -> None:

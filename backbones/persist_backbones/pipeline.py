@@ -246,6 +246,7 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
         if output_type == "latent":
             return WorldPipelineOutput(latents, None)
         backbone = self.backbone
+        latents = backbone.shape.drop_padding(latents)
         color, metres = backbone.codec.decode_images(latents, backbone.gives_depth)
         color[:, :, 0] = first.rgb[:, 0].movedim(-1, 1).to(color) / 127.5 - 1
         metres[:, 0] = first.depth[:, 0]

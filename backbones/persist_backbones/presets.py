@@ -89,7 +89,8 @@ class CogVideoXSettings:
     Args:
         preset: sizes of transformer, VAE and scheduler.
         pretrained: a plain diffusers CogVideoX directory (``transformer/``, ``vae/``, ``scheduler/``) to start from;
-            its configuration replaces the preset's.
+            its configuration replaces the preset's. A learned table of positions (5b-I2V) is cut and resampled to the
+            clips' size.
         height: pixels.
         width: pixels.
         frames: frames a clip, at least two; for a VAE that compresses time by c > 1, 2cn + 1: 9, 17, … for CogVideoX's.

@@ -44,9 +44,10 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
 
     A latent frame that folds four frames sees the projections into all four, concatenated as the camera latents are:
     at large turns a token that one of the four sees lies outside the others, and a mean or the last camera would
-    tell nothing of it. A frame that does not see the token gives zeros and a zero flag; a latent frame none of whose
-    frames sees it does not attend to it, so that the softmax is shared by what can be in the picture. Queries carry
-    the code of the video token's own (u, v), at the same wavelengths.
+    tell nothing of it; so too for the latent frames that a video token stands for. A frame that does not see the
+    token gives zeros and a zero flag; a latent frame none of whose frames sees it does not attend to it, so that the
+    softmax is shared by what can be in the picture. Queries carry the code of the video token's own (u, v), at the
+    same wavelengths.
     """
 
     settings_type = ProjectedSettings
@@ -54,18 +55,18 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
 
     def __init__(self, channels: int, settings: ProjectedSettings, video: VideoShape) -> None:
         super().__init__(channels, settings, video)
-        code = video.temporal * (6 * settings.frequencies + 1)
+        code = video.folded * (6 * settings.frequencies + 1)
         self.embed = nn.Linear(channels, settings.width)
         self.place = nn.Linear(code, settings.width, bias=False)
         self.blocks = memory_blocks(settings, video, video.camera_channels + 4 * settings.frequencies)
 
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> ProjectedMemory:
         """Features and position codes projected and summed, for each latent frame."""
-        temporal, dtype = self.video.temporal, self.embed.weight.dtype
+        frames, dtype = self.video.folded, self.embed.weight.dtype
         places, seen = image_places(tokens, cameras)
         code = torch.cat([self.code(places) * seen[..., None], seen[..., None].float()], dim=-1)
-        folded = fold_frames(code.transpose(2, 3), temporal).transpose(2, 3)
-        mask = fold_frames(seen[:, :, None], temporal).any(dim=2)
+        folded = fold_frames(code.transpose(2, 3), frames).transpose(2, 3)
+        mask = fold_frames(seen[:, :, None], frames).any(dim=2)
         hidden = self.embed(tokens.features.to(dtype))[:, None] + self.place(folded.to(dtype))
         return ProjectedMemory(hidden * mask[..., None], mask, self.query_places(cameras).to(dtype))
 

@@ -1,4 +1,4 @@
-"""Rotary positions of CogVideoX 1.0 at the size the model works at."""
+"""Rotary positions of CogVideoX 1.0 and 1.5 at the size the model works at."""
 
 from __future__ import annotations
 
@@ -9,28 +9,59 @@ import torch
 from diffusers.models.embeddings import get_3d_rotary_pos_embed
 from torch import Tensor
 
+Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the first place, and one past those of the last
 
-def rotary_positions(config: Any, frames: int, device: torch.device) -> tuple[Tensor, Tensor] | None:
+
+def rotary_positions(config: Any, grid: tuple[int, int, int], device: torch.device) -> tuple[Tensor, Tensor] | None:
     """Cosines and sines for every video token, ``None`` for models with absolute positions only.
 
+    CogVideoX 1.0 fits a clip's grid into the middle of the one it was trained on; 1.5 counts its rows and columns.
+
     Args:
-        config: of diffusers' transformer; its sample size is the one it works at, so no crop is needed.
-        frames: latent frames.
+        config: of diffusers' transformer; its sample size is the one it was trained on.
+        grid: frames, rows and columns of video tokens.
         device: where they are wanted.
     """
     if not config.use_rotary_positional_embeddings:
         return None
-    rows, columns = config.sample_height // config.patch_size, config.sample_width // config.patch_size
-    return _positions(config.attention_head_dim, rows, columns, frames, str(device))
+    if config.patch_size_t is not None:
+        return _counted(config.attention_head_dim, grid, str(device))
+    trained = (config.sample_height // config.patch_size, config.sample_width // config.patch_size)
+    return _fitted(config.attention_head_dim, grid, middle_region(grid[1:], trained), str(device))
+
+
+def middle_region(shape: tuple[int, int], trained: tuple[int, int]) -> Region:
+    """The largest region with the aspect of ``shape`` in the middle of a trained grid, both in rows and columns."""
+    rows, columns = trained
+    if shape[0] / shape[1] > rows / columns:
+        columns = round(trained[0] / shape[0] * shape[1])
+    else:
+        rows = round(trained[1] / shape[1] * shape[0])
+    top, left = round((trained[0] - rows) / 2), round((trained[1] - columns) / 2)
+    return (top, left), (top + rows, left + columns)
 
 
 @lru_cache(maxsize=4)
-def _positions(channels: int, rows: int, columns: int, frames: int, device: str) -> tuple[Tensor, Tensor]:
+def _fitted(channels: int, grid: tuple[int, int, int], region: Region, device: str) -> tuple[Tensor, Tensor]:
     cosines, sines = get_3d_rotary_pos_embed(
         embed_dim=channels,
-        crops_coords=((0, 0), (rows, columns)),
-        grid_size=(rows, columns),
-        temporal_size=frames,
+        crops_coords=region,
+        grid_size=grid[1:],
+        temporal_size=grid[0],
+        device=torch.device(device),
+    )
+    return cosines, sines
+
+
+@lru_cache(maxsize=4)
+def _counted(channels: int, grid: tuple[int, int, int], device: str) -> tuple[Tensor, Tensor]:
+    cosines, sines = get_3d_rotary_pos_embed(
+        embed_dim=channels,
+        crops_coords=None,
+        grid_size=grid[1:],
+        temporal_size=grid[0],
+        grid_type="slice",
+        max_size=grid[1:],  # what is sliced away does not change the rest
         device=torch.device(device),
     )
     return cosines, sines

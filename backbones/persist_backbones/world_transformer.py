@@ -19,6 +19,9 @@ from torch import Tensor, nn
 from persist_backbones.adapter import Adapter, PreparedMemory
 from persist_backbones.conditioning import tokens_of
 from persist_backbones.offloading import bring
+from persist_backbones.patches import fold_patches, frames_per_token, unfold_patches
+
+OFFSET = 2.0  # what CogVideoX 1.5 image-to-video was trained with as ``ofs``
 
 
 @dataclass(frozen=True)
@@ -64,10 +67,14 @@ class WorldTransformer(nn.Module):
         super().__init__()
         config = base.config
         inner = config.num_attention_heads * config.attention_head_dim
-        patch = config.patch_size
+        patch, frames, new = config.patch_size, frames_per_token(config), in_channels - config.in_channels
         self.base = base
-        self.extra_in = nn.Conv2d(in_channels - config.in_channels, inner, patch, stride=patch, bias=False)
-        self.extra_out = nn.Linear(inner, patch * patch * (out_channels - config.out_channels))
+        self.extra_in: nn.Module
+        if config.patch_size_t is None:
+            self.extra_in = nn.Conv2d(new, inner, patch, stride=patch, bias=False)
+        else:
+            self.extra_in = nn.Linear(new * frames * patch**2, inner, bias=False)
+        self.extra_out = nn.Linear(inner, frames * patch**2 * (out_channels - config.out_channels))
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
         self.camera_channels = camera_channels
         self.in_channels, self.out_channels = in_channels, out_channels
@@ -95,8 +102,11 @@ class WorldTransformer(nn.Module):
         return adapter.correct(predicted, latents, given.memory, time)
 
     def embed_time(self, given: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
-        """The time embedding with the interactions of the clip added."""
+        """The time embedding, for CogVideoX 1.5 image-to-video with ``ofs``, and the interactions of the clip added."""
         time: Tensor = self.base.time_embedding(self.base.time_proj(given.timestep).to(dtype))
+        if self.base.ofs_embedding is not None:
+            offset = torch.full((1,), OFFSET, device=time.device)
+            time = time + self.base.ofs_embedding(self.base.ofs_proj(offset).to(dtype))
         done: Tensor = self.interactions(given.interactions).sum(dim=1)
         return time + done.to(time.dtype)
 
@@ -104,10 +114,17 @@ class WorldTransformer(nn.Module):
         """Text and video tokens: diffusers' patch embedding of its own channels plus that of the new ones."""
         known = self.base.config.in_channels
         tokens: Tensor = self.base.patch_embed(text, latents[:, :, :known])
-        extra = self.extra_in(latents[:, :, known:].flatten(0, 1)).unflatten(0, latents.shape[:2])
         words = text.shape[1]
-        video = tokens[:, words:] + tokens_of(extra)
+        video = tokens[:, words:] + self.embed_new(latents[:, :, known:])
         return tokens[:, :words], self.base.embedding_dropout(video)
+
+    def embed_new(self, latents: Tensor) -> Float[Tensor, "batch token channel"]:
+        """The patch embedding of the channels that the published model does not know."""
+        config = self.base.config
+        if config.patch_size_t is not None:
+            embedded: Tensor = self.extra_in(fold_patches(latents, config.patch_size, config.patch_size_t))
+            return embedded
+        return tokens_of(self.extra_in(latents.flatten(0, 1)).unflatten(0, latents.shape[:2]))
 
     def recomputed(self, function: Callable[..., Any], *given: Any) -> Any:
         """What the function gives, computed again in the backward pass when checkpointing is on."""
@@ -130,8 +147,7 @@ class WorldTransformer(nn.Module):
         return video, text
 
     def unpatchify(self, tokens: Tensor, like: Tensor) -> Tensor:
-        """Tokens of ``patch × patch × channel`` values back to frames of the latents' size."""
-        batch, frames, _, height, width = like.shape
-        patch = self.base.config.patch_size
-        grid = tokens.reshape(batch, frames, height // patch, width // patch, -1, patch, patch)
-        return grid.permute(0, 1, 4, 2, 5, 3, 6).flatten(5, 6).flatten(3, 4)
+        """Tokens of patches back to frames of the latents' size."""
+        config = self.base.config
+        size = (like.shape[1], like.shape[3], like.shape[4])
+        return unfold_patches(tokens, size, config.patch_size, frames_per_token(config))

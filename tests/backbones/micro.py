@@ -50,18 +50,24 @@ def random_tokens(batch: int, count: int, seed: int = 3) -> MemoryTokens:
     return MemoryTokens(features, positions, torch.ones(batch, count, dtype=torch.bool))
 
 
-def random_clips(batch: int = 2, tokens: MemoryTokens | None = None, interactions: Any = None) -> Clips:
-    """Noise images on a path that moves ahead."""
+def random_clips(
+    batch: int = 2,
+    tokens: MemoryTokens | None = None,
+    interactions: Any = None,
+    size: tuple[int, int, int] = (9, SIZE, SIZE),
+) -> Clips:
+    """Noise images, so many frames of this height and width, on a path that moves ahead."""
     draw = torch.Generator().manual_seed(2)
-    poses = torch.eye(4, dtype=torch.float64).repeat(batch, 9, 1, 1)
-    poses[:, :, 2, 3] = torch.arange(9) * 0.25
-    focal = SIZE * 0.7
-    matrix = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]], dtype=torch.float64)
+    frames, height, width = size
+    poses = torch.eye(4, dtype=torch.float64).repeat(batch, frames, 1, 1)
+    poses[:, :, 2, 3] = torch.arange(frames) * 0.25
+    focal = width * 0.7
+    matrix = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
     return Clips(
-        rgb=torch.randint(0, 256, (batch, 9, SIZE, SIZE, 3), generator=draw, dtype=torch.uint8),
-        depth=torch.rand(batch, 9, SIZE, SIZE, generator=draw) * 4 + 0.3,
-        cameras=Cameras(poses, matrix.expand(batch, 9, 3, 3), SIZE, SIZE),
-        interactions=interactions or [(None,) * 8] * batch,
+        rgb=torch.randint(0, 256, (batch, *size, 3), generator=draw, dtype=torch.uint8),
+        depth=torch.rand(batch, *size, generator=draw) * 4 + 0.3,
+        cameras=Cameras(poses, matrix.expand(batch, frames, 3, 3), height, width),
+        interactions=interactions or [(None,) * (frames - 1)] * batch,
         tokens=tokens,
         seeds=list(range(batch)),
     )

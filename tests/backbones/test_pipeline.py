@@ -187,7 +187,7 @@ def test_another_scheduler_is_another_sampler():
     found, (rgb, _) = call(pipeline), backbone.generate(CLIPS, Sampling(3, "dpm", 1.5))
     assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
     pipeline.scheduler = EulerDiscreteScheduler()
-    with pytest.raises(PersistError, match="^scheduler EulerDiscreteScheduler does not keep to training"):
+    with pytest.raises(PersistError, match=r"^scheduler EulerDiscreteScheduler does not keep to training"):
         call(pipeline)
 
 

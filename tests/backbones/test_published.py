@@ -13,13 +13,15 @@ from persist_cli.registry import make_backbone
 from persist_cli.world.backbone import STAGES
 from tests.backbones.published import SCHEDULERS, TRANSFORMERS, VAES
 
-MODELS = ("2b", "5b", "5b-i2v")
+MODELS = tuple(TRANSFORMERS)
 SIZE = {"height": 480, "width": 720, "frames": 49}
 VAE_PARAMETERS = 215_583_907
 COUNTS = [  # of the published transformer, what widening adds, and the paper's memory block at its defaults
     ("2b", 1_693_783_872, 750_144, 580_737_920),
     ("5b", 5_570_283_072, 1_155_648, 1_891_102_592),
     ("5b-i2v", 5_570_479_680, 959_040, 1_891_102_592),
+    ("1.5-5b", 5_570_676_352, 2_237_056, 1_891_231_616),
+    ("1.5-5b-i2v", 5_571_594_880, 1_843_840, 1_891_231_616),
 ]
 SHOWN = {"sample_height", "sample_width", "sample_frames"}  # a preset's are those of the settings
 

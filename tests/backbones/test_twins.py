@@ -1,0 +1,199 @@
+"""Each published model's reduced twin, saved by diffusers alone and loaded by us."""
+
+import dataclasses
+
+import pytest
+import torch
+from diffusers import (
+    AutoencoderKLCogVideoX,
+    CogVideoXDDIMScheduler,
+    CogVideoXImageToVideoPipeline,
+    CogVideoXPipeline,
+    CogVideoXTransformer3DModel,
+)
+
+from persist_backbones.clip_shape import ClipShape
+from persist_backbones.noise import generators_of, noise_like
+from persist_backbones.pipeline import WorldPipeline
+from persist_cli.registry import make_backbone
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import CheckpointError
+from tests.backbones.micro import random_clips, random_tokens, shaken, with_adapter
+from tests.backbones.published import TRANSFORMERS
+from tests.backbones.twins import NAMES, SIZE, load_twin, write_twin
+
+OTHER = (9, 32, 32)  # shorter and of another shape than the configurations say
+BOTH = [(name, size) for name in NAMES for size in (SIZE, OTHER)]
+BOTH.remove(("5b-i2v", OTHER))  # diffusers takes a learned table for images of its own size only
+every_model = pytest.mark.parametrize("name", NAMES)
+
+
+@pytest.fixture(scope="module")
+def twins(tmp_path_factory):
+    home = tmp_path_factory.mktemp("twins")
+    return {name: write_twin(name, home / name) for name in NAMES}
+
+
+def plain_pipeline(folder, name):
+    """diffusers' own pipeline of a directory, without text encoder."""
+    transformer = CogVideoXTransformer3DModel.from_pretrained(folder / "transformer")
+    vae = AutoencoderKLCogVideoX.from_pretrained(folder / "vae")
+    scheduler = CogVideoXDDIMScheduler.from_pretrained(folder / "scheduler")
+    kind = CogVideoXImageToVideoPipeline if "i2v" in name else CogVideoXPipeline
+    pipe = kind(None, None, vae, transformer, scheduler)
+    pipe.set_progress_bar_config(disable=True)
+    return pipe
+
+
+def given_to(model, run):
+    """What the transformer was given when something runs: all input channels, one entry a call."""
+    seen = []
+    hook = model.transformer.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].detach()))
+    run()
+    hook.remove()
+    return seen
+
+
+@torch.no_grad()
+@every_model
+def test_the_widened_twin_is_diffusers_own_to_the_bit(twins, name):
+    model, pipe, clips = load_twin(twins[name]), plain_pipeline(twins[name], name), random_clips(2, size=SIZE)
+    torch.manual_seed(0)
+    noisy, image = torch.randn(2, 2, model.shape.padded_frames, 8, 8, 12)
+    image = image if "i2v" in name else torch.zeros_like(image)
+    given = dataclasses.replace(model.conditions(clips, torch.tensor([3, 700]), None), text=torch.randn(2, 4, 8))
+    ours = model.predict(noisy, image, given)
+    config = pipe.transformer.config
+    rotary, offset = None, noisy.new_full((1,), 2.0) if config.ofs_embed_dim else None
+    if config.use_rotary_positional_embeddings:
+        rotary = pipe._prepare_rotary_positional_embeddings(*SIZE[1:], noisy.shape[1], torch.device("cpu"))
+    inputs = torch.cat([noisy[:, :, :4], image[:, :, :4]], dim=2)[:, :, : config.in_channels]
+    theirs = pipe.transformer(inputs, given.text, given.timestep, ofs=offset, image_rotary_emb=rotary).sample
+    assert torch.equal(ours[:, :, :4], theirs)
+    assert not ours[:, :, 4:].any()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("name", "size"), BOTH)
+def test_an_untrained_twin_generates_what_diffusers_own_pipeline_does(twins, name, size):
+    model, pipe, clips = load_twin(twins[name], size), plain_pipeline(twins[name], name), random_clips(1, size=size)
+    rgb, _ = model.generate(clips, Sampling(steps=4))
+    noise = noise_like(model.encode_first(clips), generators_of(clips.seeds))[:, :, :4]
+    image = {"image": clips.rgb[:, 0].permute(0, 3, 1, 2) / 255} if "i2v" in name else {}
+    frames, height, width = size
+    video = pipe(
+        **image, prompt_embeds=torch.zeros(1, 4, 8), latents=noise, num_inference_steps=4, guidance_scale=1.0,
+        num_frames=frames, height=height, width=width, output_type="pt",
+    ).frames  # fmt: skip
+    theirs = (video.permute(0, 1, 3, 4, 2) * 255).round()
+    assert rgb.shape == theirs.shape
+    assert (rgb[:, 1:] - theirs[:, 1:]).abs().max() <= 1
+
+
+@every_model
+def test_our_own_pipeline_generates_what_the_backbone_does(twins, name):
+    model, clips = load_twin(twins[name], OTHER), random_clips(1, size=OTHER)
+    pipeline = WorldPipeline.of(model)
+    pipeline.set_progress_bar_config(disable=True)
+    found = pipeline(
+        clips.rgb[0, 0].numpy(), clips.depth[0, 0], clips.cameras, num_inference_steps=2, output_type="pt",
+        generator=generators_of(clips.seeds),
+    )  # fmt: skip
+    rgb, depth = model.generate(clips, Sampling(2))
+    assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    assert torch.equal(found.depth, depth)
+
+
+@torch.no_grad()
+@every_model
+def test_training_sees_the_image_as_sampling_does_and_as_diffusers_scales_it(twins, name):
+    model, clips = load_twin(twins[name]), random_clips(1, size=SIZE)
+    trained, sampled = (given_to(model, run)[0][:, :, 4:8] for run in (
+        lambda: model(clips, "1"), lambda: model.generate(clips, Sampling(steps=1)),
+    ))  # fmt: skip
+    first = clips.rgb[:, :1].permute(0, 4, 1, 2, 3) / 127.5 - 1
+    latents = model.codec.vae.encode(first).latent_dist.mode().transpose(1, 2)
+    scale = model.codec.vae.config.scaling_factor
+    assert torch.equal(trained, sampled)
+    assert torch.allclose(trained[:, :1], latents / scale if name.startswith("1.5") else latents * scale, atol=1e-5)
+    assert not trained[:, 1:].any()
+
+
+@every_model
+def test_every_stage_of_a_twin_has_a_finite_loss_and_gradients_everywhere(twins, name):
+    model = with_adapter(load_twin(twins[name], OTHER))
+    shaken(model)
+    model.prompt.normal_(generator=torch.Generator().manual_seed(0))
+    picked = [(*("pick_up", "drop", "toggle") * 2, "pick_up", "drop")]
+    clips = random_clips(1, random_tokens(1, 12), picked, OTHER)
+    for stage in ("codec", "1", "2"):
+        parameters = model.trained_parameters(stage)
+        loss = model(clips, stage)["loss"]
+        gradients = torch.autograd.grad(loss, list(parameters.values()))
+        still = [key for key, each in zip(parameters, gradients, strict=True) if not each.any()]
+        assert torch.isfinite(loss)
+        assert still == []
+
+
+@every_model
+def test_a_trained_twin_survives_saving_and_diffusers_reads_its_own_parts(twins, name, tmp_path):
+    model, clips = load_twin(twins[name], OTHER), random_clips(1, size=OTHER)
+    shaken(model, 0.02)
+    model.save_base(tmp_path)
+    again = make_backbone("cogvideox", model.checkpoint_settings()).eval()
+    again.load_base(tmp_path)
+    for one, two in zip(model.generate(clips, Sampling(2)), again.generate(clips, Sampling(2)), strict=True):
+        assert torch.equal(one, two)
+    pipe = plain_pipeline(tmp_path, name)
+    for ours, theirs in ((model.transformer.base, pipe.transformer), (model.codec.vae, pipe.vae)):
+        assert ours.state_dict().keys() == theirs.state_dict().keys()
+        assert all(torch.equal(value, theirs.state_dict()[key]) for key, value in ours.state_dict().items())
+    assert pipe.scheduler.config.snr_shift_scale == (3.0 if name == "2b" else 1.0)
+
+
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+def test_a_memory_reaches_the_tokens_of_1_5_whose_frames_see_it(twins, form):
+    model = with_adapter(
+        load_twin(twins["1.5-5b-i2v"], OTHER), form=form, **({"head_width": 8} if form == "canvas" else {})
+    )
+    clips = random_clips(1, size=OTHER)
+    clips.cameras.world_from_camera[:, 5:, 0, 0] = clips.cameras.world_from_camera[:, 5:, 2, 2] = -1  # look back
+    ahead, behind = random_tokens(1, 1), random_tokens(1, 1)
+    ahead.positions[:] = torch.tensor([0.0, 0.0, 5.0])
+    behind.positions[:] = torch.tensor([0.0, 0.0, -1.0])
+    seen = [model.adapter.prepare(each, clips.cameras).mask for each in (ahead, behind)]
+    if form != "cross":  # tokens of the padding and the first frame, and of the eight others
+        seen = [each.reshape(1, 2, -1).any(dim=-1).tolist() for each in seen]
+        assert seen == [[[True, True]], [[False, True]]]
+    fresh = model.generate(clips, Sampling(1))
+    shaken(model.adapter)
+    changed = model.generate(dataclasses.replace(clips, tokens=ahead), Sampling(1))
+    assert torch.isfinite(changed[1]).all()
+    assert not torch.equal(fresh[0], changed[0])
+
+
+@pytest.mark.parametrize(("frames", "multiple"), [(3, 2), (4, 2), (5, 3), (5, 1)])
+def test_dropping_what_was_padded_gives_the_latents_back(frames, multiple):
+    shape, latents = ClipShape(frames, 2, 2, 2, multiple), torch.randn(1, frames, 4, 2, 2)
+    padded = shape.pad(latents)
+    assert padded.shape[1] % multiple == 0
+    assert torch.equal(shape.drop_padding(padded), latents)
+    assert all(torch.equal(each, latents[:, 0]) for each in padded.unbind(1)[: shape.padded_frames - frames])
+
+
+@torch.no_grad()
+def test_a_learned_table_is_cut_to_the_clip_and_its_middle_resampled(twins):
+    model = load_twin(twins["5b-i2v"], OTHER)
+    table = CogVideoXTransformer3DModel.from_pretrained(twins["5b-i2v"] / "transformer").patch_embed.pos_embedding
+    ours = model.transformer.base.patch_embed.pos_embedding
+    video = table[0, 4:].unflatten(0, (5, 4, 6))[:3, :, 1:5]
+    assert torch.equal(ours[0, :4], table[0, :4])
+    assert torch.equal(ours[0, 4:], video.flatten(0, 2))
+    assert model.transformer.base.config.sample_frames == 9
+    with pytest.raises(CheckpointError, match="learned positions are for clips of 17 frames at most; ask for fewer"):
+        load_twin(twins["5b-i2v"], (25, 32, 48))
+
+
+def test_published_keys_are_kept_by_the_twins(twins):
+    for name in NAMES:
+        assert set(TRANSFORMERS[name]) <= set(load_twin(twins[name]).transformer.base.config)
