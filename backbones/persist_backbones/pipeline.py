@@ -182,26 +182,27 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
         Raises:
             PersistError: one line for inputs that do not go together or do not fit the model.
         """
-        sampling = Sampling(num_inference_steps, self._sampler(), guidance_scale)
-        backbone = self.backbone
-        backbone.check_sampling(sampling)
-        self._check(output_type, callback_on_step_end_tensor_inputs)
-        images = batch_of_images(image)
-        if images.shape[1:3] != backbone.image_size:
-            size, wanted = ("x".join(map(str, each)) for each in (images.shape[1:3], backbone.image_size))
-            raise DataError(f"an image of {size} pixels; this model takes {wanted}, depth and cameras alike")
+        backbone, sampling = self.backbone, Sampling(num_inference_steps, self._sampler(), guidance_scale)
+        self._check(sampling, output_type, callback_on_step_end_tensor_inputs)
+        images = self._images(image)
         first = make_clips(images, depth, cameras, interactions, memory_tokens, backbone.frames_per_clip)
         condition = backbone.encode_first(first)
         generators = generators_for(generator, len(images))
         noise = noise_like(condition, generators) if latents is None else latents.to(condition)
-        predict = make_denoiser(backbone, first, condition, lambda: self._guidance_scale)
-        drawing = sampling.sampler, sampling.steps, generators
-        steps = denoising(self._noting(predict), noise, self.scheduler.config, *drawing)
-        self._guidance_scale, self._num_timesteps, self._interrupt = guidance_scale, num_inference_steps, False
-        latents = self._run(steps, callback_on_step_end, callback_on_step_end_tensor_inputs)
-        output = self._output(latents, first, output_type)
+        predict = self._noting(make_denoiser(backbone, first, condition, lambda: self._guidance_scale))
+        steps = denoising(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
+        found = self._run(steps, sampling, callback_on_step_end, callback_on_step_end_tensor_inputs)
+        output = self._output(found, first, output_type)
         self.maybe_free_model_hooks()
         return output if return_dict else output.to_tuple()
+
+    def _images(self, given: Any) -> Tensor:
+        """The images as one batch, of the model's size."""
+        images = batch_of_images(given)
+        if images.shape[1:3] != self.backbone.image_size:
+            size, wanted = ("x".join(map(str, each)) for each in (images.shape[1:3], self.backbone.image_size))
+            raise DataError(f"an image of {size} pixels; this model takes {wanted}, depth and cameras alike")
+        return images
 
     def _sampler(self) -> str:
         name = next((name for name, kind in SAMPLERS.items() if type(self.scheduler) is kind), None)
@@ -212,7 +213,8 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
             )
         return name
 
-    def _check(self, output_type: str, tensors: Sequence[str]) -> None:
+    def _check(self, sampling: Sampling, output_type: str, tensors: Sequence[str]) -> None:
+        self.backbone.check_sampling(sampling)
         if output_type not in OUTPUTS:
             raise PersistError(f"unknown output_type {output_type!r}; known: {', '.join(OUTPUTS)}")
         unknown = set(tensors) - set(self._callback_tensor_inputs)
@@ -229,8 +231,11 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
 
         return noting
 
-    def _run(self, steps: Iterator[Step], callback: Callback | None, tensors: Sequence[str]) -> Tensor:
+    def _run(
+        self, steps: Iterator[Step], sampling: Sampling, callback: Callback | None, tensors: Sequence[str]
+    ) -> Tensor:
         """Latents after all steps, or after the one that was interrupted."""
+        self._guidance_scale, self._num_timesteps, self._interrupt = sampling.memory_guidance, sampling.steps, False
         with self.progress_bar(total=self._num_timesteps) as bar:
             for step in steps:
                 if callback is not None:
