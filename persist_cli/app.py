@@ -8,12 +8,25 @@ from typing import Annotated
 
 import typer
 
-from persist_cli import __version__
-from persist_cli.options import ActionsOption, Commands, GuidanceOption, JsonOption, SamplerOption, StepsOption
+from persist_cli.options import (
+    ActionsOption,
+    Commands,
+    CompareOption,
+    ControlsOption,
+    DtypeOption,
+    GuidanceOption,
+    JsonOption,
+    SamplerOption,
+    SaveMemoryOption,
+    StepsOption,
+    names_in,
+    show_version,
+)
 from persist_cli.sampling import AskedSampling
 from persist_cli.viewing.app import plugins, recipes
 from persist_cli.weights.app import weights_app
 from persist_cli.world.errors import PersistError
+from persist_cli.world.placement import Placement
 
 app = typer.Typer(
     name="persist",
@@ -34,20 +47,9 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(1)
 
 
-def names_in(text: str) -> tuple[str, ...]:
-    """The names of a list separated by commas."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-def _show_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"persist {__version__}")
-        raise typer.Exit
-
-
 @app.callback()
 def common(
-    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True)] = False,
+    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True)] = False,
 ) -> None:
     """Persistent embodied world models."""
 
@@ -218,6 +220,8 @@ def rollout(
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
     json: JsonOption = False,
 ) -> None:
     """Roll out a world model from a start frame along actions, clip by clip.
@@ -232,6 +236,7 @@ def rollout(
     plan = RolloutPlan(
         start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
         write=write, seed=seed, sampling=AskedSampling(steps, sampler, guidance),
+        placement=Placement.of(dtype, save_memory),
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 
@@ -244,9 +249,7 @@ def evaluate(
     data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
     protocol: Annotated[str, typer.Option(help="revisit, return, long or unseen.")] = "revisit",
     memories: Annotated[str, typer.Option(help="Memories to compare, the first as reference.")] = "none,voxel",
-    controls: Annotated[
-        str, typer.Option(help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy.")
-    ] = "copy,nearest,warp,codec,shuffled,emptied",
+    controls: ControlsOption = "copy,nearest,warp,codec,shuffled,emptied",
     metrics: Annotated[str, typer.Option(help="Metrics separated by commas, or all.")] = "all",
     frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
     clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
@@ -254,13 +257,13 @@ def evaluate(
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
     out: Annotated[Path, typer.Option(help="Folder for metrics.json; a stopped run goes on.")] = Path("runs/eval"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html, tables, curves, clips.")] = None,
-    compare: Annotated[
-        tuple[Path, Path] | None, typer.Option(metavar="A.json B.json", help="Compare two results instead.")
-    ] = None,
+    compare: CompareOption = None,
     json: JsonOption = False,
 ) -> None:
     """Compare checkpoints, memories and controls on equal clips of held-out scenes.
@@ -283,6 +286,7 @@ def evaluate(
         data=tuple(data), protocol=protocol, memories=names_in(memories), controls=names_in(controls),
         metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=AskedSampling(steps, sampler, guidance), batch=batch, noise=pose_noise,
+        placement=Placement.of(dtype, save_memory),
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

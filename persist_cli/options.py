@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
+
+from persist_cli import __version__
 
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
 
@@ -18,9 +21,35 @@ GuidanceOption = Annotated[
     float | None,
     typer.Option("--guidance", min=0, help="Of guidance over memory; the checkpoint's, else 1: none."),
 ]
+ControlsOption = Annotated[
+    str, typer.Option("--controls", help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy.")
+]
+CompareOption = Annotated[
+    tuple[Path, Path] | None,
+    typer.Option("--compare", metavar="A.json B.json", help="Compare two results instead."),
+]
+DtypeOption = Annotated[
+    str | None, typer.Option("--dtype", help="float32, bfloat16 or float16; the checkpoint's, float32 as a rule.")
+]
+SaveMemoryOption = Annotated[
+    str | None,
+    typer.Option("--save-memory", help="Of model-offload, sequential-offload, vae-slicing, vae-tiling, with commas."),
+]
 ActionsOption = Annotated[
     list[str] | None, typer.Option("--actions", help='Actions, as in "left*4 forward*6"; given again, another branch.')
 ]
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """The names of a list separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def show_version(wanted: bool) -> None:
+    """Say the version and end, when wanted."""
+    if wanted:
+        typer.echo(f"persist {__version__}")
+        raise typer.Exit
 
 
 class Commands(TyperGroup):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -37,6 +37,10 @@ from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
 from persist_backbones.world_transformer import Conditions
 from persist_cli.world.backbone import Backbone, Clips, Economy, Part, Sampling, Stage
 from persist_cli.world.errors import CheckpointError
+from persist_cli.world.placement import Placement
+
+if TYPE_CHECKING:
+    from persist_backbones.pipeline import WorldPipeline
 
 
 class CogVideoX(Backbone):
@@ -54,6 +58,7 @@ class CogVideoX(Backbone):
         super().__init__(settings)
         self.adapters = nn.ModuleDict()
         self.adapter_name: str | None = None
+        self.offloaded: WorldPipeline | None = None
         self.frozen = FrozenWeights(self, None)
         self.set_parts(starting_parts(settings))
 
@@ -96,6 +101,12 @@ class CogVideoX(Backbone):
     def gives_depth(self) -> bool:
         """What the settings say."""
         return self.settings.depth
+
+    def place(self, placement: Placement) -> None:
+        """Get ready to sample, as diffusers' pipelines do; weights that are offloaded rest on the CPU between clips."""
+        from persist_backbones.placing import place  # a pipeline is made around this class
+
+        self.offloaded = place(self, placement, placement.device())
 
     @property
     def adapter(self) -> Adapter[Any] | None:
@@ -174,6 +185,8 @@ class CogVideoX(Backbone):
         noise = noise_like(image, generators)
         latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
         rgb, depth = self.codec.decode(self.shape.drop_padding(latents), self.settings.depth)
+        if self.offloaded is not None:
+            self.offloaded.maybe_free_model_hooks()
         rgb[:, 0], depth[:, 0] = first.rgb[:, 0], first.depth[:, 0]
         return rgb, depth
 

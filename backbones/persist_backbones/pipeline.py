@@ -182,7 +182,7 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
         Raises:
             PersistError: one line for inputs that do not go together or do not fit the model.
         """
-        backbone, sampling = self.backbone, Sampling(num_inference_steps, self._sampler(), guidance_scale)
+        sampling, backbone = Sampling(num_inference_steps, self._sampler(), guidance_scale), self.backbone
         self._check(sampling, output_type, callback_on_step_end_tensor_inputs)
         images = self._images(image)
         first = make_clips(images, depth, cameras, interactions, memory_tokens, backbone.frames_per_clip)

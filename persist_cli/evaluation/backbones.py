@@ -13,12 +13,18 @@ from persist_cli.trajectories.clips import check_size
 from persist_cli.trajectories.store import Store
 from persist_cli.world.backbone import Backbone, Sampling
 from persist_cli.world.errors import CheckpointError
+from persist_cli.world.placement import Placement
 
 
 class Backbones:
-    """The backbone of one base at a time, loaded when another is wanted."""
+    """The backbone of one base at a time, loaded when another is wanted.
 
-    def __init__(self) -> None:
+    Args:
+        placement: how they sample.
+    """
+
+    def __init__(self, placement: Placement = Placement()) -> None:
+        self.placement = placement
         self.backbone: Backbone | None = None
         self.loaded = ""
 
@@ -31,7 +37,7 @@ class Backbones:
     def ready(self, row: Row) -> Backbone:
         """The backbone, prepared for this row."""
         backbone = self.of(row.base)
-        row.prepare(backbone)
+        row.prepare(backbone, self.placement)
         return backbone
 
 

@@ -83,7 +83,8 @@ def describe(run: Evaluation, processes: int) -> dict[str, Any]:
             "memory_guidance": run.sampling.memory_guidance,
             "seeds": list(range(run.plan.seeds)),
             "batch": run.plan.batch,
-        },
+        }
+        | run.plan.placement.changes(),
         "environment": environment(processes),
         "command": command(),
         "checkpoints": [checkpoint_json(each) | scenes_json(each) for each in run.checkpoints],

@@ -25,6 +25,7 @@ from persist_cli.sampling import AskedSampling
 from persist_cli.viewing.console import say
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import PersistError, hint
+from persist_cli.world.placement import Placement
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class EvalPlan:
     sampling: AskedSampling
     batch: int
     noise: tuple[float, float]
+    placement: Placement
 
     def once(self) -> EvalPlan:
         """The same plan without repeated names: a memory named twice would be two rows of one name."""
@@ -105,7 +107,8 @@ def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Process
     Raises:
         PersistError: one line for whatever does not fit.
     """
-    plan, backbones = plan.once(), Backbones()
+    plan.placement.device()  # what cannot be is told before anything is loaded
+    plan, backbones = plan.once(), Backbones(plan.placement)
     checkpoints = list({each.folder.resolve(): each for each in map(find_checkpoint, paths)}.values())
     sampling = common_sampling(checkpoints, plan.sampling)
     choice = RowChoice(plan.memories, plan.controls, sampling, plan.noise)
@@ -142,7 +145,8 @@ def what_is_measured(
 ) -> dict[str, Any]:
     """All that changes a figure but the data, JSON values: the same evaluation goes on where it stopped."""
     options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
-    options |= {"sampling": asdict(sampling)}
+    options |= {"sampling": asdict(sampling) | plan.placement.changes()}
+    del options["placement"]  # what else it says changes no figure
     models = [checkpoint_json(each) for each in checkpoints]
     values = options | {"checkpoints": models, "metric definitions": metric_json(metrics)}
     return dict(json.loads(json.dumps(values)))  # as a file gives it back

@@ -177,6 +177,8 @@ class Sampling(Part):
     steps: int | None = None
     sampler: str | None = None
     memory_guidance: float | None = None
+    dtype: str | None = None
+    tiling: bool = False
     seeds: list[int] = []
     batch: int | None = None
 

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_adapter, load_backbone
 from persist_cli.memorizing.memory_file import load_memory
 from persist_cli.memorizing.recall import MemoryMaker
@@ -29,6 +27,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     """Roll out a checkpoint, or else the reference model, and leave a folder for each branch; see its help."""
     if bool(plan.actions) == plan.follow:
         raise PersistError("give either --actions TEXT or --follow")
+    plan.placement.device()  # what cannot be is told before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = plan.adapter or checkpoint.default_adapter()
     walks = plan_walks(plan)
@@ -40,7 +39,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     backbone.check_sampling(sampling)
     plan = dataclasses.replace(plan, sampling=AskedSampling(**dataclasses.asdict(sampling)))
     load_adapter(backbone, checkpoint, adapter)
-    backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    backbone.place(plan.placement)
     memory = open_memory(checkpoint, adapter, plan, info)
     model = WorldModel(backbone, memory and memory.to(backbone.device), sampling, plan.seed, plan.write)
     rollouts = roll(model, walks)
@@ -114,7 +113,7 @@ def roll(model: WorldModel, walks: Sequence[Walk]) -> list[Rollout]:
 def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
     """What is needed to roll out again, JSON values."""
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
-    options |= {"sampling": plan.sampling.given()}
+    options |= {"sampling": plan.sampling.given(), "placement": dataclasses.asdict(plan.placement)}
     memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
     together = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
     return {

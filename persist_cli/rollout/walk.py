@@ -15,6 +15,7 @@ from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import DataError
 from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations, Trajectory, TrajectoryInfo
+from persist_cli.world.placement import Placement
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class RolloutPlan:
     write: bool
     seed: int
     sampling: AskedSampling
+    placement: Placement
 
 
 @dataclass(frozen=True)

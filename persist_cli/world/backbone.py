@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import PersistError
+from persist_cli.world.placement import Placement
 from persist_cli.world.settings import NoSettings
 from persist_cli.world.tokens import MemoryTokens
 
@@ -144,6 +145,19 @@ class Backbone(nn.Module, ABC):
     def gives_depth(self) -> bool:
         """Whether clips have depth after their first frame."""
         return True
+
+    def place(self, placement: Placement) -> None:
+        """Get ready to sample, on the accelerator where there is one; it may be placed again, also with other adapters.
+
+        Raises:
+            PersistError: when memory cannot be saved so.
+        """
+        device = placement.device()
+        if placement.offload != "none" or placement.slicing or placement.tiling:
+            raise PersistError(f"backbone {self.name!r} cannot save memory; leave out --save-memory")
+        if placement.dtype is not None:
+            self.to(getattr(torch, placement.dtype))
+        self.to(device).eval()
 
     def parts(self) -> list[Part]:
         """Every parameter, each in one part, in the order in which people think of them."""

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 from persist_cli.world.errors import PersistError, hint
+
+if TYPE_CHECKING:
+    import torch
 
 Precision = Literal["float32", "bfloat16", "float16"]
 Offload = Literal["none", "model", "sequential"]
@@ -51,3 +54,25 @@ class Placement:
         ways: dict[str, Offload] = {"model-offload": "model", "sequential-offload": "sequential"}
         offload = next((way for word, way in ways.items() if word in words), "none")
         return cls(dtype, offload, "vae-slicing" in words, "vae-tiling" in words)  # type: ignore[arg-type]
+
+    def changes(self) -> dict[str, Any]:
+        """What of it changes results, JSON values; empty for a checkpoint as it is."""
+        asked = {"dtype": self.dtype, "tiling": self.tiling}
+        return {name: value for name, value in asked.items() if value}
+
+    def device(self) -> torch.device:
+        """The accelerator of this process, else the CPU.
+
+        Raises:
+            PersistError: when there is no accelerator that weights could be brought to.
+        """
+        import torch
+
+        if torch.cuda.is_available():
+            return torch.device("cuda", torch.cuda.current_device())
+        if self.offload != "none":
+            raise PersistError(
+                f"--save-memory {self.offload}-offload keeps weights on the CPU for an accelerator, and there is none; "
+                "leave it out"
+            )
+        return torch.device("cpu")

@@ -116,3 +116,15 @@ def test_an_exported_model_still_knows_what_it_was_trained_on(persist, stage1, v
     command = ["eval", tmp_path / "model", "--data", walks, "--protocol", "unseen", *ONE, "--out", tmp_path / "o"]
     assert "the model was trained on its scene 'room-0'" in refused(persist, *command)
     assert not (tmp_path / "o").exists()
+
+
+def test_another_precision_is_another_evaluation_and_slices_of_the_codec_are_not(persist, walks, tmp_path):
+    model, out = write_model(tmp_path / "a"), tmp_path / "o"
+    run = ["eval", model, "--data", walks, *ONE, "--steps", 1, "--out", out]
+    assert persist(*run).code == 0
+    assert persist(*run, "--save-memory", "vae-slicing").code == 0
+    assert "dtype" not in read_json(out / "metrics.json")["sampling"]
+    told = refused(persist, *run, "--dtype", "bfloat16")
+    assert "holds another evaluation (sampling dtype: None, now bfloat16)" in told
+    assert persist(*run[:-1], tmp_path / "p", "--dtype", "bfloat16").code == 0
+    assert read_json(tmp_path / "p/metrics.json")["sampling"]["dtype"] == "bfloat16"

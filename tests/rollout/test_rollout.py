@@ -133,3 +133,21 @@ def test_quaternions_rotate_as_their_matrices_do():
         x, y, z, w = quaternion(rotation_about(axis, angle)).tolist()
         expected = [*(axis * torch.sin(torch.tensor(angle / 2))).tolist(), float(torch.cos(torch.tensor(angle / 2)))]
         assert [x, y, z, w] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_rollout_of_lower_precision_and_less_memory_says_so(persist, voxel, walks, tmp_path):
+    options = ["--actions", "forward*3", "--dtype", "bfloat16", "--save-memory", "vae-slicing,vae-tiling"]
+    assert roll(persist, voxel, walks, tmp_path, *options).code == 0
+    plan = json.loads((tmp_path / "rollout.json").read_text())["plan"]
+    assert plan["placement"] == {"dtype": "bfloat16", "offload": "none", "slicing": True, "tiling": True}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is an accelerator")
+def test_a_rollout_that_cannot_save_memory_so_is_one_line(persist, walks, tmp_path):
+    for options, cause in (
+        (["--save-memory", "model-offload"], "for an accelerator, and there is none; leave it out"),
+        (["--dtype", "int8"], "unknown --dtype 'int8'; known: float32, bfloat16, float16"),
+    ):
+        ended = roll(persist, tmp_path, walks, tmp_path / "o", "--actions", "forward", *options)
+        assert ended.code == 1
+        assert ended.err.strip().endswith(cause)

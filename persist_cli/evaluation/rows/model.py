@@ -18,6 +18,7 @@ from persist_cli.rollout.world_model import WorldModel, imagine_together
 from persist_cli.world.backbone import Backbone, Sampling
 from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations
+from persist_cli.world.placement import Placement
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,10 @@ class ModelRow(Row):
             return f"{self.checkpoint.name} without an adapter (stage 1)"
         return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.remembering.recall.definition}"
 
-    def prepare(self, backbone: Backbone) -> None:
+    def prepare(self, backbone: Backbone, placement: Placement) -> None:
         """Load the adapter."""
         load_adapter(backbone, self.checkpoint, self.adapter)
-        super().prepare(backbone)
+        super().prepare(backbone, placement)
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Rollouts from each clip's first frame along its cameras."""

@@ -6,12 +6,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
-import torch
 from torch import Tensor
 
 from persist_cli.checkpoints import Checkpoint
 from persist_cli.evaluation.cases import CaseFrames
 from persist_cli.world.backbone import Backbone
+from persist_cli.world.placement import Placement
 
 Kind = Literal["model", "control", "memory control"]
 
@@ -38,9 +38,9 @@ class Row(ABC):
     def definition(self) -> str:
         """What the row shows, in a few words."""
 
-    def prepare(self, backbone: Backbone) -> None:
-        """Make the backbone ready for this row."""
-        backbone.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    def prepare(self, backbone: Backbone, placement: Placement) -> None:
+        """Make the backbone ready for this row, placed like this."""
+        backbone.place(placement)
 
     @abstractmethod
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
