@@ -7,6 +7,7 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,12 +65,27 @@ def train_here(*arguments: str) -> None:
     assert not ended.value.code, said.getvalue()
 
 
-def in_two(*arguments: str) -> dict[str, Any]:
-    """How to start ``persist`` as two processes with gloo; ``--multi_gpu`` is accelerate's word for several."""
-    launch = ["--multi_gpu", "--num_machines", "1", "--num_processes", "2", "--mixed_precision", "no"]
+def launched(module: str, *arguments: str, kind: Sequence[str] = ("--multi_gpu",)) -> dict[str, Any]:
+    """How to start a module as two processes with gloo; ``--multi_gpu`` is accelerate's word for several."""
+    launch = [
+        *kind,
+        "--num_machines",
+        "1",
+        "--num_processes",
+        "2",
+        "--mixed_precision",
+        "no",
+        "--main_process_port",
+        "0",
+    ]
     command = [sys.executable, "-m", "accelerate.commands.launch", *launch, "--dynamo_backend", "no", "--module"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
-    return {"args": [*command, "persist_cli", *arguments], "env": environment}
+    return {"args": [*command, module, *arguments], "env": environment}
+
+
+def in_two(*arguments: str, kind: Sequence[str] = ("--multi_gpu",)) -> dict[str, Any]:
+    """How to start ``persist`` as two processes."""
+    return launched("persist_cli", *arguments, kind=kind)
 
 
 def together(*arguments: str) -> None:

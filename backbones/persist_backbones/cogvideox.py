@@ -51,6 +51,8 @@ class CogVideoX(Backbone):
     """
 
     settings_type = CogVideoXSettings
+    sharded_blocks = ("CogVideoXBlock", "MemoryBlock", "CanvasBlock")
+    kept_whole = ("codec",)
     settings: CogVideoXSettings
     prompt: Tensor
 

@@ -9,12 +9,13 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import set_seed
+from accelerate.utils import InitProcessGroupKwargs, set_seed
 
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone, step_folders
 from persist_cli.memorizing.recall import MemoryMaker
@@ -22,7 +23,9 @@ from persist_cli.options import INTERRUPTED
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, parse_yaml_mapping, read_recipe, to_plain
 from persist_cli.registry import make_backbone
 from persist_cli.training.cache import CacheSettings
+from persist_cli.training.processes import lost_processes_named
 from persist_cli.training.run_folder import RunFolder
+from persist_cli.training.sharding import shard_on_cpus, sharding_plugin
 from persist_cli.training.state import load_state
 from persist_cli.training.step_times import StepTimes
 from persist_cli.training.trainer import Stop, Trainer
@@ -30,6 +33,7 @@ from persist_cli.viewing.console import say
 from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError, RecipeError
 
+LONGEST_WAIT = timedelta(hours=1)  # for a process that neither answers nor ends, as while one writes a large model
 CHANGEABLE = {
     "steps",
     "checkpoint_every",
@@ -69,7 +73,7 @@ def run_finetune(plan: FinetunePlan) -> None:
         raise RecipeError(f"{plan.recipe}: no data set; give --data DIR")
     run = plan.out or Path("runs") / Path(plan.recipe).stem
     check_run(run, recipe, plan.resume)
-    with Stop() as stop, limited_threads(recipe.training.threads):
+    with Stop() as stop, limited_threads(recipe.training.threads), lost_processes_named(run):
         ended_by = finetune(recipe, run, stop, plan)
     if ended_by is not None:
         sys.exit(INTERRUPTED if ended_by == signal.SIGINT else 0)
@@ -145,9 +149,16 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
         raise PersistError(
             f"training.tracker={tracker} needs the package {tracker}: pip install 'persist-cli[{tracker}]'"
         )
+    plugin = sharding_plugin(settings.precision)
     accelerator = Accelerator(
-        mixed_precision=settings.precision, log_with=tracker, project_dir=run, cpu=not torch.cuda.is_available()
+        mixed_precision=settings.precision,
+        log_with=tracker,
+        project_dir=run,
+        cpu=not torch.cuda.is_available(),
+        fsdp_plugin=plugin,
+        kwargs_handlers=[InitProcessGroupKwargs(timeout=LONGEST_WAIT)],
     )
+    shard_on_cpus(plugin)
     set_seed(settings.seed)
     return accelerator
 

@@ -14,6 +14,7 @@ from persist_cli.training.log import SpeedLog, StepLog
 from persist_cli.training.state import model_folder, save_state
 from persist_cli.training.trainer import Trainer
 from persist_cli.trajectories.scenes import TrainingScenes
+from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError
 from persist_cli.world.files import remove_leftovers, write_text
 
@@ -21,7 +22,7 @@ CODEC_BATCHES = 4  # batches that the scale of the codec's latents is measured o
 
 
 class RunFolder:
-    """What a run leaves, written by the main process; the others wait for it.
+    """What a run leaves, written by the main process; where the training is sharded, by all of them.
 
     Args:
         path: of the folder, made when missing.
@@ -53,37 +54,37 @@ class RunFolder:
         step = self.trainer.state.step
         if step == self.saved:
             return
-        if self.trainer.accelerator.is_main_process:
-            try:
-                self._save()
-            except (OSError, SafetensorError) as error:  # the latter of what a backbone writes by itself
-                raise PersistError(f"{self.path}: a checkpoint cannot be written there ({error})") from error
+        try:
+            self._save()
+        except (OSError, SafetensorError) as error:  # the latter of what a backbone writes by itself
+            raise PersistError(f"{self.path}: a checkpoint cannot be written there ({error})") from error
         self.trainer.accelerator.wait_for_everyone()
         self.saved = step
 
     def _save(self) -> None:
         state, encoder = self.trainer.state, self.trainer.encoder
-        self.speed.add(state.step, encoder.figures() if encoder else {})
+        main = self.trainer.accelerator.is_main_process
+        if main:
+            self.speed.add(state.step, encoder.figures() if encoder else {})
         save_state(self.path, state, partial(self.save_model, home=model_folder(self.path, state.step)))
-        self.log.draw(self.path / "loss.png")
+        if main:
+            self.log.draw(self.path / "loss.png")
 
     def save_model(self, folder: Path, home: Path) -> None:
-        """Write the model, with averaged weights where they are kept, into a folder that will stand at ``home``."""
-        trainer, recipe, backbone = self.trainer, self.trainer.recipe, self.trainer.backbone
-        parameters, average = trainer.state.parameters.values(), trainer.state.average
-        if average is not None:
-            average.store(parameters)
-            average.copy_to(parameters)
-        try:
-            size = recipe.training.batch
-            samples = ([trainer.clips[number * size + row] for row in range(size)] for number in range(CODEC_BATCHES))
-            backbone.finish_stage(recipe.stage, (trainer.to_batch(each) for each in samples))
-            if recipe.memory is not None and self.base is not None:
-                save_adapter(backbone, self.base, recipe.memory, folder, home, self.scenes)
-            else:
-                save_base(backbone, folder, self.scenes)
-            write_text(folder / RECIPE, to_yaml(recipe))
-            write_recipes(folder, self.recipes)
-        finally:
-            if average is not None:
-                average.restore(parameters)
+        """Write the model into a folder that will stand at ``home``."""
+        with self.trainer.model_to_save() as backbone:
+            if self.trainer.accelerator.is_main_process:
+                self._write_model(backbone, folder, home)
+
+    def _write_model(self, backbone: Backbone, folder: Path, home: Path) -> None:
+        trainer, recipe = self.trainer, self.trainer.recipe
+        folder.mkdir()
+        size = recipe.training.batch
+        samples = ([trainer.clips[number * size + row] for row in range(size)] for number in range(CODEC_BATCHES))
+        backbone.finish_stage(recipe.stage, (trainer.to_batch(each) for each in samples))
+        if recipe.memory is not None and self.base is not None:
+            save_adapter(backbone, self.base, recipe.memory, folder, home, self.scenes)
+        else:
+            save_base(backbone, folder, self.scenes)
+        write_text(folder / RECIPE, to_yaml(recipe))
+        write_recipes(folder, self.recipes)

@@ -1,18 +1,26 @@
-"""The state of a run: weights, optimizer, averages and random numbers, safetensors and JSON, whole or absent."""
+"""The state of a run: weights, optimizer, averages and random numbers, safetensors and JSON, whole or absent.
+
+One file holds it, or where it is sharded one file a process; either is read by any number of processes, sharded or not.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from accelerate import PartialState
+from accelerate.utils import broadcast_object_list
 from diffusers.training_utils import EMAModel
 from torch import Tensor, nn
 
 from persist_cli.checkpoints import STEP, step_folders
+from persist_cli.training.sharding import is_sharded
+from persist_cli.training.shards import read_shards, write_shards
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import (
     folder_aside,
@@ -21,6 +29,9 @@ from persist_cli.world.files import (
     write_json,
     write_tensors,
 )
+
+WHOLE = "training.safetensors"
+SHARDS = "training"  # the folder of the processes' files
 
 
 @dataclass
@@ -42,13 +53,55 @@ class TrainingState:
     def tensors(self) -> dict[str, Tensor]:
         """All of it by name."""
         found: dict[str, Tensor] = {"random/torch": torch.get_rng_state()}
-        for number, (name, parameter) in enumerate(self.parameters.items()):
+        for name, parameter in self.parameters.items():
             found[f"parameter/{name}"] = parameter
             for key, value in self.optimizer.state[parameter].items():
                 found[f"optimizer/{key}/{name}"] = value
-            if self.average is not None:
-                found[f"average/{name}"] = self.average.shadow_params[number]
-        return found
+        return found | {f"average/{name}": each for name, each in self.averages().items()}
+
+    @property
+    def sharded(self) -> bool:
+        """Whether each process holds a part of it."""
+        return any(map(is_sharded, self.parameters.values()))
+
+    def averages(self) -> dict[str, Tensor]:
+        """The averaged parameters by name, none where none are kept."""
+        return {} if self.average is None else dict(zip(self.parameters, self.average.shadow_params, strict=True))
+
+    def write(self, folder: Path, main: bool) -> dict[str, Any]:
+        """Write all of it into a checkpoint's folder, this process its part; gives what else is to be kept."""
+        notes = {"step": self.step, "ema_steps": self.average.optimization_step if self.average else 0}
+        if self.sharded:
+            write_shards(folder / SHARDS, self.tensors())
+            return notes | {"files": len(list((folder / SHARDS).iterdir()))}
+        if main:
+            write_tensors(folder / WHOLE, self.tensors())
+        return notes
+
+    def read(self, folder: Path) -> None:
+        """Take what was written into a checkpoint's folder.
+
+        Raises:
+            CheckpointError: when a file is missing or not whole, or a tensor is missing or of another shape.
+        """
+        notes: dict[str, Any] = read_json(folder / "training.json")
+        shards = folder / SHARDS if "files" in notes else folder
+        if "files" in notes and len(list(shards.glob("*.safetensors"))) != notes["files"]:
+            raise CheckpointError(f"{shards}: of its {notes['files']} files some are missing; go back to a whole copy")
+        if "files" in notes or self.sharded:
+            self.restore(read_shards(shards, self.place), shards)
+        else:
+            self.restore(read_tensors(folder / WHOLE)[0], folder / WHOLE)
+        self.step = int(notes["step"])
+        if self.average is not None:
+            self.average.optimization_step = int(notes["ema_steps"])
+
+    def place(self, name: str, shape: torch.Size, dtype: torch.dtype) -> Tensor:
+        """A tensor to read a part of the state into: sharded like the parameter that it belongs to."""
+        parameter = self.parameters.get(name.split("/")[-1])
+        if parameter is None or parameter.shape != shape:
+            return torch.empty(shape, dtype=dtype)
+        return torch.empty_like(parameter, dtype=dtype, requires_grad=False)
 
     def restore(self, tensors: dict[str, Tensor], path: Path) -> None:
         """Take what ``tensors`` gave.
@@ -56,11 +109,12 @@ class TrainingState:
         Raises:
             CheckpointError: when a tensor is missing or of another shape.
         """
+        averages = self.averages()
         with torch.no_grad():
-            for number, (name, parameter) in enumerate(self.parameters.items()):
+            for name, parameter in self.parameters.items():
                 parameter.copy_(_take(tensors, f"parameter/{name}", parameter, path))
-                if self.average is not None:
-                    self.average.shadow_params[number].copy_(_take(tensors, f"average/{name}", parameter, path))
+                if name in averages:
+                    averages[name].copy_(_take(tensors, f"average/{name}", parameter, path))
                 moments = {
                     key.split("/")[1]: value for key, value in tensors.items()
                     if key.startswith("optimizer/") and key.endswith(f"/{name}") and key.count("/") == 2
@@ -78,36 +132,40 @@ def model_folder(run: Path, step: int) -> Path:
 
 
 def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], None]) -> None:
-    """Write a checkpoint aside, rename it to ``step-…`` and remove the older ones.
+    """Write a checkpoint aside, rename it to ``step-…`` and remove the older ones; all processes must call it.
 
     Args:
         run: the run's folder.
         state: of the training.
-        save_model: writes the model that others load into a folder.
+        save_model: makes a folder with the model that others load, on the main process.
     """
+    main = PartialState().is_main_process
     model = model_folder(run, state.step)
-    with folder_aside(model.parent) as aside:
-        (aside / model.name).mkdir()
+    with _shared_folder_aside(model.parent) as aside:
+        notes = state.write(aside, main)
         save_model(aside / model.name)
-        write_tensors(aside / "training.safetensors", state.tensors())
-        ema_steps = state.average.optimization_step if state.average else 0
-        write_json(aside / "training.json", {"step": state.step, "ema_steps": ema_steps})
-    for older in step_folders(run)[:-1]:
-        shutil.rmtree(older)
+        if main:
+            write_json(aside / "training.json", notes)
+    if main:
+        for older in step_folders(run)[:-1]:
+            shutil.rmtree(older)
+
+
+@contextlib.contextmanager
+def _shared_folder_aside(path: Path) -> Iterator[Path]:
+    """The main process's ``folder_aside``, which all processes may write into."""
+    main = PartialState().is_main_process
+    with folder_aside(path) if main else contextlib.nullcontext(path) as aside:
+        name = [str(aside)]
+        broadcast_object_list(name)
+        yield Path(name[0])
 
 
 def load_state(run: Path, state: TrainingState) -> None:
     """Restore the newest checkpoint of a run, if there is one."""
     folders = step_folders(run)
-    if not folders:
-        return
-    notes: dict[str, Any] = read_json(folders[-1] / "training.json")
-    path = folders[-1] / "training.safetensors"
-    tensors, _ = read_tensors(path)
-    state.restore(tensors, path)
-    state.step = int(notes["step"])
-    if state.average is not None:
-        state.average.optimization_step = int(notes["ema_steps"])
+    if folders:
+        state.read(folders[-1])
 
 
 def _take(tensors: dict[str, Tensor], name: str, like: Tensor, path: Path) -> Tensor:

@@ -8,6 +8,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
@@ -24,6 +25,7 @@ from persist_cli.training.economy import economy_of, make_average, make_optimize
 from persist_cli.training.keys import CacheKeys
 from persist_cli.training.log import StepLog
 from persist_cli.training.settings import TrainingSettings
+from persist_cli.training.sharding import Sharding
 from persist_cli.training.state import TrainingState
 from persist_cli.training.step_times import StepTimes, timed
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan, SharedBatches
@@ -87,8 +89,11 @@ class Trainer:
         if self.encoder is not None:
             self.clips = CachedClips(clips, self.encoder.cache)
         optimizer = make_optimizer(parameters.values(), settings)
-        average = make_average(parameters.values(), settings, accelerator.device) if settings.ema else None
+        self.sharding = Sharding(backbone, recipe, accelerator) if accelerator.is_fsdp2 else None
         self.model, self.optimizer = accelerator.prepare(backbone, optimizer)
+        if self.sharding is not None:
+            parameters = self.sharding.parameters()
+        average = make_average(parameters.values(), settings, accelerator.device) if settings.ema else None
         self.state = TrainingState(parameters, optimizer, average)
 
     def all_clips(self) -> ClipDataset:
@@ -203,12 +208,13 @@ class Trainer:
         """Gradients of one optimizer step; the mean of its logged values over micro-batches and processes."""
         parts = self.recipe.training.accumulation
         totals: dict[str, torch.Tensor] = {}
-        for _ in range(parts):
+        for part in range(parts):
             clips = self.encoded(next(batches))
-            with timed(self.times, "forward"):
-                losses = self.model(clips, self.recipe.stage)
-            with timed(self.times, "backward"):
-                self.accelerator.backward(losses["loss"] / parts)
+            with self.unsynced(last=part == parts - 1):
+                with timed(self.times, "forward"), self.accelerator.autocast():  # left out by accelerate if it shards
+                    losses = self.model(clips, self.recipe.stage)
+                with timed(self.times, "backward"):
+                    self.accelerator.backward(losses["loss"] / parts)
             for name, value in losses.items():
                 totals[name] = totals.get(name, torch.zeros_like(value)) + value.detach() / parts
         values = {name: float(self.accelerator.reduce(value, "mean")) for name, value in totals.items()}
@@ -218,6 +224,31 @@ class Trainer:
                 "training.precision=no"
             )
         return values
+
+    def unsynced(self, last: bool) -> AbstractContextManager[None]:
+        """Gradients stay with their process until the last micro-batch, but sharded ones: whole, they might not fit."""
+        if last or self.sharding is not None:
+            return nullcontext()
+        waiting: AbstractContextManager[None] = self.accelerator.no_sync(self.model)
+        return waiting
+
+    @contextmanager
+    def model_to_save(self) -> Iterator[Backbone]:
+        """The backbone, whole, with averaged weights where they are kept; all processes must enter."""
+        main = self.accelerator.is_main_process
+        if self.sharding is not None:
+            with self.sharding.gathered(self.state.averages(), main) as whole:
+                yield whole
+        elif self.state.average is None or not main:
+            yield self.backbone
+        else:
+            parameters = [*self.state.parameters.values()]
+            self.state.average.store(parameters)
+            self.state.average.copy_to(parameters)
+            try:
+                yield self.backbone
+            finally:
+                self.state.average.restore(parameters)
 
     def agreed(self, due: bool, signal: int | None) -> tuple[bool, int | None]:
         """What one process finds due, or what signal it got, as all of them see it: they save and stop together."""

@@ -106,6 +106,8 @@ class Backbone(nn.Module, ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
+    sharded_blocks: ClassVar[tuple[str, ...]] = ()  # classes of blocks that a sharded model puts together one by one
+    kept_whole: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:

@@ -80,6 +80,14 @@ def test_processes_and_micro_batches_share_the_same_samples_of_each_step(process
         assert numbers == list(range((3 + step) * 8, (4 + step) * 8))
 
 
+def test_a_run_that_changes_its_number_of_processes_reads_every_clip_once_and_in_order():
+    read = []
+    for first, processes in ((0, 2), (2, 1), (4, 4)):  # two steps by so many
+        parts = [SharedBatches(first, first + 2, 8, 2, each, processes) for each in range(processes)]
+        read += [number for micro in zip(*parts, strict=True) for batch in micro for number in batch]
+    assert read == [number for batch in SharedBatches(0, 6, 8, 1, 0, 1) for number in batch]
+
+
 def test_what_cannot_be_drawn_is_one_line(walks):
     with pytest.raises(DataError, match="a clip needs 65 frames, the longest trajectory has 24"):
         ClipDataset([walks], plan(frames=65))

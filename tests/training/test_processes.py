@@ -1,0 +1,211 @@
+"""Two processes with gloo on the CPU: DDP and FSDP2 come to what one process comes to."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_cli.checkpoints import find_checkpoint, load_backbone
+from persist_cli.training.shards import read_shards
+from persist_cli.world.files import read_tensors
+from tests.training.pair import job, run_pair
+from tests.walking import MICRO_SETTINGS, end_of, in_two, stage, train_here
+
+FSDP = {"ACCELERATE_USE_FSDP": "true", "FSDP_VERSION": "2"}
+KINDS = {"ddp": {}, "fsdp": FSDP}
+BATCH = "training.batch=4"
+NEAR = 2e-5  # of weights, which four steps of these learning rates can move by 1.4e-3
+BF16 = "training.precision=bf16"
+
+
+CHEAP = ["training.gradient_checkpointing=true", "training.frozen_precision=bf16", "training.ema_device=cpu", BF16]
+
+
+def losses(run: Path) -> list[float]:
+    return [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+def saved_model(run: Path) -> dict[str, torch.Tensor]:
+    """All weights of a run's newest checkpoint by file and name."""
+    files = sorted(max(run.glob("step-*")).glob("model/**/*.safetensors"))
+    return {f"{path.name} {name}": each for path in files for name, each in read_tensors(path)[0].items()}
+
+
+def furthest(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> float:
+    """Largest difference between weights of the same names."""
+    assert one.keys() == two.keys()
+    return max(float((one[name].float() - two[name].float()).abs().max()) for name in one if one[name].numel())
+
+
+@pytest.fixture(scope="module")
+def runs(walks, codec, stage1, tmp_path_factory):
+    """Runs of one process and of two, some of them interrupted and gone on with by one and by two again."""
+    folder = tmp_path_factory.mktemp("pair")
+
+    def of(number: str, name: str, *changes: str) -> list[str]:
+        return stage(number, walks, folder / name, f"base={codec if number == 'stage1' else stage1}", BATCH, *changes)
+
+    train_here(*of("stage1", "one-1"))
+    train_here(*of("stage2-voxel", "one-2"))
+    first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage1", f"{kind}-parts", "training.steps=1"), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage2-voxel", f"{kind}-cheap", *CHEAP), **how) for kind, how in KINDS.items()]
+    wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
+    ended = run_pair(folder, *first, wrong)
+    assert [code for code, _ in ended[:-1]] == [0] * len(first), ended
+    shutil.copytree(folder / "fsdp-parts", folder / "fsdp-first")
+    for kind in KINDS:
+        train_here(*of("stage1", f"{kind}-parts", "--resume", "training.steps=2"))
+    later = [job(*of("stage1", f"{kind}-parts", "--resume", "training.steps=3"), **how) for kind, how in KINDS.items()]
+    assert [code for code, _ in run_pair(folder, *later)] == [0, 0]
+    for kind in KINDS:
+        train_here(*of("stage1", f"{kind}-parts", "--resume"))
+    (folder / "wrong.txt").write_text(f"{ended[-1][0]} {ended[-1][1]}")
+    return folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("number", [1, 2])
+def test_two_processes_come_to_the_losses_and_weights_of_one(runs, kind, number):
+    """Stage 2 also sums two micro-batches on each process."""
+    one, two = runs / f"one-{number}", runs / f"{kind}-{number}"
+    assert losses(two) == pytest.approx(losses(one), rel=1e-5)
+    assert furthest(saved_model(one), saved_model(two)) < NEAR
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_of_two_then_one_then_two_then_one_ends_like_one_of_one(runs, kind):
+    assert losses(runs / f"{kind}-parts") == pytest.approx(losses(runs / "one-1"), rel=1e-5)
+    one, parts = (end_of(runs / name)[0] for name in ("one-1", f"{kind}-parts"))
+    assert torch.equal(one.pop("random/torch"), parts.pop("random/torch"))
+    assert furthest(one, parts) < NEAR
+    assert furthest(saved_model(runs / "one-1"), saved_model(runs / f"{kind}-parts")) < NEAR
+
+
+def test_a_sharded_checkpoint_is_a_file_a_process_with_its_half_and_no_pickle(runs):
+    step = max((runs / "fsdp-1").glob("step-*"))
+    sizes = [path.stat().st_size for path in sorted((step / "training").glob("*.safetensors"))]
+    assert max(sizes) < 0.6 * sum(sizes)
+    kinds = {path.suffix for path in step.rglob("*") if path.is_file()}
+    assert kinds == {".safetensors", ".json", ".yaml"}
+    whole = read_shards(step / "training", lambda _, shape, dtype: torch.empty(shape, dtype=dtype))
+    assert whole.keys() == end_of(runs / "one-1")[0].keys()
+
+
+def test_a_sharded_run_saves_the_model_that_others_load(runs):
+    backbone = load_backbone(find_checkpoint(runs / "fsdp-1"))
+    assert not any(parameter.is_meta for parameter in backbone.parameters())
+
+
+def test_bf16_is_as_near_to_one_process_sharded_as_not(runs):
+    exact, ddp, fsdp = (losses(runs / name) for name in ("one-1", "ddp-bf16", "fsdp-bf16"))
+    assert ddp == pytest.approx(exact, rel=1e-2)
+    assert fsdp == pytest.approx(ddp, rel=2e-3)
+    weights = saved_model(runs / "fsdp-bf16")
+    assert {each.dtype for each in weights.values()} == {torch.float32}
+
+
+def test_cheap_steps_are_as_cheap_sharded(runs):
+    """Recomputed blocks, frozen weights in bf16, averages in the memory of the CPU."""
+    assert losses(runs / "ddp-cheap") == pytest.approx(losses(runs / "one-2"), rel=1e-2)
+    assert losses(runs / "fsdp-cheap") == pytest.approx(losses(runs / "ddp-cheap"), rel=2e-3)
+
+
+def test_a_missing_or_damaged_part_of_a_checkpoint_is_one_line(persist, walks, codec, runs):
+    run = runs / "fsdp-first"
+    arguments = stage("stage1", walks, run, f"base={codec}", BATCH, "--resume")
+    part = min(next(run.glob("step-*")).glob("training/*.safetensors"))
+    content = part.read_bytes()
+    for left, cause in (
+        (content[:-9], "its parts cannot be read"),
+        (b"", "its parts cannot be read"),
+        (None, "missing"),
+    ):
+        part.unlink()
+        if left is not None:
+            part.write_bytes(left)
+        ended = persist(*arguments)
+        assert (ended.code, cause in ended.err, len(ended.err.strip().splitlines())) == (1, True, 1), ended.err
+
+
+def test_what_cannot_be_sharded_is_one_line(persist, walks, codec, runs, tmp_path, monkeypatch):
+    said = (runs / "wrong.txt").read_text()
+    assert said.startswith("1 ")
+    assert "stage codec trains codec, which is not sharded" in said
+    monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))
+    assert (ended.code, "add --fsdp_version 2" in ended.err) == (1, True)
+
+
+class Started:
+    """A run of two processes without end, from its first checkpoint on."""
+
+    def __init__(self, walks: Path, codec: Path, run: Path, *kind: str) -> None:
+        changes = [f"base={codec}", "training.steps=100000", "training.checkpoint_every=2"]
+        start = in_two(*stage("stage1", walks, run, *changes), kind=kind)
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
+        self.run, self.launcher = run, subprocess.Popen(**start, **pipes)
+        deadline = time.monotonic() + 120
+        while not list(run.glob("step-*")) and time.monotonic() < deadline and self.launcher.poll() is None:
+            time.sleep(0.05)
+        children = Path(f"/proc/{self.launcher.pid}/task/{self.launcher.pid}/children").read_text().split()
+        self.processes = [int(child) for child in children]
+
+    def end(self) -> tuple[int, str]:
+        """The launcher's exit code and all that was said."""
+        said, _ = self.launcher.communicate(timeout=60)
+        return self.launcher.returncode, said
+
+
+def go_on(persist, walks, codec, run: Path) -> None:
+    """One process takes two more steps from the run's checkpoint, which must be whole."""
+    step = int(find_checkpoint(run).folder.parent.name.removeprefix("step-"))
+    ended = persist(*stage("stage1", walks, run, "--resume", f"base={codec}", f"training.steps={step + 2}"))
+    assert ended.code == 0, ended.err
+    assert len(losses(run)) == step + 2
+    assert not list(run.glob(".partial-*"))
+
+
+@pytest.mark.parametrize("killed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_killed_process_ends_the_run_with_a_line_and_a_checkpoint_to_go_on_from(
+    persist, walks, codec, tmp_path, killed
+):
+    started = Started(walks, codec, tmp_path / "run", "--use_fsdp", "--fsdp_version", "2")
+    os.kill(started.processes[killed], signal.SIGKILL)
+    code, said = started.end()
+    lines = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert (code, len(lines)) == (1, 1), said
+    assert re.search(rf"process {1 - killed} of 2 lost another one.*step-\d+ is whole, go on with --resume", lines[0])
+    assert re.search(rf"rank +: {killed} .*\n.*exitcode +: -9", said)  # the launcher's table
+    go_on(persist, walks, codec, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("told", "code"), [("rank", 0), pytest.param("launcher", 1, marks=pytest.mark.slow)], ids=["rank", "launcher"]
+)
+def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(persist, walks, codec, tmp_path, told, code):
+    """The exit code of a launcher that was told to stop is torchrun's own."""
+    started = Started(walks, codec, tmp_path / "run", "--use_fsdp", "--fsdp_version", "2")
+    os.kill({"rank": started.processes[1], "launcher": started.launcher.pid}[told], signal.SIGTERM)
+    ended, said = started.end()
+    assert ended == code, said
+    assert said.count("go on with --resume") == 1, said
+    go_on(persist, walks, codec, tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_on_all(persist, walks, codec, tmp_path):
+    started = Started(walks, codec, tmp_path / "run", "--multi_gpu")
+    os.killpg(started.launcher.pid, signal.SIGINT)  # as a terminal does
+    _, said = started.end()
+    assert said.count("go on with --resume") == 1, said
+    go_on(persist, walks, codec, tmp_path / "run")
