@@ -47,7 +47,7 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--models", help=f"of {', '.join(MODELS)}; {','.join(PUBLISHED)} on a GPU, else the twins")
     parser.add_argument("--only", default=",".join(PARTS), help="parts to measure (default: all)")
-    parser.add_argument("--rounds", type=int, help="measured runs of each work; 5 on a GPU, else 3")
+    parser.add_argument("--rounds", type=int, help="measured runs of each work; 5 on a GPU, else 2")
     parser.add_argument("--quick", action="store_true", help="one model, one round")
     parser.add_argument("--set", action="append", default=[], help="change of the recipes, as training.compile=true")
     parser.add_argument("--device", help="cuda or cpu; what is there by default")
@@ -58,7 +58,7 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
     names = options.models.split(",") if options.models else list(PUBLISHED if on_gpu else TWINS)
     options.models = names[:1] if options.quick else names
     options.only = options.only.split(",")
-    options.rounds = 1 if options.quick else options.rounds or (5 if on_gpu else 3)
+    options.rounds = 1 if options.quick else options.rounds or (5 if on_gpu else 2)
     for kind, given, known in (("model", options.models, MODELS), ("part", options.only, PARTS)):
         for name in given:
             if name not in known:

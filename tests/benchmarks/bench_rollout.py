@@ -1,6 +1,7 @@
 """How long a rollout takes with each memory: ``python tests/benchmarks/bench_rollout.py``; prints, asserts nothing.
 
 The tiny model and the adapters are fresh: what they imagine is noise, what it costs is not. Four DDIM steps a clip.
+A second table: branches of one start imagined together and one after the other.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import MemoryChoice
 from persist_cli.registry import make_backbone
-from persist_cli.rollout.world_model import WorldModel
+from persist_cli.rollout.world_model import WorldModel, step_together
 from persist_cli.viewing.console import print_table
 from persist_cli.world.actions import walking_actions
 from persist_cli.world.backbone import Backbone, Sampling
@@ -33,6 +34,7 @@ NO_ADAPTER = "no adapter"
 MEMORIES = ("none", "voxel", "map2d", "snapshots")
 PARTS = ("recall", "denoise", "memorize")
 SIZE, STEPS, CLIPS, ROUNDS = 64, 4, 2, 4
+WAYS = ("forward*8", "left*4 forward*4", "right*4 forward*4", "left*2 forward*6")
 
 
 @dataclass
@@ -87,6 +89,39 @@ def roll(world: TimedWorldModel, name: str, start: Observations, info: Trajector
     world.step(info.vocabulary.parse("left*2 forward*2 right*2 forward*2") * CLIPS)
 
 
+def stand(world: TimedWorldModel, name: str, start: Observations, info: TrajectoryInfo) -> TimedWorldModel:
+    """The world model at the start, its memory that of a first look around."""
+    roll(world, name, start, info)
+    world.reset(start, info)
+    return world
+
+
+def branch(world: TimedWorldModel, name: str, together: bool) -> None:
+    """A clip along each of the ways."""
+    world.backbone.use_adapter(None if name == NO_ADAPTER else name)
+    ways = [world.vocabulary.parse(way) for way in WAYS]
+    branches = world.branches(len(ways))
+    if together:
+        step_together(branches, ways)
+    else:
+        for each, way in zip(branches, ways, strict=True):
+            each.step(way)
+
+
+def branch_rows(worlds: dict[str, TimedWorldModel]) -> list[tuple[str, ...]]:
+    """Seconds of all branches together and one after the other, and their ratio."""
+    works = {(name, kind): partial(branch, worlds[name], name, kind) for name in worlds for kind in (True, False)}
+    times = alternate(works, ROUNDS // 2)
+    return [
+        (
+            name,
+            *(f"{times.median((name, kind)):.3f}" for kind in (True, False)),
+            f"{times.ratio((name, True), (name, False)):.2f}×",
+        )
+        for name in worlds
+    ]
+
+
 def rows(times: Times, worlds: dict[str, TimedWorldModel]) -> list[tuple[str, ...]]:
     """Seconds a clip, relative to the memory ``none``, and how they divide into parts."""
     found = []
@@ -107,3 +142,6 @@ if __name__ == "__main__":
     say_conditions(f"rollouts of {CLIPS} clips, {STEPS} DDIM steps each, {SIZE}×{SIZE}")
     columns = ["memory", "s a clip", "time to none", *(f"{part}, ms a clip" for part in PARTS)]
     print_table("rollout of the tiny model", columns, rows(alternate(works, ROUNDS), worlds))
+    standing = {name: stand(world, name, start, info) for name, world in worlds.items()}
+    columns = ["memory", "together, s", "one after the other, s", "ratio"]
+    print_table(f"{len(WAYS)} branches of a clip each from one start", columns, branch_rows(standing))

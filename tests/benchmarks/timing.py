@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,20 +19,20 @@ from tests.rooms import Room, walk
 class Times:
     """Wall seconds of several works that took turns, by name; one number a round."""
 
-    seconds: Mapping[str, np.ndarray]
+    seconds: Mapping[Hashable, np.ndarray]
 
-    def median(self, name: str) -> float:
+    def median(self, name: Hashable) -> float:
         """Seconds of one run."""
         return float(np.median(self.seconds[name]))
 
-    def ratio(self, name: str, to: str) -> float:
+    def ratio(self, name: Hashable, to: Hashable) -> float:
         """How many times as long as another: round by round, so that a busy machine slows both."""
         return float(np.median(self.seconds[name] / self.seconds[to]))
 
 
-def alternate(works: Mapping[str, Callable[[], Any]], rounds: int = 5) -> Times:
+def alternate(works: Mapping[Any, Callable[[], Any]], rounds: int = 5) -> Times:
     """Every work once a round, after a round that does not count."""
-    seconds: dict[str, list[float]] = {name: [] for name in works}
+    seconds: dict[Hashable, list[float]] = {name: [] for name in works}
     for number in range(rounds + 1):
         for name, work in works.items():
             start = time.perf_counter()

@@ -43,7 +43,7 @@ class Model:
 
 
 SMALL = {
-    "num_attention_heads": 8, "num_layers": 8, "time_embed_dim": 256, "text_embed_dim": 64, "max_text_seq_length": 16,
+    "num_attention_heads": 6, "num_layers": 8, "time_embed_dim": 256, "text_embed_dim": 64, "max_text_seq_length": 16,
     "use_rotary_positional_embeddings": True,
 }  # fmt: skip
 AT_SIZE = {"height": 512, "width": 512}
@@ -52,9 +52,9 @@ MODELS = {
     model.name: model
     for model in (
         Model("tiny", {"preset": "tiny"}, {"form": "cross", "every": 2}, 4, 32),
-        Model("small", {"preset": "tiny", "height": 128, "width": 128, "transformer": SMALL,
+        Model("small", {"preset": "tiny", "height": 96, "width": 96, "transformer": SMALL,
                         "vae": {"block_out_channels": [16, 32, 64]}},
-              BLOCKS | {"width": 256, "token_budget": 256}, 2, 96),
+              BLOCKS | {"width": 128, "token_budget": 256}, 1, 96),
         Model("2b", {"preset": "2b"} | AT_SIZE, BLOCKS | {"width": 640, "heads": 10}, 8, 384, True),
         Model("5b", {"preset": "5b-i2v"} | AT_SIZE, BLOCKS | {"width": 1024, "heads": 16}, 4, 384, True),
     )
