@@ -1,7 +1,8 @@
 """Checkpoints: one base and small memory adapters that load onto it by name.
 
 A checkpoint folder holds ``persist.json``, the backbone's own files and ``adapters/NAME/``; that of a stage-2 run
-holds adapters only and says where its base is. A run folder stands for its newest checkpoint.
+holds adapters only and says where its base is, that of a LoRA run what it changes and where that is. A run folder
+stands for its newest checkpoint.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
 
 def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
-    """The base's backbone without adapters, with changed settings where given."""
+    """The base's backbone without adapters, with changed settings where given; LoRA is merged."""
     backbone = empty_backbone(checkpoint, settings)
     backbone.load_base(checkpoint.base_folder)
     return backbone
@@ -124,6 +125,27 @@ def save_base(backbone: Backbone, folder: Path, scenes: TrainingScenes | None = 
     write_card(folder, card, scenes)
 
 
+def save_lora(
+    backbone: Backbone, base: Checkpoint | None, folder: Path, home: Path, scenes: TrainingScenes | None = None
+) -> None:
+    """Write what LoRA trained and a card that points to what it changes.
+
+    Args:
+        backbone: with LoRA.
+        base: what it was trained on; ``None`` for the pretrained weights that the backbone's settings bring.
+        folder: to write into.
+        home: where the folder will stand in the end.
+        scenes: that base and LoRA were trained on, where they are known.
+    """
+    backbone.save_lora(folder)
+    changes: dict[str, Any] = {"settings": backbone.origin()}
+    if base is not None:
+        changes = {"base": _way(base, home), "fingerprint": base.fingerprint}
+    own = hashlib.sha256(f"{fingerprint(folder)} {changes.get('fingerprint')}".encode()).hexdigest()
+    card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings()}
+    write_card(folder, card | {"changes": changes, "fingerprint": own}, scenes)
+
+
 def write_card(folder: Path, card: dict[str, Any], scenes: TrainingScenes | None) -> None:
     """Write ``persist.json``, which makes a folder a checkpoint."""
     known = {} if scenes is None else {"training_scenes": scenes.to_json()}
@@ -152,8 +174,7 @@ def save_adapter(
     adapter.mkdir(parents=True)
     backbone.save_adapter(adapter)
     write_json(adapter / "memory.json", dataclasses.asdict(choice))
-    way = os.path.relpath(_home(base.base_folder).resolve(), home.resolve())
-    write_card(folder, {"base": way, "fingerprint": base.fingerprint}, scenes)
+    write_card(folder, {"base": _way(base, home), "fingerprint": base.fingerprint}, scenes)
 
 
 def base_files(folder: Path, pattern: str) -> list[Path]:
@@ -169,6 +190,11 @@ def fingerprint(folder: Path) -> str:
         digest.update(str(path.relative_to(folder)).encode())
         digest.update(bytes.fromhex(file_sha256(path)))
     return digest.hexdigest()
+
+
+def _way(base: Checkpoint, home: Path) -> str:
+    """The way from a checkpoint folder to what it stands on."""
+    return os.path.relpath(_home(base.base_folder).resolve(), home.resolve())
 
 
 def _home(folder: Path) -> Path:

@@ -13,12 +13,12 @@ import yaml
 from pydantic import BeforeValidator
 
 from persist_cli.training.settings import Count, TrainingSettings
-from persist_cli.world.backbone import Stage
+from persist_cli.world.backbone import Lora, Stage
 from persist_cli.world.errors import RecipeError, hint
 from persist_cli.world.settings import parse_settings
 
 EXTENDS = "extends"
-MERGED = {"backbone", "data", "training"}
+MERGED = {"backbone", "data", "lora", "training"}
 KINDS = {"memory": "name", "adapter": "form"}  # merged too, unless this is given: settings mean nothing to another kind
 
 
@@ -89,6 +89,7 @@ class Recipe:
         backbone: the video model.
         memory: stage 2 only.
         adapter: settings of the memory adapter, stage 2 only.
+        lora: trains a change of low rank of the base instead of all its weights, stage 1 only.
         data: clips.
         training: steps, batch, optimizer.
     """
@@ -99,6 +100,7 @@ class Recipe:
     backbone: BackboneChoice = field(default_factory=BackboneChoice)
     memory: MemoryChoice | None = None
     adapter: dict[str, Any] = field(default_factory=dict)
+    lora: Lora | None = None
     data: DataSettings = field(default_factory=DataSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
@@ -112,8 +114,8 @@ def recipe_names() -> list[str]:
 def read_recipe(name: str) -> dict[str, Any]:
     """Plain values of a recipe by name, or of a YAML file, with those of the recipe that it ``extends``.
 
-    Of ``backbone``, ``data`` and ``training`` it need only say what is different, and of a ``memory`` or ``adapter`` of
-    which it gives no ``name`` or ``form``; every other key stands for itself.
+    Of ``backbone``, ``data``, ``lora`` and ``training`` it need only say what is different, and of a ``memory`` or
+    ``adapter`` of which it gives no ``name`` or ``form``; every other key stands for itself.
 
     Raises:
         RecipeError: when one of them is unknown or no YAML mapping, and when they extend each other.
@@ -218,6 +220,8 @@ def _inconsistencies(recipe: Recipe) -> list[str]:
         problems.append("stage 2 needs a memory, the other stages take none")
     if recipe.stage == "2" and recipe.base is None:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
+    if recipe.lora is not None and recipe.stage != "1":
+        problems.append("lora is for stage 1 only; leave it out")
     if not recipe.data.strides or 0 in recipe.data.strides:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")
     if training.frozen_precision == "bf16" and training.precision == "no":

@@ -19,23 +19,16 @@ from persist_backbones.economy import FrozenWeights, economize
 from persist_backbones.forms import load_adapter, make_adapter, save_adapter
 from persist_backbones.guidance import make_denoiser
 from persist_backbones.inventory import parts_of
+from persist_backbones.lora import add_lora, train_lora
 from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
-from persist_backbones.parts import (
-    DiffusersParts,
-    check_fit,
-    load_parts,
-    load_world,
-    save_world,
-    starting_parts,
-    video_shape,
-    widen,
-)
+from persist_backbones.parts import DiffusersParts, check_fit, starting_parts, video_shape, widen
 from persist_backbones.presets import CogVideoXSettings
 from persist_backbones.rotary import rotary_positions
 from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
+from persist_backbones.saving import load_whole, save_change, save_whole
 from persist_backbones.world_transformer import Conditions
-from persist_cli.world.backbone import Backbone, Clips, Economy, Part, Sampling, Stage
+from persist_cli.world.backbone import Backbone, Clips, Economy, Lora, Part, Sampling, Stage
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.placement import Placement
 
@@ -72,6 +65,7 @@ class CogVideoX(Backbone):
         self.scheduler = parts.scheduler
         self.shape = clip_shape(parts.transformer, parts.vae, self.settings)
         config = parts.transformer.config
+        self.prompt: Tensor
         self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
 
     @property
@@ -132,6 +126,8 @@ class CogVideoX(Backbone):
         if module is None:
             raise CheckpointError("stage 2 trains a memory adapter; add one first")
         module.requires_grad_(True)
+        if stage == "1":
+            train_lora(self.transformer.base)
         return {name: each for name, each in self.named_parameters() if each.requires_grad}
 
     def economize(self, stage: Stage, economy: Economy) -> None:
@@ -266,17 +262,24 @@ class CogVideoX(Backbone):
 
     def save_base(self, folder: Path) -> None:
         """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
-        with self.frozen.restored():
-            self.transformer.base.save_pretrained(folder / "transformer")
-            self.codec.vae.save_pretrained(folder / "vae")
-            self.scheduler.save_pretrained(folder / "scheduler")
-            save_world(self.transformer, self.prompt, folder)
+        save_whole(self, folder)
 
     def load_base(self, folder: Path) -> None:
-        """Take diffusers' parts and ours from a folder that ``save_base`` wrote."""
-        self.set_parts(load_parts(folder))
-        if not self.prompt.is_meta:
-            self.prompt: Tensor = load_world(self.transformer, folder)
+        """Take diffusers' parts and ours from a folder that ``save_base`` or ``save_lora`` wrote."""
+        load_whole(self, folder)
+
+    def origin(self) -> dict[str, Any]:
+        """The pretrained directory, wherever one stands."""
+        given = self.settings.pretrained
+        return {"pretrained": str(Path(given).resolve()) if Path(given).is_dir() else given} if given else {}
+
+    def add_lora(self, lora: Lora) -> None:
+        """PEFT's layers in the transformer; what of it is new trains whole."""
+        add_lora(self.transformer.base, lora)
+
+    def save_lora(self, folder: Path) -> None:
+        """Write LoRA as diffusers' pipelines load it, and ``world.safetensors`` with what is ours."""
+        save_change(self, folder)
 
     def save_adapter(self, folder: Path) -> None:
         """Write the adapter in use."""

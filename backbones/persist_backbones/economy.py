@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from persist_backbones.lora import has_lora
 from persist_cli.world.backbone import Economy, Stage
 
 if TYPE_CHECKING:
@@ -56,4 +57,4 @@ def economize(backbone: CogVideoX, stage: Stage, economy: Economy) -> FrozenWeig
             block.compile()
     if economy.vae_slicing:
         backbone.codec.vae.enable_slicing()
-    return FrozenWeights(backbone, economy.frozen, saved=stage != "2")
+    return FrozenWeights(backbone, economy.frozen, saved=stage != "2" and not has_lora(transformer))

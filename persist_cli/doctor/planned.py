@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe
 from persist_cli.registry import make_backbone
@@ -53,12 +53,12 @@ def plan(recipe: Recipe, base: Checkpoint | None) -> Planned:
     """The plan of a recipe on its base, where there is one."""
     if base is not None and base.backbone != recipe.backbone.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {recipe.backbone.name!r}")
-    settings = (base.settings if base else {}) | recipe.backbone.settings
+    settings = recipe.backbone.settings
     channels = None
     with torch.device("meta"):
-        backbone = make_backbone(recipe.backbone.name, settings)
-        if base is not None:
-            backbone.load_base(base.base_folder)
+        backbone = load_backbone(base, settings) if base else make_backbone(recipe.backbone.name, settings)
+        if recipe.lora is not None:
+            backbone.add_lora(recipe.lora)
         if recipe.memory is not None:
             channels = MemoryMaker.of(recipe.memory).encoder.planned_channels
             backbone.add_adapter(recipe.memory.name, channels, recipe.adapter)

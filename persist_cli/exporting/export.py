@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,17 @@ from persist_cli.checkpoints import (
     empty_backbone,
     find_checkpoint,
     fingerprint,
+    load_backbone,
     write_card,
 )
 from persist_cli.exporting.parts import Part, adapter_parts, known_recipes
 from persist_cli.lineage import RECIPE, RECIPES, training_scenes, write_recipes
 from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.viewing.console import print_json, print_table, say, watched
+from persist_cli.world.checkpoint_folder import what_is_changed
 from persist_cli.world.errors import CheckpointError, PersistError, hint
 from persist_cli.world.files import (
+    empty_folder_aside,
     file_sha256,
     folder_aside,
     read_json,
@@ -101,7 +105,24 @@ def chosen_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, Any] | None
 
 def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dtype: torch.dtype) -> dict[str, Any]:
     """Write base, adapters and recipes into the folder, weights in this precision; returns what the card must say."""
-    home = base.base_folder
+    with whole_base(base, folder) as home:
+        return _write_checkpoint(folder, home, base, parts, dtype)
+
+
+@contextlib.contextmanager
+def whole_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
+    """A folder with all of a base's own files; that of LoRA, merged, is made beside and removed again."""
+    if what_is_changed(base.base_folder) is None:
+        yield base.base_folder
+        return
+    with empty_folder_aside(beside) as folder:
+        load_backbone(base).save_base(folder)
+        yield folder
+
+
+def _write_checkpoint(
+    folder: Path, home: Path, base: Checkpoint, parts: dict[str, Part], dtype: torch.dtype
+) -> dict[str, Any]:
     own = [path for path in base_files(home, "*") if belongs(path.relative_to(home))]
     jobs = [(path, folder / path.relative_to(home)) for path in own]
     for name, part in parts.items():

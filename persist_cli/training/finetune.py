@@ -164,7 +164,7 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
 
 
 def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryMaker | None) -> Backbone:
-    """The backbone to train: fresh or from the base, with a fresh adapter in stage 2."""
+    """The backbone to train: fresh or from the base, with fresh LoRA where asked for, a fresh adapter in stage 2."""
     settings = recipe.backbone.settings
     if base is None:
         backbone = make_backbone(recipe.backbone.name, settings)
@@ -172,6 +172,10 @@ def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryMaker
         if base.backbone != recipe.backbone.name:
             raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {recipe.backbone.name!r}")
         backbone = load_backbone(base, settings)
+    if recipe.lora is not None:
+        if base is None and not backbone.origin():
+            raise RecipeError("lora changes weights that are there; give base=RUN, or pretrained backbone.settings")
+        backbone.add_lora(recipe.lora)
     if recipe.memory is not None and maker is not None:
         backbone.add_adapter(recipe.memory.name, maker.encoder.channels, recipe.adapter)
     return backbone

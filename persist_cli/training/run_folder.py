@@ -7,7 +7,7 @@ from pathlib import Path
 
 from safetensors import SafetensorError
 
-from persist_cli.checkpoints import Checkpoint, save_adapter, save_base
+from persist_cli.checkpoints import Checkpoint, save_adapter, save_base, save_lora
 from persist_cli.lineage import RECIPE, stage_recipes, training_scenes, write_recipes
 from persist_cli.recipe import to_yaml
 from persist_cli.training.log import SpeedLog, StepLog
@@ -84,6 +84,8 @@ class RunFolder:
         backbone.finish_stage(recipe.stage, (trainer.to_batch(each) for each in samples))
         if recipe.memory is not None and self.base is not None:
             save_adapter(backbone, self.base, recipe.memory, folder, home, self.scenes)
+        elif recipe.lora is not None:
+            save_lora(backbone, self.base, folder, home, self.scenes)
         else:
             save_base(backbone, folder, self.scenes)
         write_text(folder / RECIPE, to_yaml(recipe))

@@ -8,10 +8,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, UInt8
+from pydantic import Field
 from torch import Tensor, nn
 
 from persist_cli.world.cameras import Cameras
@@ -94,6 +95,21 @@ class Economy:
     compile: bool = False
     frozen: torch.dtype | None = None
     vae_slicing: bool = False
+
+
+@dataclass(frozen=True)
+class Lora:
+    """A change of low rank that stage 1 trains instead of all weights (LoRA).
+
+    Args:
+        rank: of the change of each layer.
+        alpha: the change counts alpha / rank; by default as much as the rank.
+        targets: ends of the names of the linear layers that are changed.
+    """
+
+    rank: Annotated[int, Field(ge=1)] = 64
+    alpha: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    targets: Annotated[tuple[str, ...], Field(min_length=1)] = ("to_q", "to_k", "to_v", "to_out.0")
 
 
 class Backbone(nn.Module, ABC):
@@ -244,9 +260,27 @@ class Backbone(nn.Module, ABC):
     def save_adapter(self, folder: Path) -> None:
         """Write the adapter in use into an existing folder."""
 
+    def origin(self) -> dict[str, Any]:
+        """Those of its settings that bring the pretrained weights it began with; none when it began fresh."""
+        return {}
+
+    def add_lora(self, lora: Lora) -> None:
+        """Let stage 1 train a change of low rank of the weights that are there, and what beside them is new.
+
+        Raises:
+            PersistError: when this backbone or this installation cannot.
+        """
+        raise PersistError(f"backbone {self.name!r} has no LoRA; leave lora out")
+
+    def save_lora(self, folder: Path) -> None:
+        """Write what stage 1 trains with LoRA, and nothing of the weights that it changes, into an existing folder."""
+        raise NotImplementedError(f"backbone {self.name!r} has no LoRA")
+
     @abstractmethod
     def load_base(self, folder: Path) -> None:
         """Take the weights that ``save_base`` wrote; under torch's meta device only their shapes.
+
+        In a folder that ``save_lora`` wrote, they are those that it changes, changed.
 
         Raises:
             CheckpointError: when a file is missing, corrupt or of another shape.

@@ -55,6 +55,26 @@ def open_checkpoint(path: Path) -> CheckpointFolder:
     return CheckpointFolder(folder, card, base, base_card)
 
 
+def what_is_changed(folder: Path) -> Path | dict[str, Any] | None:
+    """What the LoRA in a base's folder changes, ``None`` for a base that is whole.
+
+    Returns:
+        The folder of another base, or those settings of the backbone that bring pretrained weights.
+
+    Raises:
+        CheckpointError: when that base is gone or another.
+    """
+    changes = read_card(folder).get("changes") if (folder / CARD).is_file() else None
+    if changes is None:
+        return None
+    if "settings" in changes:
+        return dict(changes["settings"])
+    base = model_folder((folder / changes["base"]).resolve())
+    if read_card(base)["fingerprint"] != changes["fingerprint"]:
+        raise CheckpointError(f"{folder}: was trained on another base than the one now at {base}")
+    return base
+
+
 def step_folders(run: Path) -> list[Path]:
     """Whole checkpoints of a run, the newest last."""
     return sorted(folder for folder in run.glob(f"{STEP}*") if folder.is_dir())
