@@ -18,6 +18,7 @@ from persist_cli.world.settings import parse_settings
 from persist_cli.world.tokens import MemoryTokens
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 
@@ -29,18 +30,21 @@ class MemoryMaker:
         kind: the memory's class.
         settings: an instance of its settings type.
         encoder: that all of them share.
+        device: where encoder and memories compute.
     """
 
     kind: type[Memory]
     settings: Any
     encoder: Encoder
+    device: torch.device | str = "cpu"
 
     @staticmethod
-    def of(choice: MemoryChoice) -> MemoryMaker:
-        """The maker of this choice."""
+    def of(choice: MemoryChoice, device: torch.device | str = "cpu") -> MemoryMaker:
+        """The maker of this choice, computing there."""
         kind = load_plugin("memory", choice.name)
         settings = parse_settings(kind.settings_type, choice.settings, f"memory {choice.name!r}")
-        return MemoryMaker(kind, settings, make_encoder(choice.encoder, choice.encoder_settings))
+        encoder = make_encoder(choice.encoder, choice.encoder_settings).to(device)
+        return MemoryMaker(kind, settings, encoder, device)
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """An empty memory in the frame of reference of a trajectory."""
@@ -79,5 +83,5 @@ def recall(sample: ClipSample, maker: MemoryMaker, budget: int) -> MemoryTokens:
     """What a memory of the sample's context says to the clip's cameras."""
     memory = maker.empty(sample.info)
     if sample.context is not None:
-        memory.write(sample.context)
-    return memory.read(sample.observations.cameras, budget)
+        memory.write(sample.context.to(maker.device))
+    return memory.read(sample.observations.cameras, budget).to(maker.device)

@@ -117,7 +117,7 @@ def finetune(recipe: Recipe, run: Path, stop: Stop, plan: FinetunePlan) -> int |
     """
     accelerator = make_accelerator(recipe, run)
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
-    maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
+    maker = MemoryMaker.of(recipe.memory, accelerator.device) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, maker)
     trainer = Trainer(recipe, backbone, maker, accelerator, plan.cache)
     if plan.profile:

@@ -75,7 +75,7 @@ class Sharding:
     def __init__(self, backbone: Backbone, recipe: Recipe, accelerator: Accelerator) -> None:
         kept = [backbone.get_submodule(name) for name in backbone.kept_whole]
         _check(recipe, backbone, kept)
-        self.backbone, self.stage = backbone, recipe.stage
+        self.backbone, self.all_saved = backbone, recipe.stage != "2" and recipe.lora is None
         self.trained = {name for name, each in backbone.named_parameters() if each.requires_grad}
         self.whole = _without_weights(backbone, kept)
         for module in kept:
@@ -94,7 +94,7 @@ class Sharding:
     def gathered(self, instead: Mapping[str, Tensor], main: bool) -> Iterator[Backbone]:
         """The whole backbone on the main process's CPU, one parameter after the other; all processes must enter.
 
-        In stage 2 the adapter only, which is all that is saved.
+        In stage 2 the adapter only, and of LoRA what is trained: all that is saved.
 
         Args:
             instead: what stands for some of the parameters by name, as their averages do.
@@ -103,7 +103,7 @@ class Sharding:
         found: dict[str, Tensor] = {}
         for name, parameter in self.backbone.named_parameters():
             name = name.replace(WRAPPER, "")
-            if is_sharded(parameter) and (self.stage != "2" or name in self.trained):
+            if is_sharded(parameter) and (self.all_saved or name in self.trained):
                 part = instead.get(name, parameter).detach().to(parameter.device)  # averages may be elsewhere
                 whole: Tensor = part.full_tensor()  # type: ignore[attr-defined]
                 if main:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import signal
@@ -187,7 +186,7 @@ class Trainer:
         settings = self.recipe.training
         batches = self.loader()
         while self.state.step < settings.steps:
-            with contextlib.nullcontext() if self.times is None else self.times.step():
+            with nullcontext() if self.times is None else self.times.step():
                 for group in self.optimizer.param_groups:
                     group["lr"] = learning_rate(settings, self.state.step)
                 values = self.accumulate(batches)
