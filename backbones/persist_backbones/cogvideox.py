@@ -182,6 +182,7 @@ class CogVideoX(Backbone):
         predict = make_denoiser(self, first, image, lambda: sampling.memory_guidance)
         noise = noise_like(image, generators)
         latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
+        self.transformer.reset_cache()
         rgb, depth = self.codec.decode(self.shape.drop_padding(latents), self.settings.depth)
         if self.offloaded is not None:
             self.offloaded.maybe_free_model_hooks()

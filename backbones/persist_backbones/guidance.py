@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from persist_backbones.caches import ClipCaches
 from persist_backbones.samplers import Denoiser
 from persist_cli.world.backbone import Clips
 
@@ -28,16 +29,18 @@ def make_denoiser(backbone: CogVideoX, first: Clips, image: Tensor, weight: Call
     memory = backbone.prepare_memory(first)
     conditions = backbone.conditions(first, torch.zeros(len(first.seeds), dtype=torch.long), memory)
     precision = backbone.prompt.dtype
-    image = image.to(precision)
+    image, caches = image.to(precision), ClipCaches(backbone.transformer)
 
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
         given = dataclasses.replace(conditions, timestep=timesteps)
         noisy, guidance = latents.to(precision), weight()
-        predicted = backbone.predict(noisy, image, given).to(latents.dtype)
+        with caches.prediction("cond", timesteps):
+            predicted = backbone.predict(noisy, image, given).to(latents.dtype)
         if guidance == 1.0 or memory is None:
             return predicted
         without = dataclasses.replace(given, memory=memory.emptied())
-        blind = backbone.predict(noisy, image, without).to(latents.dtype)
+        with caches.prediction("uncond", timesteps):
+            blind = backbone.predict(noisy, image, without).to(latents.dtype)
         return blind + guidance * (predicted - blind)
 
     return predict

@@ -13,10 +13,12 @@ from typing import Any
 
 import torch
 from diffusers import CogVideoXTransformer3DModel
+from diffusers.models.cache_utils import CacheMixin
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from persist_backbones.adapter import Adapter, PreparedMemory
+from persist_backbones.caches import check_cache, rest_is_cached, with_layers
 from persist_backbones.conditioning import tokens_of
 from persist_backbones.offloading import bring
 from persist_backbones.patches import fold_patches, frames_per_token, unfold_patches
@@ -45,8 +47,10 @@ class Conditions:
     memory: PreparedMemory | None = None
 
 
-class WorldTransformer(nn.Module):
+class WorldTransformer(nn.Module, CacheMixin):  # type: ignore[misc]
     """Predicts of RGB and depth latents what the objective asks for (see ``objective``).
+
+    diffusers' caches work with it: ``enable_cache(FirstBlockCacheConfig(threshold=0.1))`` before sampling.
 
     Args:
         base: diffusers' transformer.
@@ -78,9 +82,36 @@ class WorldTransformer(nn.Module):
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
         self.camera_channels = camera_channels
         self.in_channels, self.out_channels = in_channels, out_channels
+        self.timestep = 0  # of the present step, for caches
         for module in (self.extra_in, self.extra_out, self.interactions):
             for parameter in module.parameters():
                 nn.init.zeros_(parameter)
+
+    @property
+    def is_cache_enabled(self) -> bool:
+        """Whether the base has a cache."""
+        return bool(self.base.is_cache_enabled)
+
+    def enable_cache(self, config: Any) -> None:
+        """Skip work that changes little between denoising steps, by one of diffusers' caches.
+
+        Where a cache asks for the timestep (``current_timestep_callback``) and none is given, it is that of sampling.
+
+        Raises:
+            PersistError: for a cache that does not work here.
+        """
+        check_cache(config)
+        if getattr(config, "current_timestep_callback", self) is None:
+            config.current_timestep_callback = lambda: self.timestep
+        self.base.enable_cache(with_layers(config))
+
+    def disable_cache(self) -> None:
+        """Compute everything again."""
+        self.base.disable_cache()
+
+    def reset_cache(self) -> None:
+        """Forget what was kept of the last steps."""
+        CacheMixin._reset_stateful_cache(self)
 
     def forward(
         self,
@@ -137,12 +168,13 @@ class WorldTransformer(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """One of diffusers' blocks, and what the adapter has before and after it."""
         memory = None if adapter is None else given.memory
-        if adapter is not None and memory is not None:
+        blocks = self.base.transformer_blocks
+        if adapter is not None and memory is not None and not (layer and rest_is_cached(blocks[0])):
             video = adapter.before_block(layer, video, memory)
-        video, text = self.base.transformer_blocks[layer](
+        video, text = blocks[layer](
             hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=given.rotary
         )
-        if adapter is not None and memory is not None:
+        if adapter is not None and memory is not None and (layer == len(blocks) - 1 or not rest_is_cached(blocks[0])):
             video = adapter.after_block(layer, video, memory, given.camera, time)
         return video, text
 

@@ -1,0 +1,135 @@
+"""diffusers' caches with memory blocks between the cached ones, two outputs and two predictions a step."""
+
+import dataclasses
+
+import pytest
+import torch
+from diffusers.hooks import (
+    FasterCacheConfig,
+    FirstBlockCacheConfig,
+    MagCacheConfig,
+    PyramidAttentionBroadcastConfig,
+    TaylorSeerCacheConfig,
+    TextKVCacheConfig,
+)
+
+from persist_backbones.caches import ClipCaches
+from persist_backbones.pipeline import WorldPipeline
+from persist_cli.world.backbone import Sampling
+from persist_cli.world.errors import PersistError
+from persist_cli.world.tokens import MemoryTokens
+from tests.backbones.micro import CHANNELS, micro, random_clips, random_tokens, shaken, with_adapter
+
+STEPS = 8
+CLIPS, SAMPLING = random_clips(1, random_tokens(1, 5)), Sampling(STEPS, "ddim", 1.5)
+RATIOS = {"num_inference_steps": STEPS, "mag_ratios": torch.full((STEPS,), 1.01)}
+EXACT = {"taylor_factors_dtype": torch.float32}
+IDLE = {  # caches set so that they never skip anything
+    "first-block": lambda: FirstBlockCacheConfig(threshold=0.0),
+    "MagCache": lambda: MagCacheConfig(threshold=0.0, **RATIOS),
+    "TaylorSeer": lambda: TaylorSeerCacheConfig(cache_interval=1, **EXACT),
+    "pyramid attention": lambda: PyramidAttentionBroadcastConfig(spatial_attention_block_skip_range=1),
+    "FasterCache": lambda: FasterCacheConfig(spatial_attention_block_skip_range=1, is_guidance_distilled=True),
+}
+BUSY = {
+    "first-block": lambda: FirstBlockCacheConfig(threshold=1e3),
+    "MagCache": lambda: MagCacheConfig(threshold=0.2, **RATIOS),
+    "TaylorSeer": lambda: TaylorSeerCacheConfig(cache_interval=3, **EXACT),
+    "TaylorSeer lite": lambda: TaylorSeerCacheConfig(cache_interval=3, use_lite_mode=True, **EXACT),
+    "pyramid attention": lambda: PyramidAttentionBroadcastConfig(spatial_attention_block_skip_range=2),
+    "FasterCache": lambda: FasterCacheConfig(is_guidance_distilled=True),
+}
+EVERY = pytest.mark.parametrize("name", BUSY)
+
+
+def trained(**settings):
+    """A micro model with an adapter, both as training would leave them."""
+    backbone = with_adapter(micro(**settings))
+    shaken(backbone)
+    return backbone
+
+
+def equal(one, two):
+    """Whether two answers are equal to the bit."""
+    return all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+@pytest.mark.parametrize("name", IDLE)
+def test_a_cache_that_skips_nothing_changes_nothing(name):
+    backbone = trained()
+    plain = backbone.generate(CLIPS, SAMPLING)
+    backbone.transformer.enable_cache(IDLE[name]())
+    assert equal(backbone.generate(CLIPS, SAMPLING), plain)
+
+
+@EVERY
+def test_a_cache_changes_the_clip_and_keeps_nothing_for_the_next(name):
+    backbone = trained()
+    plain = backbone.generate(CLIPS, SAMPLING)
+    backbone.transformer.enable_cache(BUSY[name]())
+    cached = backbone.generate(CLIPS, SAMPLING)
+    assert not equal(cached, plain)
+    assert all(torch.isfinite(each.float()).all() for each in cached)
+    assert equal(backbone.generate(CLIPS, SAMPLING), cached)
+    batch = random_clips(2, random_tokens(2, 5))
+    assert torch.isfinite(backbone.generate(batch, SAMPLING)[1]).all()  # of another size
+    backbone.transformer.disable_cache()
+    assert equal(backbone.generate(CLIPS, SAMPLING), plain)
+
+
+@EVERY
+def test_what_is_cached_without_memory_is_not_mixed_with_what_is_cached_with_it(name):
+    backbone = trained()
+    backbone.transformer.enable_cache(BUSY[name]())
+    nothing = dataclasses.replace(CLIPS, tokens=MemoryTokens.stack([MemoryTokens.empty(CHANNELS)]))
+    blind = backbone.generate(nothing, Sampling(STEPS))
+    assert equal(backbone.generate(CLIPS, Sampling(STEPS, memory_guidance=0.0)), blind)
+
+
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+@pytest.mark.parametrize("name", ["first-block", "MagCache"])
+def test_blocks_that_are_skipped_add_their_memory_once(name, form):
+    backbone = with_adapter(micro(transformer={**micro().settings.transformer, "num_layers": 4}), form=form)
+    shaken(backbone)
+    config = MagCacheConfig(threshold=9.0, retention_ratio=0.0, **RATIOS) if name == "MagCache" else BUSY[name]()
+    backbone.transformer.enable_cache(config)
+    noisy, at = torch.randn(1, 3, 8, 8, 8, generator=torch.Generator().manual_seed(0)), torch.tensor([500])
+    given = backbone.conditions(CLIPS, at, backbone.prepare_memory(CLIPS))
+    image, caches, ran = backbone.encode_first(CLIPS), ClipCaches(backbone.transformer), []
+    backbone.transformer.base.transformer_blocks[2].attn1.register_forward_hook(lambda *_: ran.append(1))
+    with torch.no_grad(), caches.prediction("cond", at):
+        computed, cached = (backbone.predict(noisy, image, given) for _ in range(2))
+    assert len(ran) == 1
+    assert torch.allclose(cached, computed, atol=1e-4)
+
+
+@EVERY
+def test_a_pipeline_caches_as_diffusers_users_enable_it(name):
+    backbone = trained()
+    backbone.transformer.enable_cache(BUSY[name]())
+    rgb, _ = backbone.generate(CLIPS, SAMPLING)
+    pipeline, config = WorldPipeline.of(trained()), BUSY[name]()
+    pipeline.set_progress_bar_config(disable=True)
+    if hasattr(config, "current_timestep_callback"):
+        config.current_timestep_callback = lambda: pipeline.current_timestep
+    if isinstance(config, TaylorSeerCacheConfig) and not config.use_lite_mode:
+        config.cache_identifiers = [r"transformer_blocks\.\d+\.attn1"]
+    pipeline.transformer.enable_cache(config)
+    found = pipeline(
+        CLIPS.rgb[:, 0], CLIPS.depth[:, 0], CLIPS.cameras, memory_tokens=CLIPS.tokens, num_inference_steps=STEPS,
+        guidance_scale=1.5, generator=torch.Generator().manual_seed(0), output_type="pt",
+    )  # fmt: skip
+    assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+
+
+def test_a_cache_that_cannot_work_is_one_line():
+    backbone = trained()
+    with pytest.raises(
+        PersistError, match=r"^TextKVCacheConfig does not work with this transformer; known: FirstBlock"
+    ):
+        backbone.transformer.enable_cache(TextKVCacheConfig())
+    with pytest.raises(PersistError, match=r"give it is_guidance_distilled=True$"):
+        backbone.transformer.enable_cache(FasterCacheConfig())
+    backbone.transformer.base.enable_cache(TaylorSeerCacheConfig())  # whose own names for layers fit none
+    with pytest.raises(PersistError, match=r"^TaylorSeerCacheConfig fits no layer; attention is"):
+        backbone.generate(CLIPS, SAMPLING)
