@@ -51,6 +51,7 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="one model, one round")
     parser.add_argument("--set", action="append", default=[], help="change of the recipes, as training.compile=true")
     parser.add_argument("--device", help="cuda or cpu; what is there by default")
+    parser.add_argument("--precision", choices=["bfloat16", "float32"], help="bfloat16 on a GPU, else float32")
     parser.add_argument("--json", type=Path, help="file for all figures")
     options = parser.parse_args(arguments)
     options.device = torch.device(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
@@ -58,6 +59,7 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
     names = options.models.split(",") if options.models else list(PUBLISHED if on_gpu else TWINS)
     options.models = names[:1] if options.quick else names
     options.only = options.only.split(",")
+    options.precision = getattr(torch, options.precision or ("bfloat16" if on_gpu else "float32"))
     options.rounds = 1 if options.quick else options.rounds or (5 if on_gpu else 2)
     for kind, given, known in (("model", options.models, MODELS), ("part", options.only, PARTS)):
         for name in given:
@@ -70,7 +72,7 @@ def conditions(options: argparse.Namespace, peak: float, source: str) -> dict[st
     """On what, when and how it was measured."""
     return {
         "device": device_name(options.device),
-        "precision": str(precision_of(options.device)).removeprefix("torch."),
+        "precision": str(options.precision).removeprefix("torch."),
         "peak": peak,
         "peak_source": source,
         "date": datetime.now(UTC).date().isoformat(),
@@ -81,18 +83,11 @@ def conditions(options: argparse.Namespace, peak: float, source: str) -> dict[st
     }
 
 
-def precision_of(device: torch.device) -> torch.dtype:
-    """Of weights and arithmetic."""
-    return torch.bfloat16 if device.type == "cuda" else torch.float32
-
-
 def measure(options: argparse.Namespace, peak: float) -> list[Row]:
     """All parts of all models."""
     rows: list[Row] = []
     for name in options.models:
-        bench = Bench(
-            MODELS[name], options.device, precision_of(options.device), options.rounds, peak, tuple(options.set)
-        )
+        bench = Bench(MODELS[name], options.device, options.precision, options.rounds, peak, tuple(options.set))
         for part in options.only:
             began = time.monotonic()
             with TemporaryDirectory() as folder:
@@ -108,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure and print."""
     options = read_options(arguments)
     torch.manual_seed(0)
-    peak, source = peak_flops(options.device, precision_of(options.device))
+    peak, source = peak_flops(options.device, options.precision)
     facts = conditions(options, peak, source)
     rows = measure(options, peak)
     say(

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.benchmarks import bench_at_size
-from tests.benchmarks.at_size import shapes
+from tests.benchmarks.at_size import sampling, shapes
 from tests.benchmarks.at_size.measuring import Timing
 from tests.benchmarks.at_size.plain import Plain
 from tests.benchmarks.at_size.rows import Row, Target
@@ -16,22 +16,29 @@ from tests.walking import MICRO
 
 @pytest.fixture
 def micro(monkeypatch):
-    """A model so small that all parts take seconds."""
-    model = shapes.Model("micro", MICRO, {"form": "cross", "every": 2, "width": 16}, 2, 8)
-    monkeypatch.setitem(shapes.MODELS, "micro", model)
-    monkeypatch.setattr("tests.benchmarks.at_size.sampling.STEPS", (2,))
-    return model
+    """A model so small that all parts take seconds, and one that is measured as those of published size are."""
+    monkeypatch.setattr(sampling, "STEPS", (10,))
+    monkeypatch.setattr(sampling, "CONTEXT", 2)
+    monkeypatch.setitem(sampling.DINO, "num_hidden_layers", 1)
+    adapter = {"form": "cross", "every": 2, "width": 16}
+    monkeypatch.setitem(shapes.MODELS, "micro", shapes.Model("micro", MICRO, adapter, 2, 8))
+    monkeypatch.setitem(shapes.MODELS, "5b", shapes.Model("5b", MICRO, adapter, 2, 384, published=True))
+    return shapes.MODELS["micro"]
 
 
-def test_all_parts_run_on_whatever_device_is_there(micro, tmp_path, capsys):
+@pytest.mark.parametrize(("name", "precision"), [("micro", "float32"), ("5b", "bfloat16")])
+def test_all_parts_run_on_whatever_device_is_there(name, precision, micro, tmp_path, capsys):
     file = tmp_path / "rows.json"
-    bench_at_size.main(["--quick", "--models", "micro", "--device", "cpu", "--json", str(file)])
+    options = ["--models", name, "--precision", precision, "--device", "cpu", "--json", str(file)]
+    bench_at_size.main(["--quick", *options])
     found = json.loads(file.read_text())
     assert [row["what"].split(",")[0] for row in found["rows"]] == [
         "stage-1 step", "stage-2 step", "clip", "clip with voxel map", "VAE", "VAE", "map", "map",
     ]  # fmt: skip
     assert all(0 < row["utilisation"] < 1 for row in found["rows"][:4])
     assert all(row["ratio"] > 0 for row in found["rows"] if row["beside"])
+    targets = [target["text"] for row in found["rows"] for target in row["targets"]]
+    assert targets == (["no slower than plain", "utilisation ≥ 45%", "≤ 1 s", "≤ 10 % more"] if name == "5b" else [])
     assert "stage-1" in capsys.readouterr().out
 
 
