@@ -7,17 +7,19 @@ import os
 
 import pytest
 import torch
-from accelerate.state import AcceleratorState
 
 from persist_cli.app import main
 from persist_cli.memorizing.memory_file import load_memory
+from persist_cli.memorizing.recall import MemoryMaker, recall
+from persist_cli.recipe import MemoryChoice
 from persist_cli.registry import make_encoder
 from persist_cli.rollout.world_model import WorldModel, step_together
+from persist_cli.trajectories.clips import ClipDataset, ClipPlan
 from persist_cli.trajectories.store import Store
 from persist_cli.world.backbone import Sampling
 from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
 from tests.memory.views_of_room import empty, same_bits, walked
-from tests.walking import MICRO_SETTINGS, stage, train_here
+from tests.walking import MICRO_SETTINGS, SIZE, stage, train_here
 
 DEVICE = os.environ.get("PERSIST_TEST_DEVICE", "cuda")
 pytestmark = [
@@ -52,6 +54,16 @@ def test_a_memory_is_built_and_read_where_its_frames_lie_and_is_that_of_the_cpu(
     assert everywhere([others.features, others.positions, others.mask])
     assert close(mine.features, others.features)
     assert close(mine.positions, others.positions)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_what_a_clip_remembers_is_made_where_it_trains(name, walks):
+    clip = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))[5]
+    here, there = (recall(clip, MemoryMaker.of(MemoryChoice(name), device), 64) for device in ("cpu", DEVICE))
+    assert everywhere([there.features, there.positions, there.mask])
+    assert len(here) > 0
+    assert close(here.features, there.features)
+    assert close(here.positions, there.positions)
 
 
 def test_a_map_of_means_is_that_of_the_cpu_but_for_the_order_of_sums():
@@ -138,14 +150,6 @@ def test_branches_see_what_rollouts_alone_see(world):
     for seen, way in zip(together, ways, strict=True):
         alone = world("voxel", DEVICE).step(way)
         assert (seen.rgb.int() - alone.rgb.int()).abs().float().mean() < 0.5
-
-
-@pytest.fixture
-def fresh_accelerator():
-    """accelerate keeps one precision a process."""
-    AcceleratorState._reset_state(True)
-    yield
-    AcceleratorState._reset_state(True)
 
 
 @pytest.mark.parametrize("precision", ["no", "bf16"])

@@ -56,7 +56,7 @@ class TrainingState:
         for name, parameter in self.parameters.items():
             found[f"parameter/{name}"] = parameter
             for key, value in self.optimizer.state[parameter].items():
-                found[f"optimizer/{key}/{name}"] = value
+                found[f"optimizer/{key}/{name}"] = torch.as_tensor(value)  # bitsandbytes counts steps by plain numbers
         return found | {f"average/{name}": each for name, each in self.averages().items()}
 
     @property
@@ -120,7 +120,7 @@ class TrainingState:
                     if key.startswith("optimizer/") and key.endswith(f"/{name}") and key.count("/") == 2
                 }  # fmt: skip
                 self.optimizer.state[parameter] = {
-                    key: value.clone() if key == "step" else value.to(parameter.device)
+                    key: _counted(value) if key == "step" else value.to(parameter.device)
                     for key, value in moments.items()
                 }
         torch.set_rng_state(tensors["random/torch"])
@@ -166,6 +166,11 @@ def load_state(run: Path, state: TrainingState) -> None:
     folders = step_folders(run)
     if folders:
         state.read(folders[-1])
+
+
+def _counted(steps: Tensor) -> Tensor | int:
+    """Steps as the optimizer that they were saved of counts them."""
+    return steps.clone() if steps.is_floating_point() else int(steps)
 
 
 def _take(tensors: dict[str, Tensor], name: str, like: Tensor, path: Path) -> Tensor:

@@ -6,13 +6,13 @@ import shutil
 
 import pytest
 import torch
-from accelerate.state import AcceleratorState
 from diffusers.training_utils import EMAModel
 from torch.autograd.graph import saved_tensors_hooks
 
 from persist_cli.training.economy import update_average
+from persist_cli.training.state import TrainingState
 from persist_cli.world.backbone import Economy
-from persist_cli.world.files import read_tensors
+from persist_cli.world.files import read_tensors, write_json
 from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
 from tests.walking import end_of, ended_alike, stage, train_here
 
@@ -65,15 +65,7 @@ def test_checkpointing_keeps_little_of_the_forward_pass_memory_blocks_included(s
     assert held[True] < held[False] / 3
 
 
-@pytest.fixture
-def any_precision():
-    """Accelerate fixes the precision of its first accelerator for the process."""
-    AcceleratorState._reset_state(reset_partial_state=True)
-    yield
-    AcceleratorState._reset_state(reset_partial_state=True)
-
-
-@pytest.mark.usefixtures("any_precision")
+@pytest.mark.usefixtures("fresh_accelerator")
 @pytest.mark.parametrize("number", BASE)
 def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, tmp_path, number):
     base = [f"base={codec if number == 'stage1' else codec.parent / 'stage1'}", "training.precision=bf16"]
@@ -103,6 +95,16 @@ def test_an_average_moves_towards_copies_of_the_parameters_too():
         here.step(trained)
         update_average(there, trained)
     assert torch.equal(here.shadow_params[0], there.shadow_params[0])
+
+
+def test_the_state_of_an_optimizer_that_counts_by_plain_numbers_is_kept(tmp_path):
+    parameter = torch.nn.Parameter(torch.ones(3))
+    states = [TrainingState({"weight": parameter}, torch.optim.AdamW([parameter]), None) for _ in range(2)]
+    states[0].optimizer.state[parameter] = {"step": 7, "state1": torch.arange(3, dtype=torch.uint8)}
+    write_json(tmp_path / "training.json", states[0].write(tmp_path, main=True))
+    states[1].read(tmp_path)
+    kept = states[1].optimizer.state[parameter]
+    assert (type(kept["step"]), kept["step"], kept["state1"].dtype) == (int, 7, torch.uint8)
 
 
 @pytest.mark.gpu

@@ -192,3 +192,21 @@ def test_a_plan_counts_what_lora_trains(persist, stage1, lora, number):
     parts = {part["name"]: part for part in json.loads(ended.out)["parts"]}
     assert parts["LoRA"]["trained"]["1"] == parts["LoRA"]["parameters"] == 2 * 4 * (4 * 64 * 2)
     assert parts["transformer"]["trained"]["1"] == 0 < parts["widening"]["trained"]["1"]
+
+
+def test_checkpointed_steps_are_the_usual_ones_to_the_bit(persist, walks, stage1, lora, tmp_path):
+    cheap = [f"base={stage1}", *LORA, "training.gradient_checkpointing=true"]
+    assert persist(*stage("stage1", walks, tmp_path / "cheap", *cheap)).code == 0
+    assert ended_alike(lora, tmp_path / "cheap")
+
+
+@pytest.mark.usefixtures("fresh_accelerator")
+def test_a_base_in_half_the_bytes_trains_a_change_of_the_whole_one(walks, stage1, lora, tmp_path):
+    half = ["training.precision=bf16", "training.frozen_precision=bf16"]
+    train_here(*stage("stage1", walks, tmp_path / "half", f"base={stage1}", *LORA, *half))
+    changes = [read_tensors(model(run) / "pytorch_lora_weights.safetensors")[0] for run in (lora, tmp_path / "half")]
+    assert {change.dtype for change in changes[1].values()} == {torch.float32}
+    whole, low = (
+        predicted(load_backbone(find_checkpoint(run)).eval(), random_clips(), None) for run in (lora, tmp_path / "half")
+    )
+    assert (whole - low).abs().mean() < 0.2 * whole.abs().mean()
