@@ -21,6 +21,19 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell's background jo
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+DIFFUSERS_MARKERS = (  # of diffusers' own tests, which test_diffusers_mixins runs where there is a checkout
+    "attention", "autoround", "big_accelerator", "bitsandbytes", "cache", "compile", "context_parallel", "cpu_offload", "gguf",
+    "group_offload", "ip_adapter", "lora", "memory", "modelopt", "nightly", "quantization", "quanto", "sdnq",
+    "single_file", "tensor_parallel", "torchao", "training",
+)  # fmt: skip
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Know the marks of what a checkout brings."""
+    for name in DIFFUSERS_MARKERS if os.environ.get("DIFFUSERS_CHECKOUT") else ():
+        config.addinivalue_line("markers", f"{name}: of diffusers' own tests")
+
+
 @dataclass(frozen=True)
 class Ended:
     """How a command ended."""
