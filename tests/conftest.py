@@ -22,8 +22,8 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell's background jo
 
 
 DIFFUSERS_MARKERS = (  # of diffusers' own tests, which test_diffusers_mixins runs where there is a checkout
-    "attention", "autoround", "big_accelerator", "bitsandbytes", "cache", "compile", "context_parallel", "cpu_offload", "gguf",
-    "group_offload", "ip_adapter", "lora", "memory", "modelopt", "nightly", "quantization", "quanto", "sdnq",
+    "attention", "autoround", "big_accelerator", "bitsandbytes", "cache", "compile", "context_parallel", "cpu_offload",
+    "gguf", "group_offload", "ip_adapter", "lora", "memory", "modelopt", "nightly", "quantization", "quanto", "sdnq",
     "single_file", "tensor_parallel", "torchao", "training",
 )  # fmt: skip
 
