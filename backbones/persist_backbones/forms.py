@@ -12,12 +12,15 @@ from persist_backbones.canvas import CanvasAdapter
 from persist_backbones.cross import CrossAdapter
 from persist_backbones.parts import load_exactly
 from persist_backbones.projected import ProjectedAdapter
-from persist_cli.world.errors import CheckpointError
+from persist_cli.world.errors import CheckpointError, hint
 from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
 from persist_cli.world.settings import parse_settings
 
 FORMS: dict[str, type[Adapter[Any]]] = {"cross": CrossAdapter, "projected": ProjectedAdapter, "canvas": CanvasAdapter}
 DEFAULT = "cross"
+# the paper's blocks on CogVideoX-5B, one after every transformer block: it says that all of them together have about
+# 1 B parameters, and no more; a width of a third of the video's, heads of the video's, half its feed-forward
+PRESETS: dict[str, dict[str, Any]] = {"5b": {"form": "cross", "every": 1, "width": 1024, "heads": 16, "ff_factor": 0.5}}
 
 
 def make_adapter(channels: int, settings: Mapping[str, Any], video: VideoShape, where: str) -> Adapter[Any]:
@@ -25,19 +28,28 @@ def make_adapter(channels: int, settings: Mapping[str, Any], video: VideoShape, 
 
     Args:
         channels: of the memory's features.
-        settings: ``form`` and what that form has, plain values.
+        settings: ``form`` and what that form has, plain values; on top of those of the ``preset`` that they may name.
         video: the model it stands in.
         where: what the settings are called in errors.
 
     Raises:
-        CheckpointError: for an unknown form, and sizes that do not go together.
+        CheckpointError: for an unknown form or preset, and sizes that do not go together.
         RecipeError: one line with every setting that the form does not have or allow.
     """
+    settings = _on_preset(settings)
     name = str(settings.get("form", DEFAULT))
     if name not in FORMS:
         raise CheckpointError(f"unknown adapter form {name!r}; known: {', '.join(FORMS)}")
     form = FORMS[name]
     return form(channels, parse_settings(form.settings_type, settings, where), video)
+
+
+def _on_preset(settings: Mapping[str, Any]) -> dict[str, Any]:
+    own = dict(settings)
+    preset = own.pop("preset", None)
+    if preset is not None and str(preset) not in PRESETS:
+        raise CheckpointError(f"unknown adapter preset {preset!r}; {hint(str(preset), PRESETS)}")
+    return own if preset is None else PRESETS[str(preset)] | own
 
 
 def save_adapter(adapter: Adapter[Any], folder: Path) -> None:
