@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from persist_cli.doctor.app import doctor
 from persist_cli.options import (
     ActionsOption,
     Commands,
@@ -291,6 +292,7 @@ def evaluate(
     run_eval(checkpoints or [], plan, out, report, json)
 
 
+app.command(context_settings={"allow_interspersed_args": True})(doctor)
 app.add_typer(weights_app, name="weights")
 app.command()(plugins)
 app.command()(recipes)

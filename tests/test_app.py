@@ -4,7 +4,7 @@ import sys
 import pytest
 
 COMMANDS = (
-    *("collect", "import", "inspect", "finetune", "export", "memorize", "rollout", "eval"),
+    *("collect", "import", "inspect", "finetune", "doctor", "export", "memorize", "rollout", "eval"),
     *("weights", "plugins", "recipes"),
 )
 

@@ -105,9 +105,9 @@ def ended_alike(one: Path, two: Path) -> bool:
     return same and log == other_log
 
 
-def write_walks(folder: Path) -> Path:
+def write_walks(folder: Path, size: int = SIZE) -> Path:
     """Two trajectories, out and back by the reversed actions, in rooms of two names."""
-    room, vocabulary = Room(SIZE, SIZE), walking_actions(0.2, 15.0)
+    room, vocabulary = Room(size, size), walking_actions(0.2, 15.0)
     out = list(OUT)
     for number, start in enumerate((look((0.0, 1.3, 0.2), 0.0, 0.0), look((0.3, 1.3, -0.2), 90.0, 0.0))):
         actions = [*out, "pick_up", *vocabulary.reversed(out)]

@@ -18,7 +18,7 @@ from persist_backbones.conditioning import camera_latents, camera_tokens, intera
 from persist_backbones.economy import FrozenWeights, economize
 from persist_backbones.forms import load_adapter, make_adapter, save_adapter
 from persist_backbones.guidance import make_denoiser
-from persist_backbones.inventory import parts_of
+from persist_backbones.inventory import parts_of, shorten
 from persist_backbones.lora import add_lora, train_lora
 from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
@@ -65,7 +65,6 @@ class CogVideoX(Backbone):
         self.scheduler = parts.scheduler
         self.shape = clip_shape(parts.transformer, parts.vae, self.settings)
         config = parts.transformer.config
-        self.prompt: Tensor
         self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
 
     @property
@@ -117,6 +116,10 @@ class CogVideoX(Backbone):
     def parts(self) -> list[Part]:
         """VAE, transformer, what widens it, and memory adapters."""
         return parts_of(self.named_parameters())
+
+    def shorten(self, groups: int) -> float:
+        """Keep the first transformer blocks, with the adapter's."""
+        return shorten(self.transformer.base.transformer_blocks, self.adapter, groups)
 
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """The VAE's, the transformer's, or the adapter's, everything else frozen."""

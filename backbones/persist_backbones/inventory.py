@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from torch import nn
 
+from persist_backbones.adapter import Adapter
 from persist_cli.world.backbone import Part
 
 LORA = ".lora_"  # in the names that PEFT gives to what it adds
@@ -39,3 +41,18 @@ def _part_of(name: str) -> tuple[str, bool]:
     if name.startswith("adapters."):
         return ADAPTER + name.split(".")[1], True
     return "widening", True
+
+
+def shorten(blocks: nn.ModuleList, adapter: Adapter[Any] | None, groups: int) -> float:
+    """Drop all but the first groups of transformer blocks, a group being as many as one block of the adapter stands at.
+
+    Returns:
+        How many groups there were.
+    """
+    every = adapter.settings.every if adapter else 1
+    before = len(blocks) / every
+    del blocks[groups * every :]
+    if adapter is not None:
+        for layer in [each for each in adapter.blocks if int(each) >= groups * every]:
+            del adapter.blocks[layer]
+    return before

@@ -181,6 +181,13 @@ class Backbone(nn.Module, ABC):
         """Every parameter, each in one part, in the order in which people think of them."""
         return [Part(self.name, dict(self.named_parameters()))]
 
+    def shorten(self, groups: int) -> float:
+        """Keep so many groups of like layers of what is trained in depth, for estimates; returns how many there were.
+
+        What a step takes must grow linearly with the groups. By default there is one and it stays.
+        """
+        return float(groups)
+
     @abstractmethod
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Freeze all that the stage does not train and return the rest by name."""

@@ -1,0 +1,106 @@
+"""What makes a training need less memory: each change by itself, and the smallest that makes it fit."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from persist_cli.doctor.machine import Machine
+from persist_cli.recipe import Recipe
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of settings or of the launch.
+
+    Args:
+        name: what tables call it.
+        settings: as KEY=VALUE.
+        cost: how much one would rather not; rounding and time count less than another optimizer, and that less than
+            training something else.
+        sharded: whether it is a launch with FSDP2.
+    """
+
+    name: str
+    settings: tuple[str, ...]
+    cost: int
+    sharded: bool = False
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """Some changes made together; none is the recipe as it is."""
+
+    changes: tuple[Change, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The changes' names."""
+        return " + ".join(change.name for change in self.changes) or "as it is"
+
+    @property
+    def settings(self) -> list[str]:
+        """All KEY=VALUE."""
+        return [setting for change in self.changes for setting in change.settings]
+
+    @property
+    def sharded(self) -> bool:
+        """Whether one of them is FSDP2."""
+        return any(change.sharded for change in self.changes)
+
+    @property
+    def cost(self) -> int:
+        """Of all of them."""
+        return sum(change.cost for change in self.changes)
+
+    @property
+    def possible(self) -> bool:
+        """Whether the changes work together: 8-bit moments cannot be sharded."""
+        return not (self.sharded and EIGHT_BIT in self.changes)
+
+
+SLICING = Change("VAE slicing", ("training.vae_slicing=true",), 1)
+FROZEN = Change("frozen in bf16", ("training.frozen_precision=bf16",), 1)
+AVERAGE = Change("EMA on the CPU", ("training.ema_device=cpu",), 2)
+CHECKPOINTING = Change("gradient checkpointing", ("training.gradient_checkpointing=true",), 3)
+LORA = Change("LoRA", ("lora={rank: 64}",), 16)
+EIGHT_BIT = Change("8-bit optimizer", ("training.optimizer=adamw-8bit",), 4)
+
+
+def changes_of(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
+    """The changes that can make this recipe need less on this machine and are not in force yet."""
+    training, cuda = recipe.training, machine.kind == "cuda"
+    deep, averaged = recipe.stage != "codec", training.ema and training.ema_device != "cpu"
+    found: list[tuple[bool, Change]] = [
+        (not training.vae_slicing, SLICING),
+        (training.precision == "bf16" and training.frozen_precision == "no", FROZEN),
+        (bool(averaged) and cuda, AVERAGE),
+        (_samples(recipe, machine) > 1, _one_by_one(recipe, machine)),
+        (machine.devices > 1 and not sharded and deep, Change(f"FSDP over {machine.devices}", (), 2, sharded=True)),
+        (not training.gradient_checkpointing and deep, CHECKPOINTING),
+        (training.optimizer == "adamw" and cuda and not sharded, EIGHT_BIT),
+        (recipe.stage == "1" and recipe.lora is None, LORA),
+    ]
+    return [change for able, change in found if able]
+
+
+def _samples(recipe: Recipe, machine: Machine) -> float:
+    """Of a micro-batch."""
+    return recipe.training.batch / (recipe.training.accumulation * machine.devices)
+
+
+def _one_by_one(recipe: Recipe, machine: Machine) -> Change:
+    parts = max(1, recipe.training.batch // machine.devices)
+    return Change("samples one by one", (f"training.accumulation={parts}",), 2)
+
+
+def strategies(changes: Sequence[Change]) -> Iterator[Strategy]:
+    """All that can be done together, the smallest first."""
+    sets = (each for count in range(len(changes) + 1) for each in itertools.combinations(changes, count))
+    yield from sorted(filter(lambda each: each.possible, map(Strategy, sets)), key=lambda each: each.cost)
+
+
+def smallest(changes: Sequence[Change], fits: Callable[[Strategy], bool]) -> Strategy | None:
+    """The smallest strategy that fits, ``None`` when none does."""
+    return next(filter(fits, strategies(changes)), None)

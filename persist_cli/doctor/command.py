@@ -1,0 +1,144 @@
+"""``persist doctor``: what a training needs on a machine, and the smallest change that makes it fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from persist_cli.doctor.changes import Strategy, changes_of, smallest
+from persist_cli.doctor.dry_run import dry_run
+from persist_cli.doctor.machine import GIB, Machine
+from persist_cli.doctor.need import Estimator, Launch, Need
+from persist_cli.doctor.planned import Planned, plan, plan_recipe
+from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
+from persist_cli.viewing.console import print_json, print_table, say
+from persist_cli.world.errors import PersistError
+
+COLUMNS: Final = ("weights", "gradients", "optimizer", "average", "encoding", "activations", "update", "peak")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a strategy needs."""
+
+    strategy: Strategy
+    need: Need
+    fits: bool
+
+
+class Doctor:
+    """Examines a plan on a machine.
+
+    Args:
+        planned: the recipe with its backbone.
+        machine: to train on.
+        sharded: whether FSDP2 is used anyway.
+    """
+
+    def __init__(self, planned: Planned, machine: Machine, sharded: bool) -> None:
+        self.planned, self.machine, self.sharded = planned, machine, sharded
+        self.estimators = {planned.recipe.lora: Estimator(planned.backbone, planned.channels)}
+        self.changes = changes_of(planned.recipe, machine, sharded)
+
+    def examine(self, strategy: Strategy) -> Finding:
+        """What the recipe needs with these changes."""
+        launch = Launch(self.machine.devices, self.machine.kind == "cuda", self.sharded or strategy.sharded)
+        recipe = self.changed(strategy)
+        if recipe.lora not in self.estimators:  # other parameters, so another plan
+            other = plan(recipe, self.planned.base)
+            self.estimators[recipe.lora] = Estimator(other.backbone, other.channels)
+        need = self.estimators[recipe.lora].need(recipe, launch)
+        return Finding(strategy, need, need.peak <= self.machine.usable)
+
+    def changed(self, strategy: Strategy) -> Recipe:
+        """The recipe with the strategy's settings."""
+        return make_recipe(apply_overrides(to_plain(self.planned.recipe), strategy.settings), strategy.name)
+
+    def each(self) -> list[Finding]:
+        """The recipe as it is, and with each change alone."""
+        alone = [Strategy(), *(Strategy((change,)) for change in self.changes)]
+        return [self.examine(strategy) for strategy in alone]
+
+    def smallest(self) -> Finding | None:
+        """What fits with the smallest changes, ``None`` when nothing does."""
+        found = smallest(self.changes, lambda strategy: self.examine(strategy).fits)
+        return None if found is None else self.examine(found)
+
+
+def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: bool, json: bool) -> None:
+    """Print parts, what each strategy needs, and what fits.
+
+    Raises:
+        PersistError: when the recipe is wrong, or FSDP2 is asked for on one device.
+    """
+    if sharded and machine.devices == 1:
+        raise PersistError("--fsdp shares a model out over several GPUs; give --gpus N too")
+    planned = plan_recipe(name, overrides)
+    doctor = Doctor(planned, machine, sharded)
+    parts, found, best = dry_run(planned), doctor.each(), doctor.smallest()
+    if json:
+        print_json(_record(name, machine, parts, found, best))
+        return
+    rows = [
+        [part["name"], f"{part['parameters']:,}", _gib(part["bytes"])] for part in [*parts["parts"], parts["total"]]
+    ]
+    print_table(f"{name}: stage {planned.recipe.stage}", ("part", "parameters", "GiB"), rows)
+    title = f"GiB on each of {machine}, of which {_gib(machine.usable)} are planned with"
+    print_table(title, ("strategy", *COLUMNS, "fits"), [_row(each) for each in found])
+    say(_verdict(name, overrides, machine, found[0], best))
+
+
+def _verdict(name: str, overrides: Sequence[str], machine: Machine, plain: Finding, best: Finding | None) -> str:
+    if best is None:
+        return f"does not fit on {machine}, whatever is changed; take more or larger devices, or smaller clips"
+    need = f"{_gib(best.need.peak)} of {_gib(machine.usable)} GiB"
+    if not best.strategy.changes:
+        return f"fits as it is: {need}"
+    line = command(name, [*overrides, *best.strategy.settings], best, machine)
+    return f"fits with {best.strategy.name} ({need}):\n{line}"
+
+
+def command(name: str, settings: Sequence[str], best: Finding, machine: Machine) -> str:
+    """How to start the training like that."""
+    finetune = " ".join(["finetune", name, "--data DATA", *settings])
+    if machine.devices == 1:
+        return f"persist {finetune}"
+    flags = " --use_fsdp --fsdp_version 2" if best.strategy.sharded else " --multi_gpu"
+    return f"accelerate launch --num_processes {machine.devices}{flags} --module persist_cli {finetune}"
+
+
+def _record(
+    name: str, machine: Machine, parts: dict[str, Any], found: Sequence[Finding], best: Finding | None
+) -> dict[str, Any]:
+    for part in parts["parts"]:
+        del part["shapes"]
+    return {
+        "recipe": name,
+        "machine": {
+            "kind": machine.kind, "devices": machine.devices, "memory": machine.memory, "usable": machine.usable,
+        },
+        **parts,
+        "strategies": [_finding(each) for each in found],
+        "fits": found[0].fits,
+        "smallest": None if best is None else _finding(best),
+    }  # fmt: skip
+
+
+def _finding(found: Finding) -> dict[str, Any]:
+    return {
+        "name": found.strategy.name,
+        "settings": found.strategy.settings,
+        "fsdp": found.strategy.sharded,
+        "need": found.need.to_json(),
+        "fits": found.fits,
+    }
+
+
+def _row(found: Finding) -> list[str]:
+    need = found.need.to_json()
+    return [found.strategy.name, *(_gib(need[column]) for column in COLUMNS), "yes" if found.fits else "no"]
+
+
+def _gib(size: float) -> str:
+    return f"{size / GIB:.3g}" if size < GIB else f"{size / GIB:.1f}"

@@ -1,0 +1,169 @@
+"""What a process of a training needs in bytes, by what for."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from torch import nn
+
+from persist_cli.doctor.step import Activations, Encoding, StepKind, Twins
+from persist_cli.recipe import Recipe
+from persist_cli.world.backbone import Backbone
+
+FLOAT32: Final = 4
+HALF: Final = 2
+MOMENTS: Final = {
+    "adamw": 2 * FLOAT32,
+    "adamw-8bit": 2 * (1 + FLOAT32 / 256),  # a byte each, and a scale for every 256
+}
+
+
+@dataclass(frozen=True)
+class Launch:
+    """How processes share the work.
+
+    Args:
+        devices: processes, a device each.
+        cuda: whether they are GPUs.
+        sharded: FSDP2; else each has the whole model.
+    """
+
+    devices: int
+    cuda: bool
+    sharded: bool = False
+
+
+@dataclass(frozen=True)
+class Need:
+    """Bytes on one device.
+
+    Weights, moments and averages are always there. Beside them there are at most, one after the other: what encoding
+    the clips takes; activations, with gradients coming while they go; gradients with what the update of the weights
+    takes. With several micro-batches gradients are there from the first one on.
+
+    Args:
+        weights: and buffers; with FSDP also what is gathered of other processes at once.
+        gradients: and with DDP the buckets that are sent.
+        optimizer: moments of AdamW.
+        average: EMA, where it is on the device.
+        encoding: of the codec.
+        activations: in forward and backward pass, most at once.
+        shallow: of these, what is left when all gradients are there.
+        update: of the optimizer's step.
+        kept: whether gradients stay while the next micro-batch is encoded and run.
+    """
+
+    weights: int
+    gradients: int
+    optimizer: int
+    average: int
+    encoding: int
+    activations: int
+    shallow: int
+    update: int
+    kept: bool = False
+
+    @property
+    def peak(self) -> int:
+        """Most bytes at once."""
+        before = self.gradients if self.kept else 0
+        step = max(self.activations + before, self.gradients + self.shallow)
+        return self.always + max(self.encoding + before, step, self.gradients + self.update)
+
+    @property
+    def always(self) -> int:
+        """Bytes that a run holds from its second step to its end."""
+        return self.weights + self.optimizer + self.average
+
+    def to_json(self) -> dict[str, int | bool]:
+        """Plain values."""
+        return dataclasses.asdict(self) | {"peak": self.peak}
+
+
+class Estimator:
+    """Estimates what runs of one plan need under different settings; steps that it knows it does not run again.
+
+    Args:
+        backbone: a plan, on the meta device.
+        channels: of the memory's features, ``None`` without a memory.
+    """
+
+    def __init__(self, backbone: Backbone, channels: int | None) -> None:
+        self.backbone, self.twins = backbone, Twins(backbone, channels)
+        self._encodings: dict[tuple[object, ...], Encoding] = {}
+        self._steps: dict[tuple[object, ...], Activations] = {}
+
+    def need(self, recipe: Recipe, launch: Launch) -> Need:
+        """What one process of a run needs."""
+        training, backbone = recipe.training, self.backbone
+        batch = math.ceil(training.batch / (training.accumulation * launch.devices))
+        kind = StepKind(batch, launch.cuda, launch.sharded and training.precision == "bf16")
+        encoding, step = self.encoding(recipe, kind), self.step(recipe, kind)
+        trained = backbone.trained_parameters(recipe.stage)
+        count = sum(each.numel() for each in trained.values())
+        largest = max((each.numel() for each in trained.values()), default=0)
+        share = 1 / launch.devices if launch.sharded else 1.0
+        buckets = 2 if launch.devices > 1 and not launch.sharded else 1
+        averaged = training.ema and not (launch.cuda and training.ema_device == "cpu")
+        at_once = count * share if launch.cuda and training.optimizer == "adamw" else 2 * largest * share
+        return Need(
+            weights=self.weights(recipe, launch),
+            gradients=round(count * FLOAT32 * share * buckets),
+            optimizer=round(count * MOMENTS[training.optimizer] * share),
+            average=round(count * FLOAT32 * share) if averaged else 0,
+            encoding=encoding.peak,
+            activations=step.peak,
+            shallow=step.shallow,
+            update=round(at_once * FLOAT32),  # torch takes roots of all second moments at once on a GPU
+            kept=training.accumulation > 1,
+        )
+
+    def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
+        """What encoding takes in a step of this kind."""
+        kind, training = dataclasses.replace(kind, sharded=False), recipe.training  # what encodes is not sharded
+        key = (kind, training.precision, training.frozen_precision, training.vae_slicing)
+        if key not in self._encodings:
+            self._encodings[key] = self.twins.encoding(recipe, kind)
+        return self._encodings[key]
+
+    def step(self, recipe: Recipe, kind: StepKind) -> Activations:
+        """What forward and backward pass take in a step of this kind."""
+        training = recipe.training
+        key = (kind, training.precision, training.gradient_checkpointing, training.frozen_precision)
+        if key not in self._steps:
+            self._steps[key] = self.twins.activations(recipe, kind, self.encoding(recipe, kind))
+        return self._steps[key]
+
+    def weights(self, recipe: Recipe, launch: Launch) -> int:
+        """Bytes of parameters, those that are not trained in their own precision, and buffers.
+
+        With FSDP those of this process and what it gathers at once: two blocks, one of them with the gradients that
+        go out in float32, and all that stands in no block.
+        """
+        backbone, frozen = self.backbone, HALF if recipe.training.frozen_precision == "bf16" else FLOAT32
+        trained = {id(each) for each in backbone.trained_parameters(recipe.stage).values()}
+
+        def size(parameters: list[nn.Parameter]) -> int:
+            return sum(each.numel() * (FLOAT32 if id(each) in trained else frozen) for each in parameters)
+
+        parameters = list(backbone.parameters())
+        buffers = sum(each.numel() * each.element_size() for each in backbone.buffers())
+        if not launch.sharded:
+            return size(parameters) + buffers
+        whole = [each for name in backbone.kept_whole for each in backbone.get_submodule(name).parameters()]
+        kept = {id(each) for each in whole}
+        shared = [each for each in parameters if id(each) not in kept]
+        return size(whole) + buffers + size(shared) // launch.devices + self.gathered(recipe, kept)
+
+    def gathered(self, recipe: Recipe, kept: set[int]) -> int:
+        """Bytes that FSDP puts together at once."""
+        width = HALF if recipe.training.precision == "bf16" else FLOAT32
+        blocks = [each for each in self.backbone.modules() if type(each).__name__ in self.backbone.sharded_blocks]
+        sizes = [sum(each.numel() for each in block.parameters()) for block in blocks]
+        inside = {id(each) for block in blocks for each in block.parameters()}
+        rest = sum(each.numel() for each in self.backbone.parameters() if id(each) not in inside | kept)
+        most = max(sizes, default=0)
+        return round(rest * width + most * (2 * width + width + FLOAT32))

@@ -1,0 +1,141 @@
+"""The most bytes that tensors take at once while code runs, found out without computing or allocating anything.
+
+The code itself runs, on tensors that have shape, precision and life time but no values (torch's fake tensors): what
+autograd keeps for the backward pass, what is cast and copied on the way, what is computed again, all is as it will be,
+for every adapter, setting and version of the model. What the kernels of a device use inside is not seen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import weakref
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+aten = torch.ops.aten
+FLOAT32_ON_CUDA = ("layer_norm", "group_norm")  # in autocast; on a CPU they keep their input's precision
+
+
+class LiveBytes(TorchDispatchMode):
+    """Counts the bytes of all tensors that come into being within it, as long as they live; views are nothing new.
+
+    What depends on values that are not there is taken as zero, and no value as masked out. Gradients that are
+    ``set_aside`` live on, but count no more towards ``peak``.
+
+    Args:
+        known: tensors that are there already and do not count.
+        cuda: whether convolutions are those of CUDA, whose workspace is not known. On a CPU they hold a copy of input
+            or output, the larger, in the order that they work in.
+    """
+
+    def __init__(self, known: Iterable[Tensor], cuda: bool) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.cuda = cuda
+        self.now = self.peak = 0
+        self._alive: dict[int, weakref.ref[Any]] = {}
+        self._sizes: dict[int, int] = {}
+        self._known = {each.untyped_storage()._cdata for each in known}
+
+    def set_aside(self, parameter: Tensor) -> None:
+        """Count the parameter's gradient no more."""
+        if parameter.grad is not None:
+            self._forget(parameter.grad.untyped_storage()._cdata)
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run one operation and note what it made."""
+        if func is aten._local_scalar_dense.default:
+            return 1.0 if args[0].is_floating_point() else 0
+        out = _of_all_values(func, args) if func in _BY_VALUES else func(*args, **(kwargs or {}))
+        made = [each for each in (out if isinstance(out, tuple | list) else (out,)) if isinstance(each, Tensor)]
+        for each in made:
+            self._note(each)
+        if func in _CONVOLUTIONS and not self.cuda:
+            seen = [each for each in args if isinstance(each, Tensor)]
+            self.peak = max(self.peak, self.now + max(each.untyped_storage().nbytes() for each in seen + made))
+        return out
+
+    def _note(self, tensor: Tensor) -> None:
+        storage = tensor.untyped_storage()
+        key = storage._cdata
+        if key in self._alive or key in self._known:
+            return
+        size = storage.nbytes()
+        self.now += size
+        self.peak = max(self.peak, self.now)
+        self._alive[key] = weakref.ref(storage, lambda _: self._forget(key))
+        self._sizes[key] = size
+
+    def _forget(self, key: int) -> None:
+        del self._alive[key]
+        self.now -= self._sizes.pop(key)
+
+
+_CONVOLUTIONS = {aten.convolution.default, aten.convolution_backward.default}
+_BY_VALUES = {aten.nonzero.default, aten.repeat_interleave.Tensor, aten.index.Tensor}
+
+
+def _of_all_values(func: Any, args: Any) -> Any:
+    """What an operation whose result's size depends on values gives when all of them count."""
+    if func is aten.nonzero.default:
+        return args[0].new_zeros(args[0].numel(), args[0].ndim, dtype=torch.long)
+    if func is aten.repeat_interleave.Tensor:
+        return args[0].new_zeros(args[0].numel(), dtype=torch.long)
+    places: list[Tensor | None] = []
+    for index in args[1]:
+        chosen = index is not None and index.dtype == torch.bool
+        places += [index.new_zeros(index.numel(), dtype=torch.long)] * index.ndim if chosen else [index]
+    return func(args[0], places)
+
+
+@contextlib.contextmanager
+def kernels(cuda: bool) -> Iterator[None]:
+    """Within the block attention keeps no matrix of all pairs, as on every device, and norms have its precision.
+
+    They are put in torch's own place: a mode of torch's would not hold in what the backward pass computes again.
+
+    Args:
+        cuda: whether autocast shall follow CUDA's rules, where tensors are those of the CPU.
+    """
+    found = {"scaled_dot_product_attention": _attention}
+    if cuda:
+        found |= {name: _in_float32(getattr(F, name)) for name in FLOAT32_ON_CUDA}
+    before = {name: getattr(F, name) for name in found}
+    try:
+        for name, function in found.items():
+            setattr(F, name, function)
+        yield
+    finally:
+        for name, function in before.items():
+            setattr(F, name, function)
+
+
+def _attention(query: Tensor, key: Tensor, value: Tensor, *_: Any, **__: Any) -> Tensor:
+    half = torch.is_autocast_enabled("cpu")
+    parts = [each.to(torch.bfloat16) if half else each for each in (query, key, value)]
+    found: Tensor = aten._scaled_dot_product_flash_attention_for_cpu(*parts)[0]
+    return found
+
+
+def _in_float32(norm: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def exact(value: Any) -> Any:
+        return value.float() if isinstance(value, Tensor) else value
+
+    def run(*args: Any, **kwargs: Any) -> Tensor:
+        if torch.is_autocast_enabled("cpu"):
+            args, kwargs = tuple(map(exact, args)), {name: exact(value) for name, value in kwargs.items()}
+        return norm(*args, **kwargs)
+
+    return run
+
+
+@contextlib.contextmanager
+def imagined() -> Iterator[None]:
+    """Within the block tensors have no values and take no memory."""
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        yield

@@ -1,0 +1,60 @@
+"""Run as a program: train by each list of settings in turn and print the most bytes that each run took.
+
+Of a process's resident memory, less what it had before the run; a small run comes first, which loads what libraries
+load late. The environment of ``MEASURED`` keeps freed memory from staying with the process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from unittest.mock import patch
+
+from persist_cli.app import main
+from persist_cli.training.run_folder import RunFolder
+
+MEASURED = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536", "OMP_NUM_THREADS": "1"}
+SHORT = ["base=null", "training.steps=3", "training.workers=0", "training.threads=1", "training.warmup=1"]
+
+
+def measured_peaks(runs: Sequence[tuple[str, str, Sequence[str]]]) -> list[int]:
+    """Bytes of each run of (recipe, data folder, settings), all in one fresh process."""
+    command = [sys.executable, "-m", "tests.doctor.measured", json.dumps(runs)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | MEASURED)
+    found: list[int] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def resident(key: str) -> int:
+    """``VmRSS`` or ``VmHWM`` of this process in bytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(key))
+
+
+def train(recipe: str, data: str, settings: Sequence[str]) -> int:
+    """Bytes that a short run took at most, before it saves anything."""
+    gc.collect()
+    before, peaks = resident("VmRSS"), []
+    Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins again
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        patch.object(RunFolder, "save", lambda _: peaks.append(resident("VmHWM"))),
+        contextlib.redirect_stdout(sys.stderr),
+        contextlib.suppress(SystemExit),
+    ):
+        main(["finetune", recipe, "--data", data, "--out", f"{folder}/run", *SHORT, *settings])
+    return peaks[0] - before
+
+
+if __name__ == "__main__":
+    runs = json.loads(sys.argv[1])
+    small = min(runs, key=lambda run: len(run[2]))
+    train(*small)
+    print(json.dumps([train(*run) for run in runs]))  # noqa: T201
