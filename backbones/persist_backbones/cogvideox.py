@@ -24,6 +24,8 @@ from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
 from persist_backbones.parts import DiffusersParts, check_fit, starting_parts, video_shape, widen
 from persist_backbones.presets import CogVideoXSettings
+from persist_backbones.pretrained import origin_of
+from persist_backbones.prompt import ORIGINS, starting_prompt
 from persist_backbones.rotary import rotary_positions
 from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
 from persist_backbones.saving import load_whole, save_change, save_whole
@@ -56,6 +58,7 @@ class CogVideoX(Backbone):
         self.offloaded: WorldPipeline | None = None
         self.frozen = FrozenWeights(self, None)
         self.set_parts(starting_parts(settings))
+        self.prompt = starting_prompt(settings, self.prompt)
 
     def set_parts(self, parts: DiffusersParts) -> None:
         """Build the model around diffusers' parts; what is new starts at zero."""
@@ -261,8 +264,9 @@ class CogVideoX(Backbone):
         self.adapter_name = name
 
     def checkpoint_settings(self) -> dict[str, Any]:
-        """The settings without the directory that the weights once came from, and with what they predict."""
-        return super().checkpoint_settings() | {"pretrained": None, "prediction": self.scheduler.config.prediction_type}
+        """The settings without where the weights and the prompt once came from, and with what they predict."""
+        predicts = self.scheduler.config.prediction_type
+        return super().checkpoint_settings() | dict.fromkeys(ORIGINS) | {"prediction": predicts}
 
     def save_base(self, folder: Path) -> None:
         """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
@@ -274,8 +278,7 @@ class CogVideoX(Backbone):
 
     def origin(self) -> dict[str, Any]:
         """The pretrained directory, wherever one stands."""
-        given = self.settings.pretrained
-        return {"pretrained": str(Path(given).resolve()) if Path(given).is_dir() else given} if given else {}
+        return origin_of(self.settings.pretrained)
 
     def add_lora(self, lora: Lora) -> None:
         """PEFT's layers in the transformer; what of it is new trains whole."""

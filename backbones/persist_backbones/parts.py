@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from persist_backbones.objective import check_prediction
 from persist_backbones.patches import frames_per_token
 from persist_backbones.position_tables import fit_positions
 from persist_backbones.presets import PRESETS, CogVideoXSettings
+from persist_backbones.pretrained import folder_here, pretrained_folder, published_preset
 from persist_backbones.world_transformer import WorldTransformer
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
@@ -43,10 +45,19 @@ class DiffusersParts:
 
 
 def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
-    """The parts that a model of these settings begins with; a plan of weights that are not here is the preset's."""
-    if settings.pretrained is None or (planning() and not Path(settings.pretrained).is_dir()):
+    """The parts that a model of these settings begins with.
+
+    A plan asks no network: of weights that are not here it takes the sizes that their name tells, else the preset's.
+    """
+    if settings.pretrained is None:
         return make_parts(settings)
-    return load_parts(Path(settings.pretrained))
+    if not planning():
+        return load_parts(pretrained_folder(settings.pretrained))
+    folder = folder_here(settings.pretrained)
+    if folder is not None:
+        return load_parts(folder)
+    preset: Any = published_preset(settings.pretrained) or settings.preset
+    return make_parts(dataclasses.replace(settings, preset=preset))
 
 
 def planning() -> bool:

@@ -88,9 +88,13 @@ class CogVideoXSettings:
 
     Args:
         preset: sizes of transformer, VAE and scheduler.
-        pretrained: a plain diffusers CogVideoX directory (``transformer/``, ``vae/``, ``scheduler/``) to start from;
-            its configuration replaces the preset's. A learned table of positions (5b-I2V) is cut and resampled to the
-            clips' size.
+        pretrained: a plain diffusers CogVideoX directory (``transformer/``, ``vae/``, ``scheduler/``) to start from,
+            or the name of one on the hub (``zai-org/CogVideoX-5b-I2V``), which is downloaded where it is not here;
+            its configuration replaces the preset's. A learned table of positions (5b-I2V) is cut and resampled to
+            the clips' size.
+        prompt: what the model is always asked with, embedded once by the ``text_encoder/`` and ``tokenizer/`` of
+            ``pretrained``, which are never downloaded; without prompt the embedding is zeros.
+        prompt_embedding: instead of it a safetensors file with its embedding, the tensor ``prompt``.
         height: pixels.
         width: pixels.
         frames: frames a clip, at least two; for a VAE that compresses time by c > 1, 2cn + 1: 9, 17, … for CogVideoX's.
@@ -111,6 +115,8 @@ class CogVideoXSettings:
 
     preset: Literal["tiny", "2b", "5b", "5b-i2v", "1.5-5b", "1.5-5b-i2v"] = "tiny"
     pretrained: str | None = None
+    prompt: str | None = None
+    prompt_embedding: str | None = None
     height: int = 64
     width: int = 64
     frames: int = 9

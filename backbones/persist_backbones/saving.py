@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from persist_backbones.lora import merge_lora, save_lora
 from persist_backbones.parts import load_parts, load_world, save_world, starting_parts
+from persist_backbones.prompt import check_kept
 from persist_cli.world.checkpoint_folder import what_is_changed
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ def save_change(backbone: CogVideoX, folder: Path) -> None:
 
 def load_whole(backbone: CogVideoX, folder: Path) -> None:
     """Take what ``save_whole`` wrote, or what ``save_change`` did merged into the weights that it changes."""
+    check_kept(backbone.settings, folder)
     changed = what_is_changed(folder)
     if changed is None:
         backbone.set_parts(load_parts(folder))

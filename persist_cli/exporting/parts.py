@@ -94,7 +94,8 @@ def _without_places(text: str, where: str) -> str:
     values = parse_yaml_mapping(text, where)
     data: dict[str, Any] = values.get("data") or {}
     settings: dict[str, Any] = (values.get("backbone") or {}).get("settings") or {}
-    for owner, key in ((values, "base"), (data, "path"), (settings, "pretrained")):
+    places = ((values, "base"), (data, "path"), (settings, "pretrained"), (settings, "prompt_embedding"))
+    for owner, key in places:
         owner |= {key: _without_place(owner[key])} if key in owner else {}
     return yaml.safe_dump(values, sort_keys=False)
 

@@ -61,7 +61,7 @@ def test_the_widened_twin_is_diffusers_own_to_the_bit(twins, name):
     torch.manual_seed(0)
     noisy, image = torch.randn(2, 2, model.shape.padded_frames, 8, 8, 12)
     image = image if "i2v" in name else torch.zeros_like(image)
-    given = dataclasses.replace(model.conditions(clips, torch.tensor([3, 700]), None), text=torch.randn(2, 4, 8))
+    given = dataclasses.replace(model.conditions(clips, torch.tensor([3, 700]), None), text=torch.randn(2, 10, 8))
     ours = model.predict(noisy, image, given)
     config = pipe.transformer.config
     rotary, offset = None, noisy.new_full((1,), 2.0) if config.ofs_embed_dim else None
@@ -82,7 +82,7 @@ def test_an_untrained_twin_generates_what_diffusers_own_pipeline_does(twins, nam
     image = {"image": clips.rgb[:, 0].permute(0, 3, 1, 2) / 255} if "i2v" in name else {}
     frames, height, width = size
     video = pipe(
-        **image, prompt_embeds=torch.zeros(1, 4, 8), latents=noise, num_inference_steps=4, guidance_scale=1.0,
+        **image, prompt_embeds=torch.zeros(1, 10, 8), latents=noise, num_inference_steps=4, guidance_scale=1.0,
         num_frames=frames, height=height, width=width, output_type="pt",
     ).frames  # fmt: skip
     theirs = (video.permute(0, 1, 3, 4, 2) * 255).round()
@@ -186,9 +186,9 @@ def test_a_learned_table_is_cut_to_the_clip_and_its_middle_resampled(twins):
     model = load_twin(twins["5b-i2v"], OTHER)
     table = CogVideoXTransformer3DModel.from_pretrained(twins["5b-i2v"] / "transformer").patch_embed.pos_embedding
     ours = model.transformer.base.patch_embed.pos_embedding
-    video = table[0, 4:].unflatten(0, (5, 4, 6))[:3, :, 1:5]
-    assert torch.equal(ours[0, :4], table[0, :4])
-    assert torch.equal(ours[0, 4:], video.flatten(0, 2))
+    video = table[0, 10:].unflatten(0, (5, 4, 6))[:3, :, 1:5]
+    assert torch.equal(ours[0, :10], table[0, :10])
+    assert torch.equal(ours[0, 10:], video.flatten(0, 2))
     assert model.transformer.base.config.sample_frames == 9
     with pytest.raises(CheckpointError, match="learned positions are for clips of 17 frames at most; ask for fewer"):
         load_twin(twins["5b-i2v"], (25, 32, 48))

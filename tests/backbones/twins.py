@@ -16,7 +16,7 @@ NAMES = tuple(TRANSFORMERS)
 SIZE = (17, 32, 48)  # that of the configurations: frames, height and width
 SMALL = {
     "num_attention_heads": 2, "attention_head_dim": 16, "num_layers": 2, "time_embed_dim": 16, "text_embed_dim": 8,
-    "max_text_seq_length": 4, "sample_height": 8, "sample_width": 12, "sample_frames": 17,
+    "max_text_seq_length": 10, "sample_height": 8, "sample_width": 12, "sample_frames": 17,
 }  # fmt: skip
 SMALL_VAE = {
     "block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4, "layers_per_block": 1,

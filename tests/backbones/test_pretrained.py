@@ -1,0 +1,94 @@
+"""Pretrained weights by directory or by their name on the hub, which is asked only when it must be and can be."""
+
+import shutil
+
+import pytest
+import torch
+
+from persist_backbones.pretrained import folder_here, pretrained_folder, published_preset
+from persist_cli.registry import make_backbone
+from persist_cli.world.errors import CheckpointError
+from tests.backbones.twins import SIZE, load_twin, write_twin
+
+NAME = "zai-org/CogVideoX-5b-I2V"
+COMMIT = "0" * 40
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """A hub's cache of its own, and no hub."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "hub" / "models--zai-org--CogVideoX-5b-I2V"
+
+
+@pytest.fixture
+def snapshot(cache):
+    """The twin in the hub's cache, as its client would leave it."""
+    (cache / "refs").mkdir(parents=True)
+    (cache / "refs" / "main").write_text(COMMIT)
+    return write_twin("5b-i2v", cache / "snapshots" / COMMIT)
+
+
+def test_a_name_on_the_hub_is_opened_from_its_cache_without_the_hub(snapshot):
+    by_name, by_folder = load_twin(NAME), load_twin(snapshot)
+    assert pretrained_folder(NAME) == snapshot
+    pairs = zip(by_name.state_dict().values(), by_folder.state_dict().values(), strict=True)
+    assert all(torch.equal(one, two) for one, two in pairs)
+
+
+def test_a_local_directory_comes_before_a_name_on_the_hub(snapshot, tmp_path):
+    shutil.copytree(snapshot, tmp_path / NAME)
+    assert str(pretrained_folder(NAME)) == NAME
+
+
+@pytest.mark.parametrize("part", ["transformer", "vae", "scheduler"])
+def test_half_a_download_is_not_taken_for_the_whole(snapshot, part):
+    next(path for path in (snapshot / part).iterdir() if path.suffix == ".safetensors" or part == "scheduler").unlink()
+    with pytest.raises(CheckpointError, match="not whole in the hub's cache, and the hub: HF_HUB_OFFLINE is set; give"):
+        pretrained_folder(NAME)
+
+
+def test_a_lost_shard_is_not_taken_for_the_whole(snapshot):
+    model = load_twin(snapshot)
+    (snapshot / "transformer" / "diffusion_pytorch_model.safetensors").unlink()
+    model.transformer.base.save_pretrained(snapshot / "transformer", max_shard_size="20KB")
+    assert pretrained_folder(NAME) == snapshot
+    next((snapshot / "transformer").glob("*-of-*.safetensors")).unlink()
+    with pytest.raises(CheckpointError, match="not whole in the hub's cache"):
+        pretrained_folder(NAME)
+
+
+def test_what_is_nowhere_is_one_line_at_once(cache, monkeypatch):
+    with pytest.raises(CheckpointError, match=f"^{NAME}: no such directory, .* hf download {NAME} --include") as error:
+        load_twin(NAME)
+    assert "\n" not in str(error.value)
+    with pytest.raises(CheckpointError, match=r"^runs/a/b: no such directory, and not the name of a repository"):
+        load_twin("runs/a/b")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    with pytest.raises(CheckpointError, match=r"http://127.0.0.1:9 does not answer"):
+        load_twin(NAME)
+
+
+def test_a_plan_of_weights_that_are_not_here_has_the_size_that_their_name_tells(cache):
+    frames, height, width = SIZE
+    with torch.device("meta"):
+        settings = {"pretrained": NAME, "frames": frames, "height": height, "width": width}
+        model = make_backbone("cogvideox", settings)
+    assert model.transformer.base.config.num_layers == 42
+    assert folder_here(NAME) is None
+
+
+def test_a_plan_of_weights_in_the_cache_has_their_size(snapshot):
+    with torch.device("meta"):
+        model = load_twin(NAME)
+    assert model.transformer.base.config.num_layers == 2
+    assert model.prompt.is_meta
+
+
+def test_the_names_of_both_publishers_are_known():
+    known = [published_preset(f"{owner}/CogVideoX1.5-5B-I2V") for owner in ("THUDM", "zai-org", "someone")]
+    assert known == ["1.5-5b-i2v", "1.5-5b-i2v", None]

@@ -1,0 +1,132 @@
+"""The prompt's embedding: by T5 where it is, from a file, or zeros; never by a download."""
+
+import json
+import shutil
+
+import pytest
+import torch
+from diffusers import CogVideoXPipeline
+from tokenizers import Tokenizer, models, pre_tokenizers, trainers
+from transformers import T5Config, T5EncoderModel, T5Tokenizer
+
+from persist_backbones.prompt import write_prompt
+from persist_cli.registry import make_backbone
+from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import read_tensors, write_tensors
+from tests.backbones.twins import load_twin, write_twin
+
+PROMPT = "a walk"
+SPECIAL = ["<pad>", "</s>", "<unk>"]
+
+
+def small_tokenizer() -> T5Tokenizer:
+    """A unigram trained on a line."""
+    unigram = Tokenizer(models.Unigram())
+    unigram.pre_tokenizer = pre_tokenizers.Metaspace()
+    trainer = trainers.UnigramTrainer(vocab_size=40, special_tokens=SPECIAL, unk_token="<unk>", show_progress=False)
+    unigram.train_from_iterator(["a walk through a furnished house, a walk back"] * 4, trainer)
+    vocabulary = [(piece, score) for piece, score in json.loads(unigram.to_str())["model"]["vocab"]]
+    return T5Tokenizer(vocab=vocabulary, extra_ids=0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A twin with tokenizer and text encoder, as diffusers' pipeline saves them."""
+    home = write_twin("2b", tmp_path_factory.mktemp("twin"))
+    tokenizer = small_tokenizer()
+    tokenizer.save_pretrained(home / "tokenizer")
+    torch.manual_seed(1)
+    sizes = {"d_model": 8, "d_ff": 16, "d_kv": 4, "num_heads": 2, "num_layers": 1}
+    T5EncoderModel(T5Config(**sizes, vocab_size=len(tokenizer))).save_pretrained(home / "text_encoder")
+    return home
+
+
+def test_a_prompt_is_embedded_as_diffusers_pipeline_embeds_it(folder):
+    ours = load_twin(folder, prompt=PROMPT).prompt
+    encoder = T5EncoderModel.from_pretrained(folder / "text_encoder")
+    pipe = CogVideoXPipeline(T5Tokenizer.from_pretrained(folder / "tokenizer"), encoder, None, None, None)
+    with torch.no_grad():
+        theirs, _ = pipe.encode_prompt(PROMPT, do_classifier_free_guidance=False, max_sequence_length=10)
+    assert torch.equal(ours, theirs)
+    assert ours.any()
+    assert not torch.equal(load_twin(folder, prompt="").prompt, ours)
+
+
+def test_without_a_prompt_its_embedding_is_zeros_whatever_is_there(folder):
+    assert not load_twin(folder).prompt.any()
+
+
+def test_a_prompt_is_stored_with_the_checkpoint_and_nobody_else_needs_t5(folder, tmp_path):
+    model = load_twin(folder, prompt=PROMPT)
+    model.save_base(tmp_path)
+    settings = model.checkpoint_settings()
+    assert (settings["pretrained"], settings["prompt"], settings["prompt_embedding"]) == (None, None, None)
+    again = make_backbone("cogvideox", settings)
+    again.load_base(tmp_path)
+    assert torch.equal(again.prompt, model.prompt)
+
+
+def test_an_embedding_made_elsewhere_is_the_same_model(folder, tmp_path):
+    alone = tmp_path / "without T5"
+    shutil.copytree(folder, alone, ignore=shutil.ignore_patterns("text_encoder", "tokenizer"))
+    write_prompt(PROMPT, str(folder), tmp_path / "walk.safetensors")
+    model = load_twin(alone, prompt_embedding=str(tmp_path / "walk.safetensors"))
+    assert torch.equal(model.prompt, load_twin(folder, prompt=PROMPT).prompt)
+    model.save_base(alone)
+    assert torch.equal(load_twin(alone, prompt_embedding=str(alone / "world.safetensors")).prompt, model.prompt)
+    assert read_tensors(tmp_path / "walk.safetensors")[0].keys() == {"prompt"}
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"prompt": "a", "prompt_embedding": "b"}, "^give prompt or prompt_embedding, not both$"),
+        ({"prompt": "a", "pretrained": None}, "^a prompt needs pretrained weights with a text encoder; give"),
+        ({"prompt": "walk " * 9}, r"^the prompt has \d+ tokens, the transformer takes 10; shorten it$"),
+        ({"prompt_embedding": "gone.safetensors"}, "gone.safetensors"),
+    ],
+)
+def test_a_prompt_that_cannot_be_is_one_line(folder, change, cause):
+    with pytest.raises(CheckpointError, match=cause) as error:
+        load_twin(folder, **change)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("part", ["text_encoder", "tokenizer"])
+def test_a_prompt_without_its_encoder_is_one_line_that_says_what_else_to_do(folder, tmp_path, part):
+    shutil.copytree(folder, tmp_path / "twin")
+    for file in (tmp_path / "twin" / part).glob("*.json"):
+        file.write_text("{")
+    with pytest.raises(CheckpointError, match=r"the text encoder cannot be loaded .*; give backbone.settings"):
+        load_twin(tmp_path / "twin", prompt=PROMPT)
+    shutil.rmtree(tmp_path / "twin" / part)
+    with pytest.raises(CheckpointError, match=f"no {part}/ to embed the prompt with; give .* zeros$"):
+        load_twin(tmp_path / "twin", prompt=PROMPT)
+
+
+def test_an_embedding_of_another_size_or_name_is_one_line(folder, tmp_path):
+    file = tmp_path / "other.safetensors"
+    write_tensors(file, {"prompt": torch.zeros(1, 3, 8)})
+    with pytest.raises(CheckpointError, match=r"embedding of \(1, 3, 8\), but the transformer takes \(1, 10, 8\)"):
+        load_twin(folder, prompt_embedding=str(file))
+    write_tensors(file, {"text": torch.zeros(1, 10, 8)})
+    with pytest.raises(CheckpointError, match=r"no tensor 'prompt' in it; persist_backbones.prompt.write_prompt"):
+        load_twin(folder, prompt_embedding=str(file))
+
+
+def test_a_base_keeps_its_prompt(folder, tmp_path):
+    model = load_twin(folder, prompt=PROMPT)
+    model.save_base(tmp_path)
+    with torch.device("meta"):
+        other = make_backbone("cogvideox", model.checkpoint_settings() | {"prompt_embedding": "x.safetensors"})
+    with pytest.raises(CheckpointError, match="trained with a prompt of its own; leave prompt"):
+        other.load_base(tmp_path)
+
+
+def test_a_sentencepiece_model_says_which_packages_read_it(folder, tmp_path, monkeypatch):
+    shutil.copytree(folder, tmp_path / "twin")
+    (tmp_path / "twin" / "tokenizer" / "tokenizer.json").unlink()
+    (tmp_path / "twin" / "tokenizer" / "spiece.model").write_bytes(b"\0")
+    monkeypatch.setattr("transformers.utils.is_sentencepiece_available", lambda: False)
+    with pytest.raises(CheckpointError, match=r"SentencePiece model; to read it: pip install 'persist-cli\[prompt\]'"):
+        load_twin(tmp_path / "twin", prompt=PROMPT)
