@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
@@ -219,3 +220,8 @@ class Codec(nn.Module):
         """One over the standard deviation of the unscaled latents of these clips."""
         latents = self.encode(rgb, depth) / self.vae.config.scaling_factor
         return float(1 / latents.std().clamp_min(1e-6))
+
+    def take_scale(self, clips: Iterable[tuple[Tensor, Tensor]]) -> None:
+        """Scale latents from now on by the mean of what is measured on these clips of RGB and depth."""
+        scales = [self.measure_scale(rgb, depth) for rgb, depth in clips]
+        self.vae.register_to_config(scaling_factor=sum(scales) / len(scales))

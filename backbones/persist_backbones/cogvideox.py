@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from persist_backbones.adapter import Adapter, PreparedMemory, memory_of
 from persist_backbones.clip_shape import clip_shape
 from persist_backbones.codec import Codec
-from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows
+from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows, model_input
 from persist_backbones.economy import FrozenWeights, economize
 from persist_backbones.forms import load_adapter, make_adapter, save_adapter
 from persist_backbones.guidance import make_denoiser
@@ -235,12 +235,8 @@ class CogVideoX(Backbone):
         return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
 
     def predict(self, noisy: Tensor, image: Tensor, given: Conditions) -> Tensor:
-        """What the objective asks for; channels are noisy RGB, RGB image, noisy depth, depth image and camera."""
-        color, depth = noisy.chunk(2, dim=2)
-        color_image, depth_image = image.chunk(2, dim=2)
-        if not self.settings.depth:
-            depth, depth_image = torch.zeros_like(depth), torch.zeros_like(depth_image)
-        latents = torch.cat([color, color_image, depth, depth_image, given.camera.to(noisy.dtype)], dim=2)
+        """What the objective asks for."""
+        latents = model_input(noisy, image, given.camera, self.settings.depth)
         seen = camera_tokens(given.camera, self.shape.patch, self.shape.token_frames)
         given = dataclasses.replace(given, camera=seen)
         predicted: Tensor = self.transformer(latents, given, self.adapter)
@@ -249,8 +245,7 @@ class CogVideoX(Backbone):
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """After the codec's stage, measure the scale of its latents on these clips."""
         if stage == "codec":
-            scales = [self.codec.measure_scale(each.rgb, each.depth) for each in clips]
-            self.codec.vae.register_to_config(scaling_factor=sum(scales) / len(scales))
+            self.codec.take_scale((each.rgb, each.depth) for each in clips)
 
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter and use it."""

@@ -83,3 +83,18 @@ def interaction_rows(clips: Sequence[Interactions], names: Sequence[str], steps:
                 raise DataError(f"the model knows no interaction {name!r}; it has {', '.join(names) or 'none'}")
             rows[sample, step] = 1 + step * len(names) + list(names).index(name)
     return rows
+
+
+def model_input(noisy: Tensor, image: Tensor, camera: Tensor, depth: bool) -> Tensor:
+    """All channels that the transformer sees: noisy RGB, RGB image, noisy depth, depth image and camera.
+
+    Args:
+        noisy: latents ``[batch, frame, channel, height, width]`` of RGB and depth.
+        image: those of the image condition.
+        camera: camera latents.
+        depth: false gives zeros for both parts of depth.
+    """
+    (color, metres), (color_image, metres_image) = noisy.chunk(2, dim=2), image.chunk(2, dim=2)
+    if not depth:
+        metres, metres_image = torch.zeros_like(metres), torch.zeros_like(metres_image)
+    return torch.cat([color, color_image, metres, metres_image, camera.to(noisy.dtype)], dim=2)
