@@ -91,7 +91,9 @@ def measure(options: argparse.Namespace, peak: float) -> list[Row]:
         for part in options.only:
             began = time.monotonic()
             with TemporaryDirectory() as folder:
-                rows += PARTS[part](bench, Path(folder))
+                for row in PARTS[part](bench, Path(folder)):
+                    print(" | ".join(filter(None, row.cells())), file=sys.stderr)  # for a run that is stopped
+                    rows.append(row)
             print(f"{name}, {part}: {time.monotonic() - began:.0f} s", file=sys.stderr)
             release(options.device)
         del bench
