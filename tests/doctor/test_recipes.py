@@ -1,0 +1,78 @@
+"""The recipes of the published models: planned without download, and fitting where their head comments say so."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from importlib import resources
+
+import pytest
+
+from persist_cli.doctor.dry_run import dry_run
+from persist_cli.doctor.planned import plan_recipe
+from persist_cli.recipe import apply_overrides, make_recipe, read_recipe, recipe_names
+
+PUBLISHED = [name for name in recipe_names() if name.startswith("cogvideox-")]
+TRANSFORMERS = {"cogvideox-5b-i2v": 5_570_479_680, "cogvideox-2b": 1_693_783_872}
+BLOCKS_5B = 1_059_764_224
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_published_model_is_planned_without_it(name):
+    planned = plan_recipe(name, ["backbone.settings.pretrained=nobody/there"])
+    record = dry_run(planned)
+    parts = {part["name"]: part["parameters"] for part in record["parts"]}
+    assert parts["transformer"] == TRANSFORMERS[name.partition("-stage")[0]]
+    trained = {part["name"] for part in record["parts"] if part["trained"][planned.recipe.stage]}
+    fresh = {"1": {"widening", "LoRA"} if "LoRA" in parts else {"widening", "transformer"}}
+    assert trained == fresh.get(planned.recipe.stage, {"memory adapter voxel"})
+
+
+def test_the_papers_memory_blocks_have_a_billion_parameters():
+    adapter = dry_run(plan_recipe("cogvideox-5b-i2v-stage2-voxel", []))["parts"][-1]
+    assert adapter["parameters"] == BLOCKS_5B
+    assert abs(BLOCKS_5B - 1e9) < 1e8
+
+
+def test_what_stands_beside_the_preset_comes_before_it(persist):
+    changes = ["base=nowhere", "adapter.form=projected", "adapter.width=64"]
+    ended = persist("finetune", "tiny-stage2-voxel", "--dry-run", "--json", *changes, "adapter.preset=5b")
+    shapes = json.loads(ended.out)["parts"][-1]["shapes"]
+    assert shapes["adapters.voxel.blocks.0.to_key.weight"] == [64, 64]
+    assert shapes["adapters.voxel.blocks.0.ff.0.weight"] == [128, 256]
+    ended = persist("finetune", "tiny-stage2-voxel", "--dry-run", "base=nowhere", "adapter.preset=50b")
+    assert (ended.code, "unknown adapter preset '50b'; did you mean '5b'?" in ended.err) == (1, True)
+
+
+@pytest.mark.parametrize("memory", ["map2d", "snapshots", "none"])
+def test_another_memory_is_one_override(memory):
+    planned = plan_recipe("cogvideox-2b-stage2-voxel", [f"memory.name={memory}"])
+    assert (planned.recipe.memory.name, planned.channels) == (memory, 384)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_every_launch_line_shares_the_batch_out_evenly(name):
+    text = (resources.files("persist_recipes") / f"{name}.yaml").read_text()
+    head = " ".join(line.lstrip("#").rstrip(" \\") for line in text.splitlines() if line.startswith("#"))
+    runs = head.split("finetune ")[1:4]
+    for run, gpus in zip(runs, (1, 8, 64), strict=True):
+        words = shlex.split(run.split("64 GPUs")[0].split("8 GPUs")[0].partition(" DIR is")[0].replace("'", ""))
+        recipe = make_recipe(
+            apply_overrides(read_recipe(name), [each for each in words if each.startswith("training.")]), name
+        )
+        assert words[0] == name
+        assert recipe.training.batch == recipe.training.accumulation * gpus
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "machine"),
+    [("cogvideox-5b-i2v-stage1", ["--gpus", "8", "--gpu-memory", "80"]),
+     ("cogvideox-5b-i2v-stage1-lora", ["--gpu-memory", "24"]), ("cogvideox-2b-stage1-lora", ["--gpu-memory", "24"])],
+)  # fmt: skip
+def test_it_fits_on_the_card_that_it_is_for(persist, name, machine):
+    found = json.loads(persist("doctor", name, *machine, "--json").out)["smallest"]
+    sharded = ["--fsdp"] if found["fsdp"] else []
+    again = json.loads(persist("doctor", name, *machine, *sharded, *found["settings"], "--json").out)
+    assert again["fits"]
+    assert again["strategies"][0]["need"]["peak"] == found["need"]["peak"]
