@@ -29,6 +29,7 @@ from persist_cli.training.sharding import shard_on_cpus, sharding_plugin
 from persist_cli.training.state import load_state
 from persist_cli.training.step_times import StepTimes
 from persist_cli.training.trainer import Stop, Trainer
+from persist_cli.training.zero import zero_on_cpus, zero_plugin
 from persist_cli.viewing.console import say
 from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError, RecipeError
@@ -149,16 +150,18 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
         raise PersistError(
             f"training.tracker={tracker} needs the package {tracker}: pip install 'persist-cli[{tracker}]'"
         )
-    plugin = sharding_plugin(settings.precision)
+    plugin, zero = sharding_plugin(settings.precision), zero_plugin(settings)
     accelerator = Accelerator(
-        mixed_precision=settings.precision,
+        mixed_precision=settings.precision if zero is None else "no",  # DeepSpeed has its own way
         log_with=tracker,
         project_dir=run,
         cpu=not torch.cuda.is_available(),
         fsdp_plugin=plugin,
+        deepspeed_plugin=zero,
         kwargs_handlers=[InitProcessGroupKwargs(timeout=LONGEST_WAIT)],
     )
     shard_on_cpus(plugin)
+    zero_on_cpus(zero)
     set_seed(settings.seed)
     return accelerator
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,13 +40,13 @@ class TrainingState:
 
     Args:
         parameters: the trained ones by name.
-        optimizer: AdamW over them, in their order.
+        moments: the optimizer's state of each.
         average: exponential moving average of them, if one is kept.
         step: optimizer steps done; the position in the data follows from it.
     """
 
     parameters: dict[str, nn.Parameter]
-    optimizer: torch.optim.Optimizer
+    moments: MutableMapping[nn.Parameter, dict[str, Any]]
     average: EMAModel | None
     step: int = 0
 
@@ -55,7 +55,7 @@ class TrainingState:
         found: dict[str, Tensor] = {"random/torch": torch.get_rng_state()}
         for name, parameter in self.parameters.items():
             found[f"parameter/{name}"] = parameter
-            for key, value in self.optimizer.state[parameter].items():
+            for key, value in self.moments[parameter].items():
                 found[f"optimizer/{key}/{name}"] = torch.as_tensor(value)  # bitsandbytes counts steps by plain numbers
         return found | {f"average/{name}": each for name, each in self.averages().items()}
 
@@ -68,14 +68,29 @@ class TrainingState:
         """The averaged parameters by name, none where none are kept."""
         return {} if self.average is None else dict(zip(self.parameters, self.average.shadow_params, strict=True))
 
+    @contextlib.contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Within the block the parameters are their averages, where they are kept."""
+        if self.average is None:
+            yield
+            return
+        parameters = [*self.parameters.values()]
+        self.average.store(parameters)
+        self.average.copy_to(parameters)
+        try:
+            yield
+        finally:
+            self.average.restore(parameters)
+
     def write(self, folder: Path, main: bool) -> dict[str, Any]:
         """Write all of it into a checkpoint's folder, this process its part; gives what else is to be kept."""
         notes = {"step": self.step, "ema_steps": self.average.optimization_step if self.average else 0}
         if self.sharded:
             write_shards(folder / SHARDS, self.tensors())
             return notes | {"files": len(list((folder / SHARDS).iterdir()))}
+        tensors = self.tensors()  # which processes may have to gather together
         if main:
-            write_tensors(folder / WHOLE, self.tensors())
+            write_tensors(folder / WHOLE, {name: _own(tensor) for name, tensor in tensors.items()})
         return notes
 
     def read(self, folder: Path) -> None:
@@ -119,7 +134,7 @@ class TrainingState:
                     key.split("/")[1]: value for key, value in tensors.items()
                     if key.startswith("optimizer/") and key.endswith(f"/{name}") and key.count("/") == 2
                 }  # fmt: skip
-                self.optimizer.state[parameter] = {
+                self.moments[parameter] = {
                     key: _counted(value) if key == "step" else value.to(parameter.device)
                     for key, value in moments.items()
                 }
@@ -171,6 +186,11 @@ def load_state(run: Path, state: TrainingState) -> None:
 def _counted(steps: Tensor) -> Tensor | int:
     """Steps as the optimizer that they were saved of counts them."""
     return steps.clone() if steps.is_floating_point() else int(steps)
+
+
+def _own(tensor: Tensor) -> Tensor:
+    """The tensor in memory of its own: the pieces of another, as DeepSpeed's are, cannot be saved."""
+    return tensor if tensor.untyped_storage().nbytes() == tensor.nbytes else tensor.detach().clone()
 
 
 def _take(tensors: dict[str, Tensor], name: str, like: Tensor, path: Path) -> Tensor:

@@ -27,6 +27,7 @@ from persist_cli.training.settings import TrainingSettings
 from persist_cli.training.sharding import Sharding
 from persist_cli.training.state import TrainingState
 from persist_cli.training.step_times import StepTimes, timed
+from persist_cli.training.zero import ZeroState, unflattened, uses_zero
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan, SharedBatches
 from persist_cli.trajectories.reference import data_folder
 from persist_cli.viewing.console import add_task, progress
@@ -93,7 +94,10 @@ class Trainer:
         if self.sharding is not None:
             parameters = self.sharding.parameters()
         average = make_average(parameters.values(), settings, accelerator.device) if settings.ema else None
-        self.state = TrainingState(parameters, optimizer, average)
+        moments = optimizer.state
+        if uses_zero(accelerator):
+            moments = ZeroState(self.optimizer.optimizer, [*parameters.values()])
+        self.state = TrainingState(parameters, moments, average)
 
     def all_clips(self) -> ClipDataset:
         """The recipe's clips."""
@@ -213,7 +217,7 @@ class Trainer:
                 with timed(self.times, "forward"), self.accelerator.autocast():  # left out by accelerate if it shards
                     losses = self.model(clips, self.recipe.stage)
                 with timed(self.times, "backward"):
-                    self.accelerator.backward(losses["loss"] / parts)
+                    self.accelerator.backward(losses["loss"] / (1 if uses_zero(self.accelerator) else parts))
             for name, value in losses.items():
                 totals[name] = totals.get(name, torch.zeros_like(value)) + value.detach() / parts
         values = {name: float(self.accelerator.reduce(value, "mean")) for name, value in totals.items()}
@@ -226,7 +230,9 @@ class Trainer:
 
     def unsynced(self, last: bool) -> AbstractContextManager[None]:
         """Gradients stay with their process until the last micro-batch, but sharded ones: whole, they might not fit."""
-        if last or self.sharding is not None:
+        if uses_zero(self.accelerator):
+            self.accelerator.gradient_state._set_sync_gradients(last)  # DeepSpeed steps when they are synced
+        if last or self.sharding is not None or uses_zero(self.accelerator):
             return nullcontext()
         waiting: AbstractContextManager[None] = self.accelerator.no_sync(self.model)
         return waiting
@@ -238,16 +244,12 @@ class Trainer:
         if self.sharding is not None:
             with self.sharding.gathered(self.state.averages(), main) as whole:
                 yield whole
-        elif self.state.average is None or not main:
+        elif not main:
             yield self.backbone
         else:
-            parameters = [*self.state.parameters.values()]
-            self.state.average.store(parameters)
-            self.state.average.copy_to(parameters)
-            try:
+            parameters = self.state.parameters.values()
+            with unflattened(parameters) if uses_zero(self.accelerator) else nullcontext(), self.state.averaged():
                 yield self.backbone
-            finally:
-                self.state.average.restore(parameters)
 
     def agreed(self, due: bool, signal: int | None) -> tuple[bool, int | None]:
         """What one process finds due, or what signal it got, as all of them see it: they save and stop together."""
