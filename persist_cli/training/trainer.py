@@ -94,7 +94,7 @@ class Trainer:
         if self.sharding is not None:
             parameters = self.sharding.parameters()
         average = make_average(parameters.values(), settings, accelerator.device) if settings.ema else None
-        moments = optimizer.state
+        moments: Any = optimizer.state
         if uses_zero(accelerator):
             moments = ZeroState(self.optimizer.optimizer, [*parameters.values()])
         self.state = TrainingState(parameters, moments, average)

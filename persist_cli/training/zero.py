@@ -94,7 +94,7 @@ class ZeroState(MutableMapping[nn.Parameter, dict[str, Any]]):
     def __getitem__(self, parameter: nn.Parameter) -> dict[str, Any]:
         from deepspeed.utils import safe_get_full_optimizer_state
 
-        step = torch.as_tensor(self.optimizer.optimizer.state[self.flat[0]]["step"], dtype=torch.float32)
+        step = torch.as_tensor(self.optimizer.optimizer.state[self.flat[0]]["step"], dtype=torch.float32).clone()
         found = {key: safe_get_full_optimizer_state(parameter, key) for key in MOMENTS}
         return (
             {"step": step} | {key: each.cpu() for key, each in found.items()} if PartialState().is_main_process else {}
