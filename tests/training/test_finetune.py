@@ -1,11 +1,9 @@
 import json
-import os
 import random
 import shutil
 import signal
 import subprocess
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +11,7 @@ import torch
 from persist_cli.checkpoints import find_checkpoint
 from persist_cli.training.trainer import Trainer
 from tests.disk import file_limit
-from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, in_two, stage, together, train, train_here
+from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, stage, train_here
 
 
 def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
@@ -210,32 +208,3 @@ def test_a_damaged_checkpoint_or_another_base_is_one_line(persist, walks, codec,
     (model / "persist.json").write_text("{}")
     ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     assert (ended.code, "not the card of a persist checkpoint" in ended.err) == (1, True)
-
-
-@pytest.mark.slow
-def test_two_processes_stop_together_when_one_of_them_is_told_to(walks, codec, tmp_path):
-    changes = [f"base={codec}", "training.steps=100000", "training.checkpoint_minutes=0"]
-    child = subprocess.Popen(
-        **in_two(*stage("stage1", walks, tmp_path / "run", *changes)), stdout=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 120
-    while not list((tmp_path / "run").glob("step-*")) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    last = Path(f"/proc/{child.pid}/task/{child.pid}/children").read_text().split()[-1]
-    os.kill(int(last), signal.SIGTERM)
-    out, _ = child.communicate(timeout=60)
-    assert child.returncode == 0
-    assert out.count("go on with --resume") == 1
-    find_checkpoint(tmp_path / "run")
-
-
-@pytest.mark.slow
-def test_two_processes_train_like_one(walks, codec, tmp_path):
-    changes = [f"base={codec}", "training.batch=4"]
-    train(*stage("stage1", walks, tmp_path / "one", *changes))
-    together(*stage("stage1", walks, tmp_path / "two", *changes))
-    one, two = (
-        [json.loads(line)["loss"] for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
-        for name in ("one", "two")
-    )
-    assert one == pytest.approx(two, rel=1e-4)
