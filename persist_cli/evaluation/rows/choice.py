@@ -89,7 +89,9 @@ def make_rows(
     for name in named:
         for base, label in zip(bases, labels(bases), strict=True) if name == "codec" else [(bases[0], "")]:
             suffix = f" ({label})" if name == "codec" and len(bases) > 1 else ""
-            controls.append(CONTROLS[name](TITLES[name] + suffix, base, protocol))
+            control = CONTROLS[name](TITLES[name] + suffix, base, protocol)
+            control.gives_depth = name != "codec" or base.fingerprint not in choice.depthless
+            controls.append(control)
     return [*plain, *disturbed, *controls]
 
 
