@@ -117,6 +117,7 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
     rotary = ["use_rotary_positional_embeddings: true", "num_layers: 4", "in_channels: 8", "out_channels: 4"]
     settings = f"backbone.settings.transformer={{{', '.join(rotary)}, num_attention_heads: 1, attention_head_dim: 32}}"
     plan = planned(settings)
+    _fitted.cache_clear()
     Twins(plan.backbone, None).run(plan.backbone, plan.recipe, StepKind(1, True), Encoding(0, (1, 4, 8, 8, 8)))
 
     region = ((0, 0), (2, 2))
