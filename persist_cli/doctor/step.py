@@ -126,7 +126,8 @@ class Twins:
             backbone.economize(recipe.stage, economy_of(settings, torch.device("cpu")))
             if kind.sharded:
                 _halve(backbone)
-            live = LiveBytes([*backbone.parameters(), *backbone.buffers()], kind.cuda)
+            threads = None if kind.cuda else settings.threads or torch.get_num_threads()
+            live = LiveBytes([*backbone.parameters(), *backbone.buffers()], threads)
             for parameter in parameters.values():
                 parameter.register_post_accumulate_grad_hook(live.set_aside)
             with live, kernels(kind.cuda):

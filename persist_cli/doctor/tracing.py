@@ -18,6 +18,8 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from persist_cli.doctor.convolution import convolution_bytes
+
 aten = torch.ops.aten
 FLOAT32_ON_CUDA = ("layer_norm", "group_norm")  # in autocast; on a CPU they keep their input's precision
 
@@ -30,13 +32,13 @@ class LiveBytes(TorchDispatchMode):
 
     Args:
         known: tensors that are there already and do not count.
-        cuda: whether convolutions are those of CUDA, whose workspace is not known. On a CPU they hold a copy of input
-            or output, the larger, in the order that they work in.
+        threads: of torch on the CPU, whose convolutions have a workspace (see ``convolution``); ``None`` for CUDA,
+            where it is not known.
     """
 
-    def __init__(self, known: Iterable[Tensor], cuda: bool) -> None:
+    def __init__(self, known: Iterable[Tensor], threads: int | None) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.cuda = cuda
+        self.threads = threads
         self.now = self.peak = 0
         self._alive: dict[int, weakref.ref[Any]] = {}
         self._sizes: dict[int, int] = {}
@@ -55,9 +57,9 @@ class LiveBytes(TorchDispatchMode):
         made = [each for each in (out if isinstance(out, tuple | list) else (out,)) if isinstance(each, Tensor)]
         for each in made:
             self._note(each)
-        if func in _CONVOLUTIONS and not self.cuda:
-            seen = [each for each in args if isinstance(each, Tensor)]
-            self.peak = max(self.peak, self.now + max(each.untyped_storage().nbytes() for each in seen + made))
+        if func in _CONVOLUTIONS and self.threads is not None:
+            backward = func is aten.convolution_backward.default
+            self.peak = max(self.peak, self.now + convolution_bytes(args, made[0], backward, self.threads))
         return out
 
     def _note(self, tensor: Tensor) -> None:

@@ -13,21 +13,24 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from unittest.mock import patch
 
 from persist_cli.app import main
 from persist_cli.training.run_folder import RunFolder
 
+Run = tuple[str, str, list[str]]  # recipe, data folder, settings
+
 MEASURED = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536", "OMP_NUM_THREADS": "1"}
-SHORT = ["base=null", "training.steps=3", "training.workers=0", "training.threads=1", "training.warmup=1"]
+SHORT = ["base=null", "training.steps=2", "training.workers=0", "training.threads=1", "training.warmup=1"]
 
 
-def measured_peaks(runs: Sequence[tuple[str, str, Sequence[str]]]) -> list[int]:
-    """Bytes of each run of (recipe, data folder, settings), all in one fresh process."""
+def measured_peaks(runs: Sequence[Run]) -> list[int]:
+    """Bytes of each run, all in one fresh process."""
     command = [sys.executable, "-m", "tests.doctor.measured", json.dumps(runs)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | MEASURED)
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | MEASURED)
+    assert done.returncode == 0, done.stderr
     found: list[int] = json.loads(done.stdout.splitlines()[-1])
     return found
 
@@ -38,23 +41,29 @@ def resident(key: str) -> int:
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(key))
 
 
-def train(recipe: str, data: str, settings: Sequence[str]) -> int:
-    """Bytes that a short run took at most, before it saves anything."""
-    gc.collect()
-    before, peaks = resident("VmRSS"), []
-    Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins again
+def trained_bytes(run: Run, peak: Callable[[], int]) -> int:
+    """What ``peak`` says at the end of a short run, before it saves anything."""
+    recipe, data, settings = run
+    peaks: list[int] = []
     with (
         tempfile.TemporaryDirectory() as folder,
-        patch.object(RunFolder, "save", lambda _: peaks.append(resident("VmHWM"))),
+        patch.object(RunFolder, "save", lambda _: peaks.append(peak())),
         contextlib.redirect_stdout(sys.stderr),
         contextlib.suppress(SystemExit),
     ):
         main(["finetune", recipe, "--data", data, "--out", f"{folder}/run", *SHORT, *settings])
-    return peaks[0] - before
+    return peaks[0]
+
+
+def resident_bytes(run: Run) -> int:
+    """Resident bytes that a short run took at most."""
+    gc.collect()
+    before = resident("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins again
+    return trained_bytes(run, lambda: resident("VmHWM")) - before
 
 
 if __name__ == "__main__":
-    runs = json.loads(sys.argv[1])
-    small = min(runs, key=lambda run: len(run[2]))
-    train(*small)
-    print(json.dumps([train(*run) for run in runs]))  # noqa: T201
+    asked: list[Run] = json.loads(sys.argv[1])
+    resident_bytes(asked[0])
+    print(json.dumps([resident_bytes(run) for run in asked]))  # noqa: T201

@@ -43,7 +43,7 @@ def need(*settings: str, launch: Launch = ONE_GPU):
 def test_tensors_without_values_are_counted_as_long_as_they_live():
     with imagined():
         known = torch.zeros(100)
-        with LiveBytes([known], cuda=True) as live:
+        with LiveBytes([known], threads=None) as live:
             views = known[10:], torch.zeros(1000)[:10]
             other = torch.zeros(500)
             assert live.now == 6000

@@ -1,0 +1,105 @@
+"""The doctor's estimates beside what runs take: within 15 %, at three sizes and in both precisions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_cli.doctor.need import Estimator, Launch
+from persist_cli.doctor.planned import plan_recipe
+from tests.doctor.measured import SHORT, Run, measured_peaks, trained_bytes
+from tests.walking import train_here, write_walks
+
+WITHIN = 0.15
+CHECKPOINTING = "training.gradient_checkpointing=true"
+PLAIN = ["training.precision=no", "training.vae_slicing=true"]
+HALF = ["training.precision=bf16", "training.vae_slicing=true"]
+TWIN_OF_5B = (
+    "backbone.settings.transformer={num_attention_heads: 8, num_layers: 10, time_embed_dim: 512, in_channels: 32, "
+    "out_channels: 16, text_embed_dim: 32, max_text_seq_length: 1, spatial_interpolation_scale: 1.0, "
+    "use_rotary_positional_embeddings: true}"
+)
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is asked of Linux")
+
+
+@pytest.fixture(scope="module")
+def walks_of(tmp_path_factory: pytest.TempPathFactory):
+    """Settings of a backbone for square images, and walks of that size."""
+
+    def make(size: int) -> tuple[str, list[str]]:
+        folder = tmp_path_factory.getbasetemp() / f"walks-{size}"
+        if not folder.exists():
+            folder.mkdir()
+            write_walks(folder, size)
+        return str(folder), [f"backbone.settings.height={size}", f"backbone.settings.width={size}"]
+
+    return make
+
+
+def estimate(run: Run, cuda: bool = False) -> int:
+    recipe, _, settings = run
+    planned = plan_recipe(recipe, [*SHORT, *settings])
+    return Estimator(planned.backbone, planned.channels).need(planned.recipe, Launch(1, cuda)).peak
+
+
+def trained_stage1(data: str, settings: list[str]) -> Path:
+    out = Path(data).parent / "stage1"
+    train_here("finetune", "tiny-stage1", "--data", data, "--out", str(out), *SHORT, *settings)
+    return out
+
+
+def check(runs: Sequence[Run]) -> None:
+    for run, measured in zip(runs, measured_peaks(runs), strict=True):
+        assert estimate(run) == pytest.approx(measured, rel=WITHIN), run[2]
+
+
+def test_estimates_hold_for_a_tiny_model_with_and_without_gradient_checkpointing(walks_of):
+    runs: list[Run] = []
+    for size, batch in ((64, 8), (96, 2)):
+        data, settings = walks_of(size)
+        for change in ([], [CHECKPOINTING]):
+            runs.append(("tiny-stage1", data, [*settings, *PLAIN, f"training.batch={batch}", *change]))
+    check(runs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", [PLAIN, HALF], ids=["float32", "bf16"])
+def test_estimates_hold_for_a_small_twin_of_the_large_model(walks_of, precision):
+    data, settings = walks_of(64)
+    twin = [*settings, *precision, "training.batch=4", TWIN_OF_5B]
+    check([("tiny-stage1", data, [*twin, *change]) for change in ([], [CHECKPOINTING])])
+
+
+@pytest.mark.slow
+def test_estimates_hold_where_encoding_takes_most_and_for_the_codec(walks_of):
+    (data, settings), (smaller, half) = walks_of(128), walks_of(64)
+    codec = [*half, "training.precision=no", "training.batch=4", "backbone.settings.codec_window=null"]
+    check([("tiny-stage1", data, [*settings, "training.precision=no", "training.batch=4", CHECKPOINTING]),
+           ("tiny-codec", smaller, codec)])  # fmt: skip
+
+
+@pytest.mark.slow
+def test_estimates_hold_for_a_memory_adapter_and_for_lora(walks_of):
+    data, settings = walks_of(64)
+    run = [*settings, *PLAIN, "training.batch=8", TWIN_OF_5B]
+    stage1 = trained_stage1(data, run)
+    run = [each for each in run if each != TWIN_OF_5B]
+    check([("tiny-stage2-voxel", data, [*run, f"base={stage1}", "adapter={form: cross, width: 128, dropout: 0}"]),
+           ("tiny-stage1", data, [*run, f"base={stage1}", "lora={rank: 16}"])])  # fmt: skip
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("change", [[], [CHECKPOINTING]], ids=["plain", "checkpointing"])
+def test_estimates_hold_on_a_gpu(walks_of, change):
+    data, settings = walks_of(64)
+    run: Run = ("tiny-stage1", data, [*settings, *HALF, "training.batch=4", TWIN_OF_5B, *change])
+    trained_bytes(run, lambda: torch.cuda.max_memory_allocated())
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    assert estimate(run, cuda=True) == pytest.approx(
+        trained_bytes(run, lambda: torch.cuda.max_memory_allocated()) - before, rel=WITHIN
+    )
