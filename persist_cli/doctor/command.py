@@ -43,13 +43,26 @@ class Doctor:
 
     def examine(self, strategy: Strategy) -> Finding:
         """What the recipe needs with these changes."""
-        launch = Launch(self.machine.devices, self.machine.kind == "cuda", self.sharded or strategy.sharded)
-        recipe = self.changed(strategy)
-        if recipe.lora not in self.estimators:  # other parameters, so another plan
+        recipe, launch = self.changed(strategy), self.launch(strategy)
+        need = self.estimator(recipe).need(recipe, launch)
+        return Finding(strategy, need, need.peak <= self.machine.usable)
+
+    def fits(self, strategy: Strategy) -> bool:
+        """Whether these changes suffice."""
+        recipe, launch = self.changed(strategy), self.launch(strategy)
+        hopeless = self.estimator(recipe).at_least(recipe, launch).peak > self.machine.usable
+        return not hopeless and self.examine(strategy).fits
+
+    def launch(self, strategy: Strategy) -> Launch:
+        """How the processes share the work."""
+        return Launch(self.machine.devices, self.machine.kind == "cuda", self.sharded or strategy.sharded)
+
+    def estimator(self, recipe: Recipe) -> Estimator:
+        """That of the recipe's parameters, which LoRA changes."""
+        if recipe.lora not in self.estimators:
             other = plan(recipe, self.planned.base)
             self.estimators[recipe.lora] = Estimator(other.backbone, other.channels)
-        need = self.estimators[recipe.lora].need(recipe, launch)
-        return Finding(strategy, need, need.peak <= self.machine.usable)
+        return self.estimators[recipe.lora]
 
     def changed(self, strategy: Strategy) -> Recipe:
         """The recipe with the strategy's settings."""
@@ -62,7 +75,7 @@ class Doctor:
 
     def smallest(self) -> Finding | None:
         """What fits with the smallest changes, ``None`` when nothing does."""
-        found = smallest(self.changes, lambda strategy: self.examine(strategy).fits)
+        found = smallest(self.changes, self.fits)
         return None if found is None else self.examine(found)
 
 

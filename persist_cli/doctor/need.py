@@ -49,22 +49,22 @@ class Need:
         gradients: and with DDP the buckets that are sent.
         optimizer: moments of AdamW.
         average: EMA, where it is on the device.
+        update: of the optimizer's step.
+        kept: whether gradients stay while the next micro-batch is encoded and run.
         encoding: of the codec.
         activations: in forward and backward pass, most at once.
         shallow: of these, what is left when all gradients are there.
-        update: of the optimizer's step.
-        kept: whether gradients stay while the next micro-batch is encoded and run.
     """
 
     weights: int
     gradients: int
     optimizer: int
     average: int
-    encoding: int
-    activations: int
-    shallow: int
     update: int
-    kept: bool = False
+    kept: bool
+    encoding: int = 0
+    activations: int = 0
+    shallow: int = 0
 
     @property
     def peak(self) -> int:
@@ -98,13 +98,18 @@ class Estimator:
 
     def need(self, recipe: Recipe, launch: Launch) -> Need:
         """What one process of a run needs."""
-        training, backbone = recipe.training, self.backbone
+        training = recipe.training
         batch = math.ceil(training.batch / (training.accumulation * launch.devices))
         kind = StepKind(batch, launch.cuda, launch.sharded and training.precision == "bf16")
-        encoding, step = self.encoding(recipe, kind), self.step(recipe, kind)
-        trained = backbone.trained_parameters(recipe.stage)
-        count = sum(each.numel() for each in trained.values())
-        largest = max((each.numel() for each in trained.values()), default=0)
+        encoding, step = self.encoding(recipe, kind).peak, self.step(recipe, kind)
+        least = self.at_least(recipe, launch)
+        return dataclasses.replace(least, encoding=encoding, activations=step.peak, shallow=step.shallow)
+
+    def at_least(self, recipe: Recipe, launch: Launch) -> Need:
+        """The same without what a step takes, which need not be run for that."""
+        training = recipe.training
+        trained = [each.numel() for each in self.backbone.trained_parameters(recipe.stage).values()]
+        count, largest = sum(trained), max(trained, default=0)
         share = 1 / launch.devices if launch.sharded else 1.0
         buckets = 2 if launch.devices > 1 and not launch.sharded else 1
         averaged = training.ema and not (launch.cuda and training.ema_device == "cpu")
@@ -114,9 +119,6 @@ class Estimator:
             gradients=round(count * FLOAT32 * share * buckets),
             optimizer=round(count * MOMENTS[training.optimizer] * share),
             average=round(count * FLOAT32 * share) if averaged else 0,
-            encoding=encoding.peak,
-            activations=step.peak,
-            shallow=step.shallow,
             update=round(at_once * FLOAT32),  # torch takes roots of all second moments at once on a GPU
             kept=training.accumulation > 1,
         )
