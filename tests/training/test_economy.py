@@ -99,11 +99,11 @@ def test_an_average_moves_towards_copies_of_the_parameters_too():
 
 def test_the_state_of_an_optimizer_that_counts_by_plain_numbers_is_kept(tmp_path):
     parameter = torch.nn.Parameter(torch.ones(3))
-    states = [TrainingState({"weight": parameter}, torch.optim.AdamW([parameter]), None) for _ in range(2)]
-    states[0].optimizer.state[parameter] = {"step": 7, "state1": torch.arange(3, dtype=torch.uint8)}
+    states = [TrainingState({"weight": parameter}, torch.optim.AdamW([parameter]).state, None) for _ in range(2)]
+    states[0].moments[parameter] = {"step": 7, "state1": torch.arange(3, dtype=torch.uint8)}
     write_json(tmp_path / "training.json", states[0].write(tmp_path, main=True))
     states[1].read(tmp_path)
-    kept = states[1].optimizer.state[parameter]
+    kept = states[1].moments[parameter]
     assert (type(kept["step"]), kept["step"], kept["state1"].dtype) == (int, 7, torch.uint8)
 
 

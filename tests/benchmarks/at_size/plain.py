@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Any
 
 import torch
@@ -100,8 +100,8 @@ class Plain:
         return self.decode(latents).cpu()
 
 
-def share_moments(ours: torch.optim.Optimizer, plain: torch.optim.Optimizer, shared: Sequence[Tensor]) -> None:
-    """Let one optimizer use the other's moments of the weights that both train, so that they are held once."""
+def share_moments(ours: Mapping[Any, Any], plain: MutableMapping[Any, Any], shared: Sequence[Tensor]) -> None:
+    """Let one optimizer's state use the other's moments of the weights that both train, so that they are held once."""
     for parameter in shared:
-        if parameter in ours.state:
-            plain.state[parameter] = ours.state[parameter]
+        if parameter in ours:
+            plain[parameter] = ours[parameter]

@@ -96,7 +96,8 @@ def stage1_works(bench: Bench, batch: int) -> dict[str, Work]:
     def ours() -> None:
         next(steps)
         if not optimizer.state:
-            share_moments(trainer.state.optimizer, optimizer, list(plain.transformer.transformer_blocks.parameters()))
+            blocks = plain.transformer.transformer_blocks
+            share_moments(trainer.state.moments, optimizer.state, list(blocks.parameters()))
 
     return {"ours": ours, "plain": partial(plain.step, given, optimizer, settings.clip)}
 
