@@ -54,11 +54,14 @@ def runs(walks, codec, stage1, tmp_path_factory):
 
     train_here(*of("stage1", "one-1"))
     train_here(*of("stage2-voxel", "one-2"))
+    low_rank = [f"base={stage1}", "lora.rank=2"]
+    train_here(*of("stage1", "one-lora", *low_rank))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-parts", "training.steps=1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-cheap", *CHEAP), **how) for kind, how in KINDS.items()]
+    first.append(job(*of("stage1", "fsdp-lora", *low_rank), **FSDP))
     wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
     ended = run_pair(folder, *first, wrong)
     assert [code for code, _ in ended[:-1]] == [0] * len(first), ended
@@ -118,6 +121,13 @@ def test_cheap_steps_are_as_cheap_sharded(runs):
     """Recomputed blocks, frozen weights in bf16, averages in the memory of the CPU."""
     assert losses(runs / "ddp-cheap") == pytest.approx(losses(runs / "one-2"), rel=1e-2)
     assert losses(runs / "fsdp-cheap") == pytest.approx(losses(runs / "ddp-cheap"), rel=2e-3)
+
+
+def test_a_change_of_low_rank_trains_sharded_as_in_one_process(runs):
+    assert losses(runs / "fsdp-lora") == pytest.approx(losses(runs / "one-lora"), rel=1e-5)
+    one, sharded = (saved_model(runs / name) for name in ("one-lora", "fsdp-lora"))
+    assert any("lora_B" in name for name in one)
+    assert furthest(one, sharded) < NEAR
 
 
 def test_a_missing_or_damaged_part_of_a_checkpoint_is_one_line(persist, walks, codec, runs):
