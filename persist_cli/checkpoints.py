@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.recipe import MemoryChoice
+from persist_cli.recipe import BackboneChoice, MemoryChoice
 from persist_cli.sampling import read_sampling
 from persist_cli.trajectories.scenes import TrainingScenes
 from persist_cli.world.checkpoint_folder import CARD as CARD  # the tool has these from here
@@ -22,7 +22,7 @@ from persist_cli.world.checkpoint_folder import PLAIN as PLAIN
 from persist_cli.world.checkpoint_folder import STEP as STEP
 from persist_cli.world.checkpoint_folder import VERSION, adapter_folder, default_adapter, open_checkpoint
 from persist_cli.world.checkpoint_folder import step_folders as step_folders
-from persist_cli.world.errors import CheckpointError
+from persist_cli.world.errors import CheckpointError, RecipeError
 from persist_cli.world.files import file_sha256, read_json, write_json
 from persist_cli.world.settings import parse_settings
 
@@ -98,6 +98,21 @@ def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None
     backbone = empty_backbone(checkpoint, settings)
     backbone.load_base(checkpoint.base_folder)
     return backbone
+
+
+def start_backbone(choice: BackboneChoice, base: Checkpoint | None) -> Backbone:
+    """The backbone that a training begins with: fresh, or the base's with the choice's settings on top.
+
+    Raises:
+        RecipeError: when the base is of another backbone.
+    """
+    if base is None:
+        from persist_cli.registry import make_backbone
+
+        return make_backbone(choice.name, choice.settings)
+    if base.backbone != choice.name:
+        raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {choice.name!r}")
+    return load_backbone(base, choice.settings)
 
 
 def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:

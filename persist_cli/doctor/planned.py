@@ -8,13 +8,11 @@ from pathlib import Path
 
 import torch
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, start_backbone
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe
-from persist_cli.registry import make_backbone
 from persist_cli.viewing.console import warn
 from persist_cli.world.backbone import Backbone
-from persist_cli.world.errors import RecipeError
 
 
 @dataclass(frozen=True)
@@ -51,12 +49,9 @@ def plan_recipe(name: str, overrides: Sequence[str]) -> Planned:
 
 def plan(recipe: Recipe, base: Checkpoint | None) -> Planned:
     """The plan of a recipe on its base, where there is one."""
-    if base is not None and base.backbone != recipe.backbone.name:
-        raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {recipe.backbone.name!r}")
-    settings = recipe.backbone.settings
     channels = None
     with torch.device("meta"):
-        backbone = load_backbone(base, settings) if base else make_backbone(recipe.backbone.name, settings)
+        backbone = start_backbone(recipe.backbone, base)
         if recipe.lora is not None:
             backbone.add_lora(recipe.lora)
         if recipe.memory is not None:

@@ -17,11 +17,10 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import InitProcessGroupKwargs, set_seed
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint, load_backbone, step_folders
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, start_backbone, step_folders
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.options import INTERRUPTED
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, parse_yaml_mapping, read_recipe, to_plain
-from persist_cli.registry import make_backbone
 from persist_cli.training.cache import CacheSettings
 from persist_cli.training.processes import lost_processes_named
 from persist_cli.training.run_folder import RunFolder
@@ -168,13 +167,7 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
 
 def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryMaker | None) -> Backbone:
     """The backbone to train: fresh or from the base, with fresh LoRA where asked for, a fresh adapter in stage 2."""
-    settings = recipe.backbone.settings
-    if base is None:
-        backbone = make_backbone(recipe.backbone.name, settings)
-    else:
-        if base.backbone != recipe.backbone.name:
-            raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {recipe.backbone.name!r}")
-        backbone = load_backbone(base, settings)
+    backbone = start_backbone(recipe.backbone, base)
     if recipe.lora is not None:
         if base is None and not backbone.origin():
             raise RecipeError("lora changes weights that are there; give base=RUN, or pretrained backbone.settings")

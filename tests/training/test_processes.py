@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -44,16 +45,22 @@ def furthest(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> floa
     return max(float((one[name].float() - two[name].float()).abs().max()) for name in one if one[name].numel())
 
 
-@pytest.fixture(scope="module")
-def runs(walks, codec, stage1, tmp_path_factory):
-    """Runs of one process and of two, some of them interrupted and gone on with by one and by two again."""
-    folder = tmp_path_factory.mktemp("pair")
+def begun(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[..., list[str]]:
+    """What makes a run's command line, with both stages trained by one process as ``one-1`` and ``one-2``."""
 
     def of(number: str, name: str, *changes: str) -> list[str]:
         return stage(number, walks, folder / name, f"base={codec if number == 'stage1' else stage1}", BATCH, *changes)
 
     train_here(*of("stage1", "one-1"))
     train_here(*of("stage2-voxel", "one-2"))
+    return of
+
+
+@pytest.fixture(scope="module")
+def runs(walks, codec, stage1, tmp_path_factory):
+    """Runs of one process and of two, some of them interrupted and gone on with by one and by two again."""
+    folder = tmp_path_factory.mktemp("pair")
+    of = begun(folder, walks, codec, stage1)
     low_rank = [f"base={stage1}", "lora.rank=2"]
     train_here(*of("stage1", "one-lora", *low_rank))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]

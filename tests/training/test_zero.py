@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.training.pair import job, run_pair
-from tests.training.test_processes import BATCH, BF16, NEAR, furthest, losses, saved_model
+from tests.training.test_processes import BF16, NEAR, begun, furthest, losses, saved_model
 from tests.walking import end_of, stage, train_here
 
 KINDS = {f"zero{number}": {"ACCELERATE_USE_DEEPSPEED": "true", "ACCELERATE_DEEPSPEED_ZERO_STAGE": number}
@@ -18,12 +18,7 @@ needs_deepspeed = pytest.mark.skipif(importlib.util.find_spec("deepspeed") is No
 def runs(walks, codec, stage1, tmp_path_factory):
     """Runs of one process, of two with ZeRO 1 and 2, and some interrupted and gone on with by one and by two again."""
     folder = tmp_path_factory.mktemp("zero")
-
-    def of(number: str, name: str, *changes: str) -> list[str]:
-        return stage(number, walks, folder / name, f"base={codec if number == 'stage1' else stage1}", BATCH, *changes)
-
-    train_here(*of("stage1", "one-1"))
-    train_here(*of("stage2-voxel", "one-2"))
+    of = begun(folder, walks, codec, stage1)
     first = [job(*of("stage1", "zero1-1"), **KINDS["zero1"])]
     first += [job(*of("stage2-voxel", "zero2-2", "training.accumulation=2"), **KINDS["zero2"])]
     first += [job(*of("stage1", "zero2-bf16", BF16), **KINDS["zero2"])]
