@@ -7,7 +7,7 @@ import torch
 
 from tests.benchmarks import bench_at_size
 from tests.benchmarks.at_size import sampling, shapes
-from tests.benchmarks.at_size.measuring import Timing
+from tests.benchmarks.at_size.measuring import CLEAR, Timing, Turns
 from tests.benchmarks.at_size.plain import Plain
 from tests.benchmarks.at_size.rows import Row, Target
 from tests.benchmarks.at_size.training import make_batch, plain_batch
@@ -88,3 +88,17 @@ def test_a_work_that_does_not_fit_has_a_row_that_says_so():
     row = Row("5b", "clip", None, "plain diffusers", Timing((2.0, 1.0, 3.0), 10**9))
     assert row.ratio is None
     assert {"does not fit", "plain diffusers", "2 (1)", "1.00"} <= set(row.cells())
+
+
+@pytest.mark.skipif(not CLEAR.exists(), reason="peak memory is asked of Linux")
+def test_a_peak_is_that_of_the_largest_run_and_what_does_not_fit_has_no_timing():
+    numbers = iter([1, 30_000_000, 1])  # floats of the run that does not count, and of two that do
+
+    def tight():
+        raise torch.OutOfMemoryError
+
+    works = {"little": lambda: None, "tight": tight, "much": lambda: torch.ones(next(numbers))}
+    found = Turns(torch.device("cpu"), 2).measure(works)
+    assert found["tight"] is None
+    assert found["much"].peak - found["little"].peak == pytest.approx(120e6, rel=0.1)
+    assert len(found["much"].seconds) == 2

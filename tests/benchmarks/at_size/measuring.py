@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 
 Work = Callable[[], Any]
 PEAKS = {  # dense bf16 FLOP/s by the vendors' datasheets, the most special name first
+    "H200 NVL": 835e12,
     "H200": 989e12,
     "H100 PCIe": 756e12,
     "H100 NVL": 835e12,
@@ -33,7 +35,8 @@ class Timing:
 
     Args:
         seconds: of each run.
-        peak: bytes of device memory, on a CPU of resident memory; ``None`` where nobody counts.
+        peak: most bytes of device memory in any of them, on a CPU of resident memory, with all that was held before;
+            ``None`` where nobody counts.
     """
 
     seconds: tuple[float, ...]
@@ -65,27 +68,27 @@ class Turns:
 
     device: torch.device
     rounds: int
-    timings: dict[str, Timing | None] = field(default_factory=dict)
 
     def measure(self, works: Mapping[str, Work]) -> dict[str, Timing | None]:
         """Timings by name."""
-        seconds: dict[str, list[float]] = {name: [] for name in works}
-        peaks: dict[str, int | None] = {}
+        runs: dict[str, list[tuple[float, int | None]]] = {name: [] for name in works}
         for number in range(self.rounds + 1):
-            for name, work in works.items():
-                if name not in seconds:
-                    continue
-                try:
-                    taken, peaks[name] = self.run(work)
-                except torch.OutOfMemoryError:
-                    del seconds[name]
-                    release(self.device)
-                    continue
-                if number:
-                    seconds[name].append(taken)
-        return {name: Timing(tuple(seconds[name]), peaks[name]) if name in seconds else None for name in works}
+            for name in list(runs):
+                found = self.run(works[name])
+                if found is None:
+                    del runs[name]
+                elif number:
+                    runs[name].append(found)
+        return {name: timing_of(runs[name]) if name in runs else None for name in works}
 
-    def run(self, work: Work) -> tuple[float, int | None]:
+    def run(self, work: Work) -> tuple[float, int | None] | None:
+        """Seconds of one run and the most memory that was held in it; ``None`` when it does not fit."""
+        with contextlib.suppress(torch.OutOfMemoryError):
+            return self.timed(work)
+        release(self.device)  # only here, where the error no longer holds what the work had made
+        return None
+
+    def timed(self, work: Work) -> tuple[float, int | None]:
         """Seconds of one run and the most memory that was held in it."""
         forget_peak(self.device)
         synchronize(self.device)
@@ -93,6 +96,12 @@ class Turns:
         work()
         synchronize(self.device)
         return time.perf_counter() - start, peak_memory(self.device)
+
+
+def timing_of(runs: Sequence[tuple[float, int | None]]) -> Timing:
+    """Of the seconds and the peak memory of each run."""
+    peaks = [peak for _, peak in runs if peak is not None]
+    return Timing(tuple(seconds for seconds, _ in runs), max(peaks, default=None))
 
 
 def synchronize(device: torch.device) -> None:
