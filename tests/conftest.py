@@ -34,6 +34,13 @@ def pytest_configure(config: pytest.Config) -> None:
         config.addinivalue_line("markers", f"{name}: of diffusers' own tests")
 
 
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what wants a CUDA device where there is none, before its fixtures train anything."""
+    device = getattr(getattr(item, "module", None), "DEVICE", "cuda")  # test_on_gpu may be told another
+    if item.get_closest_marker("gpu") and device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device here")
+
+
 @dataclass(frozen=True)
 class Ended:
     """How a command ended."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import subprocess
 import sys
@@ -96,6 +97,11 @@ def together(*arguments: str) -> None:
 def end_of(run: Path) -> tuple[dict[str, torch.Tensor], str]:
     """All that a run came to: its newest training state and its log."""
     return read_tensors(max(run.glob("step-*")) / "training.safetensors")[0], (run / "log.jsonl").read_text()
+
+
+def losses(run: Path) -> list[float]:
+    """The loss of each step that a run logged."""
+    return [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
 
 
 def ended_alike(one: Path, two: Path) -> bool:

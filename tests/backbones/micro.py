@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -40,6 +41,18 @@ def shaken(module: torch.nn.Module, scale: float = 0.1) -> None:
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.add_(torch.randn(parameter.shape, generator=draw) * scale)
+
+
+def trained(form: str = "cross", **settings: Any) -> CogVideoX:
+    """A micro model with an adapter, both as training would leave them."""
+    backbone = with_adapter(micro(**settings), form=form, **({"head_width": 8} if form == "canvas" else {}))
+    shaken(backbone)
+    return backbone
+
+
+def equal(one: Sequence[Tensor], two: Sequence[Tensor]) -> bool:
+    """Whether two answers are equal to the bit."""
+    return all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 def random_tokens(batch: int, count: int, seed: int = 3) -> MemoryTokens:

@@ -18,7 +18,7 @@ from persist_backbones.pipeline import WorldPipeline
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import PersistError
 from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import CHANNELS, micro, random_clips, random_tokens, shaken, with_adapter
+from tests.backbones.micro import CHANNELS, equal, micro, random_clips, random_tokens, shaken, trained, with_adapter
 
 STEPS = 8
 CLIPS, SAMPLING = random_clips(1, random_tokens(1, 5)), Sampling(STEPS, "ddim", 1.5)
@@ -40,18 +40,6 @@ BUSY = {
     "FasterCache": lambda: FasterCacheConfig(is_guidance_distilled=True),
 }
 EVERY = pytest.mark.parametrize("name", BUSY)
-
-
-def trained(**settings):
-    """A micro model with an adapter, both as training would leave them."""
-    backbone = with_adapter(micro(**settings))
-    shaken(backbone)
-    return backbone
-
-
-def equal(one, two):
-    """Whether two answers are equal to the bit."""
-    return all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 @pytest.mark.parametrize("name", IDLE)

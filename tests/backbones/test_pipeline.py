@@ -25,19 +25,12 @@ from persist_cli.recipe import MemoryChoice
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import PersistError
 from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
+from tests.backbones.micro import micro, random_clips, random_tokens, shaken, trained
 
 CLIPS = random_clips(2, random_tokens(2, 5))
 FORMS = pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
 FRAMEWISE = {"vae": {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4,
                      "temporal_compression_ratio": 1}}  # fmt: skip
-
-
-def trained(form: str = "cross", **settings: object) -> CogVideoX:
-    """A micro model with an adapter, both as training would leave them."""
-    backbone = with_adapter(micro(**settings), form=form, **({"head_width": 8} if form == "canvas" else {}))
-    shaken(backbone)
-    return backbone
 
 
 def call(pipeline: WorldPipeline, **changes: object) -> WorldPipelineOutput:
@@ -107,7 +100,6 @@ def test_weights_that_rest_elsewhere_change_nothing(form, settings):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("offload", ["enable_model_cpu_offload", "enable_sequential_cpu_offload"])
 @FORMS
 def test_offloaded_weights_sample_on_the_gpu(form, offload):

@@ -8,22 +8,10 @@ from persist_backbones.tiling import overlap
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import PersistError
 from persist_cli.world.placement import Placement
-from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
+from tests.backbones.micro import equal, random_clips, random_tokens, trained, with_adapter
 
 CLIPS, SAMPLING = random_clips(2, random_tokens(2, 5)), Sampling(2, "ddim", 1.5)
 CPU = torch.device("cpu")
-
-
-def trained():
-    """A micro model with an adapter, both as training would leave them."""
-    backbone = with_adapter(micro())
-    shaken(backbone)
-    return backbone
-
-
-def equal(one, two):
-    """Whether two answers are equal to the bit."""
-    return all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 def test_slices_of_the_codec_change_no_colour_and_are_undone_by_another_placement():
@@ -69,7 +57,6 @@ def test_whole_parts_that_rest_elsewhere_give_the_same_clip_again_and_after_anot
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("offload", ["model", "sequential"])
 def test_an_offloaded_backbone_leaves_the_gpu_empty_between_clips(offload):
     backbone = trained()

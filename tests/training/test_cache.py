@@ -21,7 +21,7 @@ from persist_cli.world.errors import PersistError
 from persist_cli.world.files import ASIDE, read_tensors
 from persist_cli.world.tokens import MemoryTokens
 from tests.disk import file_limit
-from tests.walking import MICRO, MICRO_SETTINGS, SIZE, ended_alike, stage, together, train
+from tests.walking import MICRO, MICRO_SETTINGS, SIZE, ended_alike, losses, stage, train
 
 FEW = "data.clips_per_trajectory=3"
 
@@ -48,10 +48,6 @@ def test_cached_steps_equal_uncached_ones_to_the_bit(persist, walks, stage1, tmp
 
 STILL = "backbone.settings.vae={block_out_channels: [8, 8, 8], norm_num_groups: 4, latent_channels: 4, "
 ALONE = ["base=null", *MICRO_SETTINGS, STILL + "temporal_compression_ratio: 1}"]
-
-
-def losses(run: Path) -> list[float]:
-    return [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.parametrize("strides", ["[1]", "[1, -2]"])
@@ -263,15 +259,3 @@ def test_what_cannot_be_cached_is_one_line(persist, walks, codec, tmp_path):
         assert run.code == 1
         assert cause in run.err
         assert len(run.err.strip().splitlines()) == 1
-
-
-@pytest.mark.slow
-def test_two_processes_share_a_cache(walks, stage1, tmp_path):
-    changes = [f"base={stage1}", "training.batch=4", FEW]
-    together(*stage("stage2-voxel", walks, tmp_path / "without", *changes))
-    for name in ("cold", "warm"):
-        together(*stage("stage2-voxel", walks, tmp_path / name, *changes, "--cache", str(tmp_path / "cache")))
-        assert ended_alike(tmp_path / "without", tmp_path / name)
-    assert found(tmp_path / "warm") == 1
-    train(*stage("stage2-voxel", walks, tmp_path / "one", *changes, "--cache", str(tmp_path / "cache")))
-    assert found(tmp_path / "one") == 1

@@ -1,7 +1,6 @@
 """Settings that make a step cheaper: what they leave as it was, and what they cannot do."""
 
 import importlib.util
-import json
 import shutil
 
 import pytest
@@ -14,13 +13,9 @@ from persist_cli.training.state import TrainingState
 from persist_cli.world.backbone import Economy
 from persist_cli.world.files import read_tensors, write_json
 from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
-from tests.walking import end_of, ended_alike, stage, train_here
+from tests.walking import end_of, ended_alike, losses, stage, train_here
 
 BASE = {"stage1": "codec", "stage2-voxel": "stage1"}
-
-
-def losses(run):
-    return [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
 
 
 def saved(run, part):
@@ -73,7 +68,7 @@ def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, 
     train_here(*stage(number, walks, tmp_path / "cheap", *base, "training.frozen_precision=bf16"))
     assert losses(tmp_path / "cheap") == pytest.approx(losses(tmp_path / "usual"), rel=0.05)
     assert all(weight.dtype != torch.bfloat16 for weight in end_of(tmp_path / "cheap")[0].values())
-    if list((tmp_path / "cheap").glob("step-*/model/vae")):
+    if number == "stage1":
         exact = saved(codec, "vae").items()
         assert all(torch.equal(weight, saved(tmp_path / "cheap", "vae")[name]) for name, weight in exact)
         assert all(weight.dtype == torch.float32 for weight in saved(tmp_path / "cheap", "transformer").values())

@@ -11,7 +11,7 @@ import torch
 from persist_cli.checkpoints import find_checkpoint
 from persist_cli.training.trainer import Trainer
 from tests.disk import file_limit
-from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, stage, train_here
+from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, losses, stage, train_here
 
 
 def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
@@ -54,11 +54,7 @@ def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_pat
     base = [f"base={codec}", "training.batch=4", f"backbone.settings.weighting={weighting}", "training.steps=2"]
     assert persist(*stage("stage1", walks, tmp_path / "one", *base)).code == 0
     assert persist(*stage("stage1", walks, tmp_path / "two", *base, f"training.accumulation={parts}")).code == 0
-    one, two = (
-        [json.loads(line)["loss"] for line in (tmp_path / name / "log.jsonl").read_text().splitlines()]
-        for name in ("one", "two")
-    )
-    assert one == pytest.approx(two, rel=1e-4)
+    assert losses(tmp_path / "one") == pytest.approx(losses(tmp_path / "two"), rel=1e-4)
     whole, parted = (end_of(tmp_path / name)[0] for name in ("one", "two"))
     moments = [name for name in whole if "exp_avg/" in name]
     assert all(torch.allclose(whole[name], parted[name], rtol=1e-3, atol=1e-6) for name in moments)
@@ -69,8 +65,8 @@ def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_pat
 def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
     changes = ["training.steps=40", "training.learning_rate=3e-3", "training.batch=4", f"base={codec}"]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
-    losses = [json.loads(line)["loss"] for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
-    assert sum(losses[-10:]) < 0.9 * sum(losses[:10])
+    found = losses(tmp_path / "run")
+    assert sum(found[-10:]) < 0.9 * sum(found[:10])
 
 
 SIX = ["training.checkpoint_every=1", "training.steps=6"]
@@ -159,12 +155,15 @@ def test_the_packaged_sample_is_data_to_train_on(persist, walks, codec, tmp_path
 def test_ctrl_c_and_preemption_save_and_say_how_to_go_on(walks, codec, tmp_path, sent, code):
     arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=100000")
     child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    deadline = time.monotonic() + 300
-    log = tmp_path / "run/log.jsonl"
-    while not (log.is_file() and log.stat().st_size) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    child.send_signal(sent)
-    out, _ = child.communicate(timeout=300)
+    try:
+        deadline = time.monotonic() + 300
+        log = tmp_path / "run/log.jsonl"
+        while not (log.is_file() and log.stat().st_size) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        child.send_signal(sent)
+        out, _ = child.communicate(timeout=300)
+    finally:
+        child.kill()  # of a run without end nothing stays behind, whatever failed
     assert child.returncode == code
     assert "go on with --resume" in out
     find_checkpoint(tmp_path / "run")

@@ -1,6 +1,6 @@
 """Two processes with gloo on the CPU: DDP and FSDP2 come to what one process comes to."""
 
-import json
+import contextlib
 import os
 import re
 import shutil
@@ -17,20 +17,16 @@ from persist_cli.checkpoints import find_checkpoint, load_backbone
 from persist_cli.training.shards import read_shards
 from persist_cli.world.files import read_tensors
 from tests.training.pair import job, run_pair
-from tests.walking import MICRO_SETTINGS, end_of, in_two, stage, train_here
+from tests.training.test_cache import FEW, found
+from tests.walking import MICRO_SETTINGS, end_of, ended_alike, in_two, losses, stage, train_here
 
 FSDP = {"ACCELERATE_USE_FSDP": "true", "FSDP_VERSION": "2"}
 KINDS = {"ddp": {}, "fsdp": FSDP}
 BATCH = "training.batch=4"
 NEAR = 2e-5  # of weights, which four steps of these learning rates can move by 1.4e-3
 BF16 = "training.precision=bf16"
-
-
+PATIENCE = 300  # seconds, on a machine that has other things to do
 CHEAP = ["training.gradient_checkpointing=true", "training.frozen_precision=bf16", "training.ema_device=cpu", BF16]
-
-
-def losses(run: Path) -> list[float]:
-    return [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
 
 
 def saved_model(run: Path) -> dict[str, torch.Tensor]:
@@ -63,12 +59,15 @@ def runs(walks, codec, stage1, tmp_path_factory):
     of = begun(folder, walks, codec, stage1)
     low_rank = [f"base={stage1}", "lora.rank=2"]
     train_here(*of("stage1", "one-lora", *low_rank))
+    train_here(*of("stage2-voxel", "one-few", FEW))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-parts", "training.steps=1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-cheap", *CHEAP), **how) for kind, how in KINDS.items()]
     first.append(job(*of("stage1", "fsdp-lora", *low_rank), **FSDP))
+    cached = [FEW, "--cache", str(folder / "cache")]
+    first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
     wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
     ended = run_pair(folder, *first, wrong)
     assert [code for code, _ in ended[:-1]] == [0] * len(first), ended
@@ -79,6 +78,7 @@ def runs(walks, codec, stage1, tmp_path_factory):
     assert [code for code, _ in run_pair(folder, *later)] == [0, 0]
     for kind in KINDS:
         train_here(*of("stage1", f"{kind}-parts", "--resume"))
+    train_here(*of("stage2-voxel", "one-warm", *cached))
     (folder / "wrong.txt").write_text(f"{ended[-1][0]} {ended[-1][1]}")
     return folder
 
@@ -124,7 +124,7 @@ def test_bf16_is_as_near_to_one_process_sharded_as_not(runs):
     assert {each.dtype for each in weights.values()} == {torch.float32}
 
 
-def test_cheap_steps_are_as_cheap_sharded(runs):
+def test_cheap_steps_train_alike_sharded_and_not(runs):
     """Recomputed blocks, frozen weights in bf16, averages in the memory of the CPU."""
     assert losses(runs / "ddp-cheap") == pytest.approx(losses(runs / "one-2"), rel=1e-2)
     assert losses(runs / "fsdp-cheap") == pytest.approx(losses(runs / "ddp-cheap"), rel=2e-3)
@@ -135,6 +135,14 @@ def test_a_change_of_low_rank_trains_sharded_as_in_one_process(runs):
     one, sharded = (saved_model(runs / name) for name in ("one-lora", "fsdp-lora"))
     assert any("lora_B" in name for name in one)
     assert furthest(one, sharded) < NEAR
+
+
+def test_processes_share_a_cache_that_one_alone_finds_whole(runs):
+    for name in ("cold-few", "warm-few", "one-warm"):
+        assert losses(runs / name) == pytest.approx(losses(runs / "one-few"), rel=1e-5)
+    assert ended_alike(runs / "cold-few", runs / "warm-few")
+    assert [found(runs / name) for name in ("warm-few", "one-warm")] == [1, 1]
+    assert found(runs / "cold-few") < 1
 
 
 def test_a_missing_or_damaged_part_of_a_checkpoint_is_one_line(persist, walks, codec, runs):
@@ -164,65 +172,96 @@ def test_what_cannot_be_sharded_is_one_line(persist, walks, codec, runs, tmp_pat
 
 
 class Started:
-    """A run of two processes without end, from its first checkpoint on."""
+    """A run of two processes without end."""
 
-    def __init__(self, walks: Path, codec: Path, run: Path, *kind: str) -> None:
-        changes = [f"base={codec}", "training.steps=100000", "training.checkpoint_every=2"]
-        start = in_two(*stage("stage1", walks, run, *changes), kind=kind)
+    def __init__(self, run: Path, arguments: list[str], kind: tuple[str, ...]) -> None:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
-        self.run, self.launcher = run, subprocess.Popen(**start, **pipes)
-        deadline = time.monotonic() + 120
-        while not list(run.glob("step-*")) and time.monotonic() < deadline and self.launcher.poll() is None:
+        self.run, self.launcher = run, subprocess.Popen(**in_two(*arguments, kind=kind), **pipes)
+        self.processes: list[int] = []
+
+    def wait(self) -> None:
+        """Until its first checkpoint."""
+        deadline = time.monotonic() + PATIENCE
+        while not list(self.run.glob("step-*")) and time.monotonic() < deadline and self.launcher.poll() is None:
             time.sleep(0.05)
         children = Path(f"/proc/{self.launcher.pid}/task/{self.launcher.pid}/children").read_text().split()
         self.processes = [int(child) for child in children]
+        assert len(self.processes) == 2, self.end()
 
     def end(self) -> tuple[int, str]:
         """The launcher's exit code and all that was said."""
-        said, _ = self.launcher.communicate(timeout=60)
+        said, _ = self.launcher.communicate(timeout=PATIENCE)
         return self.launcher.returncode, said
 
+    def kill(self) -> None:
+        """Leave nothing behind."""
+        for process in self.processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        self.launcher.kill()
+        self.launcher.wait()
 
-def go_on(persist, walks, codec, run: Path) -> None:
-    """One process takes two more steps from the run's checkpoint, which must be whole."""
-    step = int(find_checkpoint(run).folder.parent.name.removeprefix("step-"))
-    ended = persist(*stage("stage1", walks, run, "--resume", f"base={codec}", f"training.steps={step + 2}"))
-    assert ended.code == 0, ended.err
-    assert len(losses(run)) == step + 2
-    assert not list(run.glob(".partial-*"))
+
+@pytest.fixture
+def start(walks, codec, tmp_path):
+    """What starts a run as ``run`` by a launcher's options, and returns it after its first checkpoint."""
+    started = []
+
+    def of(*kind: str) -> Started:
+        changes = [f"base={codec}", "training.steps=100000", "training.checkpoint_every=2"]
+        started.append(Started(tmp_path / "run", stage("stage1", walks, tmp_path / "run", *changes), kind))
+        started[-1].wait()
+        return started[-1]
+
+    yield of
+    for each in started:
+        each.kill()
+
+
+@pytest.fixture
+def go_on(persist, walks, codec, tmp_path):
+    """What takes two more steps from the run's checkpoint by one process, which must be whole."""
+
+    def of() -> None:
+        run = tmp_path / "run"
+        step = int(find_checkpoint(run).folder.parent.name.removeprefix("step-"))
+        ended = persist(*stage("stage1", walks, run, "--resume", f"base={codec}", f"training.steps={step + 2}"))
+        assert ended.code == 0, ended.err
+        assert len(losses(run)) == step + 2
+        assert not list(run.glob(".partial-*"))
+
+    return of
 
 
 @pytest.mark.parametrize("killed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_killed_process_ends_the_run_with_a_line_and_a_checkpoint_to_go_on_from(
-    persist, walks, codec, tmp_path, killed
-):
-    started = Started(walks, codec, tmp_path / "run", "--use_fsdp", "--fsdp_version", "2")
+def test_a_killed_process_ends_the_run_with_a_line_and_a_checkpoint_to_go_on_from(start, go_on, killed):
+    started = start("--use_fsdp", "--fsdp_version", "2")
     os.kill(started.processes[killed], signal.SIGKILL)
     code, said = started.end()
     lines = [line for line in said.splitlines() if line.startswith("error: ")]
     assert (code, len(lines)) == (1, 1), said
     assert re.search(rf"process {1 - killed} of 2 lost another one.*step-\d+ is whole, go on with --resume", lines[0])
     assert re.search(rf"rank +: {killed} .*\n.*exitcode +: -9", said)  # the launcher's table
-    go_on(persist, walks, codec, tmp_path / "run")
+    go_on()
 
 
 @pytest.mark.parametrize(
     ("told", "code"), [("rank", 0), pytest.param("launcher", 1, marks=pytest.mark.slow)], ids=["rank", "launcher"]
 )
-def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(persist, walks, codec, tmp_path, told, code):
+def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(start, go_on, told, code):
     """The exit code of a launcher that was told to stop is torchrun's own."""
-    started = Started(walks, codec, tmp_path / "run", "--use_fsdp", "--fsdp_version", "2")
+    started = start("--use_fsdp", "--fsdp_version", "2")
     os.kill({"rank": started.processes[1], "launcher": started.launcher.pid}[told], signal.SIGTERM)
     ended, said = started.end()
     assert ended == code, said
     assert said.count("go on with --resume") == 1, said
-    go_on(persist, walks, codec, tmp_path / "run")
+    go_on()
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_on_all(persist, walks, codec, tmp_path):
-    started = Started(walks, codec, tmp_path / "run", "--multi_gpu")
+def test_ctrl_c_saves_on_all(start, go_on):
+    started = start("--multi_gpu")
     os.killpg(started.launcher.pid, signal.SIGINT)  # as a terminal does
     _, said = started.end()
     assert said.count("go on with --resume") == 1, said
-    go_on(persist, walks, codec, tmp_path / "run")
+    go_on()

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tests.training.pair import job, run_pair
-from tests.training.test_processes import BF16, NEAR, begun, furthest, losses, saved_model
-from tests.walking import end_of, stage, train_here
+from tests.training.test_processes import BF16, NEAR, begun, furthest, saved_model
+from tests.walking import end_of, losses, stage, train_here
 
 KINDS = {f"zero{number}": {"ACCELERATE_USE_DEEPSPEED": "true", "ACCELERATE_DEEPSPEED_ZERO_STAGE": number}
          for number in ("1", "2")}  # fmt: skip
