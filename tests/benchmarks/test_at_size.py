@@ -4,13 +4,15 @@ import json
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from tests.benchmarks import bench_at_size
 from tests.benchmarks.at_size import sampling, shapes
 from tests.benchmarks.at_size.measuring import CLEAR, Timing, Turns
 from tests.benchmarks.at_size.plain import Plain
 from tests.benchmarks.at_size.rows import Row, Target
-from tests.benchmarks.at_size.training import make_batch, plain_batch
+from tests.benchmarks.at_size.sampling import Scene
+from tests.benchmarks.at_size.training import make_batch, plain_batch, stage1_works
 from tests.walking import MICRO
 
 
@@ -68,6 +70,29 @@ def test_the_plain_model_says_what_ours_does_when_it_has_its_weights(micro):
         joined = torch.cat([color, color_image, depth, depth_image, camera], dim=2)
         plain.predict(joined, timesteps, plain.rotary(latents))
     assert torch.allclose(seen[0], seen[1][:, -seen[0].shape[1] :], atol=1e-5)
+
+
+def counted(work):
+    """FLOPs of a work, backward included, by torch."""
+    with FlopCounterMode(display=False) as counter:
+        work()
+    return counter.get_total_flops()
+
+
+def test_ours_and_the_plain_loop_pipeline_and_codec_do_the_same_work(micro, tmp_path):
+    """Within a thousandth, for cameras."""
+    bench = shapes.Bench(micro, torch.device("cpu"), torch.float32, 1, 1.0)
+    steps = {name: counted(work) for name, work in stage1_works(bench, 2).items()}
+    assert steps["ours"] == pytest.approx(steps["plain"], rel=1e-3)
+    bench.backbone.requires_grad_(False)
+    plain = Plain(bench)
+    clips = {name: counted(work) for name, work in sampling.clip_works(Scene(bench, tmp_path), plain, 3).items()}
+    assert clips["alone"] == pytest.approx(clips["plain"], rel=1e-3)
+    assert clips["memory"] > clips["alone"]
+    seen, images = bench.clips(1, bench.size[0]), sampling.plain_images(bench)
+    codec, latents = bench.backbone.codec, plain.encode(images)
+    assert counted(lambda: codec.encode(seen.rgb, seen.depth)) == counted(lambda: plain.encode(images))
+    assert counted(lambda: codec.decode(latents)) == counted(lambda: plain.decode(latents))
 
 
 def test_an_unknown_model_or_part_is_a_usage_error(capsys):

@@ -143,6 +143,12 @@ def forward(video: VideoSizes, memory: MemorySizes | None = None) -> int:
     return total + embedding(video, memory) + len(memory.layers) * each
 
 
+def clip(steps: int, video: VideoSizes, memory: MemorySizes | None = None) -> int:
+    """Of so many passes, of which the first embeds the memory's tokens; the codec is not counted."""
+    again = 0 if memory is None else embedding(video, memory)
+    return steps * forward(video, memory) - (steps - 1) * again
+
+
 def stage1_step(video: VideoSizes) -> int:
     """Of the forward and backward pass when the whole transformer is trained."""
     return 3 * forward(video) - entrance(video)
