@@ -8,10 +8,9 @@ import torch
 from persist_backbones.pretrained import folder_here, pretrained_folder, published_preset
 from persist_cli.registry import make_backbone
 from persist_cli.world.errors import CheckpointError
-from tests.backbones.twins import SIZE, load_twin, write_twin
+from tests.backbones.twins import SIZE, load_twin, write_snapshot, write_twin
 
 NAME = "zai-org/CogVideoX-5b-I2V"
-COMMIT = "0" * 40
 
 
 @pytest.fixture
@@ -20,15 +19,13 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.chdir(tmp_path)
-    return tmp_path / "hub" / "models--zai-org--CogVideoX-5b-I2V"
+    return tmp_path / "hub"
 
 
 @pytest.fixture
 def snapshot(cache):
-    """The twin in the hub's cache, as its client would leave it."""
-    (cache / "refs").mkdir(parents=True)
-    (cache / "refs" / "main").write_text(COMMIT)
-    return write_twin("5b-i2v", cache / "snapshots" / COMMIT)
+    """The twin in the hub's cache."""
+    return write_twin("5b-i2v", write_snapshot(cache, NAME))
 
 
 def test_a_name_on_the_hub_is_opened_from_its_cache_without_the_hub(snapshot):

@@ -13,7 +13,7 @@ from persist_backbones.prompt import write_prompt
 from persist_cli.registry import make_backbone
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
-from tests.backbones.twins import load_twin, write_twin
+from tests.backbones.twins import load_twin, write_snapshot, write_twin
 
 PROMPT = "a walk"
 SPECIAL = ["<pad>", "</s>", "<unk>"]
@@ -102,6 +102,18 @@ def test_a_prompt_without_its_encoder_is_one_line_that_says_what_else_to_do(fold
     shutil.rmtree(tmp_path / "twin" / part)
     with pytest.raises(CheckpointError, match=f"no {part}/ to embed the prompt with; give .* zeros$"):
         load_twin(tmp_path / "twin", prompt=PROMPT)
+
+
+def test_a_prompt_asks_no_hub_even_where_one_could_be_asked(tmp_path, monkeypatch):
+    asked, name = [], "zai-org/CogVideoX-2b"
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr("socket.getaddrinfo", lambda host, *_, **__: asked.append(host) or [])
+    write_twin("2b", write_snapshot(tmp_path / "hub", name))
+    assert not load_twin(name).prompt.any()
+    with pytest.raises(CheckpointError, match=r"no text_encoder/ to embed the prompt with; give .* zeros$"):
+        load_twin(name, prompt=PROMPT)
+    assert asked == []
 
 
 def test_an_embedding_of_another_size_or_name_is_one_line(folder, tmp_path):

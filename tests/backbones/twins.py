@@ -47,6 +47,14 @@ def write_twin(name: str, folder: Path) -> Path:
     return folder
 
 
+def write_snapshot(hub: Path, name: str) -> Path:
+    """The folder of a repository's only snapshot in a hub's cache, as its client would leave it, for its files."""
+    commit, home = "0" * 40, hub / f"models--{name.replace('/', '--')}"
+    (home / "refs").mkdir(parents=True)
+    (home / "refs" / "main").write_text(commit)
+    return home / "snapshots" / commit
+
+
 def load_twin(folder: Path, size: tuple[int, int, int] = SIZE, **settings: Any) -> CogVideoX:
     """The twin as our backbone."""
     frames, height, width = size

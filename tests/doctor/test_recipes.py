@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from importlib import resources
 
@@ -54,8 +55,9 @@ def test_another_memory_is_one_override(memory):
 def test_every_launch_line_shares_the_batch_out_evenly(name):
     text = (resources.files("persist_recipes") / f"{name}.yaml").read_text()
     head = " ".join(line.lstrip("#").rstrip(" \\") for line in text.splitlines() if line.startswith("#"))
-    runs = head.split("finetune ")[1:4]
-    for run, gpus in zip(runs, (1, 8, 64), strict=True):
+    launch = head.split("finetune ")
+    for launcher, run, gpus in zip(launch[:3], launch[1:4], (1, 8, 64), strict=True):
+        assert re.findall(r"--num_processes (\d+)", launcher) == ([] if gpus == 1 else [str(gpus)])
         words = shlex.split(run.split("64 GPUs")[0].split("8 GPUs")[0].partition(" DIR is")[0].replace("'", ""))
         recipe = make_recipe(
             apply_overrides(read_recipe(name), [each for each in words if each.startswith("training.")]), name

@@ -16,6 +16,7 @@ from persist_cli.training import keys
 from persist_cli.training.cache import STALE, Cache, CacheSettings, cache_key
 from persist_cli.training.cached_clips import CachedClips, ClipCache, ClipEncoder
 from persist_cli.training.keys import CacheKeys
+from persist_cli.training.settings import TrainingSettings
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan
 from persist_cli.world.errors import PersistError
 from persist_cli.world.files import ASIDE, read_tensors
@@ -113,11 +114,12 @@ def keys_of(walks, voxel):
     backbone, usual = load_backbone(checkpoint), checkpoint.memory_choice("voxel")
     choice = ClipDataset([walks], ClipPlan(9, (1,), 5, 3, (SIZE, SIZE))).choose(0)
 
-    def of(stage="2", budget=7, **changes):
+    def of(stage="2", budget=7, encoding="x", precision="no", **changes):
         memory = replace(usual, **changes) if stage == "2" else None
         backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget})
         maker = MemoryMaker.of(memory) if memory else None
-        return CacheKeys.of(Recipe(stage, memory=memory), backbone, maker, "x", "cpu").of_clip(choice)
+        recipe = Recipe(stage, memory=memory, training=TrainingSettings(precision=precision))
+        return CacheKeys.of(recipe, backbone, maker, encoding, "cpu").of_clip(choice)
 
     return of
 
@@ -128,6 +130,12 @@ def test_stages_and_memories_share_latents_and_nothing_that_depends_on_more(keys
     assert {each.latents for each in found} == {keys_of("1").latents}
     assert len({each.tokens for each in found}) == len(found)
     assert keys_of("1").tokens is None
+
+
+def test_another_codec_or_precision_has_other_latents_and_the_same_tokens(keys_of):
+    found = [keys_of(), keys_of(encoding="y"), keys_of(precision="bf16")]
+    assert len({each.latents for each in found}) == len(found)
+    assert {each.tokens for each in found} == {found[0].tokens}
 
 
 @pytest.mark.parametrize("newer", ["memory", "encoder"])
