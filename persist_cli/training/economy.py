@@ -49,7 +49,7 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSetting
         from bitsandbytes.optim import AdamW8bit
     except ImportError as error:
         raise PersistError(
-            "training.optimizer=adamw-8bit needs the package bitsandbytes: pip install bitsandbytes"
+            "training.optimizer=adamw-8bit needs the package bitsandbytes: pip install 'persist-cli[bitsandbytes]'"
         ) from error
     optimizer: torch.optim.Optimizer = AdamW8bit(parameters, lr=rate, weight_decay=decay)
     return optimizer

@@ -90,7 +90,7 @@ class TrainingState:
             return notes | {"files": len(list((folder / SHARDS).iterdir()))}
         tensors = self.tensors()  # which processes may have to gather together
         if main:
-            write_tensors(folder / WHOLE, {name: _own(tensor) for name, tensor in tensors.items()})
+            write_tensors(folder / WHOLE, _apart(tensors))
         return notes
 
     def read(self, folder: Path) -> None:
@@ -188,9 +188,19 @@ def _counted(steps: Tensor) -> Tensor | int:
     return steps.clone() if steps.is_floating_point() else int(steps)
 
 
-def _own(tensor: Tensor) -> Tensor:
-    """The tensor in memory of its own: the pieces of another, as DeepSpeed's are, cannot be saved."""
-    return tensor if tensor.untyped_storage().nbytes() == tensor.nbytes else tensor.detach().clone()
+def _apart(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors, each in memory of its own, as safetensors wants them.
+
+    DeepSpeed's are pieces of one; bitsandbytes' share the tables that their bytes stand for.
+    """
+    seen: set[int] = set()
+    found: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        storage = tensor.untyped_storage()
+        shared = storage.data_ptr() in seen or storage.nbytes() != tensor.nbytes
+        seen.add(storage.data_ptr())
+        found[name] = tensor.detach().clone() if shared else tensor
+    return found
 
 
 def _take(tensors: dict[str, Tensor], name: str, like: Tensor, path: Path) -> Tensor:

@@ -92,14 +92,17 @@ def test_an_average_moves_towards_copies_of_the_parameters_too():
     assert torch.equal(here.shadow_params[0], there.shadow_params[0])
 
 
-def test_the_state_of_an_optimizer_that_counts_by_plain_numbers_is_kept(tmp_path):
-    parameter = torch.nn.Parameter(torch.ones(3))
-    states = [TrainingState({"weight": parameter}, torch.optim.AdamW([parameter]).state, None) for _ in range(2)]
-    states[0].moments[parameter] = {"step": 7, "state1": torch.arange(3, dtype=torch.uint8)}
+def test_the_state_of_an_8_bit_optimizer_is_kept(tmp_path):
+    weights, table = {name: torch.nn.Parameter(torch.ones(3)) for name in ("one", "two")}, torch.arange(4.0)
+    states = [TrainingState(weights, torch.optim.AdamW([*weights.values()]).state, None) for _ in range(2)]
+    for parameter in weights.values():  # it counts by plain numbers, and all share the table that bytes stand for
+        states[0].moments[parameter] = {"step": 7, "state1": torch.arange(3, dtype=torch.uint8), "qmap1": table}
     write_json(tmp_path / "training.json", states[0].write(tmp_path, main=True))
     states[1].read(tmp_path)
-    kept = states[1].moments[parameter]
-    assert (type(kept["step"]), kept["step"], kept["state1"].dtype) == (int, 7, torch.uint8)
+    for parameter in weights.values():
+        kept = states[1].moments[parameter]
+        assert (type(kept["step"]), kept["step"], kept["state1"].dtype) == (int, 7, torch.uint8)
+        assert torch.equal(kept["qmap1"], table)
 
 
 @pytest.mark.gpu
@@ -139,7 +142,7 @@ def test_what_cannot_be_made_cheaper_is_one_line(persist, walks, codec, tmp_path
     cases = [("training.compile=true", "training.compile needs a C++ compiler on a CPU (no-such-compiler)")]
     cases += [("training.frozen_precision=bf16", "needs training.precision bf16")]
     if importlib.util.find_spec("bitsandbytes") is None:
-        cases += [("training.optimizer=adamw-8bit", "needs the package bitsandbytes: pip install bitsandbytes")]
+        cases += [("training.optimizer=adamw-8bit", "bitsandbytes: pip install 'persist-cli[bitsandbytes]'")]
     for change, cause in cases:
         ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", change))
         assert (ended.code, cause in ended.err, len(ended.err.strip().splitlines())) == (1, True, 1)
@@ -152,3 +155,18 @@ def test_a_backbone_that_has_no_cheaper_steps_says_so():
     Backbone.economize(micro(), "1", Economy())
     with pytest.raises(PersistError, match="backbone 'cogvideox' has no cheaper steps"):
         Backbone.economize(micro(), "1", Economy(compile=True))
+
+
+@pytest.mark.parametrize("usual", ["stage1"], indirect=True)
+def test_an_8_bit_optimizer_trains_nearly_alike_and_resumes_to_the_bit(persist, usual, tmp_path):
+    pytest.importorskip("bitsandbytes")
+    run, cheap = usual
+    eight = "training.optimizer=adamw-8bit"
+    assert persist(*cheap(eight)).code == 0
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=0.02)
+    assert torch.uint8 in {each.dtype for each in end_of(tmp_path / "cheap")[0].values()}
+    halves = tmp_path / "halves"
+    for steps, more in ((2, []), (4, ["--resume"])):
+        arguments = [halves if each == str(tmp_path / "cheap") else each for each in cheap(eight)]
+        assert persist(*map(str, arguments), f"training.steps={steps}", *more).code == 0
+    assert ended_alike(tmp_path / "cheap", halves)
