@@ -162,9 +162,13 @@ class CogVideoX(Backbone):
         weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
         return squared_error(predicted, target, weights, self.settings.depth)
 
-    def encoding(self, stage: Stage) -> str | None:
-        """The frozen codec's fingerprint; ``None`` in its own stage."""
-        return None if stage == "codec" else self.codec.fingerprint()
+    def encodes(self, stage: Stage) -> bool:
+        """In all stages but the codec's own."""
+        return stage != "codec"
+
+    def encoding(self) -> str:
+        """The codec's fingerprint."""
+        return self.codec.fingerprint()
 
     @property
     def frames_alone(self) -> bool:

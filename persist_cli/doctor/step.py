@@ -84,15 +84,12 @@ class Twins:
         self.shallow.shorten(SHALLOW)
 
     def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
-        """What encoding takes; nothing in the codec's own stage."""
-        if recipe.stage == "codec":
+        """What encoding takes; nothing where the stage encodes nothing before its step."""
+        if not self.shallow.encodes(recipe.stage):
             return Encoding(0)
         with self.imagined(self.shallow, recipe, kind) as (backbone, live), autocast(recipe), torch.no_grad():
             clips = imagined_clips(backbone, self.channels, kind.batch)
-            try:
-                latents = backbone.encode(clips)
-            except NotImplementedError:  # it keeps nothing of a clip
-                return Encoding(0)
+            latents = backbone.encode(clips)
             return Encoding(live.peak, tuple(latents.shape), latents.dtype)
 
     def activations(self, recipe: Recipe, kind: StepKind, encoding: Encoding) -> Activations:

@@ -48,18 +48,17 @@ class CacheKeys:
     hashes: dict[Path, str] = dataclasses.field(default_factory=dict)  # of trajectories, each computed once
 
     @staticmethod
-    def of(recipe: Recipe, backbone: Backbone, maker: MemoryMaker | None, encoding: str, device: str) -> CacheKeys:
+    def of(recipe: Recipe, backbone: Backbone, maker: MemoryMaker | None, device: str) -> CacheKeys:
         """Those of a run.
 
         Args:
             recipe: of the run.
-            backbone: on which the budget of tokens and the size of images depend.
+            backbone: which encodes, and on which the budget of tokens and the size of images depend.
             maker: of memories, ``None`` without one.
-            encoding: the backbone's, of this stage.
             device: the kind of device that encodes.
         """
         made_by = {"persist": __version__, "torch": torch.__version__, "device": device}
-        latents = made_by | {"encoding": encoding, "precision": recipe.training.precision}
+        latents = made_by | {"encoding": backbone.encoding(), "precision": recipe.training.precision}
         tokens = None
         if maker is not None and recipe.memory is not None:
             tokens = made_by | _of_memory(recipe.memory, maker, backbone)

@@ -118,10 +118,10 @@ class Trainer:
         again = recipe.data.clips_per_trajectory > 0
         if settings is None and not again:
             return None
-        encoding = backbone.encoding(recipe.stage)
+        encodes = backbone.encodes(recipe.stage)
         if settings is None:
-            return None if encoding is None else ClipEncoder(backbone, self.maker, self.accelerator, None)
-        if encoding is None:
+            return ClipEncoder(backbone, self.maker, self.accelerator, None) if encodes else None
+        if not encodes:
             raise RecipeError(
                 f"--cache: in stage {recipe.stage} backbone {backbone.name!r} keeps nothing of a clip; leave it out"
             )
@@ -130,7 +130,7 @@ class Trainer:
                 "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
                 "data.clips_per_trajectory=32, or leave --cache out"
             )
-        keys = CacheKeys.of(recipe, backbone, self.maker, encoding, self.accelerator.device.type)
+        keys = CacheKeys.of(recipe, backbone, self.maker, self.accelerator.device.type)
         return ClipEncoder(backbone, self.maker, self.accelerator, ClipCache(Cache(settings), keys))
 
     def loader(self) -> Iterator[Clips]:
@@ -180,7 +180,7 @@ class Trainer:
 
     def encoded(self, clips: Clips) -> Clips:
         """The clips with their latents, which the model would make by itself, so that they are timed apart."""
-        if self.times is None or clips.latents is not None or self.recipe.stage == "codec":
+        if self.times is None or clips.latents is not None or not self.backbone.encodes(self.recipe.stage):
             return clips
         with self.times.part("encode"), torch.no_grad(), self.accelerator.autocast():
             return dataclasses.replace(clips, latents=self.backbone.encode(clips))

@@ -205,9 +205,13 @@ class Backbone(nn.Module, ABC):
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
         """Scalars of one training step; ``"loss"`` is minimised, the others are logged."""
 
-    def encoding(self, stage: Stage) -> str | None:
-        """A fingerprint of what ``encode`` depends on besides the clips; ``None``: a stage trains what encodes."""
-        return None
+    def encodes(self, stage: Stage) -> bool:
+        """Whether clips can be encoded before a step of this stage, which then does not train what encodes them."""
+        return False
+
+    def encoding(self) -> str:
+        """A fingerprint of what ``encode`` depends on besides the clips."""
+        raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
     def encode(self, clips: Clips) -> Tensor:
         """What of the clips can be kept between steps, batch axis first; ``forward`` takes it as ``Clips.latents``."""

@@ -139,10 +139,11 @@ def test_a_sampling_that_cannot_be_drawn_is_told_before_anything_is_made(samplin
 
 def test_a_backbone_that_says_no_more_has_depth_and_keeps_nothing_of_a_clip():
     backbone = micro(depth=False)
-    with pytest.raises(NotImplementedError, match="backbone 'cogvideox' keeps nothing of a clip"):
-        Backbone.encode(backbone, random_clips(1))
+    for attempt in (lambda: Backbone.encode(backbone, random_clips(1)), lambda: Backbone.encoding(backbone)):
+        with pytest.raises(NotImplementedError, match="backbone 'cogvideox' keeps nothing of a clip"):
+            attempt()
     assert Backbone.gives_depth.fget(backbone)
-    assert Backbone.encoding(backbone, "1") is None
+    assert not Backbone.encodes(backbone, "1")
     for sampling, cause in ((Sampling(0), "0 denoising steps"), (Sampling(1, "euler"), "unknown sampler 'euler'")):
         with pytest.raises(PersistError, match=cause):
             Backbone.check_sampling(backbone, sampling)

@@ -109,17 +109,19 @@ def test_a_resumed_run_with_a_cache_equals_an_uninterrupted_one_without(persist,
 
 @pytest.fixture
 def keys_of(walks, voxel):
-    """The keys of one clip for a stage, a budget of tokens, and changes to the memory."""
+    """The keys of one clip for a stage, a budget of tokens, a codec that moves, and changes to the memory."""
     checkpoint = find_checkpoint(voxel)
     backbone, usual = load_backbone(checkpoint), checkpoint.memory_choice("voxel")
     choice = ClipDataset([walks], ClipPlan(9, (1,), 5, 3, (SIZE, SIZE))).choose(0)
 
-    def of(stage="2", budget=7, encoding="x", precision="no", **changes):
+    def of(stage="2", budget=7, codec=0.0, precision="no", **changes):
         memory = replace(usual, **changes) if stage == "2" else None
         backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget})
         maker = MemoryMaker.of(memory) if memory else None
         recipe = Recipe(stage, memory=memory, training=TrainingSettings(precision=precision))
-        return CacheKeys.of(recipe, backbone, maker, encoding, "cpu").of_clip(choice)
+        with torch.no_grad():
+            next(backbone.codec.parameters()).add_(codec)
+        return CacheKeys.of(recipe, backbone, maker, "cpu").of_clip(choice)
 
     return of
 
@@ -133,7 +135,7 @@ def test_stages_and_memories_share_latents_and_nothing_that_depends_on_more(keys
 
 
 def test_another_codec_or_precision_has_other_latents_and_the_same_tokens(keys_of):
-    found = [keys_of(), keys_of(encoding="y"), keys_of(precision="bf16")]
+    found = [keys_of(), keys_of(codec=1.0), keys_of(precision="bf16")]
     assert len({each.latents for each in found}) == len(found)
     assert {each.tokens for each in found} == {found[0].tokens}
 
