@@ -13,9 +13,9 @@ import yaml
 from pydantic import BeforeValidator
 
 from persist_cli.training.settings import Count, TrainingSettings
-from persist_cli.world.backbone import Lora, Stage
 from persist_cli.world.errors import RecipeError, hint
 from persist_cli.world.settings import parse_settings
+from persist_cli.world.stages import Lora, Stage
 
 EXTENDS = "extends"
 MERGED = {"backbone", "data", "lora", "training"}

@@ -30,9 +30,10 @@ from persist_backbones.rotary import rotary_positions
 from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
 from persist_backbones.saving import load_whole, save_change, save_whole
 from persist_backbones.world_transformer import Conditions
-from persist_cli.world.backbone import Backbone, Clips, Economy, Lora, Part, Sampling, Stage
+from persist_cli.world.backbone import Backbone, Clips, Sampling
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.placement import Placement
+from persist_cli.world.stages import Economy, Lora, Part, Stage
 
 if TYPE_CHECKING:
     from persist_backbones.pipeline import WorldPipeline

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from persist_backbones.lora import has_lora
-from persist_cli.world.backbone import Economy, Stage
+from persist_cli.world.stages import Economy, Stage
 
 if TYPE_CHECKING:
     from persist_backbones.cogvideox import CogVideoX

@@ -8,7 +8,7 @@ from typing import Any
 from torch import nn
 
 from persist_backbones.adapter import Adapter
-from persist_cli.world.backbone import Part
+from persist_cli.world.stages import Part
 
 LORA = ".lora_"  # in the names that PEFT gives to what it adds
 ADAPTER = "memory adapter "

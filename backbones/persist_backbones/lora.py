@@ -12,9 +12,9 @@ from diffusers import CogVideoXTransformer3DModel
 from diffusers.loaders.lora_base import LORA_ADAPTER_METADATA_KEY, LORA_WEIGHT_NAME_SAFE
 
 from persist_backbones.inventory import LORA
-from persist_cli.world.backbone import Lora
 from persist_cli.world.errors import CheckpointError, PersistError, RecipeError, hint
 from persist_cli.world.files import read_tensors, write_tensors
+from persist_cli.world.stages import Lora
 
 PREFIX = "transformer."  # of the names in a pipeline's LoRA file
 DOWN, UP = ".lora_A.weight", ".lora_B.weight"

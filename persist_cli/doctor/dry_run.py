@@ -7,7 +7,7 @@ from typing import Any
 
 from persist_cli.doctor.planned import Planned, plan_recipe
 from persist_cli.viewing.console import print_json, print_table
-from persist_cli.world.backbone import Part, Stage
+from persist_cli.world.stages import Part, Stage
 
 
 def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:

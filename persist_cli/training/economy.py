@@ -11,8 +11,8 @@ from diffusers.training_utils import EMAModel
 from torch import nn
 
 from persist_cli.training.settings import TrainingSettings
-from persist_cli.world.backbone import Economy
 from persist_cli.world.errors import PersistError
+from persist_cli.world.stages import Economy
 
 COMPILERS = ("c++", "g++", "clang++")  # what torch.compile looks for on a CPU
 

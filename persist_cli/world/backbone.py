@@ -8,21 +8,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, UInt8
-from pydantic import Field
 from torch import Tensor, nn
 
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import PersistError
 from persist_cli.world.placement import Placement
 from persist_cli.world.settings import NoSettings
+from persist_cli.world.stages import Economy, Lora, Part, Stage
 from persist_cli.world.tokens import MemoryTokens
 
-Stage = Literal["codec", "1", "2"]
-STAGES: tuple[Stage, ...] = ("codec", "1", "2")
 Interactions = tuple[str | None, ...]  # one for each step between two frames of a clip
 
 
@@ -63,53 +61,6 @@ class Sampling:
     steps: int = 50
     sampler: str = "ddim"
     memory_guidance: float = 1.0
-
-
-@dataclass(frozen=True)
-class Part:
-    """Some of a backbone's parameters under a name that people know.
-
-    Args:
-        name: of the part.
-        parameters: by their names in the backbone.
-        new: whether they begin fresh even where the rest is pretrained.
-    """
-
-    name: str
-    parameters: Mapping[str, nn.Parameter]
-    new: bool = False
-
-
-@dataclass(frozen=True)
-class Economy:
-    """What makes a training step cheaper and changes nothing but rounding.
-
-    Args:
-        gradient_checkpointing: compute hidden states between blocks again in the backward pass.
-        compile: the blocks, by ``torch.compile``.
-        frozen: precision of the weights that the stage does not train; ``None`` leaves them theirs.
-        vae_slicing: encode clips one by one.
-    """
-
-    gradient_checkpointing: bool = False
-    compile: bool = False
-    frozen: torch.dtype | None = None
-    vae_slicing: bool = False
-
-
-@dataclass(frozen=True)
-class Lora:
-    """A change of low rank that stage 1 trains instead of all weights (LoRA).
-
-    Args:
-        rank: of the change of each layer.
-        alpha: the change counts alpha / rank; by default as much as the rank.
-        targets: ends of the names of the linear layers that are changed.
-    """
-
-    rank: Annotated[int, Field(ge=1)] = 64
-    alpha: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    targets: Annotated[tuple[str, ...], Field(min_length=1)] = ("to_q", "to_k", "to_v", "to_out.0")
 
 
 class Backbone(nn.Module, ABC):

@@ -10,7 +10,7 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 
 from persist_backbones.cogvideox import CogVideoX
 from persist_cli.registry import make_backbone
-from persist_cli.world.backbone import STAGES
+from persist_cli.world.stages import STAGES
 from tests.backbones.published import SCHEDULERS, TRANSFORMERS, VAES
 
 MODELS = tuple(TRANSFORMERS)

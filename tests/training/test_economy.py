@@ -10,8 +10,8 @@ from torch.autograd.graph import saved_tensors_hooks
 
 from persist_cli.training.economy import update_average
 from persist_cli.training.state import TrainingState
-from persist_cli.world.backbone import Economy
 from persist_cli.world.files import read_tensors, write_json
+from persist_cli.world.stages import Economy
 from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
 from tests.walking import end_of, ended_alike, losses, stage, train_here
 

@@ -16,8 +16,8 @@ from diffusers import (
 from persist_backbones.parts import make_parts
 from persist_backbones.presets import CogVideoXSettings
 from persist_cli.checkpoints import find_checkpoint, load_backbone
-from persist_cli.world.backbone import Lora
 from persist_cli.world.files import read_tensors
+from persist_cli.world.stages import Lora
 from tests.backbones.micro import micro, predicted, random_clips
 from tests.walking import MICRO, MICRO_SETTINGS, ended_alike, stage, train_here
 

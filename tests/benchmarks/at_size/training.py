@@ -15,7 +15,8 @@ from torch.utils.data import Dataset
 
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.training.trainer import Trainer
-from persist_cli.world.backbone import Clips, Stage
+from persist_cli.world.backbone import Clips
+from persist_cli.world.stages import Stage
 from persist_cli.world.tokens import MemoryTokens
 from tests.benchmarks.at_size import flops
 from tests.benchmarks.at_size.measuring import Timing, Turns, Work, release
