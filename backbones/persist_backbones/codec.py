@@ -185,9 +185,16 @@ class Codec(nn.Module):
         return unfold_pixels(folded, pixel_patch(self.vae))
 
     def loss(
-        self, rgb: Tensor, depth: Tensor, kl_weight: float, generators: list[torch.Generator]
+        self,
+        rgb: Tensor,
+        depth: Tensor,
+        window: tuple[int, int, int] | None,
+        kl_weight: float,
+        generators: list[torch.Generator],
     ) -> dict[str, Tensor]:
-        """Reconstruction error (mean absolute plus squared) and prior of a batch of clips."""
+        """Reconstruction error (mean absolute plus squared) and prior of a batch of clips, or of a window of each."""
+        if window:
+            rgb, depth = self.windows(rgb, depth, window, generators)
         images = self.images(rgb, depth)
         posterior = self.posterior(images)
         shape = posterior.mean.shape[1:]

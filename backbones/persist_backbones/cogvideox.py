@@ -145,10 +145,8 @@ class CogVideoX(Backbone):
         """The codec's loss, or that of denoising RGB and depth latents."""
         generators = generators_of(clips.seeds)
         if stage == "codec":
-            rgb, depth = clips.rgb, clips.depth
-            if self.settings.codec_window:
-                rgb, depth = self.codec.windows(rgb, depth, self.settings.codec_window, generators)
-            return self.codec.loss(rgb, depth, self.settings.kl_weight, generators)
+            window, weight = self.settings.codec_window, self.settings.kl_weight
+            return self.codec.loss(clips.rgb, clips.depth, window, weight, generators)
         kept = self.encode(clips) if clips.latents is None else clips.latents
         latents, first = (kept, kept[:, :1]) if self.frames_alone else (kept[:, :-1], kept[:, -1:])
         latents, image = self.shape.pad(latents), self.image_condition(first)
@@ -235,8 +233,7 @@ class CogVideoX(Backbone):
 
     def camera_latents(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Plücker rays at the latents' size."""
-        printed = self.settings.rays == "printed"
-        cameras = clips.cameras.to(self.prompt.device)
+        cameras, printed = clips.cameras.to(self.prompt.device), self.settings.rays == "printed"
         return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
 
     def predict(self, noisy: Tensor, image: Tensor, given: Conditions) -> Tensor:

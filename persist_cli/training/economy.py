@@ -55,10 +55,11 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSetting
     return optimizer
 
 
-def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings, device: torch.device) -> EMAModel:
-    """The moving average of the parameters, where the settings want it."""
+def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> EMAModel:
+    """The moving average of the parameters, beside them or where the settings want it."""
     average = EMAModel(parameters, decay=settings.ema, use_ema_warmup=True)
-    average.to("cpu" if settings.ema_device == "cpu" else device)
+    if settings.ema_device == "cpu":
+        average.to("cpu")
     return average
 
 

@@ -37,14 +37,17 @@ def sharding_plugin(precision: str) -> FullyShardedDataParallelPlugin | None:
         return None
     if os.environ.get("FSDP_VERSION", "1") != "2":
         raise PersistError("--use_fsdp: only FSDP2 is supported; add --fsdp_version 2 to accelerate launch")
-    from torch.distributed.fsdp import MixedPrecisionPolicy
+    from torch.distributed.fsdp import CPUOffloadPolicy, MixedPrecisionPolicy
 
     half = MixedPrecisionPolicy(torch.bfloat16, torch.float32, cast_forward_inputs=False)
-    return FullyShardedDataParallelPlugin(
+    plugin = FullyShardedDataParallelPlugin(
         fsdp_version=2,
         mixed_precision_policy=half if precision == "bf16" else None,
         cpu_ram_efficient_loading=False,  # every process reads the weights itself
     )
+    if isinstance(plugin.cpu_offload, CPUOffloadPolicy) and not torch.cuda.is_available():
+        plugin.cpu_offload = CPUOffloadPolicy(pin_memory=False)  # there is nothing to pin it for
+    return plugin
 
 
 def shard_on_cpus(plugin: FullyShardedDataParallelPlugin | None) -> None:

@@ -93,7 +93,7 @@ class Trainer:
         self.model, self.optimizer = accelerator.prepare(backbone, optimizer)
         if self.sharding is not None:
             parameters = self.sharding.parameters()
-        average = make_average(parameters.values(), settings, accelerator.device) if settings.ema else None
+        average = make_average(parameters.values(), settings) if settings.ema else None
         moments: Any = optimizer.state
         if uses_zero(accelerator):
             moments = ZeroState(self.optimizer.optimizer, [*parameters.values()])
