@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
-from persist_cli.doctor.changes import Strategy, changes_of, smallest
+from persist_cli.doctor.changes import OFFLOADED, SHARDED, STAGE2, Strategy, changes_of, smallest
 from persist_cli.doctor.dry_run import dry_run
 from persist_cli.doctor.machine import GIB, Machine
 from persist_cli.doctor.need import Estimator, Launch, Need
-from persist_cli.doctor.planned import Planned, plan, plan_recipe
+from persist_cli.doctor.planned import Planned, plan, plan_recipe, plan_stage2
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
-from persist_cli.viewing.console import print_json, print_table, say
+from persist_cli.training.sharding import check_sharded
+from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import PersistError
 
 COLUMNS: Final = ("weights", "gradients", "optimizer", "average", "encoding", "activations", "update", "peak")
@@ -20,8 +24,16 @@ COLUMNS: Final = ("weights", "gradients", "optimizer", "average", "encoding", "a
 
 @dataclass(frozen=True)
 class Finding:
-    """What a strategy needs."""
+    """What a strategy needs.
 
+    Args:
+        recipe: by name.
+        strategy: changes of it.
+        need: of one device.
+        fits: whether it has that.
+    """
+
+    recipe: str
     strategy: Strategy
     need: Need
     fits: bool
@@ -34,10 +46,12 @@ class Doctor:
         planned: the recipe with its backbone.
         machine: to train on.
         sharded: whether FSDP2 is used anyway.
+        stage2: the plan of a stage 2 on this stage 1, to compare with.
     """
 
-    def __init__(self, planned: Planned, machine: Machine, sharded: bool) -> None:
+    def __init__(self, planned: Planned, machine: Machine, sharded: bool, stage2: Planned | None = None) -> None:
         self.planned, self.machine, self.sharded = planned, machine, sharded
+        self.stage2 = stage2
         self.estimators = {planned.recipe.lora: Estimator(planned.backbone, planned.channels)}
         self.changes = changes_of(planned.recipe, machine, sharded)
 
@@ -45,7 +59,7 @@ class Doctor:
         """What the recipe needs with these changes."""
         recipe, launch = self.changed(strategy), self.launch(strategy)
         need = self.estimator(recipe).need(recipe, launch)
-        return Finding(strategy, need, need.peak <= self.machine.usable)
+        return Finding(self.planned.name, strategy, need, need.peak <= self.machine.usable)
 
     def fits(self, strategy: Strategy) -> bool:
         """Whether these changes suffice."""
@@ -55,12 +69,13 @@ class Doctor:
 
     def launch(self, strategy: Strategy) -> Launch:
         """How the processes share the work."""
-        return Launch(self.machine.devices, self.machine.kind == "cuda", self.sharded or strategy.sharded)
+        sharded, offloaded = self.sharded or strategy.sharded, OFFLOADED in strategy.flags
+        return Launch(self.machine.devices, self.machine.kind == "cuda", sharded, offloaded)
 
     def estimator(self, recipe: Recipe) -> Estimator:
         """That of the recipe's parameters, which LoRA changes."""
         if recipe.lora not in self.estimators:
-            other = plan(recipe, self.planned.base)
+            other = plan(self.planned.name, recipe, self.planned.base)
             self.estimators[recipe.lora] = Estimator(other.backbone, other.channels)
         return self.estimators[recipe.lora]
 
@@ -69,9 +84,16 @@ class Doctor:
         return make_recipe(apply_overrides(to_plain(self.planned.recipe), strategy.settings), strategy.name)
 
     def each(self) -> list[Finding]:
-        """The recipe as it is, and with each change alone."""
-        alone = [Strategy(), *(Strategy((change,)) for change in self.changes)]
-        return [self.examine(strategy) for strategy in alone]
+        """The recipe as it is, with each change alone, and stage 2 as its own recipe is."""
+        works = [partial(self.examine, Strategy((change,) if change else ())) for change in (None, *self.changes)]
+        if self.stage2 is not None:
+            works.append(partial(self.examine_stage2, self.stage2))
+        return [work() for work in watched(works, "each alone", "strategy")]
+
+    def examine_stage2(self, planned: Planned) -> Finding:
+        """What a stage 2 needs."""
+        found = Doctor(planned, self.machine, self.sharded).examine(Strategy())
+        return dataclasses.replace(found, strategy=STAGE2)
 
     def smallest(self) -> Finding | None:
         """What fits with the smallest changes, ``None`` when nothing does."""
@@ -88,10 +110,13 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     if sharded and machine.devices == 1:
         raise PersistError("--fsdp shares a model out over several GPUs; give --gpus N too")
     planned = plan_recipe(name, overrides)
-    doctor = Doctor(planned, machine, sharded)
+    if sharded:
+        planned.backbone.trained_parameters(planned.recipe.stage)
+        check_sharded(planned.recipe, planned.backbone)
+    doctor = Doctor(planned, machine, sharded, plan_stage2(planned, overrides))
     parts, found, best = dry_run(planned), doctor.each(), doctor.smallest()
     if json:
-        print_json(_record(name, machine, parts, found, best))
+        print_json(_record(machine, parts, found, best))
         return
     rows = [
         [part["name"], f"{part['parameters']:,}", _gib(part["bytes"])] for part in [*parts["parts"], parts["total"]]
@@ -99,35 +124,38 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     print_table(f"{name}: stage {planned.recipe.stage}", ("part", "parameters", "GiB"), rows)
     title = f"GiB on each of {machine}, of which {_gib(machine.usable)} are planned with"
     print_table(title, ("strategy", *COLUMNS, "fits"), [_row(each) for each in found])
-    say(_verdict(name, overrides, machine, found[0], best))
+    say(_verdict(doctor, overrides, best))
 
 
-def _verdict(name: str, overrides: Sequence[str], machine: Machine, plain: Finding, best: Finding | None) -> str:
+def _verdict(doctor: Doctor, overrides: Sequence[str], best: Finding | None) -> str:
+    machine = doctor.machine
     if best is None:
         return f"does not fit on {machine}, whatever is changed; take more or larger devices, or smaller clips"
     need = f"{_gib(best.need.peak)} of {_gib(machine.usable)} GiB"
+    if best.need.host:
+        need += f", and {_gib(best.need.host)} GiB of the memory of the CPU"
     if not best.strategy.changes:
         return f"fits as it is: {need}"
-    line = command(name, [*overrides, *best.strategy.settings], best, machine)
-    return f"fits with {best.strategy.name} ({need}):\n{line}"
+    return f"fits with {best.strategy.name} ({need}):\n{command(doctor, overrides, best.strategy)}"
 
 
-def command(name: str, settings: Sequence[str], best: Finding, machine: Machine) -> str:
-    """How to start the training like that."""
-    finetune = " ".join(["finetune", name, "--data DATA", *settings])
-    if machine.devices == 1:
+def command(doctor: Doctor, overrides: Sequence[str], strategy: Strategy) -> str:
+    """How to start the training like that, for a shell."""
+    settings = [shlex.quote(each) for each in (*overrides, *strategy.settings)]
+    finetune = " ".join(["finetune", shlex.quote(doctor.planned.name), "--data DATA", *settings])
+    flags = list(dict.fromkeys([SHARDED, *strategy.flags])) if doctor.sharded else strategy.flags
+    devices = doctor.machine.devices
+    if devices == 1 and not flags:
         return f"persist {finetune}"
-    flags = " --use_fsdp --fsdp_version 2" if best.strategy.sharded else " --multi_gpu"
-    return f"accelerate launch --num_processes {machine.devices}{flags} --module persist_cli {finetune}"
+    kind = " ".join(flags or ["--multi_gpu"])
+    return f"accelerate launch --num_processes {devices} {kind} --module persist_cli {finetune}"
 
 
-def _record(
-    name: str, machine: Machine, parts: dict[str, Any], found: Sequence[Finding], best: Finding | None
-) -> dict[str, Any]:
+def _record(machine: Machine, parts: dict[str, Any], found: Sequence[Finding], best: Finding | None) -> dict[str, Any]:
     for part in parts["parts"]:
         del part["shapes"]
     return {
-        "recipe": name,
+        "recipe": found[0].recipe,
         "machine": {
             "kind": machine.kind, "devices": machine.devices, "memory": machine.memory, "usable": machine.usable,
         },
@@ -141,8 +169,9 @@ def _record(
 def _finding(found: Finding) -> dict[str, Any]:
     return {
         "name": found.strategy.name,
+        "recipe": found.recipe,
         "settings": found.strategy.settings,
-        "fsdp": found.strategy.sharded,
+        "launch": found.strategy.flags,
         "need": found.need.to_json(),
         "fits": found.fits,
     }

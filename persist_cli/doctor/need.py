@@ -29,11 +29,18 @@ class Launch:
         devices: processes, a device each.
         cuda: whether they are GPUs.
         sharded: FSDP2; else each has the whole model.
+        offloaded: sharded, and each share rests in the memory of the CPU, where the optimizer works too.
     """
 
     devices: int
     cuda: bool
     sharded: bool = False
+    offloaded: bool = False
+
+    @property
+    def share(self) -> float:
+        """Of what is sharded, the part that rests on one device."""
+        return 0.0 if self.offloaded else 1 / self.devices if self.sharded else 1.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,7 @@ class Need:
         encoding: of the codec.
         activations: in forward and backward pass, most at once.
         shallow: of these, what is left when all gradients are there.
+        host: beside the device, in the memory of the CPU, for all processes together.
     """
 
     weights: int
@@ -62,6 +70,7 @@ class Need:
     average: int
     update: int
     kept: bool
+    host: int
     encoding: int = 0
     activations: int = 0
     shallow: int = 0
@@ -110,7 +119,7 @@ class Estimator:
         training = recipe.training
         trained = [each.numel() for each in self.backbone.trained_parameters(recipe.stage).values()]
         count, largest = sum(trained), max(trained, default=0)
-        share = 1 / launch.devices if launch.sharded else 1.0
+        share = launch.share
         buckets = 2 if launch.devices > 1 and not launch.sharded else 1
         averaged = training.ema and not (launch.cuda and training.ema_device == "cpu")
         at_once = count * share if launch.cuda and training.optimizer == "adamw" else 2 * largest * share
@@ -121,7 +130,17 @@ class Estimator:
             average=round(count * FLOAT32 * share) if averaged else 0,
             update=round(at_once * FLOAT32),  # torch takes roots of all second moments at once on a GPU
             kept=training.accumulation > 1,
+            host=self.host(recipe, launch, count),
         )
+
+    def host(self, recipe: Recipe, launch: Launch, count: int) -> int:
+        """Bytes of what is trained that rest in the memory of the CPU, where the devices are others."""
+        training = recipe.training
+        averages = count * FLOAT32 if training.ema else 0
+        if launch.offloaded:
+            return self.weights_of(recipe)[1] + round(count * (FLOAT32 + MOMENTS[training.optimizer])) + averages
+        apart = launch.cuda and training.ema_device == "cpu"
+        return averages * (1 if launch.sharded else launch.devices) if apart else 0
 
     def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
         """What encoding takes in a step of this kind."""
@@ -140,28 +159,36 @@ class Estimator:
         return self._steps[key]
 
     def weights(self, recipe: Recipe, launch: Launch) -> int:
-        """Bytes of parameters, those that are not trained in their own precision, and buffers.
+        """Bytes of parameters and buffers.
 
         With FSDP those of this process and what it gathers at once: two blocks, one of them with the gradients that
         go out in float32, and all that stands in no block.
         """
+        whole, shared = self.weights_of(recipe)
+        gathered = self.gathered(recipe) if launch.sharded else 0
+        buffers = sum(each.numel() * each.element_size() for each in self.backbone.buffers())
+        return whole + buffers + round(shared * launch.share) + gathered
+
+    def weights_of(self, recipe: Recipe) -> tuple[int, int]:
+        """Bytes of the parameters that FSDP leaves whole, and of the rest; the frozen ones in their own precision."""
         backbone, frozen = self.backbone, HALF if recipe.training.frozen_precision == "bf16" else FLOAT32
         trained = {id(each) for each in backbone.trained_parameters(recipe.stage).values()}
 
         def size(parameters: list[nn.Parameter]) -> int:
             return sum(each.numel() * (FLOAT32 if id(each) in trained else frozen) for each in parameters)
 
-        parameters = list(backbone.parameters())
-        buffers = sum(each.numel() * each.element_size() for each in backbone.buffers())
-        if not launch.sharded:
-            return size(parameters) + buffers
-        whole = [each for name in backbone.kept_whole for each in backbone.get_submodule(name).parameters()]
+        whole = self.kept_whole()
         kept = {id(each) for each in whole}
-        shared = [each for each in parameters if id(each) not in kept]
-        return size(whole) + buffers + size(shared) // launch.devices + self.gathered(recipe, kept)
+        return size(whole), size([each for each in backbone.parameters() if id(each) not in kept])
 
-    def gathered(self, recipe: Recipe, kept: set[int]) -> int:
+    def kept_whole(self) -> list[nn.Parameter]:
+        """The parameters that are never sharded."""
+        backbone = self.backbone
+        return [each for name in backbone.kept_whole for each in backbone.get_submodule(name).parameters()]
+
+    def gathered(self, recipe: Recipe) -> int:
         """Bytes that FSDP puts together at once."""
+        kept = {id(each) for each in self.kept_whole()}
         width = HALF if recipe.training.precision == "bf16" else FLOAT32
         blocks = [each for each in self.backbone.modules() if type(each).__name__ in self.backbone.sharded_blocks]
         sizes = [sum(each.numel() for each in block.parameters()) for block in blocks]

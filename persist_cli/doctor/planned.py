@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 
 from persist_cli.checkpoints import Checkpoint, find_checkpoint, start_backbone
 from persist_cli.memorizing.recall import MemoryMaker
-from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe
+from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import warn
 from persist_cli.world.backbone import Backbone
 
@@ -20,12 +21,14 @@ class Planned:
     """A recipe and the backbone that it trains.
 
     Args:
+        name: of the recipe, or its file.
         recipe: of the run.
         backbone: on the meta device, with the adapter to train in use in stage 2.
         channels: of the memory's features; ``None`` without a memory.
         base: what the run starts from, where that is there.
     """
 
+    name: str
     recipe: Recipe
     backbone: Backbone
     channels: int | None
@@ -44,10 +47,24 @@ def plan_recipe(name: str, overrides: Sequence[str]) -> Planned:
     base = find_checkpoint(Path(recipe.base)) if recipe.base and Path(recipe.base).exists() else None
     if recipe.base and base is None:
         warn(f"{recipe.base}: no base there yet; planned with the backbone settings of {name} and their defaults")
-    return plan(recipe, base)
+    return plan(name, recipe, base)
 
 
-def plan(recipe: Recipe, base: Checkpoint | None) -> Planned:
+def plan_stage2(planned: Planned, overrides: Sequence[str]) -> Planned | None:
+    """The plan of the voxel memory's recipe on a stage-1 recipe, ``None`` where none comes with persist.
+
+    Args:
+        planned: what it stands on.
+        overrides: of that, which hold for it too.
+    """
+    name = re.sub("-stage1(-lora)?$", "-stage2-voxel", planned.name)
+    if name == planned.name or name not in recipe_names():
+        return None
+    values = apply_overrides(read_recipe(name), [*overrides, "lora=null", f"base={planned.name}"])
+    return plan(name, make_recipe(values, name), None)
+
+
+def plan(name: str, recipe: Recipe, base: Checkpoint | None) -> Planned:
     """The plan of a recipe on its base, where there is one."""
     channels = None
     with torch.device("meta"):
@@ -57,4 +74,4 @@ def plan(recipe: Recipe, base: Checkpoint | None) -> Planned:
         if recipe.memory is not None:
             channels = MemoryMaker.of(recipe.memory).encoder.planned_channels
             backbone.add_adapter(recipe.memory.name, channels, recipe.adapter)
-    return Planned(recipe, backbone, channels, base)
+    return Planned(name, recipe, backbone, channels, base)

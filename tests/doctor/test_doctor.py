@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import functools
 import json
+import shlex
 
 import pytest
 import torch
 
 from persist_backbones.rotary import _fitted
-from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, Strategy
-from persist_cli.doctor.command import Doctor, Finding, command
+from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
+from persist_cli.doctor.command import Doctor, command
 from persist_cli.doctor.machine import GIB, Machine
 from persist_cli.doctor.need import Estimator, Launch
 from persist_cli.doctor.planned import plan_recipe
 from persist_cli.doctor.step import Encoding, StepKind, Twins
 from persist_cli.doctor.tracing import LiveBytes, imagined
+from persist_cli.training.sharding import check_sharded
 from tests.walking import MICRO_SETTINGS
 
 MICRO = [*MICRO_SETTINGS, "base=null"]
@@ -73,6 +75,39 @@ def test_fsdp_shares_out_what_is_trained():
         assert shared.to_json()[name] == pytest.approx(whole.to_json()[name] / 8, abs=8)
 
 
+def test_what_is_offloaded_rests_in_the_memory_of_the_cpu_but_what_is_never_sharded():
+    shared, offloaded = (need(launch=Launch(2, True, True, offloaded)) for offloaded in (False, True))
+    assert (offloaded.gradients, offloaded.optimizer, offloaded.average, offloaded.update) == (0, 0, 0, 0)
+    assert offloaded.activations == shared.activations
+    codec = sum(each.nbytes for each in estimator().backbone.get_submodule("codec").parameters())
+    assert codec < offloaded.weights < shared.weights
+    trained = sum(each.nbytes for each in estimator().backbone.trained_parameters("1").values())
+    assert offloaded.host == 5 * trained  # weights, gradients, two moments, average
+    assert shared.host == 0
+
+
+def test_an_average_on_the_cpu_is_there_once_a_process_or_in_shares():
+    average = "training.ema_device=cpu"
+    trained = sum(each.nbytes for each in estimator().backbone.trained_parameters("1").values())
+    assert need(average, launch=Launch(2, True)).host == 2 * trained
+    assert need(average, launch=Launch(2, True, sharded=True)).host == trained
+
+
+@pytest.mark.parametrize(
+    ("recipe", "settings", "sharded"),
+    [("tiny-stage1", [], False), ("tiny-stage1", [], True), ("tiny-stage2-voxel", [], False),
+     *[("tiny-stage1", [f"training.{each}"], False) for each in ("frozen_precision=bf16", "optimizer=adamw-8bit")]],
+)  # fmt: skip
+def test_no_strategy_is_refused_by_the_training_that_it_is_for(recipe, settings, sharded):
+    plan = planned(*settings, "base=nowhere", recipe=recipe)
+    doctor = Doctor(plan, Machine("cuda", 2, 1), sharded)
+    plan.backbone.trained_parameters(plan.recipe.stage)
+    together = [each for each in strategies(doctor.changes) if doctor.launch(each).sharded]
+    assert bool(together) is (not settings)
+    for strategy in together:
+        check_sharded(doctor.changed(strategy), plan.backbone)
+
+
 def test_the_smallest_change_that_is_reported_fits_when_it_is_made(persist):
     plain = need().peak
     settings = [*MICRO, *SMALL, "--gpu-memory", str(plain * 0.8 / GIB)]
@@ -95,11 +130,23 @@ def test_no_smaller_set_of_changes_would_have_fitted():
 def test_what_is_said_can_be_run():
     doctor = Doctor(planned(), Machine("cuda", 2, 1), sharded=False)
     strategy = Strategy((FROZEN, CHECKPOINTING, EIGHT_BIT))
-    line = command("tiny-stage1", [*SMALL, *strategy.settings], Finding(strategy, need(), True), doctor.machine)
+    line = command(doctor, [*MICRO, *SMALL], strategy)
     assert line.startswith("accelerate launch --num_processes 2 --multi_gpu --module persist_cli finetune tiny-stage1 ")
-    assert (
-        plan_recipe("tiny-stage1", [word for word in line.split() if "=" in word]).recipe.training.optimizer != "adamw"
-    )
+    settings = [word for word in shlex.split(line) if "=" in word]
+    assert plan_recipe("tiny-stage1", settings).recipe == doctor.changed(strategy)
+    for sharded, machine in ((True, Machine("cuda", 2, 1)), (False, Machine("cuda", 1, 1))):
+        line = command(Doctor(planned(), machine, sharded), [], Strategy((OFFLOAD,)))
+        flags = "--use_fsdp --fsdp_version 2 --fsdp_offload_params true"
+        assert f"--num_processes {machine.devices} {flags} --module" in line
+
+
+def test_a_plan_of_stage_1_is_beside_that_of_the_stage_2_that_stands_on_it(persist):
+    settings = [*MICRO, *SMALL, "base=nowhere", "--gpus", "1", "--gpu-memory", "1", "--json"]
+    found = {name: json.loads(persist("doctor", name, *settings).out) for name in ("tiny-stage1", "tiny-stage2-voxel")}
+    last = found["tiny-stage1"]["strategies"][-1]
+    assert (last["name"], last["recipe"]) == ("stage 2 only", "tiny-stage2-voxel")
+    assert last["need"] == found["tiny-stage2-voxel"]["strategies"][0]["need"]
+    assert not any(each["name"] == "stage 2 only" for each in found["tiny-stage2-voxel"]["strategies"])
 
 
 def test_every_form_of_memory_can_be_estimated():
@@ -128,7 +175,8 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
 @pytest.mark.parametrize(
     ("options", "cause"),
     [(["--gpus", "8"], "give --gpu-memory GB"), (["--gpu-memory", "80", "--fsdp"], "give --gpus N too"),
-     (["training.stpes=1"], "did you mean 'training.steps'")],
+     (["training.stpes=1"], "did you mean 'training.steps'"),
+     (["--gpus", "2", "--gpu-memory", "80", "--fsdp", "training.optimizer=adamw-8bit"], "is not sharded; use adamw")],
 )  # fmt: skip
 def test_what_cannot_be_planned_is_one_line(persist, options, cause):
     if torch.cuda.is_available() and "--gpu-memory" not in options and "--gpus" in options:

@@ -66,6 +66,7 @@ def runs(walks, codec, stage1, tmp_path_factory):
     first += [job(*of("stage1", f"{kind}-parts", "training.steps=1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-cheap", *CHEAP), **how) for kind, how in KINDS.items()]
     first.append(job(*of("stage1", "fsdp-lora", *low_rank), **FSDP))
+    first.append(job(*of("stage1", "fsdp-offloaded", BF16), **FSDP, FSDP_OFFLOAD_PARAMS="true"))
     cached = [FEW, "--cache", str(folder / "cache")]
     first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
     wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
@@ -121,6 +122,8 @@ def test_bf16_is_as_near_to_one_process_sharded_as_not(runs):
     assert ddp == pytest.approx(exact, rel=1e-2)
     assert fsdp == pytest.approx(ddp, rel=2e-3)
     weights = saved_model(runs / "fsdp-bf16")
+    assert losses(runs / "fsdp-offloaded") == fsdp
+    assert furthest(saved_model(runs / "fsdp-offloaded"), weights) == 0
     assert {each.dtype for each in weights.values()} == {torch.float32}
 
 
