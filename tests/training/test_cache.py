@@ -253,6 +253,13 @@ def test_a_full_cache_says_so_once_and_the_run_goes_on(persist, walks, codec, tm
     assert 0 < sum(sizes) <= 1e4
 
 
+def test_two_writers_keep_to_one_bound(tmp_path):
+    writers = [Cache(CacheSettings(tmp_path, 1e-4)) for _ in range(2)]
+    for number in range(60):
+        writers[number % 2].put(f"{number:040}", {"a": torch.ones(1000)})
+    assert 0.9e5 < sum(path.stat().st_size for path in entries(tmp_path)) <= 1e5
+
+
 def test_what_cannot_be_cached_is_one_line(persist, walks, codec, tmp_path):
     (tmp_path / "file").write_text("")
     cache = ["--cache", tmp_path / "cache"]

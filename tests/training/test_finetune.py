@@ -10,6 +10,7 @@ import torch
 
 from persist_cli.checkpoints import find_checkpoint
 from persist_cli.training.trainer import Trainer
+from persist_cli.world.files import read_tensors
 from tests.disk import file_limit
 from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, losses, stage, train_here
 
@@ -67,6 +68,19 @@ def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
     found = losses(tmp_path / "run")
     assert sum(found[-10:]) < 0.9 * sum(found[:10])
+
+
+def test_the_saved_weights_are_the_moving_average_of_those_after_each_step(persist, walks, codec, tmp_path):
+    states = []
+    for changes in (["training.steps=1"], ["training.steps=2", "--resume"]):
+        assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)).code == 0
+        states.append(end_of(tmp_path / "run")[0])
+    model = next((tmp_path / "run").glob("step-*")) / "model/transformer/diffusion_pytorch_model.safetensors"
+    kept = 2 ** (-2 / 3)  # what is new weighs so much in the second step of diffusers' warm-up
+    for name, saved in read_tensors(model)[0].items():
+        first, second = (state[f"parameter/transformer.base.{name}"] for state in states)
+        assert torch.allclose(saved, first + kept * (second - first), atol=1e-7)
+    assert not torch.equal(first, second)
 
 
 SIX = ["training.checkpoint_every=1", "training.steps=6"]
