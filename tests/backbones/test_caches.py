@@ -66,6 +66,18 @@ def test_a_cache_changes_the_clip_and_keeps_nothing_for_the_next(name):
 
 
 @EVERY
+def test_a_clip_that_is_broken_off_leaves_nothing_for_the_next(name):
+    backbone, left = trained(), [None] * 7  # two predictions a step
+    backbone.transformer.enable_cache(BUSY[name]())
+    whole = backbone.generate(CLIPS, SAMPLING)
+    breaking = backbone.transformer.register_forward_pre_hook(lambda *_: left.pop())
+    with pytest.raises(IndexError):
+        backbone.generate(CLIPS, SAMPLING)
+    breaking.remove()
+    assert equal(backbone.generate(CLIPS, SAMPLING), whole)
+
+
+@EVERY
 def test_what_is_cached_without_memory_is_not_mixed_with_what_is_cached_with_it(name):
     backbone = trained()
     backbone.transformer.enable_cache(BUSY[name]())
