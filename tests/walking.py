@@ -8,7 +8,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,12 @@ def together(*arguments: str) -> None:
 def end_of(run: Path) -> tuple[dict[str, torch.Tensor], str]:
     """All that a run came to: its newest training state and its log."""
     return read_tensors(max(run.glob("step-*")) / "training.safetensors")[0], (run / "log.jsonl").read_text()
+
+
+def first_gradients(state: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """All gradients of a run's first step, of the training state after it."""
+    moments = [each.flatten() for name, each in state.items() if "exp_avg/" in name]
+    return torch.cat(moments) / 0.1  # AdamW's first moments begin with so much of them
 
 
 def losses(run: Path) -> list[float]:

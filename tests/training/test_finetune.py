@@ -12,7 +12,7 @@ from persist_cli.checkpoints import find_checkpoint
 from persist_cli.training.trainer import Trainer
 from persist_cli.world.files import read_tensors
 from tests.disk import file_limit
-from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, losses, stage, train_here
+from tests.walking import MICRO_SETTINGS, PERSIST, end_of, ended_alike, first_gradients, losses, stage, train_here
 
 
 def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
@@ -61,6 +61,12 @@ def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_pat
     assert all(torch.allclose(whole[name], parted[name], rtol=1e-3, atol=1e-6) for name in moments)
     differences = [(whole[name] - parted[name]).flatten() for name in whole if name.startswith("parameter/")]
     assert torch.cat(differences).abs().mean() < 1e-2 * 4e-4  # a hundredth of a step
+
+
+def test_gradients_are_clipped_by_the_norm_of_all_of_them(persist, walks, codec, tmp_path):
+    changes = [f"base={codec}", "training.steps=1", "training.clip=0.001"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
+    assert first_gradients(end_of(tmp_path / "run")[0]).norm() == pytest.approx(0.001, rel=1e-3)
 
 
 def test_training_lowers_the_loss(persist, walks, codec, tmp_path):

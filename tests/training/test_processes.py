@@ -18,15 +18,22 @@ from persist_cli.training.shards import read_shards
 from persist_cli.world.files import read_tensors
 from tests.training.pair import job, run_pair
 from tests.training.test_cache import FEW, found
-from tests.walking import MICRO_SETTINGS, end_of, ended_alike, in_two, losses, stage, train_here
+from tests.walking import MICRO_SETTINGS, end_of, ended_alike, first_gradients, in_two, losses, stage, train_here
 
 FSDP = {"ACCELERATE_USE_FSDP": "true", "FSDP_VERSION": "2"}
 KINDS = {"ddp": {}, "fsdp": FSDP}
 BATCH = "training.batch=4"
+CLIP = 0.01  # less than the norm of any step's gradients here
 NEAR = 2e-5  # of weights, which four steps of these learning rates can move by 1.4e-3
 BF16 = "training.precision=bf16"
 PATIENCE = 300  # seconds, on a machine that has other things to do
 CHEAP = ["training.gradient_checkpointing=true", "training.frozen_precision=bf16", "training.ema_device=cpu", BF16]
+
+
+def sharded_state(run: Path) -> dict[str, torch.Tensor]:
+    """The training state of a run's newest checkpoint, of the parts of all processes."""
+    folder = max(run.glob("step-*")) / "training"
+    return read_shards(folder, lambda _, shape, dtype: torch.empty(shape, dtype=dtype))
 
 
 def saved_model(run: Path) -> dict[str, torch.Tensor]:
@@ -45,7 +52,8 @@ def begun(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[...,
     """What makes a run's command line, with both stages trained by one process as ``one-1`` and ``one-2``."""
 
     def of(number: str, name: str, *changes: str) -> list[str]:
-        return stage(number, walks, folder / name, f"base={codec if number == 'stage1' else stage1}", BATCH, *changes)
+        base = f"base={codec if number == 'stage1' else stage1}"
+        return stage(number, walks, folder / name, base, BATCH, f"training.clip={CLIP}", *changes)
 
     train_here(*of("stage1", "one-1"))
     train_here(*of("stage2-voxel", "one-2"))
@@ -108,8 +116,11 @@ def test_a_sharded_checkpoint_is_a_file_a_process_with_its_half_and_no_pickle(ru
     assert max(sizes) < 0.6 * sum(sizes)
     kinds = {path.suffix for path in step.rglob("*") if path.is_file()}
     assert kinds == {".safetensors", ".json", ".yaml"}
-    whole = read_shards(step / "training", lambda _, shape, dtype: torch.empty(shape, dtype=dtype))
-    assert whole.keys() == end_of(runs / "one-1")[0].keys()
+    assert sharded_state(runs / "fsdp-1").keys() == end_of(runs / "one-1")[0].keys()
+
+
+def test_sharded_gradients_are_clipped_by_the_norm_of_all_of_them(runs):
+    assert first_gradients(sharded_state(runs / "fsdp-first")).norm() == pytest.approx(CLIP, rel=1e-3)
 
 
 def test_a_sharded_run_saves_the_model_that_others_load(runs):
@@ -148,9 +159,9 @@ def test_processes_share_a_cache_that_one_alone_finds_whole(runs):
     assert found(runs / "cold-few") < 1
 
 
-def test_a_missing_or_damaged_part_of_a_checkpoint_is_one_line(persist, walks, codec, runs):
-    run = runs / "fsdp-first"
-    arguments = stage("stage1", walks, run, f"base={codec}", BATCH, "--resume")
+def test_a_missing_or_damaged_part_of_a_checkpoint_is_one_line(persist, walks, codec, runs, tmp_path):
+    run = shutil.copytree(runs / "fsdp-first", tmp_path / "run")
+    arguments = stage("stage1", walks, run, f"base={codec}", BATCH, f"training.clip={CLIP}", "--resume")
     part = min(next(run.glob("step-*")).glob("training/*.safetensors"))
     content = part.read_bytes()
     for left, cause in (
