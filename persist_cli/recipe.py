@@ -18,8 +18,7 @@ from persist_cli.world.settings import parse_settings
 from persist_cli.world.stages import Lora, Stage
 
 EXTENDS = "extends"
-MERGED = {"backbone", "data", "lora", "training"}
-KINDS = {"memory": "name", "adapter": "form"}  # merged too, unless this is given: settings mean nothing to another kind
+KINDS = {"backbone": "name", "memory": "name", "adapter": "form"}  # settings of one mean nothing to another
 
 
 @dataclass(frozen=True)
@@ -114,8 +113,8 @@ def recipe_names() -> list[str]:
 def read_recipe(name: str) -> dict[str, Any]:
     """Plain values of a recipe by name, or of a YAML file, with those of the recipe that it ``extends``.
 
-    Of ``backbone``, ``data``, ``lora`` and ``training`` it need only say what is different, and of a ``memory`` or
-    ``adapter`` of which it gives no ``name`` or ``form``; every other key stands for itself.
+    It need only say what is different, key by key inside mappings too. A ``backbone``, ``memory``, ``adapter`` or
+    encoder that it names begins without the settings of the one before.
 
     Raises:
         RecipeError: when one of them is unknown or no YAML mapping, and when they extend each other.
@@ -135,14 +134,15 @@ def _read_extended(name: str, readers: tuple[str, ...]) -> dict[str, Any]:
     if _is_file(name) and _is_file(extended):
         extended = str(Path(name).parent / extended)
     merged = _read_extended(extended, (*readers, name))
-    for key, value in values.items():
-        mappings = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = merged[key] | value if mappings and _adds_to(key, value) else value
-    return merged
+    return merged | {key: _merged(key, merged.get(key), value) for key, value in values.items()}
 
 
-def _adds_to(key: str, value: dict[str, Any]) -> bool:
-    return key in MERGED or (key in KINDS and KINDS[key] not in value)
+def _merged(key: str, before: Any, value: Any) -> Any:
+    """The value, with what it does not say taken from the one before where both are mappings."""
+    if not isinstance(before, dict) or not isinstance(value, dict) or KINDS.get(key) in value:
+        return value
+    kept = {name: each for name, each in before.items() if name != "encoder_settings" or "encoder" not in value}
+    return kept | {name: _merged(name, kept.get(name), each) for name, each in value.items()}
 
 
 def _recipe_text(name: str) -> str:

@@ -90,6 +90,24 @@ def test_a_recipe_changes_the_memory_and_adapter_it_extends_unless_it_names_anot
     assert found["memory"] == extended["memory"] | {"encoder": "dinov2"}
 
 
+def test_a_recipe_changes_one_setting_of_the_backbone_and_keeps_the_others(tmp_path):
+    (tmp_path / "a.yaml").write_text(
+        "extends: cogvideox-5b-i2v-stage1\nbackbone: {settings: {pretrained: DIR, transformer: {num_layers: 2}}}\n"
+    )
+    (tmp_path / "b.yaml").write_text("extends: a.yaml\nbackbone: {settings: {transformer: {dropout: 0.1}}}\n")
+    names = (str(tmp_path / "b.yaml"), "cogvideox-5b-i2v-stage1")
+    found, extended = (make_recipe(read_recipe(name), name) for name in names)
+    changed = {"pretrained": "DIR", "transformer": {"num_layers": 2, "dropout": 0.1}}
+    assert found.backbone.settings == extended.backbone.settings | changed
+
+
+def test_an_encoder_that_is_named_begins_without_the_settings_of_the_one_before(tmp_path):
+    (tmp_path / "a.yaml").write_text("extends: cogvideox-5b-i2v-stage2-voxel\nmemory: {encoder: patches}\n")
+    found, extended = read_recipe(str(tmp_path / "a.yaml"))["memory"], read_recipe("cogvideox-5b-i2v-stage2-voxel")
+    assert "encoder_settings" in extended["memory"]
+    assert found == {"name": "voxel", "encoder": "patches"}
+
+
 def test_a_recipe_cannot_extend_itself_nor_what_there_is_not(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: b.yaml")
     (tmp_path / "b.yaml").write_text("extends: a.yaml")
