@@ -1,4 +1,4 @@
-"""What a process of a run says when another one is gone."""
+"""Processes of one run: what CPUs may do that accelerate leaves to GPUs, and what one says when another is gone."""
 
 from __future__ import annotations
 
@@ -6,11 +6,24 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from accelerate import PartialState
+from accelerate import DistributedType, PartialState
+from accelerate.state import AcceleratorState
 from torch import distributed
 
 from persist_cli.checkpoints import step_folders
 from persist_cli.world.errors import PersistError
+
+
+def on_cpus_too(kind: DistributedType) -> AcceleratorState | None:
+    """The state of processes on CPUs, which then work in this way; ``None`` where they do not work on CPUs.
+
+    torch and DeepSpeed do there what accelerate would put DDP in the place of.
+    """
+    state = AcceleratorState()
+    if state.distributed_type != DistributedType.MULTI_CPU:
+        return None
+    state.distributed_type = PartialState._shared_state["distributed_type"] = kind
+    return state
 
 
 @contextlib.contextmanager

@@ -13,11 +13,11 @@ from collections.abc import Iterator, Mapping
 
 import torch
 from accelerate import Accelerator, DistributedType
-from accelerate.state import AcceleratorState, PartialState
 from accelerate.utils import FullyShardedDataParallelPlugin
 from torch import Tensor, nn
 
 from persist_cli.recipe import Recipe
+from persist_cli.training.processes import on_cpus_too
 from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError
 
@@ -51,11 +51,10 @@ def sharding_plugin(precision: str) -> FullyShardedDataParallelPlugin | None:
 
 
 def shard_on_cpus(plugin: FullyShardedDataParallelPlugin | None) -> None:
-    """Let processes on CPUs shard as well: torch does it there, accelerate would give them DDP instead."""
-    state = AcceleratorState()
-    if plugin is not None and state.distributed_type == DistributedType.MULTI_CPU:
-        state.distributed_type, state.fsdp_plugin = DistributedType.FSDP, plugin
-        PartialState._shared_state["distributed_type"] = DistributedType.FSDP
+    """Let processes on CPUs shard as well, where a plugin asks for it."""
+    state = on_cpus_too(DistributedType.FSDP) if plugin is not None else None
+    if state is not None:
+        state.fsdp_plugin = plugin
 
 
 def is_sharded(parameter: Tensor) -> bool:

@@ -14,10 +14,11 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator, DistributedType
-from accelerate.state import AcceleratorState, PartialState
+from accelerate.state import PartialState
 from accelerate.utils import DeepSpeedPlugin
 from torch import Tensor, nn
 
+from persist_cli.training.processes import on_cpus_too
 from persist_cli.training.settings import TrainingSettings
 from persist_cli.world.errors import PersistError
 
@@ -50,11 +51,10 @@ def zero_plugin(settings: TrainingSettings) -> DeepSpeedPlugin | None:
 
 
 def zero_on_cpus(plugin: DeepSpeedPlugin | None) -> None:
-    """Let processes on CPUs use it as well: DeepSpeed does it there, accelerate would give them DDP instead."""
-    state = AcceleratorState()
-    if plugin is not None and state.distributed_type == DistributedType.MULTI_CPU:
-        state.distributed_type, state.deepspeed_plugins = DistributedType.DEEPSPEED, plugin
-        PartialState._shared_state["distributed_type"] = DistributedType.DEEPSPEED
+    """Let processes on CPUs use it as well, where a plugin asks for it."""
+    state = on_cpus_too(DistributedType.DEEPSPEED) if plugin is not None else None
+    if plugin is not None and state is not None:
+        state.deepspeed_plugins = plugin
         plugin.set_mixed_precision("no")
         plugin.select(_from_accelerator_state=True)
 
