@@ -3,7 +3,8 @@
 On a GPU the published sizes at 9×512×512 in bfloat16, on a CPU small twins in float32, both with random weights: steps
 of both training stages (samples/s, peak memory, model FLOP utilisation), the latency of a clip with and without memory,
 the codec, the map. Beside them the same step and pipeline written plainly on diffusers, which take turns with ours.
-FLOPs are counted by the formula of ``at_size/flops.py``. Targets are those for one H200; asserts nothing.
+Steps are of latents that are known; weights, gradients and moments have the same precision; nothing is averaged. FLOPs
+are counted by the formula of ``at_size/flops.py``. Targets are those for one H200; asserts nothing.
 
     python tests/benchmarks/bench_at_size.py --models 5b --only steps,clips --json at-size.json
     python tests/benchmarks/bench_at_size.py --set training.compile=true

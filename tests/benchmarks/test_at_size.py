@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from tests import resident
 from tests.benchmarks import bench_at_size
 from tests.benchmarks.at_size import sampling, shapes
-from tests.benchmarks.at_size.measuring import CLEAR, Timing, Turns
+from tests.benchmarks.at_size.measuring import Timing, Turns
 from tests.benchmarks.at_size.plain import Plain
 from tests.benchmarks.at_size.rows import Row, Target
 from tests.benchmarks.at_size.sampling import Scene
@@ -115,7 +116,7 @@ def test_a_work_that_does_not_fit_has_a_row_that_says_so():
     assert {"does not fit", "plain diffusers", "2 (1)", "1.00"} <= set(row.cells())
 
 
-@pytest.mark.skipif(not CLEAR.exists(), reason="peak memory is asked of Linux")
+@pytest.mark.skipif(not resident.KNOWN, reason="peak memory is asked of Linux")
 def test_a_peak_is_that_of_the_largest_run_and_what_does_not_fit_has_no_timing():
     numbers = iter([1, 30_000_000, 1])  # floats of the run that does not count, and of two that do
 

@@ -14,11 +14,11 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from unittest.mock import patch
 
 from persist_cli.app import main
 from persist_cli.training.run_folder import RunFolder
+from tests.resident import forget_peak, peak_resident, resident_now
 
 Run = tuple[str, str, list[str]]  # recipe, data folder, settings
 
@@ -33,12 +33,6 @@ def measured_peaks(runs: Sequence[Run]) -> list[int]:
     assert done.returncode == 0, done.stderr
     found: list[int] = json.loads(done.stdout.splitlines()[-1])
     return found
-
-
-def resident(key: str) -> int:
-    """``VmRSS`` or ``VmHWM`` of this process in bytes."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(key))
 
 
 def trained_bytes(run: Run, peak: Callable[[], int]) -> int:
@@ -58,9 +52,9 @@ def trained_bytes(run: Run, peak: Callable[[], int]) -> int:
 def resident_bytes(run: Run) -> int:
     """Resident bytes that a short run took at most."""
     gc.collect()
-    before = resident("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")  # VmHWM begins again
-    return trained_bytes(run, lambda: resident("VmHWM")) - before
+    before = resident_now()
+    forget_peak()
+    return trained_bytes(run, peak_resident) - before
 
 
 if __name__ == "__main__":

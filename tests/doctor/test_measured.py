@@ -10,6 +10,7 @@ import torch
 
 from persist_cli.doctor.need import Estimator, Launch
 from persist_cli.doctor.planned import plan_recipe
+from tests import resident
 from tests.doctor.measured import SHORT, Run, measured_peaks, trained_bytes
 from tests.walking import train_here, write_walks
 
@@ -23,7 +24,7 @@ TWIN_OF_5B = (
     "use_rotary_positional_embeddings: true}"
 )
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is asked of Linux")
+pytestmark = pytest.mark.skipif(not resident.KNOWN, reason="peak memory is asked of Linux")
 
 
 @pytest.fixture(scope="module")

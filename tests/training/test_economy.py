@@ -74,7 +74,7 @@ def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, 
         assert all(weight.dtype == torch.float32 for weight in saved(tmp_path / "cheap", "transformer").values())
 
 
-def test_half_the_bytes_of_what_a_stage_does_not_train():
+def test_what_a_stage_does_not_train_takes_half_the_bytes():
     backbone = with_adapter(micro())
     trained = backbone.trained_parameters("2")
     backbone.economize("2", Economy(frozen=torch.bfloat16))

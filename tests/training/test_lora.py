@@ -209,4 +209,4 @@ def test_a_base_in_half_the_bytes_trains_a_change_of_the_whole_one(walks, stage1
     whole, low = (
         predicted(load_backbone(find_checkpoint(run)).eval(), random_clips(), None) for run in (lora, tmp_path / "half")
     )
-    assert (whole - low).abs().mean() < 0.2 * whole.abs().mean()
+    assert (whole - low).abs().mean() < 0.05 * whole.abs().mean()  # the change itself is most of it

@@ -7,11 +7,12 @@ import gc
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+
+from tests import resident
 
 Work = Callable[[], Any]
 PEAKS = {  # dense bf16 FLOP/s by the vendors' datasheets, the most special name first
@@ -25,8 +26,6 @@ PEAKS = {  # dense bf16 FLOP/s by the vendors' datasheets, the most special name
     "RTX 4090": 165e12,
     "RTX 3090": 71e12,
 }
-CLEAR, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
-RESET_PEAK = "5"  # what Linux takes as: forget the greatest resident size so far
 
 
 @dataclass(frozen=True)
@@ -121,18 +120,15 @@ def forget_peak(device: torch.device) -> None:
     """Begin to look for the most memory anew."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    elif CLEAR.exists():
-        CLEAR.write_text(RESET_PEAK)
+    elif resident.KNOWN:
+        resident.forget_peak()
 
 
 def peak_memory(device: torch.device) -> int | None:
     """The most bytes held since ``forget_peak``; ``None`` where nobody counts."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    if not STATUS.exists():
-        return None
-    lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
-    return int(lines["VmHWM"].split()[0]) * 1024
+    return resident.peak_resident() if resident.KNOWN else None
 
 
 def device_name(device: torch.device) -> str:
