@@ -74,7 +74,7 @@ def test_every_launch_line_shares_the_batch_out_evenly(name):
 )  # fmt: skip
 def test_it_fits_on_the_card_that_it_is_for(persist, name, machine):
     found = json.loads(persist("doctor", name, *machine, "--json").out)["smallest"]
-    sharded = ["--fsdp"] if found["fsdp"] else []
+    sharded = ["--fsdp"] if found["launch"] else []
     again = json.loads(persist("doctor", name, *machine, *sharded, *found["settings"], "--json").out)
     assert again["fits"]
     assert again["strategies"][0]["need"]["peak"] == found["need"]["peak"]
