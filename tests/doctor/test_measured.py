@@ -81,6 +81,14 @@ def test_estimates_hold_for_a_small_twin_of_the_large_model(walks_of, precision)
 
 
 @pytest.mark.slow
+def test_estimates_hold_for_8_bit_moments(walks_of):
+    pytest.importorskip("bitsandbytes")
+    data, settings = walks_of(64)
+    twin = [*settings, *PLAIN, "training.batch=4", TWIN_OF_5B, "training.optimizer=adamw-8bit"]
+    check([("tiny-stage1", data, [*twin, *change]) for change in ([], [CHECKPOINTING])])
+
+
+@pytest.mark.slow
 def test_estimates_hold_where_encoding_takes_most_and_for_the_codec(walks_of):
     (data, settings), (smaller, half) = walks_of(128), walks_of(64)
     codec = [*half, "training.precision=no", "training.batch=4", "backbone.settings.codec_window=null"]
