@@ -3,8 +3,9 @@
 On a GPU the published sizes at 9×512×512 in bfloat16, on a CPU small twins in float32, both with random weights: steps
 of both training stages (samples/s, peak memory, model FLOP utilisation), the latency of a clip with and without memory,
 the codec, the map. Beside them the same step and pipeline written plainly on diffusers, which take turns with ours.
-Steps are of latents that are known; weights, gradients and moments have the same precision; nothing is averaged. FLOPs
-are counted by the formula of ``at_size/flops.py``. Targets are those for one H200; asserts nothing.
+Steps are of latents that are known; weights, gradients and moments have the same precision, with ``--precision mixed``
+float32 as in the recipes, under autocast; nothing is averaged. FLOPs are counted by the formula of
+``at_size/flops.py``. Targets are those for one H200; asserts nothing.
 
     python tests/benchmarks/bench_at_size.py --models 5b --only steps,clips --json at-size.json
     python tests/benchmarks/bench_at_size.py --set training.compile=true
@@ -52,7 +53,7 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="one model, one round")
     parser.add_argument("--set", action="append", default=[], help="change of the recipes, as training.compile=true")
     parser.add_argument("--device", help="cuda or cpu; what is there by default")
-    parser.add_argument("--precision", choices=["bfloat16", "float32"], help="bfloat16 on a GPU, else float32")
+    parser.add_argument("--precision", choices=["bfloat16", "float32", "mixed"], help="bfloat16 on a GPU, else float32")
     parser.add_argument("--json", type=Path, help="file for all figures")
     options = parser.parse_args(arguments)
     options.device = torch.device(options.device or ("cuda" if torch.cuda.is_available() else "cpu"))
@@ -60,7 +61,8 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
     names = options.models.split(",") if options.models else list(PUBLISHED if on_gpu else TWINS)
     options.models = names[:1] if options.quick else names
     options.only = options.only.split(",")
-    options.precision = getattr(torch, options.precision or ("bfloat16" if on_gpu else "float32"))
+    options.precision = options.precision or ("bfloat16" if on_gpu else "float32")
+    options.dtype = torch.float32 if options.precision == "float32" else torch.bfloat16
     options.rounds = 1 if options.quick else options.rounds or (5 if on_gpu else 2)
     for kind, given, known in (("model", options.models, MODELS), ("part", options.only, PARTS)):
         for name in given:
@@ -73,7 +75,7 @@ def conditions(options: argparse.Namespace, peak: float, source: str) -> dict[st
     """On what, when and how it was measured."""
     return {
         "device": device_name(options.device),
-        "precision": str(options.precision).removeprefix("torch."),
+        "precision": options.precision,
         "peak": peak,
         "peak_source": source,
         "date": datetime.now(UTC).date().isoformat(),
@@ -88,7 +90,8 @@ def measure(options: argparse.Namespace, peak: float) -> list[Row]:
     """All parts of all models."""
     rows: list[Row] = []
     for name in options.models:
-        bench = Bench(MODELS[name], options.device, options.precision, options.rounds, peak, tuple(options.set))
+        mixed = options.precision == "mixed"
+        bench = Bench(MODELS[name], options.device, options.dtype, options.rounds, peak, tuple(options.set), mixed)
         for part in options.only:
             began = time.monotonic()
             with TemporaryDirectory() as folder:
@@ -106,7 +109,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure and print."""
     options = read_options(arguments)
     torch.manual_seed(0)
-    peak, source = peak_flops(options.device, options.precision)
+    peak, source = peak_flops(options.device, options.dtype)
     facts = conditions(options, peak, source)
     rows = measure(options, peak)
     say(

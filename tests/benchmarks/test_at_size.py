@@ -29,7 +29,8 @@ def micro(monkeypatch):
     return shapes.MODELS["micro"]
 
 
-@pytest.mark.parametrize(("name", "precision"), [("micro", "float32"), ("5b", "bfloat16")])
+@pytest.mark.usefixtures("fresh_accelerator")
+@pytest.mark.parametrize(("name", "precision"), [("micro", "float32"), ("5b", "bfloat16"), ("5b", "mixed")])
 def test_all_parts_run_on_whatever_device_is_there(name, precision, micro, tmp_path, capsys):
     file = tmp_path / "rows.json"
     options = ["--models", name, "--precision", precision, "--device", "cpu", "--json", str(file)]

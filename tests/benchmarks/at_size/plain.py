@@ -36,7 +36,7 @@ class Plain:
         self.scheduler = CogVideoXDDIMScheduler.from_config(bench.backbone.scheduler.config)
         self.scale = self.vae.config.scaling_factor
         self.prompt = bench.backbone.prompt
-        self.precision = bench.precision
+        self.precision, self.mixed = bench.precision, bench.mixed
 
     def rotary(self, latents: Tensor) -> tuple[Tensor, Tensor] | None:
         """Cosines and sines, for models with rotary positions."""
@@ -64,7 +64,8 @@ class Plain:
         timesteps = torch.randint(0, self.scheduler.config.num_train_timesteps, (len(latents),), device=latents.device)
         noisy = self.scheduler.add_noise(latents, noise, timesteps)
         target = self.scheduler.get_velocity(latents, noise, timesteps)
-        predicted = self.predict(torch.cat([noisy, image, camera], dim=2), timesteps, self.rotary(latents))
+        with torch.autocast(latents.device.type, torch.bfloat16, enabled=self.mixed):
+            predicted = self.predict(torch.cat([noisy, image, camera], dim=2), timesteps, self.rotary(latents))
         loss = F.mse_loss(predicted.float(), target.float())
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.transformer.parameters(), clip)

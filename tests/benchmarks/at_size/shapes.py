@@ -72,6 +72,7 @@ class Bench:
         rounds: measured runs of each work, after one that does not count.
         peak: FLOP/s that the device can do in this precision.
         changes: of the training recipes, as ``training.compile=true``.
+        mixed: whether steps hold float32 weights and compute in bf16, as the recipes of the published models do.
     """
 
     model: Model
@@ -80,6 +81,7 @@ class Bench:
     rounds: int
     peak: float
     changes: tuple[str, ...] = ()
+    mixed: bool = False
     backbone: Any = field(init=False)
 
     def __post_init__(self) -> None:
@@ -89,6 +91,17 @@ class Bench:
         scheduler = CogVideoXDDIMScheduler.from_config(self.backbone.scheduler.config)  # one whose tables are float32
         self.backbone.scheduler = scheduler
         self.backbone.to(self.device, self.precision).eval()
+
+    @contextmanager
+    def training(self) -> Iterator[None]:
+        """Within the block weights are as steps hold them."""
+        usual, self.precision = self.precision, torch.float32 if self.mixed else self.precision
+        self.backbone.to(self.precision)
+        try:
+            yield
+        finally:
+            self.precision = usual
+            self.backbone.to(usual)
 
     @contextmanager
     def made_here(self) -> Iterator[None]:

@@ -48,11 +48,12 @@ class FixedBatchTrainer(Trainer):
         self.batch = batch
         changes = [
             "base=none", f"training.batch={len(batch.seeds)}", f"training.steps={ENDLESS}", "training.warmup=0",
-            "training.cooldown=0", "training.ema=0", "training.precision=no", "data.clips_per_trajectory=0",
-            *bench.changes,
+            "training.cooldown=0", "training.ema=0", f"training.precision={'bf16' if bench.mixed else 'no'}",
+            "data.clips_per_trajectory=0", *bench.changes,
         ]  # fmt: skip
         recipe = make_recipe(apply_overrides(read_recipe(RECIPES[stage]), changes), "the benchmark")
-        super().__init__(recipe, bench.backbone, None, Accelerator(cpu=bench.device.type == "cpu"))
+        accelerator = Accelerator(cpu=bench.device.type == "cpu", mixed_precision=recipe.training.precision)
+        super().__init__(recipe, bench.backbone, None, accelerator)
 
     def all_clips(self) -> Any:
         return NoClips()
@@ -116,7 +117,8 @@ def fitting(bench: Bench, stage: Stage) -> tuple[int, dict[str, Timing | None]]:
     while True:
         bench.backbone.train()
         try:
-            timings = Turns(bench.device, bench.rounds).measure(make(bench, batch))
+            with bench.training():
+                timings = Turns(bench.device, bench.rounds).measure(make(bench, batch))
         except torch.OutOfMemoryError:
             timings = {"ours": None}
         bench.backbone.zero_grad(set_to_none=True)
