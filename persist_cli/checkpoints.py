@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.recipe import BackboneChoice, MemoryChoice
+from persist_cli.recipe import BackboneChoice, MemoryChoice, Recipe
 from persist_cli.sampling import read_sampling
 from persist_cli.trajectories.scenes import TrainingScenes
 from persist_cli.world.checkpoint_folder import CARD as CARD  # the tool has these from here
@@ -113,6 +113,11 @@ def start_backbone(choice: BackboneChoice, base: Checkpoint | None) -> Backbone:
     if base.backbone != choice.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {choice.name!r}")
     return load_backbone(base, choice.settings)
+
+
+def starts_from_nothing(recipe: Recipe, backbone: Backbone) -> bool:
+    """Whether the video model would be trained on the latents of a codec with random weights."""
+    return recipe.stage == "1" and recipe.base is None and not backbone.origin()
 
 
 def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:

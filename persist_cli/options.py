@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -9,8 +10,13 @@ import typer
 from typer.core import TyperGroup
 
 from persist_cli import __version__
+from persist_cli.world.errors import PersistError
 
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
+OF_THE_DISK: Final = {  # what a command cannot help
+    errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM,
+    errno.EROFS,
+}  # fmt: skip
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
@@ -53,12 +59,17 @@ def show_version(wanted: bool) -> None:
 
 
 class Commands(TyperGroup):
-    """Commands that Ctrl-C ends in one line, with exit code 130."""
+    """Commands that Ctrl-C ends in one line, with exit code 130, and a disk that is full or closed with 1."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was asked for."""
         try:
             return super().invoke(ctx)
+        except OSError as error:
+            if error.errno not in OF_THE_DISK:
+                raise
+            place, cause = error.filename or "a file cannot be written", error.strerror
+            raise PersistError(f"{place}: {cause}; make room there, or choose another place") from error
         except KeyboardInterrupt:
             typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
             raise typer.Exit(INTERRUPTED) from None

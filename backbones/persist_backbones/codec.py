@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +18,8 @@ from persist_backbones.depth_code import decode_depth, encode_depth, fill_missin
 from persist_backbones.framewise import batch_to_frames, code_frames_alone, frames_to_batch
 from persist_backbones.offloading import computing_device
 from persist_cli.world.errors import CheckpointError
+
+WHOLE = 2**30  # values, as CogVideoXSafeConv3d has it
 
 
 def pixel_patch(vae: AutoencoderKLCogVideoX) -> int:
@@ -47,6 +49,11 @@ def check_vae(vae: AutoencoderKLCogVideoX) -> None:
             f"a VAE of {stages[0]} blocks cannot compress time by {config.temporal_compression_ratio}, only by "
             f"{', '.join(map(str, ratios))}"
         )
+
+
+def in_parts(run: Callable[[Tensor], Tensor], samples: Tensor, most: int) -> Tensor:
+    """What becomes of samples, so many at a time."""
+    return run(samples) if len(samples) <= most else torch.cat([run(part) for part in samples.split(most)])
 
 
 def fold_pixels(
@@ -169,9 +176,24 @@ class Codec(nn.Module):
         """Distribution of the unscaled latents ``[stacked, channel, latent_frame, rows, columns]``."""
         folded = fold_pixels(images, pixel_patch(self.vae)).to(self.vae.dtype)
         if not self.frames_alone:
-            return self.vae.encode(folded).latent_dist
+            most = self.samples_at_once(self.vae.config.block_out_channels[0], folded.shape[-2:])
+            return DiagonalGaussianDistribution(
+                in_parts(lambda part: self.vae.encode(part).latent_dist.parameters, folded, most)
+            )
         found = self.vae.encode(frames_to_batch(folded)).latent_dist
         return DiagonalGaussianDistribution(batch_to_frames(found.parameters, images.shape[2]))
+
+    def samples_at_once(self, channels: int, size: Sequence[int]) -> int:
+        """How many samples go through the VAE together, so that diffusers does not split its convolutions in time.
+
+        It splits those whose input has more than ``WHOLE`` values, and fails where a part is shorter than the kernel.
+
+        Args:
+            channels: most that a convolution at full size takes.
+            size: the full height and width, as the VAE sees them.
+        """
+        frames = 2 * self.temporal + 1 + 2  # that it codes at once, and the kernel's past
+        return max(1, WHOLE // (channels * frames * math.prod(size)))
 
     def images_of(
         self, latents: Float[Tensor, "stacked channel latent_frame rows columns"]
@@ -181,7 +203,10 @@ class Codec(nn.Module):
         if self.frames_alone:
             folded = batch_to_frames(self.vae.decode(frames_to_batch(latents)).sample, latents.shape[2])
         else:
-            folded = self.vae.decode(latents).sample
+            larger = self.spatial // pixel_patch(self.vae)
+            size = [larger * each for each in latents.shape[-2:]]
+            most = self.samples_at_once(max(self.vae.config.block_out_channels[:2]), size)
+            folded = in_parts(lambda part: self.vae.decode(part).sample, latents, most)
         return unfold_pixels(folded, pixel_patch(self.vae))
 
     def loss(

@@ -21,7 +21,7 @@ from persist_backbones.objective import check_prediction
 from persist_backbones.patches import frames_per_token
 from persist_backbones.position_tables import fit_positions
 from persist_backbones.presets import PRESETS, CogVideoXSettings
-from persist_backbones.pretrained import folder_here, pretrained_folder, published_preset
+from persist_backbones.pretrained import check_name, folder_here, pretrained_folder, published_preset
 from persist_backbones.world_transformer import WorldTransformer
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
@@ -32,6 +32,7 @@ SUBFOLDERS = {
     "scheduler": CogVideoXDDIMScheduler,
 }
 
+MAY_BE_ZERO = {"dropout", "freq_shift", "ofs_embed_dim", "norm_eps", "shift_factor"}  # of numbers in configurations
 INITIAL_LOG_VARIANCE = -6.0  # of fresh latents: noise that does not drown what has not been learnt yet
 
 
@@ -56,6 +57,7 @@ def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
     folder = folder_here(settings.pretrained)
     if folder is not None:
         return load_parts(folder)
+    check_name(settings.pretrained)
     preset: Any = published_preset(settings.pretrained) or settings.preset
     return make_parts(dataclasses.replace(settings, preset=preset))
 
@@ -125,11 +127,20 @@ def _read_config(folder: Path, name: str) -> dict[str, Any]:
 
 def _make_part(name: str, config: dict[str, Any]) -> Any:
     values = name == "scheduler"  # its tables are values and no weights, also of a plan
+    _check_sizes(name, config)
     try:
         with torch.device("cpu") if values else contextlib.nullcontext():
             return SUBFOLDERS[name](**config)
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, ArithmeticError) as error:
         raise CheckpointError(f"diffusers cannot make a {name} of these settings ({_cause(error)})") from error
+
+
+def _check_sizes(name: str, config: dict[str, Any]) -> None:
+    """Raise ``CheckpointError`` for sizes below 1, which torch takes and nobody can compute with."""
+    empty = [key for key, value in config.items() if type(value) is int and value < 1 and key not in MAY_BE_ZERO]
+    if empty and name != "scheduler":
+        given = ", ".join(f"{key} {config[key]}" for key in empty)
+        raise CheckpointError(f"diffusers cannot make a {name} of these settings ({given}: at least 1)")
 
 
 def _cause(error: Exception) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from pydantic import NonNegativeFloat, PositiveFloat
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from persist_backbones.objective import Prediction, Weighting
 
@@ -117,8 +117,8 @@ class CogVideoXSettings:
     pretrained: str | None = None
     prompt: str | None = None
     prompt_embedding: str | None = None
-    height: int = 64
-    width: int = 64
+    height: PositiveInt = 64
+    width: PositiveInt = 64
     frames: int = 9
     interactions: tuple[str, ...] = ("pick_up", "drop", "toggle")
     rays: Literal["correct", "printed"] = "correct"
@@ -127,6 +127,6 @@ class CogVideoXSettings:
     weighting: Weighting = "uniform"
     snr_gamma: PositiveFloat = 5.0
     kl_weight: NonNegativeFloat = 1e-6
-    codec_window: tuple[int, int, int] | None = None
+    codec_window: tuple[int, PositiveInt, PositiveInt] | None = None
     transformer: dict[str, Any] = field(default_factory=dict)
     vae: dict[str, Any] = field(default_factory=dict)

@@ -52,6 +52,12 @@ def folder_here(name: str) -> Path | None:
         return None
 
 
+def check_name(name: str) -> None:
+    """Raise ``CheckpointError`` for what is no local directory and cannot be a repository of the hub either."""
+    if not REPOSITORY.fullmatch(name):
+        raise CheckpointError(f"{name}: no such directory, and not the name of a repository on the hub (owner/model)")
+
+
 def pretrained_folder(name: str) -> Path:
     """The local directory of this name, else that of a repository of the hub in its cache.
 
@@ -63,8 +69,7 @@ def pretrained_folder(name: str) -> Path:
     folder = folder_here(name)
     if folder is not None and (not _of_the_hub(name) or all(_complete(folder / part) for part in PARTS)):
         return folder
-    if not REPOSITORY.fullmatch(name):
-        raise CheckpointError(f"{name}: no such directory, and not the name of a repository on the hub (owner/model)")
+    check_name(name)
     obstacle = hub_obstacle()
     if obstacle:
         parts = " ".join(f"'{part}/*'" for part in PARTS)

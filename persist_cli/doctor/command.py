@@ -11,10 +11,11 @@ from typing import Any, Final
 
 from persist_cli.doctor.changes import OFFLOADED, SHARDED, STAGE2, Strategy, changes_of, smallest
 from persist_cli.doctor.dry_run import dry_run
-from persist_cli.doctor.machine import GIB, Machine
+from persist_cli.doctor.machine import Machine, gib
 from persist_cli.doctor.need import Estimator, Launch, Need
 from persist_cli.doctor.planned import Planned, plan, plan_recipe, plan_stage2
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
+from persist_cli.training.settings import check_sharing
 from persist_cli.training.sharding import check_sharded
 from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import PersistError
@@ -105,11 +106,13 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     """Print parts, what each strategy needs, and what fits.
 
     Raises:
-        PersistError: when the recipe is wrong, or FSDP2 is asked for on one device.
+        PersistError: when the recipe is wrong or cannot be shared by the devices, or FSDP2 is asked for on one.
     """
     if sharded and machine.devices == 1:
         raise PersistError("--fsdp shares a model out over several GPUs; give --gpus N too")
     planned = plan_recipe(name, overrides)
+    training = planned.recipe.training
+    check_sharing(training.batch, training.accumulation, machine.devices)
     if sharded:
         planned.backbone.trained_parameters(planned.recipe.stage)
         check_sharded(planned.recipe, planned.backbone)
@@ -118,11 +121,9 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     if json:
         print_json(_record(machine, parts, found, best))
         return
-    rows = [
-        [part["name"], f"{part['parameters']:,}", _gib(part["bytes"])] for part in [*parts["parts"], parts["total"]]
-    ]
+    rows = [[part["name"], f"{part['parameters']:,}", gib(part["bytes"])] for part in [*parts["parts"], parts["total"]]]
     print_table(f"{name}: stage {planned.recipe.stage}", ("part", "parameters", "GiB"), rows)
-    title = f"GiB on each of {machine}, of which {_gib(machine.usable)} are planned with"
+    title = f"GiB on each of {machine}, of which {gib(machine.usable)} are planned with"
     print_table(title, ("strategy", *COLUMNS, "fits"), [_row(each) for each in found])
     say(_verdict(doctor, overrides, best))
 
@@ -131,17 +132,17 @@ def _verdict(doctor: Doctor, overrides: Sequence[str], best: Finding | None) -> 
     machine = doctor.machine
     if best is None:
         return f"does not fit on {machine}, whatever is changed; take more or larger devices, or smaller clips"
-    need = f"{_gib(best.need.peak)} of {_gib(machine.usable)} GiB"
+    how = f"with {best.strategy.name}" if best.strategy.changes else "as it is"
+    need = f"{gib(best.need.peak)} of {gib(machine.usable)} GiB"
     if best.need.host:
-        need += f", and {_gib(best.need.host)} GiB of the memory of the CPU"
-    if not best.strategy.changes:
-        return f"fits as it is: {need}"
-    return f"fits with {best.strategy.name} ({need}):\n{command(doctor, overrides, best.strategy)}"
+        need += f", and {gib(best.need.host)} GiB of the memory of the CPU"
+    return f"fits {how} ({need}):\n{command(doctor, overrides, best.strategy)}"
 
 
 def command(doctor: Doctor, overrides: Sequence[str], strategy: Strategy) -> str:
     """How to start the training like that, for a shell."""
-    settings = [shlex.quote(each) for each in (*overrides, *strategy.settings)]
+    begin = ["backbone.settings.pretrained=DIR"] if doctor.planned.from_nothing else []
+    settings = [shlex.quote(each) for each in (*overrides, *strategy.settings, *begin)]
     finetune = " ".join(["finetune", shlex.quote(doctor.planned.name), "--data DATA", *settings])
     flags = list(dict.fromkeys([SHARDED, *strategy.flags])) if doctor.sharded else strategy.flags
     devices = doctor.machine.devices
@@ -179,8 +180,4 @@ def _finding(found: Finding) -> dict[str, Any]:
 
 def _row(found: Finding) -> list[str]:
     need = found.need.to_json()
-    return [found.strategy.name, *(_gib(need[column]) for column in COLUMNS), "yes" if found.fits else "no"]
-
-
-def _gib(size: float) -> str:
-    return f"{size / GIB:.3g}" if size < GIB else f"{size / GIB:.1f}"
+    return [found.strategy.name, *(gib(need[column]) for column in COLUMNS), "yes" if found.fits else "no"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from persist_cli.doctor.machine import gib
 from persist_cli.doctor.planned import Planned, plan_recipe
 from persist_cli.viewing.console import print_json, print_table
 from persist_cli.world.stages import Part, Stage
@@ -19,7 +20,7 @@ def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:
         return
     stages = list(record["total"]["trained"])
     title = f"{recipe}: stage {planned.recipe.stage} of {planned.backbone.name}"
-    columns = ["part", "parameters", "GB", "new", *(f"trained in {_spoken(stage)}" for stage in stages)]
+    columns = ["part", "parameters", "GiB", "new", *(f"{_spoken(stage)} trains" for stage in stages)]
     print_table(title, columns, [_row(part) for part in [*record["parts"], record["total"]]])
 
 
@@ -65,7 +66,7 @@ def _record(part: Part, trained: dict[Stage, set[str]]) -> dict[str, Any]:
 
 def _row(record: dict[str, Any]) -> list[str]:
     counts = [record["new"], *record["trained"].values()]
-    size = f"{record['bytes'] / 1e9:.3f}"
+    size = gib(record["bytes"])
     return [record["name"], f"{record['parameters']:,}", size, *(f"{count:,}" if count else "-" for count in counts)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from typing import Final
@@ -38,6 +39,11 @@ class Machine:
         return f"{self.devices} {name}{'s' if self.devices > 1 else ''} of {self.memory / GIB:.0f} GB"
 
 
+def gib(size: float) -> str:
+    """Bytes in GiB, as tables have them."""
+    return f"{size / GIB:.3g}" if size < GIB else f"{size / GIB:.1f}"
+
+
 def machine_of(gpus: int | None, gpu_memory: float | None) -> Machine:
     """GPUs that are asked for, of the size of those here where none is given; else what is here.
 
@@ -46,8 +52,10 @@ def machine_of(gpus: int | None, gpu_memory: float | None) -> Machine:
         gpu_memory: GB of each, as cards are called: 2³⁰ bytes.
 
     Raises:
-        PersistError: when GPUs are asked for, none is here and their memory is not given.
+        PersistError: when GPUs are asked for, none is here and their memory is not given, and when it is no number.
     """
+    if gpu_memory is not None and not math.isfinite(gpu_memory):
+        raise PersistError(f"--gpu-memory {gpu_memory}: give the GB of a card, as in 80")
     here = torch.cuda.device_count()
     if gpus is None and gpu_memory is None and not here:
         return Machine("cpu", 1, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

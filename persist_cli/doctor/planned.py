@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint, start_backbone
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, start_backbone, starts_from_nothing
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import warn
@@ -33,6 +33,11 @@ class Planned:
     backbone: Backbone
     channels: int | None
     base: Checkpoint | None
+
+    @property
+    def from_nothing(self) -> bool:
+        """Whether the training begins with random weights, its codec's too."""
+        return starts_from_nothing(self.recipe, self.backbone)
 
 
 def plan_recipe(name: str, overrides: Sequence[str]) -> Planned:

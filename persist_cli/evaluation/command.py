@@ -20,7 +20,7 @@ from persist_cli.reporting.report import write_report
 from persist_cli.reporting.text import print_tables
 from persist_cli.trajectories.reference import data_folder
 from persist_cli.viewing.console import print_json, say
-from persist_cli.world.files import write_json
+from persist_cli.world.files import check_folder, write_json
 
 RESULTS = "metrics.json"
 
@@ -30,6 +30,9 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
 
     Without paths it is the reference model's; the data set ``sample`` is that of the package.
     """
+    for folder in (out, report):
+        if folder is not None:
+            check_folder(folder)
     processes = Processes()
     plan = replace(plan, data=tuple(data_folder(str(folder)) for folder in plan.data))
     run, backbones = prepare(paths or [reference_checkpoint()], plan, out, processes)

@@ -29,6 +29,7 @@ from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.checkpoint_folder import what_is_changed
 from persist_cli.world.errors import CheckpointError, PersistError, hint
 from persist_cli.world.files import (
+    check_folder,
     empty_folder_aside,
     file_sha256,
     folder_aside,
@@ -66,6 +67,7 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         raise PersistError(f"unknown dtype {plan.dtype!r}; {hint(plan.dtype, PRECISIONS)}")
     if out.exists():
         raise PersistError(f"{out}: exists already; choose another --out")
+    check_folder(out)
     base = find_checkpoint(plan.checkpoint)
     parts = adapter_parts(base, plan.runs)
     default = default_of(base, parts, plan.default)

@@ -16,7 +16,7 @@ from persist_cli.registry import make_encoder, make_memory
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 from persist_cli.viewing.map import draw_map
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import remove_leftovers
+from persist_cli.world.files import check_folder, remove_leftovers
 from persist_cli.world.memory import Memory
 
 
@@ -118,5 +118,6 @@ def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _check_out(out: Path) -> None:
+    check_folder(out.parent)
     if out.is_dir() or out.suffix == ".png":
         raise CheckpointError(f"{out}: name a file to write, as in memory.safetensors (its map is drawn to .png)")

@@ -19,6 +19,7 @@ from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.trajectories.clips import check_size
 from persist_cli.viewing.console import add_task, print_json, progress, say
 from persist_cli.world.errors import CheckpointError, PersistError
+from persist_cli.world.files import check_folder
 from persist_cli.world.memory import Memory
 from persist_cli.world.observations import Observations, TrajectoryInfo
 
@@ -58,8 +59,9 @@ def check_folders(out: Path, branches: int) -> list[Path]:
     """Where the branches go: ``out`` for one, 0, 1, … in it for several.
 
     Raises:
-        PersistError: when several find rollouts there that they would not replace.
+        PersistError: when no folder can be made there, or several find rollouts there that they would not replace.
     """
+    check_folder(out)
     if branches == 1:
         return [out]
     folders = [out / str(number) for number in range(branches)]

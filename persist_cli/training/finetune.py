@@ -17,7 +17,7 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import InitProcessGroupKwargs, set_seed
 
-from persist_cli.checkpoints import Checkpoint, find_checkpoint, start_backbone, step_folders
+from persist_cli.checkpoints import Checkpoint, find_checkpoint, start_backbone, starts_from_nothing, step_folders
 from persist_cli.memorizing.recall import MemoryMaker
 from persist_cli.options import INTERRUPTED
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, parse_yaml_mapping, read_recipe, to_plain
@@ -29,11 +29,16 @@ from persist_cli.training.state import load_state
 from persist_cli.training.step_times import StepTimes
 from persist_cli.training.trainer import Stop, Trainer
 from persist_cli.training.zero import zero_on_cpus, zero_plugin
-from persist_cli.viewing.console import say
+from persist_cli.viewing.console import say, warn
 from persist_cli.world.backbone import Backbone
 from persist_cli.world.errors import PersistError, RecipeError
+from persist_cli.world.files import check_folder
 
 LONGEST_WAIT = timedelta(hours=1)  # for a process that neither answers nor ends, as while one writes a large model
+FROM_NOTHING = (
+    "begins with random weights, those of the codec too; give backbone.settings.pretrained=DIR for a pretrained model, "
+    "or base=RUN for a codec trained here"
+)
 CHANGEABLE = {
     "steps",
     "checkpoint_every",
@@ -91,7 +96,8 @@ def limited_threads(threads: int) -> Iterator[None]:
 
 
 def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
-    """Raise a one-line error when the folder holds a run and this one does not go on with it."""
+    """Raise a one-line error when the folder is none, or holds a run and this one does not go on with it."""
+    check_folder(run)
     if not step_folders(run):
         return
     if not resume:
@@ -119,6 +125,8 @@ def finetune(recipe: Recipe, run: Path, stop: Stop, plan: FinetunePlan) -> int |
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
     maker = MemoryMaker.of(recipe.memory, accelerator.device) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, maker)
+    if accelerator.is_main_process and starts_from_nothing(recipe, backbone):
+        warn(f"{run}: {FROM_NOTHING}")
     trainer = Trainer(recipe, backbone, maker, accelerator, plan.cache)
     if plan.profile:
         trainer.times = StepTimes(accelerator.device, recipe.training.batch)

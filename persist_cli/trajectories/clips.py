@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch.utils.data import BatchSampler, Dataset
 
+from persist_cli.training.settings import check_sharing
 from persist_cli.trajectories.store import Store, TrajectoryFile
 from persist_cli.world.actions import ActionVocabulary
 from persist_cli.world.backbone import Interactions
@@ -161,10 +162,7 @@ class SharedBatches(BatchSampler):
     def __init__(
         self, first_step: int, last_step: int, batch: int, accumulation: int, process: int, processes: int
     ) -> None:
-        if batch % (accumulation * processes):
-            raise DataError(
-                f"training.batch {batch} cannot be shared by {processes} processes with {accumulation} micro-batches"
-            )
+        check_sharing(batch, accumulation, processes)
         self.first_step, self.last_step, self.batch = first_step, last_step, batch
         self.accumulation, self.process, self.processes = accumulation, process, processes
 
@@ -202,4 +200,8 @@ def check_size(info: TrajectoryInfo, image_size: tuple[int, int], where: str) ->
     """Raise ``DataError`` when images are not of the size that a model takes."""
     if (info.height, info.width) != image_size:
         height, width = image_size
-        raise DataError(f"{where}: images are {info.height}x{info.width}, the model takes {height}x{width}")
+        raise DataError(
+            f"{where}: images are {info.height}x{info.width}, the model takes {height}x{width}; collect "
+            f"or import them with --size {height}x{width}, or take a model of theirs (finetune: "
+            f"backbone.settings.height={info.height} backbone.settings.width={info.width})"
+        )

@@ -25,6 +25,8 @@ from persist_cli.world.files import plain
 
 Item = TypeVar("Item")
 
+BORDER = 3  # characters between two columns of a table
+LONGEST_NAME = 40  # of a row that is not broken into lines
 PIPED_WIDTH = 160  # columns of a table that goes into a file or pipe
 
 OUT = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
@@ -75,13 +77,55 @@ def print_json(value: Any) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table on standard output; the first column is the row's name."""
-    table = Table(title=title, title_justify="left")
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    OUT.print(table)
+    """A table on standard output; the first column is the row's name.
+
+    Where the columns do not fit beside each other without cutting words, the rest follows in tables below.
+    """
+    columned = [[_plain(text) for text in (column, *(row[n] for row in rows))] for n, column in enumerate(columns)]
+    whole = [max(map(len, texts)) for texts in columned]
+    words = [max(len(word) for text in texts for word in (*text.split(), "")) for texts in columned]
+    words[0] = whole[0] if whole[0] <= LONGEST_NAME else words[0]
+    for count, others in enumerate(side_by_side(words, OUT.width)):
+        shown = (0, *others)
+        table = Table(title=None if count else title, title_justify="left")
+        widths = fitted([whole[each] for each in shown], [words[each] for each in shown], OUT.width)
+        for number, width in zip(shown, widths, strict=True):
+            table.add_column(columns[number], justify="right" if number else "left", width=width)
+        for row in rows:
+            table.add_row(*(row[number] for number in shown))
+        OUT.print(table)
+
+
+def side_by_side(words: Sequence[int], room: int) -> Iterator[list[int]]:
+    """Numbers of the columns after the first that fit beside it, table after table.
+
+    Args:
+        words: least width of each column.
+        room: of the terminal, in characters.
+    """
+    taken: list[int] = []
+    for number in range(1, len(words)):
+        if taken and sum(words[each] + BORDER for each in (0, *taken, number)) + 1 > room:
+            yield taken
+            taken = []
+        taken.append(number)
+    yield taken
+
+
+def fitted(whole: Sequence[int], words: Sequence[int], room: int) -> list[int]:
+    """Widths of columns in a terminal, the widest made narrower first, none less than its longest word."""
+    widths = list(whole)
+    while sum(widths) + BORDER * len(widths) + 1 > room:
+        wide = [number for number, width in enumerate(widths) if width > words[number]]
+        if not wide:
+            break
+        widths[max(wide, key=widths.__getitem__)] -= 1
+    return widths
+
+
+def _plain(text: str) -> str:
+    """Text without markup."""
+    return Text.from_markup(text).plain
 
 
 def say(text: str) -> None:

@@ -7,18 +7,26 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.world.errors import CheckpointError
+from persist_cli.world.errors import CheckpointError, PersistError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 ASIDE = ".partial-"
+
+
+def check_folder(path: Path) -> None:
+    """Raise ``PersistError`` when a file stands where this folder is or would be made, before any work is done."""
+    there = next((each for each in (path, *path.parents) if each.exists()), path)
+    if there.exists() and not there.is_dir():
+        raise PersistError(f"{path}: no folder can be made there, {there} is a file; choose another --out")
 
 
 @contextlib.contextmanager
@@ -71,7 +79,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
             try:
                 save_file(contiguous, aside, dict(metadata or {}))
             except SafetensorError as error:
-                raise OSError(f"{path}: {str(error).splitlines()[0]}") from error
+                raise _of_the_system(path, str(error).splitlines()[0]) from error
         (around / path.name).replace(path)
 
 
@@ -151,6 +159,12 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
             shutil.rmtree(leftover, ignore_errors=True)
         else:
             leftover.unlink(missing_ok=True)
+
+
+def _of_the_system(path: Path, said: str) -> OSError:
+    """The system's error that another language reports as text."""
+    found = re.search(r"os error (\d+)", said)
+    return OSError(int(found[1]), os.strerror(int(found[1])), str(path)) if found else OSError(f"{path}: {said}")
 
 
 def _place_aside(path: Path) -> Path:

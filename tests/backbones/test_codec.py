@@ -12,6 +12,8 @@ from diffusers import AutoencoderKLCogVideoX
 from persist_backbones.codec import fold_pixels, unfold_pixels
 from persist_backbones.cogvideox import CogVideoX
 from persist_backbones.framewise import batch_to_frames, frames_to_batch
+from persist_cli.doctor.tracing import imagined
+from persist_cli.registry import make_backbone
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import CheckpointError
 from tests.backbones.micro import micro, random_clips, shaken
@@ -77,6 +79,30 @@ def test_the_fast_convolution_learns_what_diffusers_would(still: CogVideoX) -> N
     for (name, one), two in zip(plain.named_parameters(), still.codec.vae.parameters(), strict=True):
         if one.grad is not None:
             assert torch.allclose(one.grad, two.grad, rtol=1e-3, atol=1e-2), name
+
+
+@torch.no_grad()
+def test_samples_that_are_too_many_at_once_for_diffusers_go_through_it_in_parts() -> None:
+    codec = micro().codec
+    few, many = (random_clips(count, size=(9, 32, 32)) for count in (1, 3))
+    whole = codec.encode(many.rgb, many.depth)
+    codec.samples_at_once = lambda *_: 2  # type: ignore[method-assign]
+    assert torch.allclose(codec.encode(many.rgb, many.depth), whole, atol=1e-5)
+    assert codec.decode(whole)[0].shape == many.rgb.shape
+    assert codec.encode(few.rgb, few.depth).shape == whole[:1].shape
+
+
+@torch.no_grad()
+def test_the_papers_clips_are_decoded_whatever_their_number() -> None:
+    sizes = {"height": 512, "width": 512, "frames": 9}
+    with torch.device("meta"):
+        codec = make_backbone("cogvideox", {"preset": "5b-i2v"} | sizes).codec
+    assert codec.samples_at_once(128, (512, 512)) == 2
+    assert codec.samples_at_once(256, (512, 512)) == 1
+    with imagined():
+        codec.to_empty(device="cpu")
+        rgb, depth = codec.decode(torch.zeros(4, 3, 32, 64, 64))
+    assert (rgb.shape, depth.shape) == ((4, 9, 512, 512, 3), (4, 9, 512, 512))
 
 
 def test_folding_loses_nothing() -> None:

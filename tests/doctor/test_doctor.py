@@ -132,7 +132,7 @@ def test_what_is_said_can_be_run():
     strategy = Strategy((FROZEN, CHECKPOINTING, EIGHT_BIT))
     line = command(doctor, [*MICRO, *SMALL], strategy)
     assert line.startswith("accelerate launch --num_processes 2 --multi_gpu --module persist_cli finetune tiny-stage1 ")
-    settings = [word for word in shlex.split(line) if "=" in word]
+    settings = [word for word in shlex.split(line) if "=" in word and not word.endswith("=DIR")]
     assert plan_recipe("tiny-stage1", settings).recipe == doctor.changed(strategy)
     for sharded, machine in ((True, Machine("cuda", 2, 1)), (False, Machine("cuda", 1, 1))):
         line = command(Doctor(planned(), machine, sharded), [], Strategy((OFFLOAD,)))
@@ -147,6 +147,14 @@ def test_a_plan_of_stage_1_is_beside_that_of_the_stage_2_that_stands_on_it(persi
     assert (last["name"], last["recipe"]) == ("stage 2 only", "tiny-stage2-voxel")
     assert last["need"] == found["tiny-stage2-voxel"]["strategies"][0]["need"]
     assert not any(each["name"] == "stage 2 only" for each in found["tiny-stage2-voxel"]["strategies"])
+
+
+def test_the_line_for_a_shell_has_what_was_asked_for_and_the_weights_to_begin_with(persist):
+    machine = ["--gpus", "2", "--gpu-memory", "80", "--fsdp"]
+    changes = [*MICRO, "training.batch=8", "lora={rank: 2}"]
+    words = shlex.split(persist("doctor", "tiny-stage1", *machine, *changes).out.splitlines()[-1])
+    assert words[:6] == ["accelerate", "launch", "--num_processes", "2", "--use_fsdp", "--fsdp_version"]
+    assert words[words.index("DATA") + 1 :] == [*changes, "backbone.settings.pretrained=DIR"]
 
 
 def test_every_form_of_memory_can_be_estimated():
@@ -176,7 +184,14 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
     ("options", "cause"),
     [(["--gpus", "8"], "give --gpu-memory GB"), (["--gpu-memory", "80", "--fsdp"], "give --gpus N too"),
      (["training.stpes=1"], "did you mean 'training.steps'"),
-     (["--gpus", "2", "--gpu-memory", "80", "--fsdp", "training.optimizer=adamw-8bit"], "is not sharded; use adamw")],
+     (["--gpus", "2", "--gpu-memory", "80", "--fsdp", "training.optimizer=adamw-8bit"], "is not sharded; use adamw"),
+     (["--gpu-memory", "inf"], "give the GB of a card"),
+     (["--gpu-memory", "80", "--gpus", "3"], "by 3 processes with 1 micro-batches; give training.batch=15 training.ac"),
+     (["--gpu-memory", "80", "--gpus", "8", "training.accumulation=8"], "give training.accumulation=2"),
+     (["backbone.settings.height=0"], "height: Input should be greater than 0"),
+     (["backbone.settings.transformer={num_layers: 0}"], "num_layers 0: at least 1"),
+     (["backbone.settings.vae={temporal_compression_ratio: 0}"], "temporal_compression_ratio 0: at least 1"),
+     (["backbone.settings.pretrained=nowhere"], "nowhere: no such directory, and not the name of a repository")],
 )  # fmt: skip
 def test_what_cannot_be_planned_is_one_line(persist, options, cause):
     if torch.cuda.is_available() and "--gpu-memory" not in options and "--gpus" in options:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from persist_cli.trajectories.clips import ClipDataset, ClipPlan, SharedBatches
-from persist_cli.world.errors import DataError
+from persist_cli.world.errors import DataError, RecipeError
 from tests.walking import SIZE
 
 
@@ -93,5 +93,5 @@ def test_what_cannot_be_drawn_is_one_line(walks):
         ClipDataset([walks], plan(frames=65))
     with pytest.raises(DataError, match="images are 32x32, the model takes 64x64"):
         ClipDataset([walks], plan(image_size=(64, 64)))
-    with pytest.raises(DataError, match="cannot be shared by 3 processes"):
+    with pytest.raises(RecipeError, match=r"cannot be shared by 3 processes .* give training.batch=6 training.acc"):
         SharedBatches(0, 1, 8, 1, 0, 3)

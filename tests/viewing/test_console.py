@@ -4,8 +4,10 @@ import json
 import math
 
 import pytest
+from rich.console import Console
 
-from persist_cli.viewing.console import print_json
+from persist_cli.viewing import console
+from persist_cli.viewing.console import print_json, print_table
 from persist_cli.world.files import write_json
 
 FIGURES = {"psnr": [20.0, math.nan], "rmse": (math.inf, {"low": -math.inf})}
@@ -17,3 +19,20 @@ def test_json_has_null_where_a_figure_is_not_defined(tmp_path, capsys):
     print_json(FIGURES)
     for text in ((tmp_path / "a.json").read_text(), capsys.readouterr().out):
         assert json.loads(text, parse_constant=pytest.fail) == PLAIN
+
+
+@pytest.mark.parametrize("room", [60, 80, 100, 160])
+def test_no_table_cuts_a_number_or_a_name_whatever_the_terminal(room, capsys, monkeypatch):
+    monkeypatch.setattr(console, "OUT", Console(width=room))
+    columns = ["strategy", *(f"column {number}" for number in range(9)), "what it is"]
+    rows = [["gradient checkpointing", *(f"{number}570479680" for number in range(9)), "some words that may wrap"]]
+    print_table("title", columns, rows)
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= room
+    assert all(f" {cell} " in printed for cell in rows[0][:-1])
+    assert all(word in printed for word in rows[0][-1].split())
+
+
+def test_one_table_is_enough_where_there_is_room(capsys):
+    print_table("title", ["a", "b", "c"], [["x", "1", "2"]])
+    assert [line.split() for line in capsys.readouterr().out.splitlines() if "x" in line] == [list("│x│1│2│")]
