@@ -110,11 +110,28 @@ def _load_part(folder: Path, name: str) -> Any:
         )
     if planning():
         return _make_part(name, _read_config(folder, name))
-    options = {} if name == "scheduler" else {"use_safetensors": True, "low_cpu_mem_usage": False}
+    options: dict[str, Any] = {"subfolder": name, "local_files_only": True}
     try:
-        return SUBFOLDERS[name].from_pretrained(folder, subfolder=name, local_files_only=True, **options)
+        if name == "scheduler":
+            return SUBFOLDERS[name].from_pretrained(folder, **options)
+        part, found = SUBFOLDERS[name].from_pretrained(
+            folder, use_safetensors=True, low_cpu_mem_usage=False, output_loading_info=True, **options
+        )
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
         raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
+    _check_all_loaded(folder / name, found)
+    return part
+
+
+def _check_all_loaded(folder: Path, found: dict[str, Any]) -> None:
+    """Raise ``CheckpointError`` where weights and configuration differ, of which diffusers leaves the rest random."""
+    for problem, names in (("lack", found["missing_keys"]), ("have besides", found["unexpected_keys"])):
+        names = sorted(each for each in names if not each.endswith("pos_embedding"))  # computed, but for 5b-I2V's
+        if names:
+            raise CheckpointError(
+                f"{folder}: its weights {problem} {len(names)} tensors of its config.json, first {names[0]!r}; "
+                "take a whole copy of both"
+            )
 
 
 def _read_config(folder: Path, name: str) -> dict[str, Any]:
@@ -144,8 +161,9 @@ def _check_sizes(name: str, config: dict[str, Any]) -> None:
 
 
 def _cause(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    lines = [line.strip() for line in str(error).strip().splitlines()]
+    first = " ".join(lines[: 2 if lines and lines[0].endswith(":") else 1])
+    return first or type(error).__name__
 
 
 def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:

@@ -61,6 +61,8 @@ def starting_prompt(
         raise CheckpointError(
             f"{source}: a prompt's embedding of {tuple(found.shape)}, but the transformer takes {tuple(zeros.shape)}"
         )
+    if not found.isfinite().all():
+        raise CheckpointError(f"{source}: a prompt's embedding with values that are no numbers; make it again")
     return found.to(zeros)
 
 

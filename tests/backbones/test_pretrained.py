@@ -8,6 +8,7 @@ import torch
 from persist_backbones.pretrained import folder_here, pretrained_folder, published_preset
 from persist_cli.registry import make_backbone
 from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import read_json, write_json
 from tests.backbones.twins import SIZE, load_twin, write_snapshot, write_twin
 
 NAME = "zai-org/CogVideoX-5b-I2V"
@@ -89,3 +90,21 @@ def test_a_plan_of_weights_in_the_cache_has_their_size(snapshot):
 def test_the_names_of_both_publishers_are_known():
     known = [published_preset(f"{owner}/CogVideoX1.5-5B-I2V") for owner in ("THUDM", "zai-org", "someone")]
     assert known == ["1.5-5b-i2v", "1.5-5b-i2v", None]
+
+
+@pytest.mark.parametrize(
+    ("layers", "cause"), [(3, "lack .* first 'transformer_blocks.2"), (1, "have besides .*blocks.1")]
+)
+def test_weights_of_another_configuration_are_neither_filled_up_nor_cut(tmp_path, layers, cause):
+    config = write_twin("5b-i2v", tmp_path) / "transformer" / "config.json"
+    write_json(config, read_json(config) | {"num_layers": layers})
+    with pytest.raises(CheckpointError, match=rf"transformer: its weights {cause}.*take a whole copy of both"):
+        load_twin(tmp_path, SIZE)
+
+
+def test_weights_of_other_shapes_are_one_line_that_names_one(tmp_path):
+    config = write_twin("2b", tmp_path) / "transformer" / "config.json"
+    write_json(config, read_json(config) | {"num_attention_heads": 4})
+    with pytest.raises(CheckpointError, match=r"transformer: cannot be loaded \(.*shape") as error:
+        load_twin(tmp_path, SIZE)
+    assert "\n" not in str(error.value)
