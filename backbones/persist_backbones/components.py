@@ -49,8 +49,9 @@ class WorldModules(ModelMixin, ConfigMixin):  # type: ignore[misc]
     def of(backbone: CogVideoX) -> WorldModules:
         """The modules of a backbone, shared with it."""
         theirs = (backbone.transformer.base.config, backbone.codec.vae.config)
-        with torch.device("meta"):
-            made = WorldModules(backbone.checkpoint_settings(), *map(dict, theirs))
+        plain = [{key: each for key, each in config.items() if not key.startswith("_")} for config in theirs]
+        with torch.device("meta"):  # what begins with _ is where they were read, as a path
+            made = WorldModules(backbone.checkpoint_settings(), *plain)
         for name in dict(made.named_children()):
             setattr(made, name, getattr(backbone.transformer, name))
         made.prompt = backbone.prompt

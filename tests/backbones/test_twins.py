@@ -199,3 +199,9 @@ def test_a_twin_differs_from_the_published_model_by_its_sizes_alone(twins, name)
     config = load_twin(twins[name]).transformer.base.config
     sizes = {*SMALL, "in_channels", "out_channels", "ofs_embed_dim"}
     assert {key for key, value in TRANSFORMERS[name].items() if config[key] != value} <= sizes
+
+
+def test_a_pipeline_of_pretrained_weights_is_saved_without_where_they_were(twins, tmp_path):
+    WorldPipeline.of(load_twin(twins["2b"])).save_pretrained(tmp_path)
+    assert str(twins["2b"]) not in (tmp_path / "world" / "config.json").read_text()
+    assert WorldPipeline.from_pretrained(tmp_path).backbone.shape == load_twin(twins["2b"]).shape
