@@ -20,6 +20,8 @@ from persist_cli.world.stages import Lora, Stage
 EXTENDS = "extends"
 KINDS = {"backbone": "name", "memory": "name", "adapter": "form"}  # settings of one mean nothing to another
 
+SETTINGS_OF = {"backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings"}
+
 
 @dataclass(frozen=True)
 class BackboneChoice:
@@ -175,16 +177,18 @@ def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
 
 
 def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """The mapping with ``a.b=value`` changes, values read as YAML."""
+    """The mapping with ``a.b=value`` changes, values read as YAML.
+
+    Another backbone, memory or encoder begins without the settings that the mapping has for the one before.
+    """
     changed: dict[str, Any] = _copy(values)
-    for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals or not key:
-            raise RecipeError(f"cannot read {override!r}; write KEY=VALUE, as in training.steps=200")
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise RecipeError(f"cannot read the value in {override!r}") from error
+    read = [_read_override(override) for override in overrides]
+    for key, value in read:
+        choice, _, kind = key.partition(".")
+        there = changed.get(choice)
+        if key in SETTINGS_OF and isinstance(there, dict) and there.get(kind, value) != value:
+            there.pop(SETTINGS_OF[key], None)
+    for key, value in read:
         *parents, last = key.split(".")
         place = changed
         for parent in parents:
@@ -193,6 +197,16 @@ def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict
             place = place[parent]
         place[last] = value
     return changed
+
+
+def _read_override(override: str) -> tuple[str, Any]:
+    key, equals, text = override.partition("=")
+    if not equals or not key:
+        raise RecipeError(f"cannot read {override!r}; write KEY=VALUE, as in training.steps=200")
+    try:
+        return key, yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise RecipeError(f"cannot read the value in {override!r}") from error
 
 
 def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:

@@ -94,10 +94,10 @@ def merge_lora(transformer: CogVideoXTransformer3DModel, folder: Path, check: bo
 def weights_digest(transformer: CogVideoXTransformer3DModel) -> str:
     """A hash of names, shapes and some values of each weight: tells models apart without reading all of them."""
     digest = hashlib.sha256()
-    for name, parameter in sorted(transformer.named_parameters()):
-        values = parameter.detach().flatten()
+    for name, tensor in sorted(transformer.state_dict().items()):  # tables of positions too
+        values = tensor.detach().flatten()
         some = values[:: max(1, len(values) // SAMPLED)].float().cpu().contiguous()
-        digest.update(f"{name} {tuple(parameter.shape)}".encode() + some.numpy().tobytes())
+        digest.update(f"{name} {tuple(tensor.shape)}".encode() + some.numpy().tobytes())
     return digest.hexdigest()
 
 

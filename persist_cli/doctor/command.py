@@ -15,8 +15,8 @@ from persist_cli.doctor.machine import Machine, gib
 from persist_cli.doctor.need import Estimator, Launch, Need
 from persist_cli.doctor.planned import Planned, plan, plan_recipe, plan_stage2
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
-from persist_cli.training.settings import check_sharing
 from persist_cli.training.sharding import check_sharded
+from persist_cli.trajectories.clips import check_sharing
 from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import PersistError
 

@@ -7,8 +7,6 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from persist_cli.world.errors import RecipeError
-
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -16,28 +14,6 @@ Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Precision = Annotated[  # YAML reads the word no as false
     Literal["no", "bf16"], BeforeValidator(lambda given: "no" if given is False else given)
 ]
-
-
-def check_sharing(batch: int, accumulation: int, processes: int) -> None:
-    """Raise ``RecipeError`` when processes cannot have equal parts of a batch in so many micro-batches.
-
-    Args:
-        batch: samples of an optimizer step.
-        accumulation: micro-batches of it.
-        processes: that share each.
-    """
-    if batch % (accumulation * processes) == 0:
-        return
-    share = batch // processes
-    if batch % processes:
-        advice = f"training.batch={max(1, share) * processes} training.accumulation={max(1, share)}"
-    else:
-        most = max(parts for parts in range(1, min(accumulation, share) + 1) if share % parts == 0)
-        advice = f"training.accumulation={most}"
-    raise RecipeError(
-        f"training.batch {batch} cannot be shared by {processes} processes with {accumulation} micro-batches; "
-        f"give {advice}"
-    )
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from torch.utils.data import BatchSampler, Dataset
 
-from persist_cli.training.settings import check_sharing
 from persist_cli.trajectories.store import Store, TrajectoryFile
 from persist_cli.world.actions import ActionVocabulary
 from persist_cli.world.backbone import Interactions
-from persist_cli.world.errors import DataError
+from persist_cli.world.errors import DataError, RecipeError
 from persist_cli.world.observations import Observations, TrajectoryInfo
 
 
@@ -145,6 +144,28 @@ class ClipDataset(Dataset[ClipSample]):
         count = min(start, self.plan.context_frames - 1)
         earlier = random.permutation(start)[:count]
         return [*sorted(int(frame) for frame in earlier), start]
+
+
+def check_sharing(batch: int, accumulation: int, processes: int) -> None:
+    """Raise ``RecipeError`` when processes cannot have equal parts of a batch in so many micro-batches.
+
+    Args:
+        batch: samples of an optimizer step.
+        accumulation: micro-batches of it.
+        processes: that share each.
+    """
+    if batch % (accumulation * processes) == 0:
+        return
+    share = batch // processes
+    if batch % processes:
+        advice = f"training.batch={max(1, share) * processes} training.accumulation={max(1, share)}"
+    else:
+        most = max(parts for parts in range(1, min(accumulation, share) + 1) if share % parts == 0)
+        advice = f"training.accumulation={most}"
+    raise RecipeError(
+        f"training.batch {batch} cannot be shared by {processes} processes with {accumulation} micro-batches; "
+        f"give {advice}"
+    )
 
 
 class SharedBatches(BatchSampler):

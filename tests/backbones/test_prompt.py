@@ -121,6 +121,9 @@ def test_an_embedding_of_another_size_or_name_is_one_line(folder, tmp_path):
     write_tensors(file, {"prompt": torch.zeros(1, 3, 8)})
     with pytest.raises(CheckpointError, match=r"embedding of \(1, 3, 8\), but the transformer takes \(1, 10, 8\)"):
         load_twin(folder, prompt_embedding=str(file))
+    write_tensors(file, {"prompt": torch.full((1, 10, 8), torch.nan)})
+    with pytest.raises(CheckpointError, match="with values that are no numbers; make it again"):
+        load_twin(folder, prompt_embedding=str(file))
     write_tensors(file, {"text": torch.zeros(1, 10, 8)})
     with pytest.raises(CheckpointError, match=r"no tensor 'prompt' in it; persist_backbones.prompt.write_prompt"):
         load_twin(folder, prompt_embedding=str(file))

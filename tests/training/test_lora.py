@@ -13,12 +13,14 @@ from diffusers import (
     CogVideoXTransformer3DModel,
 )
 
+from persist_backbones.lora import weights_digest
 from persist_backbones.parts import make_parts
 from persist_backbones.presets import CogVideoXSettings
 from persist_cli.checkpoints import find_checkpoint, load_backbone
 from persist_cli.world.files import read_tensors
 from persist_cli.world.stages import Lora
 from tests.backbones.micro import micro, predicted, random_clips
+from tests.backbones.twins import load_twin, write_twin
 from tests.walking import MICRO, MICRO_SETTINGS, ended_alike, stage, train_here
 
 LORA = ["lora.rank=4", "lora.alpha=8", "training.learning_rate=0.01"]
@@ -149,6 +151,14 @@ def test_a_run_may_change_a_plain_diffusers_directory(persist, walks, pretrained
     ended = persist("rollout", tmp_path / "run", "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     path.write_bytes(whole)
     assert (ended.code, "was trained on other weights than those" in ended.err) == (1, True)
+
+
+def test_a_change_of_low_rank_knows_the_positions_that_it_was_trained_with(tmp_path):
+    twin = load_twin(write_twin("5b-i2v", tmp_path / "twin")).transformer.base
+    before = weights_digest(twin)
+    with torch.no_grad():
+        twin.patch_embed.pos_embedding[:, -1] += 1
+    assert weights_digest(twin) != before
 
 
 def test_what_lora_cannot_do_is_one_line(persist, walks, stage1, codec, tmp_path, monkeypatch):

@@ -108,6 +108,15 @@ def test_an_encoder_that_is_named_begins_without_the_settings_of_the_one_before(
     assert found == {"name": "voxel", "encoder": "patches"}
 
 
+@pytest.mark.parametrize("change", ["memory.encoder=patches", "memory={encoder: patches}"])
+def test_another_encoder_on_the_command_line_begins_without_settings_too(change):
+    recipe = read_recipe("cogvideox-5b-i2v-stage2-voxel")
+    found = make_recipe(apply_overrides(recipe, ["memory.encoder_settings.patch=2", change]), "x").memory
+    same = make_recipe(apply_overrides(recipe, ["memory.encoder=dinov2", "memory.settings.cell=[1, 1, 1]"]), "x").memory
+    assert found.encoder_settings == ({"patch": 2} if "." in change else {})
+    assert same.encoder_settings == recipe["memory"]["encoder_settings"]
+
+
 def test_a_recipe_cannot_extend_itself_nor_what_there_is_not(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: b.yaml")
     (tmp_path / "b.yaml").write_text("extends: a.yaml")
