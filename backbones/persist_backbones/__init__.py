@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from persist_backbones.pipeline import WorldPipeline
+    from persist_backbones.pipelines.pipeline import WorldPipeline
     from persist_cli.world.placement import Precision
 
 
@@ -25,6 +25,22 @@ def load(folder: Path | str, adapter: str | None = None, dtype: Precision | None
     Raises:
         PersistError: one line when there is no such checkpoint or adapter, or it is damaged.
     """
-    from persist_backbones.loading import load_pipeline  # diffusers takes seconds to import
+    from persist_backbones.pipelines.loading import load_pipeline  # diffusers takes seconds to import
 
     return load_pipeline(Path(folder), adapter, dtype)
+
+
+def write_prompt(prompt: str, pretrained: str, path: Path | str) -> None:
+    """Write a prompt's embedding for ``backbone.settings.prompt_embedding``, on a machine that has the text encoder.
+
+    Args:
+        prompt: text.
+        pretrained: a diffusers CogVideoX directory with ``text_encoder/`` and ``tokenizer/``.
+        path: a safetensors file to write.
+
+    Raises:
+        PersistError: one line when T5 is not there or unusable, and for a prompt that is too long.
+    """
+    from persist_backbones.weights.prompt import save_prompt  # transformers takes seconds to import
+
+    save_prompt(prompt, pretrained, Path(path))

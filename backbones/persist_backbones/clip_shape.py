@@ -16,7 +16,7 @@ from torch import Tensor
 
 from persist_backbones.codec import spatial_compression
 from persist_backbones.patches import frames_per_token
-from persist_backbones.presets import CogVideoXSettings
+from persist_backbones.weights.presets import CogVideoXSettings
 
 
 @dataclass(frozen=True)

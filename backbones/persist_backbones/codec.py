@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
 from persist_backbones.framewise import batch_to_frames, code_frames_alone, frames_to_batch
-from persist_backbones.offloading import computing_device
+from persist_backbones.sampling.offloading import computing_device
 from persist_cli.world.errors import CheckpointError
 
 WHOLE = 2**30  # values, as CogVideoXSafeConv3d has it

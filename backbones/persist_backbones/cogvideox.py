@@ -11,24 +11,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, PreparedMemory, memory_of
+from persist_backbones.adapters.adapter import Adapter, PreparedMemory, memory_of
+from persist_backbones.adapters.forms import load_adapter, make_adapter, save_adapter
 from persist_backbones.clip_shape import clip_shape
 from persist_backbones.codec import Codec
 from persist_backbones.conditioning import camera_latents, camera_tokens, interaction_rows, model_input
 from persist_backbones.economy import FrozenWeights, economize
-from persist_backbones.forms import load_adapter, make_adapter, save_adapter
-from persist_backbones.guidance import make_denoiser
 from persist_backbones.inventory import parts_of, shorten
-from persist_backbones.lora import add_lora, train_lora
 from persist_backbones.noise import draw_timesteps, generators_of, noise_like
 from persist_backbones.objective import loss_weights, predicted_target, squared_error
-from persist_backbones.parts import DiffusersParts, check_fit, starting_parts, video_shape, widen
-from persist_backbones.presets import CogVideoXSettings
-from persist_backbones.pretrained import origin_of
-from persist_backbones.prompt import ORIGINS, starting_prompt
 from persist_backbones.rotary import rotary_positions
-from persist_backbones.samplers import SAMPLERS, check_sampling, denoise
-from persist_backbones.saving import load_whole, save_change, save_whole
+from persist_backbones.sampling.guidance import make_denoiser
+from persist_backbones.sampling.samplers import SAMPLERS, check_sampling, denoise
+from persist_backbones.weights.lora import add_lora, train_lora
+from persist_backbones.weights.parts import DiffusersParts, check_fit, starting_parts, video_shape, widen
+from persist_backbones.weights.presets import CogVideoXSettings
+from persist_backbones.weights.pretrained import origin_of
+from persist_backbones.weights.prompt import ORIGINS, starting_prompt
+from persist_backbones.weights.saving import load_whole, save_change, save_whole
 from persist_backbones.world_transformer import Conditions
 from persist_cli.world.backbone import Backbone, Clips, Sampling
 from persist_cli.world.errors import CheckpointError
@@ -36,7 +36,7 @@ from persist_cli.world.placement import Placement
 from persist_cli.world.stages import Economy, Lora, Part, Stage
 
 if TYPE_CHECKING:
-    from persist_backbones.pipeline import WorldPipeline
+    from persist_backbones.pipelines.pipeline import WorldPipeline
 
 
 class CogVideoX(Backbone):
@@ -103,7 +103,7 @@ class CogVideoX(Backbone):
 
     def place(self, placement: Placement) -> None:
         """Get ready to sample, as diffusers' pipelines do; weights that are offloaded rest on the CPU between clips."""
-        from persist_backbones.placing import place  # a pipeline is made around this class
+        from persist_backbones.sampling.placing import place  # a pipeline is made around this class
 
         self.offloaded = place(self, placement, placement.device())
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from persist_backbones.lora import has_lora
+from persist_backbones.weights.lora import has_lora
 from persist_cli.world.stages import Economy, Stage
 
 if TYPE_CHECKING:

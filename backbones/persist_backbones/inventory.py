@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from persist_backbones.adapter import Adapter
+from persist_backbones.adapters.adapter import Adapter
 from persist_cli.world.stages import Part
 
 LORA = ".lora_"  # in the names that PEFT gives to what it adds

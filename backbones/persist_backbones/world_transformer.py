@@ -17,11 +17,11 @@ from diffusers.models.cache_utils import CacheMixin
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, PreparedMemory
-from persist_backbones.caches import check_cache, rest_is_cached, with_layers
+from persist_backbones.adapters.adapter import Adapter, PreparedMemory
 from persist_backbones.conditioning import tokens_of
-from persist_backbones.offloading import bring
 from persist_backbones.patches import fold_patches, frames_per_token, unfold_patches
+from persist_backbones.sampling.caches import check_cache, rest_is_cached, with_layers
+from persist_backbones.sampling.offloading import bring
 
 OFFSET = 2.0  # what CogVideoX 1.5 image-to-video was trained with as ``ofs``
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from persist_backbones.adapter import PreparedMemory
+from persist_backbones.adapters.adapter import PreparedMemory
 from persist_backbones.cogvideox import CogVideoX
 from persist_cli.registry import make_backbone
 from persist_cli.world.backbone import Clips

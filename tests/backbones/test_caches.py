@@ -13,8 +13,8 @@ from diffusers.hooks import (
     TextKVCacheConfig,
 )
 
-from persist_backbones.caches import ClipCaches
-from persist_backbones.pipeline import WorldPipeline
+from persist_backbones.pipelines.pipeline import WorldPipeline
+from persist_backbones.sampling.caches import ClipCaches
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import PersistError
 from persist_cli.world.tokens import MemoryTokens

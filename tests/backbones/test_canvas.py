@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from persist_backbones.canvas import CanvasAdapter
+from persist_backbones.adapters.canvas import CanvasAdapter
 from persist_backbones.conditioning import tokens_of
 from persist_cli.world.tokens import MemoryTokens
 from tests.backbones.micro import CHANNELS, micro, predicted, random_clips, random_tokens, shaken, with_adapter

@@ -25,7 +25,7 @@ from typing import Any
 
 import pytest
 
-from persist_backbones.pipeline import WorldPipeline
+from persist_backbones.pipelines.pipeline import WorldPipeline
 from persist_cli.world.tokens import MemoryTokens
 from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
 from tests.walking import MICRO

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.forms import FORMS
-from persist_backbones.memory_block import position_code
+from persist_backbones.adapters.forms import FORMS
+from persist_backbones.adapters.memory_block import position_code
 from persist_cli.world.actions import rotation_about
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.cameras import Cameras

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.forms import FORMS
-from persist_backbones.projected import image_places
+from persist_backbones.adapters.forms import FORMS
+from persist_backbones.adapters.projected import image_places
 from persist_cli.world.tokens import MemoryTokens
 from tests.backbones.micro import (
     CHANNELS,

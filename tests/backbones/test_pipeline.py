@@ -18,8 +18,8 @@ from PIL import Image
 
 import persist_backbones
 from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.pipeline import WorldPipeline, WorldPipelineOutput
-from persist_backbones.tiling import enable_tiling
+from persist_backbones.pipelines.pipeline import WorldPipeline, WorldPipelineOutput
+from persist_backbones.sampling.tiling import enable_tiling
 from persist_cli.checkpoints import find_checkpoint, save_adapter, save_base
 from persist_cli.recipe import MemoryChoice
 from persist_cli.world.backbone import Sampling

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from persist_backbones.placing import place
-from persist_backbones.tiling import overlap
+from persist_backbones.sampling.placing import place
+from persist_backbones.sampling.tiling import overlap
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import PersistError
 from persist_cli.world.placement import Placement

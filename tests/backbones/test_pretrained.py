@@ -5,7 +5,7 @@ import shutil
 import pytest
 import torch
 
-from persist_backbones.pretrained import folder_here, pretrained_folder, published_preset
+from persist_backbones.weights.pretrained import folder_here, pretrained_folder, published_preset
 from persist_cli.registry import make_backbone
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_json, write_json

@@ -9,7 +9,7 @@ from diffusers import CogVideoXPipeline
 from tokenizers import Tokenizer, models, pre_tokenizers, trainers
 from transformers import T5Config, T5EncoderModel, T5Tokenizer
 
-from persist_backbones.prompt import write_prompt
+from persist_backbones import write_prompt
 from persist_cli.registry import make_backbone
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
@@ -125,7 +125,7 @@ def test_an_embedding_of_another_size_or_name_is_one_line(folder, tmp_path):
     with pytest.raises(CheckpointError, match="with values that are no numbers; make it again"):
         load_twin(folder, prompt_embedding=str(file))
     write_tensors(file, {"text": torch.zeros(1, 10, 8)})
-    with pytest.raises(CheckpointError, match=r"no tensor 'prompt' in it; persist_backbones.prompt.write_prompt"):
+    with pytest.raises(CheckpointError, match=r"no tensor 'prompt' in it; persist_backbones.write_prompt"):
         load_twin(folder, prompt_embedding=str(file))
 
 

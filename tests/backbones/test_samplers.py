@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from persist_backbones.noise import generators_of, noise_like
-from persist_backbones.presets import PRESETS
-from persist_backbones.samplers import MULTISTEP, SAMPLERS, denoise, make_schedule
+from persist_backbones.sampling.samplers import MULTISTEP, SAMPLERS, denoise, make_schedule
+from persist_backbones.weights.presets import PRESETS
 from persist_cli.world.errors import PersistError
 
 UNSHIFTED, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3

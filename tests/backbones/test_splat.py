@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from persist_backbones.splat import rasterize, splat
+from persist_backbones.adapters.splat import rasterize, splat
 from persist_cli.world.actions import rotation_about
 from persist_cli.world.cameras import Cameras
 

@@ -14,7 +14,7 @@ from diffusers import (
 
 from persist_backbones.clip_shape import ClipShape
 from persist_backbones.noise import generators_of, noise_like
-from persist_backbones.pipeline import WorldPipeline
+from persist_backbones.pipelines.pipeline import WorldPipeline
 from persist_cli.registry import make_backbone
 from persist_cli.world.backbone import Sampling
 from persist_cli.world.errors import CheckpointError

@@ -3,7 +3,7 @@ import json
 import pytest
 from PIL import Image
 
-from persist_backbones.samplers import SAMPLERS
+from persist_backbones.sampling.samplers import SAMPLERS
 from persist_cli.world.errors import CheckpointError
 from tests.benchmarks.bench_sampling import fresh_model, main
 from tests.walking import MICRO

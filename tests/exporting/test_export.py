@@ -4,7 +4,7 @@ import json
 import pytest
 import torch
 
-from persist_backbones.parts import load_exactly
+from persist_backbones.weights.parts import load_exactly
 from persist_cli.checkpoints import find_checkpoint, load_adapter, load_backbone
 from persist_cli.sampling import AskedSampling, sampling_of
 from persist_cli.world.backbone import Sampling

@@ -13,9 +13,9 @@ from diffusers import (
     CogVideoXTransformer3DModel,
 )
 
-from persist_backbones.lora import weights_digest
-from persist_backbones.parts import make_parts
-from persist_backbones.presets import CogVideoXSettings
+from persist_backbones.weights.lora import weights_digest
+from persist_backbones.weights.parts import make_parts
+from persist_backbones.weights.presets import CogVideoXSettings
 from persist_cli.checkpoints import find_checkpoint, load_backbone
 from persist_cli.world.files import read_tensors
 from persist_cli.world.stages import Lora

@@ -13,15 +13,15 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
 from torch import Tensor, nn
 
-from persist_backbones.adapter import VideoShape
+from persist_backbones.adapters.adapter import VideoShape
 from persist_backbones.clip_shape import clip_shape
 from persist_backbones.codec import Codec, check_vae, spatial_compression
 from persist_backbones.conditioning import RAY_CHANNELS
 from persist_backbones.objective import check_prediction
 from persist_backbones.patches import frames_per_token
 from persist_backbones.position_tables import fit_positions
-from persist_backbones.presets import PRESETS, CogVideoXSettings
-from persist_backbones.pretrained import check_name, folder_here, pretrained_folder, published_preset
+from persist_backbones.weights.presets import PRESETS, CogVideoXSettings
+from persist_backbones.weights.pretrained import check_name, folder_here, pretrained_folder, published_preset
 from persist_backbones.world_transformer import WorldTransformer
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from persist_backbones.adapter import NEAR
+from persist_backbones.adapters.adapter import NEAR
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.geometry import nearest_at, project
 

@@ -10,11 +10,11 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 from diffusers.configuration_utils import ConfigMixin, register_to_config
 from diffusers.models.modeling_utils import ModelMixin
 
-from persist_backbones.adapter import Adapter, VideoShape
+from persist_backbones.adapters.adapter import Adapter, VideoShape
+from persist_backbones.adapters.forms import make_adapter
 from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.forms import make_adapter
-from persist_backbones.parts import DiffusersParts, widen
-from persist_backbones.presets import CogVideoXSettings
+from persist_backbones.weights.parts import DiffusersParts, widen
+from persist_backbones.weights.presets import CogVideoXSettings
 from persist_cli.world.settings import parse_settings
 
 BASE = "base"  # diffusers' transformer inside ours, a component of its own

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from persist_backbones.caches import ClipCaches
-from persist_backbones.samplers import Denoiser
+from persist_backbones.sampling.caches import ClipCaches
+from persist_backbones.sampling.samplers import Denoiser
 from persist_cli.world.backbone import Clips
 
 if TYPE_CHECKING:

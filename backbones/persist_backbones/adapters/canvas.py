@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
-from persist_backbones.canvas_head import CanvasHead
+from persist_backbones.adapters.adapter import Adapter, AdapterSettings, PreparedMemory, VideoShape
+from persist_backbones.adapters.canvas_head import CanvasHead
+from persist_backbones.adapters.splat import rasterize, splat
 from persist_backbones.conditioning import fold_frames, tokens_of
-from persist_backbones.splat import rasterize, splat
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.tokens import MemoryTokens

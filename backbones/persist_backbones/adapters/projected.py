@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from persist_backbones.adapter import NEAR, Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapters.adapter import NEAR, Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapters.memory_block import AttentionSettings, memory_blocks, position_code
 from persist_backbones.conditioning import fold_frames
-from persist_backbones.memory_block import AttentionSettings, memory_blocks, position_code
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.geometry import pixel_centers, project
 from persist_cli.world.tokens import MemoryTokens

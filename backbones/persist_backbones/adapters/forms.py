@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from persist_backbones.adapter import Adapter, VideoShape
-from persist_backbones.canvas import CanvasAdapter
-from persist_backbones.cross import CrossAdapter
-from persist_backbones.parts import load_exactly
-from persist_backbones.projected import ProjectedAdapter
+from persist_backbones.adapters.adapter import Adapter, VideoShape
+from persist_backbones.adapters.canvas import CanvasAdapter
+from persist_backbones.adapters.cross import CrossAdapter
+from persist_backbones.adapters.projected import ProjectedAdapter
+from persist_backbones.weights.parts import load_exactly
 from persist_cli.world.errors import CheckpointError, hint
 from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
 from persist_cli.world.settings import parse_settings

@@ -8,8 +8,8 @@ from typing import get_args
 import torch
 
 from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.pipeline import WorldPipeline
-from persist_backbones.presets import CogVideoXSettings
+from persist_backbones.pipelines.pipeline import WorldPipeline
+from persist_backbones.weights.presets import CogVideoXSettings
 from persist_cli.world.checkpoint_folder import CARD, PLAIN, adapter_folder, default_adapter, open_checkpoint
 from persist_cli.world.errors import CheckpointError, hint
 from persist_cli.world.placement import Precision

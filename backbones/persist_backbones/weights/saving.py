@@ -6,9 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from persist_backbones.lora import merge_lora, save_lora
-from persist_backbones.parts import load_parts, load_world, save_world, starting_parts
-from persist_backbones.prompt import check_kept
+from persist_backbones.weights.lora import merge_lora, save_lora
+from persist_backbones.weights.parts import load_parts, load_world, save_world, starting_parts
+from persist_backbones.weights.prompt import check_kept
 from persist_cli.world.checkpoint_folder import what_is_changed
 
 if TYPE_CHECKING:

@@ -15,12 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.components import MemoryAdapter, WorldModules, assemble
-from persist_backbones.guidance import make_denoiser
 from persist_backbones.noise import noise_like
-from persist_backbones.parts import DiffusersParts
-from persist_backbones.pipeline_inputs import batch_of_images, make_clips
-from persist_backbones.samplers import SAMPLERS, Denoiser, Step, denoising
+from persist_backbones.pipelines.components import MemoryAdapter, WorldModules, assemble
+from persist_backbones.pipelines.inputs import batch_of_images, make_clips
+from persist_backbones.sampling.guidance import make_denoiser
+from persist_backbones.sampling.samplers import SAMPLERS, Denoiser, Step, denoising
+from persist_backbones.weights.parts import DiffusersParts
 from persist_cli.world.backbone import Clips, Interactions, Sampling
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError, DataError, PersistError

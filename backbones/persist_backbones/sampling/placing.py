@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from persist_backbones.codec import pixel_patch
-from persist_backbones.pipeline import WorldPipeline
-from persist_backbones.tiling import enable_tiling
+from persist_backbones.pipelines.pipeline import WorldPipeline
+from persist_backbones.sampling.tiling import enable_tiling
 from persist_cli.world.placement import Placement
 
 if TYPE_CHECKING:

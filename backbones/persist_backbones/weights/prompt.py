@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_backbones.presets import CogVideoXSettings
-from persist_backbones.pretrained import pretrained_folder
+from persist_backbones.weights.presets import CogVideoXSettings
+from persist_backbones.weights.pretrained import pretrained_folder
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_json, read_tensors, write_tensors
 
@@ -70,21 +70,12 @@ def read_prompt(path: Path) -> Float[Tensor, "1 word channel"]:
     """The tensor ``prompt`` of a safetensors file: one of ``write_prompt``, or a checkpoint's ``world.safetensors``."""
     tensors, _ = read_tensors(path)
     if NAME not in tensors:
-        raise CheckpointError(f"{path}: no tensor {NAME!r} in it; persist_backbones.prompt.write_prompt makes one")
+        raise CheckpointError(f"{path}: no tensor {NAME!r} in it; persist_backbones.write_prompt makes one")
     return tensors[NAME]
 
 
-def write_prompt(prompt: str, pretrained: str, path: Path) -> None:
-    """Write a prompt's embedding for ``prompt_embedding``, on a machine that has the text encoder.
-
-    Args:
-        prompt: text.
-        pretrained: a diffusers CogVideoX directory with ``text_encoder/`` and ``tokenizer/``.
-        path: a safetensors file to write.
-
-    Raises:
-        CheckpointError: as ``embed_prompt``.
-    """
+def save_prompt(prompt: str, pretrained: str, path: Path) -> None:
+    """See ``persist_backbones.write_prompt``."""
     folder = pretrained_folder(pretrained)
     words = read_json(folder / "transformer" / "config.json")["max_text_seq_length"]
     write_tensors(path, {NAME: embed_prompt(prompt, folder, words)})

@@ -1,0 +1,1 @@
+"""Memory adapters: how tokens of a memory reach the video."""

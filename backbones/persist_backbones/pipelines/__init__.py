@@ -1,0 +1,1 @@
+"""A backbone as a pipeline of diffusers' kind."""
