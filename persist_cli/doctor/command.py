@@ -21,6 +21,7 @@ from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import PersistError
 
 COLUMNS: Final = ("weights", "gradients", "optimizer", "average", "encoding", "activations", "update", "peak")
+MOST_SAMPLES: Final = 4096  # of a micro-batch
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,9 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     planned = plan_recipe(name, overrides)
     training = planned.recipe.training
     check_sharing(training.batch, training.accumulation, machine.devices)
+    samples = training.batch // (training.accumulation * machine.devices)
+    if samples > MOST_SAMPLES:
+        raise PersistError(f"{samples} samples at once on a device: no plan is made of more than {MOST_SAMPLES}")
     if sharded:
         planned.backbone.trained_parameters(planned.recipe.stage)
         check_sharded(planned.recipe, planned.backbone)

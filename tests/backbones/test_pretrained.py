@@ -8,7 +8,7 @@ import torch
 from persist_backbones.weights.pretrained import folder_here, pretrained_folder, published_preset
 from persist_cli.registry import make_backbone
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_json, write_json
+from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
 from tests.backbones.twins import SIZE, load_twin, write_snapshot, write_twin
 
 NAME = "zai-org/CogVideoX-5b-I2V"
@@ -100,6 +100,22 @@ def test_weights_of_another_configuration_are_neither_filled_up_nor_cut(tmp_path
     write_json(config, read_json(config) | {"num_layers": layers})
     with pytest.raises(CheckpointError, match=rf"transformer: its weights {cause}.*take a whole copy of both"):
         load_twin(tmp_path, SIZE)
+
+
+def test_what_of_a_part_is_missing_or_no_mapping_is_one_line_that_diffusers_adds_nothing_to(tmp_path, capfd, caplog):
+    folder = write_twin("5b-i2v", tmp_path) / "transformer"
+    weights = folder / "diffusion_pytorch_model.safetensors"
+    tensors = read_tensors(weights)[0]
+    write_tensors(weights, {name: each for name, each in tensors.items() if name != "patch_embed.pos_embedding"})
+    with pytest.raises(CheckpointError, match=r"its weights lack 1 tensors .*, first 'patch_embed.pos_embedding'"):
+        load_twin(tmp_path, SIZE)
+    weights.unlink()
+    with pytest.raises(CheckpointError, match=f"transformer: no {weights.name} in it; take a whole copy"):
+        load_twin(tmp_path, SIZE)
+    (folder / "config.json").write_text("[]")
+    with pytest.raises(CheckpointError, match="transformer: its configuration is no mapping"):
+        load_twin(tmp_path, SIZE)
+    assert capfd.readouterr().err + caplog.text == ""
 
 
 def test_weights_of_other_shapes_are_one_line_that_names_one(tmp_path):

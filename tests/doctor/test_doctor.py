@@ -183,6 +183,7 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
 @pytest.mark.parametrize(
     ("options", "cause"),
     [(["--gpus", "8"], "give --gpu-memory GB"), (["--gpu-memory", "80", "--fsdp"], "give --gpus N too"),
+     (["--gpu-memory", "80", "training.batch=10000000"], "10000000 samples at once on a device"),
      (["training.stpes=1"], "did you mean 'training.steps'"),
      (["--gpus", "2", "--gpu-memory", "80", "--fsdp", "training.optimizer=adamw-8bit"], "is not sharded; use adamw"),
      (["--gpu-memory", "inf"], "give the GB of a card"),

@@ -14,6 +14,7 @@ SMALL = [
 BLOCKS = ["memory.encoder=patches", "adapter={width: 16, heads: 2, token_budget: 32}", "data.context_frames=4"]
 
 
+@pytest.mark.usefixtures("fresh_accelerator")
 @pytest.mark.parametrize("family", TWINS)
 def test_a_familys_recipes_train_one_after_the_other(persist, walks, tmp_path, family):
     twin = f"backbone.settings.pretrained={write_twin(TWINS[family], tmp_path / 'twin')}"

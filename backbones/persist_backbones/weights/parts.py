@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,13 @@ from persist_backbones.objective import check_prediction
 from persist_backbones.patches import frames_per_token
 from persist_backbones.position_tables import fit_positions
 from persist_backbones.weights.presets import PRESETS, CogVideoXSettings
-from persist_backbones.weights.pretrained import check_name, folder_here, pretrained_folder, published_preset
+from persist_backbones.weights.pretrained import (
+    check_name,
+    folder_here,
+    missing_files,
+    pretrained_folder,
+    published_preset,
+)  # fmt: skip
 from persist_backbones.world_transformer import WorldTransformer
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_tensors, write_tensors
@@ -108,25 +116,48 @@ def _load_part(folder: Path, name: str) -> Any:
         raise CheckpointError(
             f"{folder}: no {name}/ folder; a diffusers CogVideoX directory has {', '.join(SUBFOLDERS)}"
         )
+    config = _read_config(folder, name)
     if planning():
-        return _make_part(name, _read_config(folder, name))
+        return _make_part(name, config)
+    missing = missing_files(folder / name)
+    if missing:
+        raise CheckpointError(f"{folder / name}: no {missing[0]} in it; take a whole copy, its weights as safetensors")
     options: dict[str, Any] = {"subfolder": name, "local_files_only": True}
     try:
         if name == "scheduler":
             return SUBFOLDERS[name].from_pretrained(folder, **options)
-        part, found = SUBFOLDERS[name].from_pretrained(
-            folder, use_safetensors=True, low_cpu_mem_usage=False, output_loading_info=True, **options
-        )
+        with _silent("diffusers.models.modeling_utils"):  # what it warns of is refused below
+            part, found = SUBFOLDERS[name].from_pretrained(
+                folder, use_safetensors=True, low_cpu_mem_usage=False, output_loading_info=True, **options
+            )
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
         raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
-    _check_all_loaded(folder / name, found)
+    computed = () if config.get("use_learned_positional_embeddings") else ("patch_embed.pos_embedding",)
+    _check_all_loaded(folder / name, found, computed)
     return part
 
 
-def _check_all_loaded(folder: Path, found: dict[str, Any]) -> None:
-    """Raise ``CheckpointError`` where weights and configuration differ, of which diffusers leaves the rest random."""
+@contextlib.contextmanager
+def _silent(name: str) -> Iterator[None]:
+    """Within the block this logger says nothing."""
+    logger = logging.getLogger(name)
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+def _check_all_loaded(folder: Path, found: dict[str, Any], computed: Sequence[str]) -> None:
+    """Raise ``CheckpointError`` where weights and configuration differ, of which diffusers leaves the rest random.
+
+    Args:
+        folder: of both.
+        found: what diffusers says of loading them.
+        computed: tensors that may stand in the weights or not.
+    """
     for problem, names in (("lack", found["missing_keys"]), ("have besides", found["unexpected_keys"])):
-        names = sorted(each for each in names if not each.endswith("pos_embedding"))  # computed, but for 5b-I2V's
+        names = sorted(set(names) - set(computed))
         if names:
             raise CheckpointError(
                 f"{folder}: its weights {problem} {len(names)} tensors of its config.json, first {names[0]!r}; "
@@ -139,6 +170,8 @@ def _read_config(folder: Path, name: str) -> dict[str, Any]:
         config = SUBFOLDERS[name].load_config(folder, subfolder=name, local_files_only=True)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{folder / name}: its configuration cannot be read ({_cause(error)})") from error
+    if not isinstance(config, dict):
+        raise CheckpointError(f"{folder / name}: its configuration is no mapping; take a whole copy")
     return {key: value for key, value in config.items() if not key.startswith("_")}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
 from persist_cli.world.errors import CheckpointError
@@ -12,6 +11,7 @@ from persist_cli.world.hub import hub_obstacle
 
 PARTS = ("transformer", "vae", "scheduler")
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+WEIGHTS = "diffusion_pytorch_model.safetensors"  # of a part that is not split into several files
 PUBLISHED = {  # what the repositories of THUDM, now zai-org, hold
     "CogVideoX-2b": "2b",
     "CogVideoX-5b": "5b",
@@ -67,7 +67,7 @@ def pretrained_folder(name: str) -> Path:
         CheckpointError: one line when there is no such directory, and the repository cannot be had either.
     """
     folder = folder_here(name)
-    if folder is not None and (not _of_the_hub(name) or all(_complete(folder / part) for part in PARTS)):
+    if folder is not None and (not _of_the_hub(name) or not any(missing_files(folder / part) for part in PARTS)):
         return folder
     check_name(name)
     obstacle = hub_obstacle()
@@ -95,12 +95,12 @@ def _download(name: str) -> Path:
         raise CheckpointError(f"{name}: the hub does not give it ({cause})") from error
 
 
-def _complete(part: Path) -> bool:
-    """Whether a part of a snapshot has its configuration and all of its weights."""
+def missing_files(part: Path) -> list[str]:
+    """Names of the configuration and of the weights that a part's folder ought to have and has not."""
     if part.name == "scheduler":
-        return (part / "scheduler_config.json").is_file()
-    weights: Iterable[str] = ["diffusion_pytorch_model.safetensors"]
-    index = part / "diffusion_pytorch_model.safetensors.index.json"
-    if index.is_file():
-        weights = set(read_json(index)["weight_map"].values())
-    return all((part / name).is_file() for name in ("config.json", *weights))
+        wanted = ["scheduler_config.json"]
+    else:
+        index = part / "diffusion_pytorch_model.safetensors.index.json"
+        weights = set(read_json(index)["weight_map"].values()) if index.is_file() else {WEIGHTS}
+        wanted = ["config.json", *sorted(weights)]
+    return [name for name in wanted if not (part / name).is_file()]
