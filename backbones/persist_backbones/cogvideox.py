@@ -23,8 +23,9 @@ from persist_backbones.objective import loss_weights, predicted_target, squared_
 from persist_backbones.rotary import rotary_positions
 from persist_backbones.sampling.guidance import make_denoiser
 from persist_backbones.sampling.samplers import SAMPLERS, check_sampling, denoise
+from persist_backbones.weights.diffusers_parts import DiffusersParts
 from persist_backbones.weights.lora import add_lora, train_lora
-from persist_backbones.weights.parts import DiffusersParts, check_fit, starting_parts, video_shape, widen
+from persist_backbones.weights.parts import check_fit, starting_parts, video_shape, widen
 from persist_backbones.weights.presets import CogVideoXSettings
 from persist_backbones.weights.pretrained import origin_of
 from persist_backbones.weights.prompt import ORIGINS, starting_prompt
@@ -215,8 +216,7 @@ class CogVideoX(Backbone):
         """The batch's tokens embedded by the adapter in use, ``None`` without adapter."""
         if self.adapter is None:
             return None
-        name = f"adapter {self.adapter_name!r}"
-        prepared: PreparedMemory = memory_of(self.adapter, name, clips, self.prompt.device)
+        prepared: PreparedMemory = memory_of(self.adapter, f"adapter {self.adapter_name!r}", clips, self.prompt.device)
         return prepared
 
     def conditions(self, clips: Clips, timesteps: Tensor, memory: PreparedMemory | None) -> Conditions:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
 
-from persist_backbones.weights.parts import load_parts
+from persist_backbones.weights.diffusers_parts import load_parts
 from persist_cli.registry import make_backbone
 from persist_cli.world.errors import CheckpointError
 from tests.walking import MICRO, SIZE

@@ -13,7 +13,8 @@ from diffusers.models.modeling_utils import ModelMixin
 from persist_backbones.adapters.adapter import Adapter, VideoShape
 from persist_backbones.adapters.forms import make_adapter
 from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.weights.parts import DiffusersParts, widen
+from persist_backbones.weights.diffusers_parts import DiffusersParts
+from persist_backbones.weights.parts import widen
 from persist_backbones.weights.presets import CogVideoXSettings
 from persist_cli.world.settings import parse_settings
 

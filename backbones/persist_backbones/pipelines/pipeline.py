@@ -20,7 +20,7 @@ from persist_backbones.pipelines.components import MemoryAdapter, WorldModules, 
 from persist_backbones.pipelines.inputs import batch_of_images, make_clips
 from persist_backbones.sampling.guidance import make_denoiser
 from persist_backbones.sampling.samplers import SAMPLERS, Denoiser, Step, denoising
-from persist_backbones.weights.parts import DiffusersParts
+from persist_backbones.weights.diffusers_parts import DiffusersParts
 from persist_cli.world.backbone import Clips, Interactions, Sampling
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError, DataError, PersistError

@@ -6,8 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from persist_backbones.weights.diffusers_parts import load_parts
 from persist_backbones.weights.lora import merge_lora, save_lora
-from persist_backbones.weights.parts import load_parts, load_world, save_world, starting_parts
+from persist_backbones.weights.parts import load_world, save_world, starting_parts
 from persist_backbones.weights.prompt import check_kept
 from persist_cli.world.checkpoint_folder import what_is_changed
 
