@@ -92,6 +92,31 @@ def test_dinov2_takes_any_size_and_a_block_in_the_middle(tiny_dino):
     assert not torch.allclose(features, last)
 
 
+@pytest.mark.parametrize("layer", [1, 2, None])
+def test_dinov2_gives_what_transformers_has_behind_a_block_and_computes_no_further(tiny_dino, layer, capfd):
+    from transformers import Dinov2Model
+
+    encoder, rgb = make_encoder("dinov2", {"weights": str(tiny_dino), "layer": layer}), walked(1).rgb[:, :42, :56]
+    features = encoder.encode(rgb)
+    assert capfd.readouterr().err == ""  # not even a bar
+    model = Dinov2Model.from_pretrained(tiny_dino).eval()
+    with torch.no_grad():
+        states = model(encoder._pixels(rgb, 3, 4), output_hidden_states=True).hidden_states
+        expected = model.layernorm(states[-1 if layer is None else layer])[:, 1:].reshape(1, 3, 4, 24)
+    assert torch.equal(features, expected)
+    assert len(encoder._model.encoder.layer) == (layer or len(states) - 1)
+
+
+def test_dinov2_in_bf16_gives_nearly_the_same_features_in_float32(tiny_dino):
+    exact, half = (
+        make_encoder("dinov2", {"weights": str(tiny_dino), "precision": each}) for each in ("float32", "bf16")
+    )
+    rgb = walked(2).rgb
+    likeness = torch.nn.functional.cosine_similarity(exact.encode(rgb), half.encode(rgb), dim=-1)
+    assert half.encode(rgb).dtype == torch.float32
+    assert 0.99 < likeness.min() < 1
+
+
 def test_dinov2_frames_do_not_depend_on_their_neighbours_to_the_bit(tiny_dino):
     encoder, rgb = make_encoder("dinov2", {"weights": str(tiny_dino)}), walked(3).rgb
     assert torch.equal(encoder.encode(rgb)[1], encoder.encode(rgb[1:2])[0])

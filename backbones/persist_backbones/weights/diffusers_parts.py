@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 
 from persist_backbones.weights.pretrained import missing_files
 from persist_cli.world.errors import CheckpointError
+from persist_cli.world.quiet import silent
 
 SUBFOLDERS = {
     "transformer": CogVideoXTransformer3DModel,
@@ -62,7 +62,7 @@ def _load_part(folder: Path, name: str) -> Any:
     try:
         if name == "scheduler":
             return SUBFOLDERS[name].from_pretrained(folder, **options)
-        with _silent("diffusers.models.modeling_utils"):  # what it warns of is refused below
+        with silent("diffusers.models.modeling_utils"):  # what it warns of is refused below
             part, found = SUBFOLDERS[name].from_pretrained(
                 folder, use_safetensors=True, low_cpu_mem_usage=False, output_loading_info=True, **options
             )
@@ -71,17 +71,6 @@ def _load_part(folder: Path, name: str) -> Any:
     computed = () if config.get("use_learned_positional_embeddings") else ("patch_embed.pos_embedding",)
     _check_all_loaded(folder / name, found, computed)
     return part
-
-
-@contextlib.contextmanager
-def _silent(name: str) -> Iterator[None]:
-    """Within the block this logger says nothing."""
-    logger = logging.getLogger(name)
-    before, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = before
 
 
 def _check_all_loaded(folder: Path, found: dict[str, Any], computed: Sequence[str]) -> None:

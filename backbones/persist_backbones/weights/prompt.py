@@ -15,6 +15,7 @@ from persist_backbones.weights.presets import CogVideoXSettings
 from persist_backbones.weights.pretrained import pretrained_folder
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.files import read_json, read_tensors, write_tensors
+from persist_cli.world.quiet import without_bars
 
 ORIGINS = ("pretrained", "prompt", "prompt_embedding")  # settings of a model's beginning: a checkpoint holds the rest
 NAME = "prompt"  # of the tensor in files
@@ -101,9 +102,10 @@ def embed_prompt(prompt: str, folder: Path, words: int) -> Float[Tensor, "1 word
     _check_tokenizer(folder / "tokenizer")
     try:
         tokenizer = T5Tokenizer.from_pretrained(folder / "tokenizer", local_files_only=True)
-        encoder = T5EncoderModel.from_pretrained(
-            folder / "text_encoder", local_files_only=True, use_safetensors=True, dtype="auto"
-        )
+        with without_bars():
+            encoder = T5EncoderModel.from_pretrained(
+                folder / "text_encoder", local_files_only=True, use_safetensors=True, dtype="auto"
+            )
     except (OSError, ValueError, RuntimeError, KeyError, TypeError, ImportError) as error:
         cause = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise CheckpointError(f"{folder}: the text encoder cannot be loaded ({cause}); {OTHERWISE}") from error

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -17,6 +17,7 @@ from torch import Tensor
 from persist_cli.world.encoder import Encoder
 from persist_cli.world.errors import CheckpointError
 from persist_cli.world.hub import hub_obstacle, in_hub_cache
+from persist_cli.world.quiet import without_bars
 from persist_cli.world.weights import cached_weight
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -40,12 +41,14 @@ class DinoV2Settings:
             follows in either case. DINOv2-S-derived was tuned for another task in its last blocks: take its block 8.
         batch: frames encoded at once. More is faster on a GPU, but then the last bits of a feature depend on
             the frames beside it, and a map on how its frames were grouped.
+        precision: ``bf16`` computes in it, on a GPU for far less time.
     """
 
     weights: str = "dinov2-small"
     size: PositiveInt | None = None
     layer: PositiveInt | None = None
     batch: PositiveInt = 1
+    precision: Literal["float32", "bf16"] = "float32"
 
 
 class DinoV2(Encoder):
@@ -84,13 +87,13 @@ class DinoV2(Encoder):
         """Normalised patch features of the chosen block, without class and register tokens."""
         model = self._model.to(self._device)
         rows, columns = self._rows_and_columns(rgb.shape[1], rgb.shape[2])
-        layer = self.settings.layer or self._config.num_hidden_layers
         parts = []
         for part in torch.split(rgb, self.settings.batch):
             pixels = self._pixels(part.to(self._device), rows, columns)
-            states = model(pixels, output_hidden_states=True).hidden_states[layer]
-            parts.append(model.layernorm(states)[:, -rows * columns :].reshape(len(part), rows, columns, -1))
-        return torch.cat(parts).float()
+            with torch.autocast(self._device.type, torch.bfloat16, enabled=self.settings.precision == "bf16"):
+                states = model(pixels).last_hidden_state
+            parts.append(states[:, -rows * columns :].reshape(len(part), rows, columns, -1).float())
+        return torch.cat(parts)
 
     @cached_property
     def _config(self) -> Any:
@@ -108,12 +111,15 @@ class DinoV2(Encoder):
         from transformers import Dinov2Model
 
         options = {"use_safetensors": True, "config": self._config, "dtype": torch.float32}
-        return self._opened(Dinov2Model, **options).eval().requires_grad_(False)
+        model = self._opened(Dinov2Model, **options).eval().requires_grad_(False)
+        del model.encoder.layer[self.settings.layer or len(model.encoder.layer) :]  # nobody looks at what they give
+        return model
 
     def _opened(self, kind: Any, **options: Any) -> Any:
         source, local = self._source
         try:
-            return kind.from_pretrained(source, local_files_only=local, **options)
+            with without_bars():
+                return kind.from_pretrained(source, local_files_only=local, **options)
         except _UNUSABLE as error:
             cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise self._without(f"{source} failed ({cause})") from error
