@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -90,10 +91,14 @@ class DinoV2(Encoder):
         parts = []
         for part in torch.split(rgb, self.settings.batch):
             pixels = self._pixels(part.to(self._device), rows, columns)
-            with torch.autocast(self._device.type, torch.bfloat16, enabled=self.settings.precision == "bf16"):
+            with self._computing():
                 states = model(pixels).last_hidden_state
             parts.append(states[:, -rows * columns :].reshape(len(part), rows, columns, -1).float())
         return torch.cat(parts)
+
+    def _computing(self) -> AbstractContextManager[Any]:
+        exactly = self.settings.precision == "float32"
+        return nullcontext() if exactly else torch.autocast(self._device.type, torch.bfloat16)
 
     @cached_property
     def _config(self) -> Any:
