@@ -21,6 +21,8 @@ from persist_cli.viewing.console import print_json, print_table, say, watched
 from persist_cli.world.errors import PersistError
 
 COLUMNS: Final = ("weights", "gradients", "optimizer", "average", "encoding", "activations", "update", "peak")
+OF_A_MACHINE: Final = 8  # GPUs, where there are several machines
+EACH_MACHINE: Final = "--machine_rank R --main_process_ip HOST --main_process_port 29500"  # R counts them from 0
 MOST_SAMPLES: Final = 4096  # of a micro-batch
 
 
@@ -153,7 +155,9 @@ def command(doctor: Doctor, overrides: Sequence[str], strategy: Strategy) -> str
     if devices == 1 and not flags:
         return f"persist {finetune}"
     kind = " ".join(flags or ["--multi_gpu"])
-    return f"accelerate launch --num_processes {devices} {kind} --module persist_cli {finetune}"
+    machines, left = divmod(devices, OF_A_MACHINE)
+    spread = f"--num_machines {machines} {EACH_MACHINE} " if machines > 1 and not left else ""
+    return f"accelerate launch {spread}--num_processes {devices} {kind} --module persist_cli {finetune}"
 
 
 def _record(machine: Machine, parts: dict[str, Any], found: Sequence[Finding], best: Finding | None) -> dict[str, Any]:

@@ -138,6 +138,8 @@ def test_what_is_said_can_be_run():
         line = command(Doctor(planned(), machine, sharded), [], Strategy((OFFLOAD,)))
         flags = "--use_fsdp --fsdp_version 2 --fsdp_offload_params true"
         assert f"--num_processes {machine.devices} {flags} --module" in line
+    line = command(Doctor(planned(), Machine("cuda", 64, 1), False), [], Strategy())
+    assert line.startswith("accelerate launch --num_machines 8 --machine_rank R --main_process_ip HOST ")
 
 
 def test_a_plan_of_stage_1_is_beside_that_of_the_stage_2_that_stands_on_it(persist):
