@@ -22,6 +22,7 @@ from persist_backbones.conditioning import tokens_of
 from persist_backbones.patches import fold_patches, frames_per_token, unfold_patches
 from persist_backbones.sampling.caches import check_cache, rest_is_cached, with_layers
 from persist_backbones.sampling.offloading import bring
+from persist_backbones.zero_init import zero_init
 
 OFFSET = 2.0  # what CogVideoX 1.5 image-to-video was trained with as ``ofs``
 
@@ -83,9 +84,7 @@ class WorldTransformer(nn.Module, CacheMixin):  # type: ignore[misc]
         self.camera_channels = camera_channels
         self.in_channels, self.out_channels = in_channels, out_channels
         self.timestep = 0  # of the present step, for caches
-        for module in (self.extra_in, self.extra_out, self.interactions):
-            for parameter in module.parameters():
-                nn.init.zeros_(parameter)
+        zero_init(self.extra_in, self.extra_out, self.interactions)
 
     @property
     def is_cache_enabled(self) -> bool:

@@ -7,6 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from persist_backbones.zero_init import zero_init
+
 
 class CanvasHead(nn.Module):
     """Corrects the prediction by the canvas, beside the blocks and past them.
@@ -30,9 +32,7 @@ class CanvasHead(nn.Module):
         self.modulation = nn.Linear(time, 2 * width)
         self.mix = nn.Conv2d(width, width, 3, padding=1)
         self.out = nn.Conv2d(width, outputs, 3, padding=1)
-        for layer in (self.modulation, self.out):
-            for parameter in layer.parameters():
-                nn.init.zeros_(parameter)
+        zero_init(self.modulation, self.out)
 
     def forward(
         self,

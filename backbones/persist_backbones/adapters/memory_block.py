@@ -13,6 +13,7 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from persist_backbones.adapters.adapter import AdapterSettings, VideoShape
+from persist_backbones.zero_init import zero_init
 from persist_cli.world.errors import CheckpointError
 
 SHORTEST, LONGEST = 0.5, 128.0  # wavelengths of the position code in metres: two cells, twice the paper's map
@@ -91,9 +92,7 @@ class MemoryBlock(nn.Module):
         self.norm2 = nn.LayerNorm(video_channels)
         hidden = int(video_channels * ff_factor)
         self.ff = nn.Sequential(nn.Linear(video_channels, hidden), nn.GELU("tanh"), nn.Linear(hidden, video_channels))
-        for layer in (self.modulation, self.to_out, self.ff[2]):
-            for parameter in layer.parameters():
-                nn.init.zeros_(parameter)
+        zero_init(self.modulation, self.to_out, self.ff[2])
 
     def forward(
         self,
