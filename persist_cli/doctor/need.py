@@ -177,18 +177,13 @@ class Estimator:
         def size(parameters: list[nn.Parameter]) -> int:
             return sum(each.numel() * (FLOAT32 if id(each) in trained else frozen) for each in parameters)
 
-        whole = self.kept_whole()
+        whole = backbone.whole_parameters()
         kept = {id(each) for each in whole}
         return size(whole), size([each for each in backbone.parameters() if id(each) not in kept])
 
-    def kept_whole(self) -> list[nn.Parameter]:
-        """The parameters that are never sharded."""
-        backbone = self.backbone
-        return [each for name in backbone.kept_whole for each in backbone.get_submodule(name).parameters()]
-
     def gathered(self, recipe: Recipe) -> int:
         """Bytes that FSDP puts together at once."""
-        kept = {id(each) for each in self.kept_whole()}
+        kept = {id(each) for each in self.backbone.whole_parameters()}
         width = HALF if recipe.training.precision == "bf16" else FLOAT32
         blocks = [each for each in self.backbone.modules() if type(each).__name__ in self.backbone.sharded_blocks]
         sizes = [sum(each.numel() for each in block.parameters()) for block in blocks]

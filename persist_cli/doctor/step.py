@@ -137,7 +137,7 @@ def autocast(recipe: Recipe) -> torch.autocast:
 
 
 def _halve(backbone: Backbone) -> None:
-    whole = {id(each) for name in backbone.kept_whole for each in backbone.get_submodule(name).parameters()}
+    whole = {id(each) for each in backbone.whole_parameters()}
     for parameter in backbone.parameters():
         if id(parameter) not in whole:
             parameter.data = parameter.data.to(torch.bfloat16)

@@ -121,7 +121,7 @@ class Sharding:
 def check_sharded(recipe: Recipe, backbone: Backbone) -> None:
     """Raise ``PersistError`` when a recipe asks for what cannot be sharded; its stage's parameters are unfrozen."""
     settings, named = recipe.training, ", ".join(backbone.kept_whole)
-    if any(each.requires_grad for name in backbone.kept_whole for each in backbone.get_submodule(name).parameters()):
+    if any(each.requires_grad for each in backbone.whole_parameters()):
         raise PersistError(f"--use_fsdp: stage {recipe.stage} trains {named}, which is not sharded; use --multi_gpu")
     if settings.optimizer != "adamw":
         raise PersistError(f"--use_fsdp: training.optimizer={settings.optimizer} is not sharded; use adamw")

@@ -132,6 +132,10 @@ class Backbone(nn.Module, ABC):
         """Every parameter, each in one part, in the order in which people think of them."""
         return [Part(self.name, dict(self.named_parameters()))]
 
+    def whole_parameters(self) -> list[nn.Parameter]:
+        """Those of the submodules that are never sharded."""
+        return [each for name in self.kept_whole for each in self.get_submodule(name).parameters()]
+
     def shorten(self, groups: int) -> float:
         """Keep so many groups of like layers of what is trained in depth, for estimates; returns how many there were.
 
