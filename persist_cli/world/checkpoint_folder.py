@@ -48,10 +48,7 @@ def open_checkpoint(path: Path) -> CheckpointFolder:
     base, card = folder, read_card(folder)
     base_card = card
     if card.get("base"):
-        base = model_folder((folder / card["base"]).resolve())
-        base_card = read_card(base)
-        if base_card["fingerprint"] != str(card.get("fingerprint", "")):
-            raise CheckpointError(f"{folder}: was trained on another base than the one now at {base}")
+        base, base_card = _open_base(folder, card)
     return CheckpointFolder(folder, card, base, base_card)
 
 
@@ -69,10 +66,16 @@ def what_is_changed(folder: Path) -> Path | dict[str, Any] | None:
         return None
     if "settings" in changes:
         return dict(changes["settings"])
-    base = model_folder((folder / changes["base"]).resolve())
-    if read_card(base)["fingerprint"] != changes["fingerprint"]:
+    return _open_base(folder, changes)[0]
+
+
+def _open_base(folder: Path, pointer: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
+    """The folder and the card of the base that a checkpoint points to, if it is still the one it was trained on."""
+    base = model_folder((folder / pointer["base"]).resolve())
+    card = read_card(base)
+    if card["fingerprint"] != str(pointer.get("fingerprint", "")):
         raise CheckpointError(f"{folder}: was trained on another base than the one now at {base}")
-    return base
+    return base, card
 
 
 def step_folders(run: Path) -> list[Path]:
