@@ -216,24 +216,24 @@ class CogVideoX(Backbone):
         """The batch's tokens embedded by the adapter in use, ``None`` without adapter."""
         if self.adapter is None:
             return None
-        prepared: PreparedMemory = memory_of(self.adapter, f"adapter {self.adapter_name!r}", clips, self.prompt.device)
+        prepared: PreparedMemory = memory_of(self.adapter, f"adapter {self.adapter_name!r}", clips, self.device)
         return prepared
 
     def conditions(self, clips: Clips, timesteps: Tensor, memory: PreparedMemory | None) -> Conditions:
         """Prompt, interactions, cameras and memory of a batch."""
-        device, steps = self.prompt.device, self.settings.frames - 1
+        steps = self.settings.frames - 1
         return Conditions(
             text=self.prompt.expand(len(clips.seeds), -1, -1),
             timestep=timesteps,
-            interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(device),
+            interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(self.device),
             camera=self.camera_latents(clips),
-            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, device),
+            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.device),
             memory=memory,
         )
 
     def camera_latents(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Plücker rays at the latents' size."""
-        cameras, printed = clips.cameras.to(self.prompt.device), self.settings.rays == "printed"
+        cameras, printed = clips.cameras.to(self.device), self.settings.rays == "printed"
         return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
 
     def predict(self, noisy: Tensor, image: Tensor, given: Conditions) -> Tensor:
@@ -296,5 +296,5 @@ class CogVideoX(Backbone):
         self._take_adapter(name, load_adapter(folder, video_shape(self.transformer, self.codec)))
 
     def _take_adapter(self, name: str, adapter: Adapter[Any]) -> None:
-        self.adapters[name] = adapter.to(self.prompt.device)
+        self.adapters[name] = adapter.to(self.device)
         self.adapter_name = name
