@@ -42,7 +42,7 @@ class DinoV2Settings:
             follows in either case. DINOv2-S-derived was tuned for another task in its last blocks: take its block 8.
         batch: frames encoded at once. More is faster on a GPU, but then the last bits of a feature depend on
             the frames beside it, and a map on how its frames were grouped.
-        precision: ``bf16`` computes in it, on a GPU for far less time.
+        precision: ``bf16`` computes in it; features are float32 in either case.
     """
 
     weights: str = "dinov2-small"
