@@ -19,7 +19,6 @@ from persist_cli.world.stages import Lora, Stage
 
 EXTENDS = "extends"
 KINDS = {"backbone": "name", "memory": "name", "adapter": "form"}  # settings of one mean nothing to another
-
 SETTINGS_OF = {"backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings"}
 
 

@@ -92,7 +92,7 @@ def changes_of(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
         (not training.vae_slicing, SLICING),
         (training.precision == "bf16" and not half and not (sharded and frozen.whole), frozen),
         (bool(averaged) and cuda, AVERAGE),
-        (_samples(recipe, machine) > 1, _one_by_one(recipe, machine)),
+        (training.samples_at_once(machine.devices) > 1, _one_by_one(recipe, machine)),
         (machine.devices > 1 and not sharded and can_shard, Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))),
         (not training.gradient_checkpointing and deep, CHECKPOINTING),
         (training.optimizer == "adamw" and cuda and not sharded, EIGHT_BIT),
@@ -100,11 +100,6 @@ def changes_of(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
         (recipe.stage == "1" and recipe.lora is None, LORA),
     ]
     return [change for able, change in found if able]
-
-
-def _samples(recipe: Recipe, machine: Machine) -> float:
-    """Of a micro-batch."""
-    return recipe.training.batch / (recipe.training.accumulation * machine.devices)
 
 
 def _one_by_one(recipe: Recipe, machine: Machine) -> Change:

@@ -116,7 +116,7 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     planned = plan_recipe(name, overrides)
     training = planned.recipe.training
     check_sharing(training.batch, training.accumulation, machine.devices)
-    samples = training.batch // (training.accumulation * machine.devices)
+    samples = training.samples_at_once(machine.devices)
     if samples > MOST_SAMPLES:
         raise PersistError(f"{samples} samples at once on a device: no plan is made of more than {MOST_SAMPLES}")
     if sharded:

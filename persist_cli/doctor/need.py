@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -108,7 +107,7 @@ class Estimator:
     def need(self, recipe: Recipe, launch: Launch) -> Need:
         """What one process of a run needs."""
         training = recipe.training
-        batch = math.ceil(training.batch / (training.accumulation * launch.devices))
+        batch = training.samples_at_once(launch.devices)
         kind = StepKind(batch, launch.cuda, launch.sharded and training.precision == "bf16")
         encoding, step = self.encoding(recipe, kind).peak, self.step(recipe, kind)
         least = self.at_least(recipe, launch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -68,3 +69,7 @@ class TrainingSettings:
     ema_device: Literal["model", "cpu"] = "model"
     frozen_precision: Precision = "no"
     vae_slicing: bool = False
+
+    def samples_at_once(self, processes: int) -> int:
+        """Samples of a micro-batch on each of so many processes, the most where they cannot have equal parts."""
+        return math.ceil(self.batch / (self.accumulation * processes))

@@ -41,7 +41,7 @@ def zero_plugin(settings: TrainingSettings) -> DeepSpeedPlugin | None:
     config = plugin.deepspeed_config
     _check(plugin, config, settings)
     processes = int(os.environ.get("WORLD_SIZE", "1"))
-    config["train_micro_batch_size_per_gpu"] = max(1, settings.batch // (settings.accumulation * processes))
+    config["train_micro_batch_size_per_gpu"] = settings.samples_at_once(processes)
     config["gradient_accumulation_steps"] = settings.accumulation
     config["train_batch_size"] = "auto"
     config["gradient_clipping"] = settings.clip
