@@ -114,7 +114,8 @@ class TrajectoryFile:
         depth = [self._image(row["depth"], decode_depth, number) for number, row in zip(wanted, rows, strict=True)]
         poses = torch.tensor([row["world_from_camera"] for row in rows], dtype=torch.float64).reshape(-1, 4, 4)
         cameras = self._cameras(poses)
-        observations = Observations(torch.from_numpy(np.stack(rgb)), torch.from_numpy(np.stack(depth)), cameras)
+        images = (torch.stack([torch.from_numpy(each) for each in part]) for part in (rgb, depth))  # in torch's memory
+        observations = Observations(*images, cameras)
         return Trajectory(self.name, observations, tuple(row["action"] for row in rows), info, wanted[0])
 
     def poses(self) -> Float[Tensor, "frame 4 4"]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from persist_cli.world.errors import CheckpointError, PersistError
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from torch import Tensor, nn
 
 ASIDE = ".partial-"
 
@@ -84,7 +84,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file.
+    """Tensors and metadata of a safetensors file, the tensors in memory that torch allocated.
+
+    Those that safetensors gives lie where they lie in the file. At addresses that are not aligned as torch's own are,
+    some processors' kernels round differently, so a model that was read would not compute what the written one did.
 
     Raises:
         CheckpointError: one line when the file is missing, truncated or not safetensors.
@@ -95,9 +98,15 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise CheckpointError(f"{path}: no such file")
     try:
         with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+            return {name: file.get_tensor(name).clone() for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
     except (SafetensorError, ValueError, OSError) as error:
         raise CheckpointError(f"{path}: not a whole safetensors file ({str(error).splitlines()[0]})") from error
+
+
+def reallocate(module: nn.Module) -> None:
+    """Move the weights of a module that another library read into memory that torch allocated; see ``read_tensors``."""
+    for tensor in (*module.parameters(), *module.buffers()):
+        tensor.data = tensor.data.clone()
 
 
 def read_json(path: Path) -> Any:

@@ -21,6 +21,7 @@ from persist_cli.world.errors import CheckpointError
 from tests.backbones.micro import random_clips, random_tokens, shaken, with_adapter
 from tests.backbones.published import TRANSFORMERS
 from tests.backbones.twins import NAMES, SIZE, SMALL, load_twin, write_twin
+from tests.misaligned import misalign, misaligned
 
 OTHER = (9, 32, 32)  # shorter and of another shape than the configurations say
 BOTH = [(name, size) for name in NAMES for size in (SIZE, OTHER)]
@@ -149,6 +150,28 @@ def test_a_trained_twin_survives_saving_and_diffusers_reads_its_own_parts(twins,
         assert ours.state_dict().keys() == theirs.state_dict().keys()
         assert all(torch.equal(value, theirs.state_dict()[key]) for key, value in ours.state_dict().items())
     assert pipe.scheduler.config.snr_shift_scale == (3.0 if name == "2b" else 1.0)
+
+
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+def test_weights_are_loaded_into_memory_that_torch_allocated_wherever_they_lie_in_their_files(twins, form, tmp_path):
+    model = with_adapter(load_twin(twins["5b-i2v"], OTHER), form=form)
+    for folder in ("base", "adapter"):
+        (tmp_path / folder).mkdir()
+    model.save_base(tmp_path / "base")
+    model.save_adapter(tmp_path / "adapter")
+    WorldPipeline.of(model).save_pretrained(tmp_path / "pipeline")
+    for path in tmp_path.rglob("*.safetensors"):
+        misalign(path)
+    with torch.device("meta"):
+        loaded = make_backbone("cogvideox", model.checkpoint_settings())
+    loaded.load_base(tmp_path / "base")
+    loaded.load_adapter("memory", tmp_path / "adapter")
+    pipeline = WorldPipeline.from_pretrained(tmp_path / "pipeline")
+    assert misaligned(loaded) == misaligned(pipeline.backbone) == []
+    clips = random_clips(1, size=OTHER)
+    for again in (loaded.eval(), pipeline.backbone):
+        for one, two in zip(model.generate(clips, Sampling(2)), again.generate(clips, Sampling(2)), strict=True):
+            assert torch.equal(one, two)
 
 
 @pytest.mark.parametrize("form", ["cross", "projected", "canvas"])

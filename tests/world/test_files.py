@@ -13,6 +13,7 @@ from persist_cli.world.files import (
     written_aside,
 )
 from tests.disk import file_limit
+from tests.misaligned import ALIGNMENT, write_misaligned
 
 
 def test_a_failed_writer_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -21,6 +22,14 @@ def test_a_failed_writer_leaves_the_old_file_and_nothing_else(tmp_path):
         pass  # nothing was written aside, as when a disk is full
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_tensors_are_read_into_memory_that_torch_allocated(tmp_path):
+    tensors = {name: torch.randn(7, 5) for name in "abc"}
+    write_misaligned(tmp_path / "a.safetensors", tensors)
+    found, _ = read_tensors(tmp_path / "a.safetensors")
+    assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
+    assert all(tensor.data_ptr() % ALIGNMENT == 0 for tensor in found.values())
 
 
 def test_a_truncated_tensor_file_is_one_line(tmp_path):

@@ -12,7 +12,7 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 from diffusers.utils import BaseOutput
 from diffusers.video_processor import VideoProcessor
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from persist_backbones.cogvideox import CogVideoX
 from persist_backbones.noise import noise_like
@@ -24,6 +24,7 @@ from persist_backbones.weights.diffusers_parts import DiffusersParts
 from persist_cli.world.backbone import Clips, Interactions, Sampling
 from persist_cli.world.cameras import Cameras
 from persist_cli.world.errors import CheckpointError, DataError, PersistError
+from persist_cli.world.files import reallocate
 from persist_cli.world.tokens import MemoryTokens
 
 Callback = Callable[["WorldPipeline", int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
@@ -142,6 +143,9 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> Self:
         """As diffusers' own, safetensors only."""
         pipeline: Self = super().from_pretrained(pretrained_model_name_or_path, **options | {"use_safetensors": True})
+        for part in pipeline.components.values():
+            if isinstance(part, nn.Module):
+                reallocate(part)
         return pipeline
 
     @torch.no_grad()

@@ -13,6 +13,7 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 
 from persist_backbones.weights.pretrained import missing_files
 from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import reallocate
 from persist_cli.world.quiet import silent
 
 SUBFOLDERS = {
@@ -70,6 +71,7 @@ def _load_part(folder: Path, name: str) -> Any:
         raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
     computed = () if config.get("use_learned_positional_embeddings") else ("patch_embed.pos_embedding",)
     _check_all_loaded(folder / name, found, computed)
+    reallocate(part)
     return part
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from persist_backbones.weights.presets import CogVideoXSettings
 from persist_backbones.weights.pretrained import pretrained_folder
 from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_json, read_tensors, write_tensors
+from persist_cli.world.files import read_json, read_tensors, reallocate, write_tensors
 from persist_cli.world.quiet import without_bars
 
 ORIGINS = ("pretrained", "prompt", "prompt_embedding")  # settings of a model's beginning: a checkpoint holds the rest
@@ -109,6 +109,7 @@ def embed_prompt(prompt: str, folder: Path, words: int) -> Float[Tensor, "1 word
     except (OSError, ValueError, RuntimeError, KeyError, TypeError, ImportError) as error:
         cause = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise CheckpointError(f"{folder}: the text encoder cannot be loaded ({cause}); {OTHERWISE}") from error
+    reallocate(encoder)
     tokens = tokenizer(prompt, padding="max_length", max_length=words, return_tensors="pt").input_ids
     if tokens.shape[1] > words:
         raise CheckpointError(f"the prompt has {tokens.shape[1]} tokens, the transformer takes {words}; shorten it")

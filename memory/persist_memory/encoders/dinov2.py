@@ -17,6 +17,7 @@ from torch import Tensor
 
 from persist_cli.world.encoder import Encoder
 from persist_cli.world.errors import CheckpointError
+from persist_cli.world.files import reallocate
 from persist_cli.world.hub import hub_obstacle, in_hub_cache
 from persist_cli.world.quiet import without_bars
 from persist_cli.world.weights import cached_weight
@@ -117,6 +118,7 @@ class DinoV2(Encoder):
 
         options = {"use_safetensors": True, "config": self._config, "dtype": torch.float32}
         model = self._opened(Dinov2Model, **options).eval().requires_grad_(False)
+        reallocate(model)
         del model.encoder.layer[self.settings.layer or len(model.encoder.layer) :]  # nobody looks at what they give
         return model
 
