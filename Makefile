@@ -6,16 +6,16 @@ STAMP := $(VENV)/.installed
 .PHONY: demo demo-train table1 table1-reference test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.demos.reference runs/demo
+	$(VENV)/bin/python -m persist_cli.reproduce.reference_demo runs/demo
 
 demo-train: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.demos.training runs/demo-train
+	$(VENV)/bin/python -m persist_cli.reproduce.training_demo runs/demo-train
 
 table1: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.table1 runs/table1
+	$(VENV)/bin/python -m persist_cli.reproduce.table1 runs/table1
 
 table1-reference: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.table1 runs/table1-reference --reference
+	$(VENV)/bin/python -m persist_cli.reproduce.table1 runs/table1-reference --reference
 
 test: $(STAMP) lint
 	$(VENV)/bin/python -m pytest -m "not slow and not gpu"

@@ -1,5 +1,5 @@
 """``python -m persist_cli`` is ``persist``, for launchers that start modules."""
 
-from persist_cli.app import main
+from persist_cli.cli.app import main
 
 main()

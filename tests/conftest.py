@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.walking import MICRO_SETTINGS, stage, train_here, write_walks
+from tests.support.walking import MICRO_SETTINGS, stage, train_here, write_walks
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ["PERSIST_REFERENCE"] = os.devnull  # tests bring their own model; those of the packaged one say so
@@ -56,7 +56,7 @@ Persist = Callable[..., Ended]
 @pytest.fixture
 def persist(capsys: pytest.CaptureFixture[str]) -> Persist:
     """The command line, run in this process."""
-    from persist_cli.app import main
+    from persist_cli.cli.app import main
 
     def run(*arguments: object) -> Ended:
         capsys.readouterr()

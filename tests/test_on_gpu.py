@@ -8,18 +8,18 @@ import os
 import pytest
 import torch
 
-from persist_cli.app import main
-from persist_cli.memorizing.memory_file import load_memory
-from persist_cli.memorizing.recall import MemoryMaker, recall
+from persist_cli.api.backbone import Sampling
+from persist_cli.cli.app import main
+from persist_cli.data.clips import ClipDataset, ClipPlan
+from persist_cli.data.store import Store
+from persist_cli.memorize.factory import MemoryMaker, recall
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.plugins import make_encoder
 from persist_cli.recipe import MemoryChoice
-from persist_cli.registry import make_encoder
 from persist_cli.rollout.world_model import WorldModel, step_together
-from persist_cli.trajectories.clips import ClipDataset, ClipPlan
-from persist_cli.trajectories.store import Store
-from persist_cli.world.backbone import Sampling
-from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
-from tests.memory.views_of_room import empty, same_bits, walked
-from tests.walking import MICRO_SETTINGS, SIZE, losses, stage, train_here
+from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
+from tests.support.room_views import empty, same_bits, walked
+from tests.support.walking import MICRO_SETTINGS, SIZE, losses, stage, train_here
 
 DEVICE = os.environ.get("PERSIST_TEST_DEVICE", "cuda")
 pytestmark = pytest.mark.gpu

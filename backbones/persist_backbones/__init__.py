@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from persist_backbones.pipelines.pipeline import WorldPipeline
-    from persist_cli.world.placement import Precision
+    from persist_backbones.pipeline.pipeline import WorldPipeline
+    from persist_cli.api.inference import Precision
 
 
 def load(folder: Path | str, adapter: str | None = None, dtype: Precision | None = None) -> WorldPipeline:
@@ -25,7 +25,7 @@ def load(folder: Path | str, adapter: str | None = None, dtype: Precision | None
     Raises:
         PersistError: one line when there is no such checkpoint or adapter, or it is damaged.
     """
-    from persist_backbones.pipelines.loading import load_pipeline  # diffusers takes seconds to import
+    from persist_backbones.pipeline.load import load_pipeline  # diffusers takes seconds to import
 
     return load_pipeline(Path(folder), adapter, dtype)
 
@@ -41,6 +41,6 @@ def write_prompt(prompt: str, pretrained: str, path: Path | str) -> None:
     Raises:
         PersistError: one line when T5 is not there or unusable, and for a prompt that is too long.
     """
-    from persist_backbones.weights.prompt import save_prompt  # transformers takes seconds to import
+    from persist_backbones.cogvideox.prompt import save_prompt  # transformers takes seconds to import
 
     save_prompt(prompt, pretrained, Path(path))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.memory import Memory
-from persist_cli.world.observations import Observations
-from persist_cli.world.tokens import MemoryTokens
-from persist_memory.stored import check_mergeable, check_tensors
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations
+from persist_cli.api.tokens import MemoryTokens
+from persist_memory.stored_tensors import check_mergeable, check_tensors
 
 
 class NoMemory(Memory):

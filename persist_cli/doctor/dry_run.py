@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from persist_cli.api.stages import Part, Stage
 from persist_cli.doctor.machine import gib
-from persist_cli.doctor.planned import Planned, plan_recipe
+from persist_cli.doctor.meta_model import Planned, plan_recipe
 from persist_cli.viewing.console import print_json, print_table
-from persist_cli.world.stages import Part, Stage
 
 
 def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import Final
 
 import torch
 
-from persist_cli.world.errors import PersistError
+from persist_cli.errors import PersistError
 
 GIB: Final = 2**30  # as makers of cards say GB
 RESERVE: Final = 0.1  # of a card's memory that is not planned with: its context, kernels' workspaces, fragmentation

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import torch
 
+from persist_cli.api.backbone import Backbone, Clips
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.tokens import MemoryTokens
 from persist_cli.doctor.tracing import LiveBytes, imagined, kernels
 from persist_cli.recipe import Recipe
-from persist_cli.training.economy import economy_of
-from persist_cli.world.backbone import Backbone, Clips
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.tokens import MemoryTokens
+from persist_cli.train.optimizer import economy_of
 
 SHALLOW, DEEPER = 2, 4  # groups of layers; one alone is first and last at once
 

@@ -1,16 +1,12 @@
-"""The most bytes that tensors take at once while code runs, found out without computing or allocating anything.
-
-The code itself runs, on tensors that have shape, precision and life time but no values (torch's fake tensors): what
-autograd keeps for the backward pass, what is cast and copied on the way, what is computed again, all is as it will be,
-for every adapter, setting and version of the model. What the kernels of a device use inside is not seen.
-"""
+"""What a convolution holds on a CPU beside its input and output, as torch 2 has it."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import weakref
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, Final
 
 import torch
 import torch.nn.functional as F
@@ -18,9 +14,36 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from persist_cli.doctor.convolution import convolution_bytes
+SMALL: Final = 20480  # batch × channels × the first two sizes, up to which one thread unfolds
+
+FEW: Final = 16  # samples, from which on it does not
+
+
+def convolution_bytes(args: Any, out: Tensor, backward: bool, threads: int) -> int:
+    """Bytes of workspace.
+
+    oneDNN holds a copy of input or output, the larger, in the order that it works in. One thread leaves small ones
+    in float32 to a kernel of torch that unfolds the input: at each place of the output all that the weights see.
+
+    Args:
+        args: of ``aten.convolution`` or of its backward, which has the output's gradient before the rest.
+        out: the output, or the input's gradient.
+        backward: which of the two it is.
+        threads: of torch.
+    """
+    given, weight, stride, dilation = (args[1], args[2], args[4], args[6]) if backward else (*args[:2], *args[3:6:2])
+    result = args[0] if backward else out
+    plain = all(step == 1 for step in (*stride, *dilation)) and max(weight.shape[-2:]) <= 3
+    small = given.shape[0] < FEW and math.prod(given.shape[:4]) <= SMALL
+    places, kernel = math.prod(result.shape[2:]), math.prod(weight.shape[2:])
+    if threads == 1 and plain and small and given.dtype == torch.float32:
+        unfolded: int = given.shape[0] * weight.shape[1] * kernel * places * given.element_size()
+        return unfolded if kernel > 1 else 0
+    return max(each.numel() * each.element_size() for each in (given, result))
+
 
 aten = torch.ops.aten
+
 FLOAT32_ON_CUDA = ("layer_norm", "group_norm")  # in autocast; on a CPU they keep their input's precision
 
 
@@ -79,6 +102,7 @@ class LiveBytes(TorchDispatchMode):
 
 
 _CONVOLUTIONS = {aten.convolution.default, aten.convolution_backward.default}
+
 _BY_VALUES = {aten.nonzero.default, aten.repeat_interleave.Tensor, aten.index.Tensor}
 
 

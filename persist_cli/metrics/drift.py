@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.api.geometry import unproject
+from persist_cli.api.observations import Observations
 from persist_cli.metrics.depth import DepthMetric
 from persist_cli.metrics.metric import Prediction
-from persist_cli.world.geometry import unproject
-from persist_cli.world.observations import Observations
 
 VOXEL = 0.05  # metres
 TRUE_GRID = 256  # pixels along the longer side that are fused

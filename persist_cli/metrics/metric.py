@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
-from persist_cli.world.errors import DataError
-from persist_cli.world.observations import Observations
+from persist_cli.api.observations import Observations
+from persist_cli.errors import DataError
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_tensors
-from persist_cli.world.weights import cached_weight
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_tensors
+from persist_cli.io.hub import cached_weight
 
 Shapes = Mapping[str, tuple[int, ...]]
 

@@ -1,4 +1,4 @@
-"""SRC, scene revisit consistency: whether a place looks on return as it did when first generated."""
+"""Frames that return to an earlier pose, and how far the path went in between."""
 
 from __future__ import annotations
 
@@ -9,14 +9,28 @@ from functools import lru_cache
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.encoder import Encoder
+from persist_cli.api.geometry import pose_differences
+from persist_cli.io.hub import cached_weight
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
 from persist_cli.metrics.networks import exact_inference, missing_weights, network_device
-from persist_cli.metrics.returns import farthest, returns
-from persist_cli.world.encoder import Encoder
-from persist_cli.world.weights import cached_weight
+
+
+def returns(first_visits: Int64[Tensor, " frame"]) -> list[tuple[int, int]]:
+    """Each frame that returns, with the frame of its first visit."""
+    return [(frame, first) for frame, first in enumerate(first_visits.tolist()) if first >= 0]
+
+
+def farthest(cameras: Cameras, first: int, last: int) -> int:
+    """The number of the camera from ``first`` to ``last`` that is farthest from ``first``, in metres + radians."""
+    poses = cameras.world_from_camera[first : last + 1].double().cpu()
+    metres, degrees = pose_differences(poses, poses[:1].expand_as(poses))
+    return first + int((metres + torch.deg2rad(degrees)).argmax())
+
 
 SIZE = 224  # pixels of the longer side
 
@@ -146,6 +160,6 @@ def _encoded(rgb: Tensor) -> VideoFeatures:
 
 @lru_cache(maxsize=2)
 def _encoder(weights: str, layer: int | None, device: torch.device) -> Encoder:
-    from persist_cli.registry import make_encoder
+    from persist_cli.plugins import make_encoder
 
     return make_encoder("dinov2", {"weights": weights, "size": SIZE, "layer": layer}).to(device)

@@ -1,23 +1,50 @@
-"""What a rollout leaves: videos, contact sheet, maps, poses, the memory and its figures."""
+"""Poses as TUM files: a line ``t tx ty tz qx qy qz qw`` for each frame, world_from_camera, OpenCV axes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations
+from persist_cli.io.files import write_json, write_text
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
-from persist_cli.rollout.walk import Rollout
-from persist_cli.trajectories.tum import write_poses
+from persist_cli.rollout.camera_path import Rollout
 from persist_cli.viewing.map import draw_map
 from persist_cli.viewing.sheet import write_sheet
 from persist_cli.viewing.video import beside, color_depth, write_video
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.files import write_json
-from persist_cli.world.memory import Memory
-from persist_cli.world.observations import Observations
+
+
+def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
+    """(qx, qy, qz, qw) with qw ≥ 0: the eigenvector of Bar-Itzhack's symmetric matrix of the largest eigenvalue."""
+    r = rotation.double()
+    k = torch.stack(
+        [
+            torch.stack([r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]]),
+            torch.stack([r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]]),
+            torch.stack([r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]]),
+            torch.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r.trace()]),
+        ]
+    )
+    vector: Tensor = torch.linalg.eigh(k / 3).eigenvectors[:, -1]
+    return vector if vector[3] >= 0 else -vector
+
+
+def write_poses(path: Path, timestamps: Sequence[float], poses: Float[Tensor, "frame 4 4"]) -> None:
+    """A TUM trajectory file, readable by evo."""
+    lines = []
+    for timestamp, pose in zip(timestamps, poses, strict=True):
+        values = [*pose[:3, 3].tolist(), *quaternion(pose[:3, :3]).tolist()]
+        lines.append(" ".join([f"{timestamp:.6f}", *(f"{value:.9f}" for value in values)]))
+    write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
+
 
 SOMETIMES = ("compare.mp4", "map-before.png", "map-after.png", "memory.safetensors")  # what not every rollout leaves
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import torch
 
-from persist_cli.trajectories.clips import interactions_of
-from persist_cli.world.backbone import Backbone, Clips, Interactions, Sampling
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.errors import PersistError
-from persist_cli.world.memory import Memory
-from persist_cli.world.observations import Observations, TrajectoryInfo
-from persist_cli.world.tokens import MemoryTokens
+from persist_cli.api.backbone import Backbone, Clips, Interactions, Sampling
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.data.clips import interactions_of
+from persist_cli.errors import PersistError
 
 
 @dataclass(frozen=True)

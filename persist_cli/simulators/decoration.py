@@ -9,16 +9,7 @@ import colorsys
 
 import numpy as np
 
-from persist_cli.simulators.houses import (
-    NORTH,
-    SOUTH,
-    Colour,
-    Door,
-    Paint,
-    Picture,
-    Rectangle,
-    door_span,
-)
+from persist_cli.simulators.houses import NORTH, SOUTH, Colour, Door, Paint, Picture, Rectangle, door_span
 
 PICTURES = (1, 5)  # tries a wall, the last not included
 PORTRAITS = 82  # in MiniWorld's folder of them

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from persist_cli.api.actions import ActionVocabulary, walking_actions
+from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.api.simulator import AgentSettings, Simulator
+from persist_cli.errors import DataError
 from persist_cli.simulators.building import build_house
 from persist_cli.simulators.houses import Ground, House, Rectangle, Thing, is_clear
 from persist_cli.simulators.rendering import Renderer
-from persist_cli.world.actions import ActionVocabulary, walking_actions
-from persist_cli.world.errors import DataError
-from persist_cli.world.observations import Frame, TrajectoryInfo
-from persist_cli.world.simulator import AgentSettings, Simulator
 
 GRAIN = 2.0**32  # positions are whole multiples of this part of a metre, so that going back is exact
 STRIDE = 0.1  # metres between the places that are checked along a step

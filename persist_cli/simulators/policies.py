@@ -1,11 +1,8 @@
-"""Policies: how an agent walks through a scene, as generators of actions.
-
-A policy yields an action and is sent whether the world allowed it; only allowed actions are recorded. Policies
-know a scene through the ``Simulator`` interface alone.
-"""
+"""Routes: how far every free place of a scene is from a goal, and which way leads nearer to it."""
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
@@ -13,22 +10,113 @@ from dataclasses import replace
 
 import numpy as np
 
-from persist_cli.simulators.routes import FreeGrid, Ground, clear_distance
-from persist_cli.world.actions import STAY
-from persist_cli.world.errors import DataError
-from persist_cli.world.observations import Frame
-from persist_cli.world.simulator import Simulator
+from persist_cli.api.actions import STAY
+from persist_cli.api.observations import Frame
+from persist_cli.api.simulator import Simulator
+from persist_cli.errors import DataError
+
+Ground = tuple[float, float]
+
+Cell = tuple[int, int]
+
+SPACING = 0.2  # metres between grid places
+
+FINE = 0.1  # metres between the places looked at along a straight way
+
+NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+
+
+class FreeGrid:
+    """The free places of the open scene on a square grid.
+
+    Args:
+        simulator: with an open scene; what it says is free now counts.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        low, high = simulator.bounds
+        self._low = low
+        counts = [max(1, math.ceil((b - a) / SPACING)) for a, b in zip(low, high, strict=True)]
+        cells = ((i, j) for i in range(counts[0]) for j in range(counts[1]))
+        self.free = {cell for cell in cells if simulator.is_free(self.place(cell))}
+        self._beside = {cell: list(self._neighbours(cell)) for cell in self.free}
+
+    def place(self, cell: Cell) -> Ground:
+        """The middle of a cell in metres."""
+        return self._low[0] + (cell[0] + 0.5) * SPACING, self._low[1] + (cell[1] + 0.5) * SPACING
+
+    def cell(self, ground: Ground) -> Cell:
+        """The cell around a place."""
+        x, z = ((value - low) / SPACING for value, low in zip(ground, self._low, strict=True))
+        return math.floor(x), math.floor(z)
+
+    def distances(self, goal: Ground) -> dict[Cell, float]:
+        """Metres of the shortest way from each cell to the goal; cells without a way are missing (Dijkstra)."""
+        found: dict[Cell, float] = {}
+        queue = [(offset, cell) for cell, offset in self.around(goal)]
+        heapq.heapify(queue)
+        while queue:
+            distance, cell = heapq.heappop(queue)
+            if cell in found:
+                continue
+            found[cell] = distance
+            for neighbour, length in self._beside[cell]:
+                if neighbour not in found:
+                    heapq.heappush(queue, (distance + length, neighbour))
+        return found
+
+    def around(self, ground: Ground) -> list[tuple[Cell, float]]:
+        """The free cells next to a place, nearest first, with the metres to their middles.
+
+        A free place may lie in a cell whose middle is not free.
+        """
+        i, j = self.cell(ground)
+        cells = [(i + by_i, j + by_j) for by_i, by_j in [(0, 0), *NEIGHBOURS]]
+        near = [(cell, math.dist(ground, self.place(cell))) for cell in cells if cell in self.free]
+        return sorted(near, key=lambda item: item[1])
+
+    def remaining(self, ground: Ground, distances: dict[Cell, float]) -> float:
+        """Metres from a place to where ``distances`` lead, infinite without a way."""
+        return min((distances.get(cell, math.inf) + offset for cell, offset in self.around(ground)), default=math.inf)
+
+    def _neighbours(self, cell: Cell) -> Iterator[tuple[Cell, float]]:
+        """Free cells beside a cell, and diagonal ones past which no corner stands."""
+        i, j = cell
+        for by_i, by_j in NEIGHBOURS:
+            beside = (i + by_i, j) in self.free and (i, j + by_j) in self.free
+            if (i + by_i, j + by_j) in self.free and beside:
+                yield (i + by_i, j + by_j), SPACING * math.hypot(by_i, by_j)
+
+
+def clear_distance(simulator: Simulator, start: Ground, heading: float, longest: float, stride: float) -> float:
+    """Metres that the agent could walk straight ahead from a place, in whole strides."""
+    x, z = simulator.ahead(heading)
+    parts = max(1, math.ceil(stride / FINE))
+    for number in range(1, parts * math.floor(longest / stride + 1e-9) + 1):
+        walked = number * stride / parts
+        if not simulator.is_free((start[0] + walked * x, start[1] + walked * z)):
+            return (number - 1) // parts * stride
+    return math.floor(longest / stride + 1e-9) * stride
+
 
 Walk = Generator[str, bool, None]
+
 Policy = Callable[[Simulator, np.random.Generator, int], Walk]
 
 SIGHT = 4.0  # metres that explore looks ahead
+
 OPEN_VIEW = 0.75  # metres ahead that explore likes to see: a wall before the nose shows nothing
+
 EFFORT = 3.0  # metres of new ground that explore gives for not turning right round
+
 PATCH = 0.5  # metres of the squares in which explore counts its visits
+
 NEAR_GOAL = 0.4  # metres at which a goal counts as reached
+
 LOOK_AROUND = 0.3  # how often path looks around before it sets out
+
 PATIENCE = 4  # steps without getting nearer, after which path gives up a goal
+
 MOST_REFUSALS = 200  # in a row
 
 

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from persist_cli.errors import PluginError
 from persist_cli.simulators.houses import House, Thing
 from persist_cli.simulators.meshes import Mesh, MeshPart, read_mesh
 from persist_cli.simulators.panels import Panel, house_panels
-from persist_cli.world.errors import PluginError
 
 NEAR, FAR = 0.04, 100.0  # metres
 SKY = 99.0  # what seems farther away is missing

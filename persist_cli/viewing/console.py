@@ -21,7 +21,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from persist_cli.world.files import plain
+from persist_cli.io.files import plain
 
 Item = TypeVar("Item")
 

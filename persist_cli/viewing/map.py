@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.world.files import written_aside
-from persist_cli.world.memory import MapPoints
+from persist_cli.api.memory import MapPoints
+from persist_cli.io.files import written_aside
 
 PATH_COLORS = ("#d81b60", "#1e88e5", "#ffb300", "#004d40", "#8e24aa")
 UNSEEN = (0.94, 0.94, 0.95, 1.0)

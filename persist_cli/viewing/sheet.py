@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from persist_cli.world.files import written_aside
+from persist_cli.io.files import written_aside
 
 CELL = 96  # pixels of a frame's height
 GAP = 4

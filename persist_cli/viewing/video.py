@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from persist_cli.world.errors import DataError
-from persist_cli.world.files import written_aside
+from persist_cli.errors import DataError
+from persist_cli.io.files import written_aside
 
 SMALLEST = 256  # pixels of the shorter side of a written image
 STRIP = 20  # pixels of the strip with a video's name

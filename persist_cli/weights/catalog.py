@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from persist_cli.world.errors import PersistError, hint
+from persist_cli.errors import PersistError, hint
 
 
 @dataclass(frozen=True)

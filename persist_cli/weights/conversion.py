@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from persist_cli.errors import CheckpointError
 from persist_cli.metrics.lpips import ALEX, VGG
 from persist_cli.weights.onnx import linear_weights, read_onnx_weights
 from persist_cli.weights.unpickling import read_pickled_arrays
-from persist_cli.world.errors import CheckpointError
 
 HEADS: Final = 5
 ALEX_CHANNELS: Final = (3, *(layer.channels[1] for layer in ALEX))

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from persist_cli.world.errors import CheckpointError
+from persist_cli.errors import CheckpointError
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5  # protobuf's wire types
 GRAPH: Final = 7  # field of ModelProto

@@ -15,7 +15,7 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
-from persist_cli.world.errors import CheckpointError
+from persist_cli.errors import CheckpointError
 
 DEEPEST: Final = 16  # levels of a tree: far more than a network's, and an end to one that holds itself
 MOST: Final = 10_000  # arrays of a tree, so that one branch shared by many does not grow without end

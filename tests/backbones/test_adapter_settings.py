@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from persist_cli.world.errors import CheckpointError, PersistError, RecipeError
-from tests.backbones.micro import CHANNELS, micro, with_adapter
+from persist_cli.errors import CheckpointError, PersistError, RecipeError
+from tests.support.micro_model import CHANNELS, micro, with_adapter
 
 OWN = {
     "cross": {"heads", "frequencies", "positions"},

@@ -13,12 +13,21 @@ from diffusers.hooks import (
     TextKVCacheConfig,
 )
 
-from persist_backbones.pipelines.pipeline import WorldPipeline
-from persist_backbones.sampling.caches import ClipCaches
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.errors import PersistError
-from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import CHANNELS, equal, micro, random_clips, random_tokens, shaken, trained, with_adapter
+from persist_backbones.extensions.caches import ClipCaches
+from persist_backbones.pipeline.pipeline import WorldPipeline
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import PersistError
+from tests.support.micro_model import (
+    CHANNELS,
+    equal,
+    micro,
+    random_clips,
+    random_tokens,
+    shaken,
+    trained,
+    with_adapter,
+)
 
 STEPS = 8
 CLIPS, SAMPLING = random_clips(1, random_tokens(1, 5)), Sampling(STEPS, "ddim", 1.5)

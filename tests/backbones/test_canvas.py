@@ -6,10 +6,18 @@ import pytest
 import torch
 
 from persist_backbones.adapters.canvas import CanvasAdapter
-from persist_backbones.conditioning import tokens_of
-from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import CHANNELS, micro, predicted, random_clips, random_tokens, shaken, with_adapter
-from tests.walking import SIZE
+from persist_backbones.tensors import tokens_of
+from persist_cli.api.tokens import MemoryTokens
+from tests.support.micro_model import (
+    CHANNELS,
+    micro,
+    predicted,
+    random_clips,
+    random_tokens,
+    shaken,
+    with_adapter,
+)
+from tests.support.walking import SIZE
 
 BEHIND = MemoryTokens(
     torch.full((2, 1, CHANNELS), 0.7),

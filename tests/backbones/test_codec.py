@@ -9,14 +9,13 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX
 
-from persist_backbones.codec import fold_pixels, unfold_pixels
-from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.framewise import batch_to_frames, frames_to_batch
+from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.codec import batch_to_frames, fold_pixels, frames_to_batch, unfold_pixels
+from persist_cli.api.backbone import Sampling
 from persist_cli.doctor.tracing import imagined
-from persist_cli.registry import make_backbone
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.errors import CheckpointError
-from tests.backbones.micro import micro, random_clips, shaken
+from persist_cli.errors import CheckpointError
+from persist_cli.plugins import make_backbone
+from tests.support.micro_model import micro, random_clips, shaken
 
 STILL = {
     "vae": {

@@ -25,10 +25,10 @@ from typing import Any
 
 import pytest
 
-from persist_backbones.pipelines.pipeline import WorldPipeline
-from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import micro, random_clips, random_tokens, shaken, with_adapter
-from tests.walking import MICRO
+from persist_backbones.pipeline.pipeline import WorldPipeline
+from persist_cli.api.tokens import MemoryTokens
+from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
+from tests.support.walking import MICRO
 
 CHECKOUT = os.environ.get("DIFFUSERS_CHECKOUT")
 NAME = "diffusers_tests"  # their package is called as ours is

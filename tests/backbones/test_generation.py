@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.conditioning import camera_latents
-from persist_backbones.depth_code import decode_depth, encode_depth, fill_missing
-from persist_backbones.objective import loss_weights
-from persist_cli.world.backbone import Backbone, Sampling
-from persist_cli.world.errors import CheckpointError, DataError, PersistError
-from tests.backbones.micro import micro, random_clips, shaken
+from persist_backbones.cogvideox.codec import decode_depth, encode_depth, fill_missing
+from persist_backbones.cogvideox.diffusion import loss_weights
+from persist_backbones.cogvideox.inputs import camera_latents
+from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.errors import CheckpointError, DataError, PersistError
+from tests.support.micro_model import micro, random_clips, shaken
 
 
 def test_depth_survives_its_code_from_a_hand_to_a_hall():

@@ -7,12 +7,20 @@ import torch
 
 from persist_backbones.adapters.forms import FORMS
 from persist_backbones.adapters.memory_block import position_code
-from persist_cli.world.actions import rotation_about
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import CHANNELS, micro, predicted, random_clips, random_tokens, shaken, with_adapter
+from persist_cli.api.actions import rotation_about
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import CheckpointError
+from tests.support.micro_model import (
+    CHANNELS,
+    micro,
+    predicted,
+    random_clips,
+    random_tokens,
+    shaken,
+    with_adapter,
+)
 
 QUICK = Sampling(steps=2)
 every_form = pytest.mark.parametrize("form", FORMS)

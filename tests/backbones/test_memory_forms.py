@@ -7,8 +7,8 @@ import torch
 
 from persist_backbones.adapters.forms import FORMS
 from persist_backbones.adapters.projected import image_places
-from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import (
+from persist_cli.api.tokens import MemoryTokens
+from tests.support.micro_model import (
     CHANNELS,
     micro,
     predicted,

@@ -17,15 +17,15 @@ from diffusers import (
 from PIL import Image
 
 import persist_backbones
-from persist_backbones.cogvideox import CogVideoX
-from persist_backbones.pipelines.pipeline import WorldPipeline, WorldPipelineOutput
-from persist_backbones.sampling.tiling import enable_tiling
-from persist_cli.checkpoints import find_checkpoint, save_adapter, save_base
+from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.extensions.offload import enable_tiling
+from persist_backbones.pipeline.pipeline import WorldPipeline, WorldPipelineOutput
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.checkpoints.checkpoint import find_checkpoint, save_adapter, save_base
+from persist_cli.errors import PersistError
 from persist_cli.recipe import MemoryChoice
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.errors import PersistError
-from persist_cli.world.tokens import MemoryTokens
-from tests.backbones.micro import micro, random_clips, random_tokens, shaken, trained
+from tests.support.micro_model import micro, random_clips, random_tokens, shaken, trained
 
 CLIPS = random_clips(2, random_tokens(2, 5))
 FORMS = pytest.mark.parametrize("form", ["cross", "projected", "canvas"])

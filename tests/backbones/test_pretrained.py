@@ -5,11 +5,11 @@ import shutil
 import pytest
 import torch
 
-from persist_backbones.weights.pretrained import folder_here, pretrained_folder, published_preset
-from persist_cli.registry import make_backbone
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
-from tests.backbones.twins import SIZE, load_twin, write_snapshot, write_twin
+from persist_backbones.cogvideox.pretrained import folder_here, pretrained_folder, published_preset
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_json, read_tensors, write_json, write_tensors
+from persist_cli.plugins import make_backbone
+from tests.support.twins import SIZE, load_twin, write_snapshot, write_twin
 
 NAME = "zai-org/CogVideoX-5b-I2V"
 

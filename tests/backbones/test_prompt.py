@@ -10,10 +10,10 @@ from tokenizers import Tokenizer, models, pre_tokenizers, trainers
 from transformers import T5Config, T5EncoderModel, T5Tokenizer
 
 from persist_backbones import write_prompt
-from persist_cli.registry import make_backbone
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_tensors, write_tensors
-from tests.backbones.twins import load_twin, write_snapshot, write_twin
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_tensors, write_tensors
+from persist_cli.plugins import make_backbone
+from tests.support.twins import load_twin, write_snapshot, write_twin
 
 PROMPT = "a walk"
 SPECIAL = ["<pad>", "</s>", "<unk>"]

@@ -8,10 +8,10 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 
-from persist_backbones.cogvideox import CogVideoX
-from persist_cli.registry import make_backbone
-from persist_cli.world.stages import STAGES
-from tests.backbones.published import SCHEDULERS, TRANSFORMERS, VAES
+from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_cli.api.stages import STAGES
+from persist_cli.plugins import make_backbone
+from tests.support.published_configs import SCHEDULERS, TRANSFORMERS, VAES
 
 MODELS = tuple(TRANSFORMERS)
 SIZE = {"height": 480, "width": 720, "frames": 49}

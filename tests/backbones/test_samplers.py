@@ -8,10 +8,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from persist_backbones.noise import generators_of, noise_like
-from persist_backbones.sampling.samplers import MULTISTEP, SAMPLERS, denoise, make_schedule
-from persist_backbones.weights.presets import PRESETS
-from persist_cli.world.errors import PersistError
+from persist_backbones.cogvideox.config import PRESETS
+from persist_backbones.cogvideox.diffusion import (
+    MULTISTEP,
+    SAMPLERS,
+    denoise,
+    generators_of,
+    make_schedule,
+    noise_like,
+)
+from persist_cli.errors import PersistError
 
 UNSHIFTED, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3
 CONFIGS = pytest.mark.parametrize("config", [UNSHIFTED, SHIFTED], ids=["shift 1", "shift 3"])

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from persist_backbones.adapters.splat import rasterize, splat
-from persist_cli.world.actions import rotation_about
-from persist_cli.world.cameras import Cameras
+from persist_cli.api.actions import rotation_about
+from persist_cli.api.cameras import Cameras
 
 SIDE, FOCAL = 8, 5.6
 

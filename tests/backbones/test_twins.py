@@ -12,16 +12,16 @@ from diffusers import (
     CogVideoXTransformer3DModel,
 )
 
-from persist_backbones.clip_shape import ClipShape
-from persist_backbones.noise import generators_of, noise_like
-from persist_backbones.pipelines.pipeline import WorldPipeline
-from persist_cli.registry import make_backbone
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.errors import CheckpointError
-from tests.backbones.micro import random_clips, random_tokens, shaken, with_adapter
-from tests.backbones.published import TRANSFORMERS
-from tests.backbones.twins import NAMES, SIZE, SMALL, load_twin, write_twin
-from tests.misaligned import misalign, misaligned
+from persist_backbones.cogvideox.diffusion import generators_of, noise_like
+from persist_backbones.cogvideox.inputs import ClipShape
+from persist_backbones.pipeline.pipeline import WorldPipeline
+from persist_cli.api.backbone import Sampling
+from persist_cli.errors import CheckpointError
+from persist_cli.plugins import make_backbone
+from tests.support.micro_model import random_clips, random_tokens, shaken, with_adapter
+from tests.support.misaligned import misalign, misaligned
+from tests.support.published_configs import TRANSFORMERS
+from tests.support.twins import NAMES, SIZE, SMALL, load_twin, write_twin
 
 OTHER = (9, 32, 32)  # shorter and of another shape than the configurations say
 BOTH = [(name, size) for name in NAMES for size in (SIZE, OTHER)]

@@ -4,10 +4,10 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
 
-from persist_backbones.weights.diffusers_parts import load_parts
-from persist_cli.registry import make_backbone
-from persist_cli.world.errors import CheckpointError
-from tests.walking import MICRO, SIZE
+from persist_backbones.cogvideox.pretrained import load_parts
+from persist_cli.errors import CheckpointError
+from persist_cli.plugins import make_backbone
+from tests.support.walking import MICRO, SIZE
 
 
 @pytest.fixture

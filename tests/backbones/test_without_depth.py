@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.cogvideox import CogVideoX
-from persist_cli.world.backbone import Sampling
-from tests.backbones.micro import micro, random_clips, shaken
+from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_cli.api.backbone import Sampling
+from tests.support.micro_model import micro, random_clips, shaken
 
 
 @pytest.fixture

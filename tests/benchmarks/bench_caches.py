@@ -30,14 +30,19 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.checkpoints import find_checkpoint, load_adapter, load_backbone
-from persist_cli.memorizing.recall import MemoryMaker
-from persist_cli.packaged import reference_checkpoint, sample_data
+from persist_cli.api.backbone import Backbone, Clips, Sampling
+from persist_cli.api.inference import Placement
+from persist_cli.checkpoints.checkpoint import (
+    find_checkpoint,
+    load_adapter,
+    load_backbone,
+    reference_checkpoint,
+)
+from persist_cli.data.reference import sample_data
+from persist_cli.data.store import Store
+from persist_cli.memorize.factory import MemoryMaker
 from persist_cli.rollout.world_model import Question, batch_of
-from persist_cli.trajectories.store import Store
 from persist_cli.viewing.console import print_table
-from persist_cli.world.backbone import Backbone, Clips, Sampling
-from persist_cli.world.placement import Placement
 from tests.benchmarks.timing import alternate, say_conditions
 
 UNCACHED = "none"

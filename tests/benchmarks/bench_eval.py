@@ -16,7 +16,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.viewing.console import print_table, say
-from tests.walking import MICRO_SETTINGS, PERSIST, stage, train, write_walks
+from tests.support.walking import MICRO_SETTINGS, PERSIST, stage, train, write_walks
 
 COUNTS = (10, 100, 1000)
 OPTIONS = ["--memories", "voxel", "--controls", "copy,nearest,shuffled", "--seeds", "1", "--steps", "1"]

@@ -31,7 +31,7 @@ app()
 PROGRAMS = {
     "bare Python": ["-c", "pass"],
     "import typer": ["-c", "import typer"],
-    "import persist_cli.app": ["-c", "import persist_cli.app"],
+    "import persist_cli.cli.app": ["-c", "import persist_cli.cli.app"],
     "typer hello world --help": ["-c", HELLO, "--help"],
     "persist --help": ["-m", "persist_cli", "--help"],
     "persist eval --help": ["-m", "persist_cli", "eval", "--help"],

@@ -18,13 +18,13 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.registry import make_encoder, make_memory
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.memory import FrameOfReference, Memory
+from persist_cli.api.observations import Observations
+from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.viewing.console import print_table
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.memory import FrameOfReference, Memory
-from persist_cli.world.observations import Observations
-from persist_memory.sparse_grid import pack
-from tests.rooms import UP, Room, look, walk
+from persist_memory.grid.storage import pack
+from tests.support.rooms import UP, Room, look, walk
 
 BUDGETS = (256, 4096)
 ROOM_CELLS = 20  # cells along the side of a room

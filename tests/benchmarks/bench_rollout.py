@@ -18,17 +18,17 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.api.actions import walking_actions
+from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.plugins import make_backbone
 from persist_cli.recipe import MemoryChoice
-from persist_cli.registry import make_backbone
 from persist_cli.rollout.world_model import WorldModel, step_together
 from persist_cli.viewing.console import print_table
-from persist_cli.world.actions import walking_actions
-from persist_cli.world.backbone import Backbone, Sampling
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.observations import Observations, TrajectoryInfo
 from tests.benchmarks.timing import Times, alternate, say_conditions
-from tests.rooms import UP, Room, look
+from tests.support.rooms import UP, Room, look
 
 NO_ADAPTER = "no adapter"
 MEMORIES = ("none", "voxel", "map2d", "snapshots")

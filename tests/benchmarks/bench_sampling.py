@@ -24,26 +24,25 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.checkpoints import find_checkpoint, save_adapter, save_base
-from persist_cli.evaluation.backbones import Backbones
-from persist_cli.evaluation.cases import Case, CaseFrames, read_case
-from persist_cli.evaluation.measuring import Measurer, choose_metrics, make_setup
-from persist_cli.evaluation.protocols import PROTOCOLS
-from persist_cli.evaluation.protocols.protocol import Selected
-from persist_cli.evaluation.provenance import checkpoint_json, environment, metric_json
-from persist_cli.evaluation.rows.choice import FORGETFUL, PLAIN, RowChoice, make_rows
-from persist_cli.evaluation.rows.model import ModelRow
-from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.observations import Observations
+from persist_cli.checkpoints.checkpoint import find_checkpoint, reference_checkpoint, save_adapter, save_base
+from persist_cli.data.reference import sample_data
+from persist_cli.errors import CheckpointError
+from persist_cli.evaluate.bases import Backbones
+from persist_cli.evaluate.cases import Case, CaseFrames, read_case
+from persist_cli.evaluate.measure import Measurer, choose_metrics, make_setup
+from persist_cli.evaluate.protocols import PROTOCOLS, Selected
+from persist_cli.evaluate.provenance import checkpoint_json, environment, metric_json
+from persist_cli.evaluate.rows.build_rows import FORGETFUL, PLAIN, RowChoice, make_rows
+from persist_cli.evaluate.rows.model import ModelRow
+from persist_cli.io.files import write_json, written_aside
+from persist_cli.memorize.factory import MemoryMaker
 from persist_cli.metrics import METRICS
-from persist_cli.packaged import reference_checkpoint, sample_data
+from persist_cli.plugins import make_backbone
 from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.registry import make_backbone
 from persist_cli.rollout.world_model import WorldModel, clip_seed, imagine_together
 from persist_cli.viewing.console import print_table, say, watched
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import write_json, written_aside
-from persist_cli.world.observations import Observations
 from tests.benchmarks.timing import Times, say_conditions, write_walks
 
 PROTOCOL = PROTOCOLS["revisit"]

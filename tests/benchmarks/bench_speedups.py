@@ -19,16 +19,17 @@ from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXCaus
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_backbones.conditioning import camera_latents, fold_frames
-from persist_backbones.framewise import FramewiseConv
-from persist_cli.memorizing.recall import MemoryMaker, collate, recall
+from persist_backbones.cogvideox.codec import FramewiseConv
+from persist_backbones.cogvideox.inputs import camera_latents
+from persist_backbones.tensors import fold_frames
+from persist_cli.api.backbone import Backbone, Clips
+from persist_cli.api.geometry import plucker
+from persist_cli.data.clips import ClipDataset, ClipPlan, ClipSample
+from persist_cli.memorize.factory import MemoryMaker, collate, recall
+from persist_cli.plugins import make_backbone
 from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.registry import make_backbone
-from persist_cli.training.cache import Cache, CacheSettings
-from persist_cli.trajectories.clips import ClipDataset, ClipPlan, ClipSample
+from persist_cli.train.clip_cache import Cache, CacheSettings
 from persist_cli.viewing.console import print_table
-from persist_cli.world.backbone import Backbone, Clips
-from persist_cli.world.geometry import plucker
 from tests.benchmarks.timing import alternate, say_conditions, write_walks
 
 BATCH, LARGE, ROUNDS = 16, 64, 3

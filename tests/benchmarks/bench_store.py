@@ -16,11 +16,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.trajectories.clips import ClipDataset, ClipPlan
-from persist_cli.trajectories.images import decode_depth, decode_rgb, encode_depth, encode_rgb
-from persist_cli.trajectories.store import Store
+from persist_cli.api.observations import Observations
+from persist_cli.data.clips import ClipDataset, ClipPlan
+from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
+from persist_cli.data.store import Store
 from persist_cli.viewing.console import print_table
-from persist_cli.world.observations import Observations
 from tests.benchmarks.timing import Times, alternate, say_conditions, write_walks
 
 FRAMES, CLIPS = 9, 8  # frames a clip, clips a run

@@ -19,13 +19,13 @@ from accelerate import Accelerator
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.memorizing.recall import MemoryMaker
+from persist_cli.api.backbone import Clips
+from persist_cli.memorize.factory import MemoryMaker
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
-from persist_cli.training.cache import CacheSettings
-from persist_cli.training.finetune import prepare_backbone
-from persist_cli.training.trainer import Trainer
+from persist_cli.train.clip_cache import CacheSettings
+from persist_cli.train.finetune import prepare_backbone
+from persist_cli.train.trainer import Trainer
 from persist_cli.viewing.console import print_table
-from persist_cli.world.backbone import Clips
 from tests.benchmarks.timing import Times, alternate, say_conditions, write_walks
 
 BATCH, ROUNDS = 4, 4

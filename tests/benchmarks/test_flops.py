@@ -7,9 +7,9 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from tests.backbones.micro import micro, random_clips, random_tokens, with_adapter
-from tests.benchmarks.at_size import flops
-from tests.walking import MICRO
+from tests.benchmarks.full_scale import flops
+from tests.support.micro_model import micro, random_clips, random_tokens, with_adapter
+from tests.support.walking import MICRO
 
 TOKENS = 12
 

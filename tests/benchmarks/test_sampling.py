@@ -3,10 +3,10 @@ import json
 import pytest
 from PIL import Image
 
-from persist_backbones.sampling.samplers import SAMPLERS
-from persist_cli.world.errors import CheckpointError
+from persist_backbones.cogvideox.diffusion import SAMPLERS
+from persist_cli.errors import CheckpointError
 from tests.benchmarks.bench_sampling import fresh_model, main
-from tests.walking import MICRO
+from tests.support.walking import MICRO
 
 
 @pytest.fixture(scope="module")

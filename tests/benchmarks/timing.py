@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from persist_cli.viewing.console import say
-from tests.rooms import Room, walk
+from tests.support.rooms import Room, walk
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,16 @@ import shlex
 import pytest
 import torch
 
-from persist_backbones.rotary import _fitted
+from persist_backbones.cogvideox.inputs import _fitted
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
-from persist_cli.doctor.command import Doctor, command
+from persist_cli.doctor.doctor import Doctor, command
 from persist_cli.doctor.machine import GIB, Machine
-from persist_cli.doctor.need import Estimator, Launch
-from persist_cli.doctor.planned import plan_recipe
+from persist_cli.doctor.memory_estimate import Estimator, Launch
+from persist_cli.doctor.meta_model import plan_recipe
 from persist_cli.doctor.step import Encoding, StepKind, Twins
 from persist_cli.doctor.tracing import LiveBytes, imagined
-from persist_cli.training.sharding import check_sharded
-from tests.walking import MICRO_SETTINGS
+from persist_cli.train.distributed import check_sharded
+from tests.support.walking import MICRO_SETTINGS
 
 MICRO = [*MICRO_SETTINGS, "base=null"]
 SMALL = ["training.batch=8", "training.precision=bf16"]

@@ -8,11 +8,11 @@ import shutil
 import pytest
 from diffusers import CogVideoXTransformer3DModel
 
-from persist_cli.checkpoints import find_checkpoint, load_backbone
-from persist_cli.doctor.planned import plan_recipe
-from tests.backbones.micro import micro
-from tests.exporting.runs import write_base
-from tests.walking import MICRO_SETTINGS
+from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
+from persist_cli.doctor.meta_model import plan_recipe
+from tests.support.export_runs import write_base
+from tests.support.micro_model import micro
+from tests.support.walking import MICRO_SETTINGS
 
 
 def test_a_plan_counts_what_the_trained_model_has(tmp_path):

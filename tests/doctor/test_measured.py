@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_cli.doctor.need import Estimator, Launch
-from persist_cli.doctor.planned import plan_recipe
-from tests import resident
-from tests.doctor.measured import SHORT, Run, measured_peaks, trained_bytes
-from tests.walking import train_here, write_walks
+from persist_cli.doctor.memory_estimate import Estimator, Launch
+from persist_cli.doctor.meta_model import plan_recipe
+from tests.support import resident_memory as resident
+from tests.support.measured_memory import SHORT, Run, measured_peaks, trained_bytes
+from tests.support.walking import train_here, write_walks
 
 WITHIN = 0.15
 CHECKPOINTING = "training.gradient_checkpointing=true"

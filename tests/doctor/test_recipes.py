@@ -10,7 +10,7 @@ from importlib import resources
 import pytest
 
 from persist_cli.doctor.dry_run import dry_run
-from persist_cli.doctor.planned import plan_recipe
+from persist_cli.doctor.meta_model import plan_recipe
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe, recipe_names
 
 PUBLISHED = [name for name in recipe_names() if name.startswith("cogvideox-")]

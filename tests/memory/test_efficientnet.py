@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from persist_cli.world.errors import CheckpointError, RecipeError
-from persist_cli.world.files import write_json, write_tensors
-from persist_cli.world.weights import cached_weight
+from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.io.files import write_json, write_tensors
+from persist_cli.io.hub import cached_weight
 from persist_memory.encoders.efficientnet import EfficientNetLite0, EfficientNetLite0Settings, tensor_names
-from tests.memory.views_of_room import walked
+from tests.support.room_views import walked
 
 FETCHED = pytest.mark.skipif(cached_weight("efficientnet-lite0") is None, reason="persist weights fetch first")
 

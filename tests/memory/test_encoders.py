@@ -3,12 +3,12 @@ import shutil
 import pytest
 import torch
 
-from persist_cli.registry import make_encoder
-from persist_cli.world.errors import CheckpointError, RecipeError
-from persist_cli.world.files import write_json
-from persist_cli.world.weights import cached_weight
+from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.io.files import write_json
+from persist_cli.io.hub import cached_weight
+from persist_cli.plugins import make_encoder
 from persist_memory.encoders.patches import EXACT, PatchesSettings, projection
-from tests.memory.views_of_room import walked
+from tests.support.room_views import walked
 
 
 @pytest.fixture(scope="module")

@@ -2,10 +2,10 @@
 
 import torch
 
-from persist_cli.world.geometry import in_view, unproject
-from persist_cli.world.observations import Observations
-from persist_memory.pixel_runs import Sampling, keys_of, pixel_cells
-from tests.memory.views_of_room import empty, kitchen, same_bits, written
+from persist_cli.api.geometry import in_view, unproject
+from persist_cli.api.observations import Observations
+from persist_memory.grid.pooling import Sampling, keys_of, pixel_cells
+from tests.support.room_views import empty, kitchen, same_bits, written
 
 AGREE = 0.05  # metres along the ray: the same surface, not one behind the other
 

@@ -2,9 +2,9 @@ import math
 
 import torch
 
-from persist_cli.world.actions import rotation_about
-from tests.memory.views_of_room import empty, moved, observe, walked, written
-from tests.rooms import UP, look
+from persist_cli.api.actions import rotation_about
+from tests.support.room_views import empty, moved, observe, walked, written
+from tests.support.rooms import UP, look
 
 
 def test_all_heights_of_a_place_fall_into_one_cell():

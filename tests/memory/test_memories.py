@@ -3,11 +3,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.memory import FORMAT_VERSION
-from persist_cli.world.tokens import MemoryTokens
-from tests.memory.views_of_room import MEMORIES, empty, observe, same_bits, walked, written
-from tests.rooms import look
+from persist_cli.api.memory import FORMAT_VERSION
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import CheckpointError
+from tests.support.room_views import MEMORIES, empty, observe, same_bits, walked, written
+from tests.support.rooms import look
 
 
 @pytest.mark.parametrize("name", MEMORIES)

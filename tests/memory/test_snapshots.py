@@ -2,10 +2,10 @@ import math
 
 import torch
 
-from persist_cli.world.actions import rotation_about
-from persist_cli.world.geometry import unproject
-from tests.memory.views_of_room import empty, moved, observe, same_bits, shift, walked, written
-from tests.rooms import look
+from persist_cli.api.actions import rotation_about
+from persist_cli.api.geometry import unproject
+from tests.support.room_views import empty, moved, observe, same_bits, shift, walked, written
+from tests.support.rooms import look
 
 
 def test_any_rigid_motion_of_the_world_changes_no_token_relative_to_the_camera():

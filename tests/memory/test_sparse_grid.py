@@ -1,6 +1,6 @@
 import torch
 
-from persist_memory.sparse_grid import BLOCK, LIMIT, Column, SparseGrid, pack, unpack
+from persist_memory.grid.storage import BLOCK, LIMIT, Column, SparseGrid, pack, unpack
 
 
 def some_cells(count: int, reach: int = 40, seed: int = 0) -> torch.Tensor:

@@ -3,14 +3,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from persist_cli.registry import make_encoder
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.errors import CheckpointError, DataError
-from persist_cli.world.geometry import project, unproject
-from persist_cli.world.observations import Observations
-from persist_memory.pixel_runs import CENTERED
-from tests.memory.views_of_room import empty, moved, observe, same_bits, shift, walked, written
-from tests.rooms import look
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import project, unproject
+from persist_cli.api.observations import Observations
+from persist_cli.errors import CheckpointError, DataError
+from persist_cli.plugins import make_encoder
+from persist_memory.grid.pooling import CENTERED
+from tests.support.room_views import empty, moved, observe, same_bits, shift, walked, written
+from tests.support.rooms import look
 
 SIZE = torch.tensor([0.25, 1.0, 0.25], dtype=torch.float64)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from persist_cli.metrics import METRICS
-from tests.metrics.predictions import noise, prediction, setup, still
+from tests.support.predictions import noise, prediction, setup, still
 
 PERFECT = {"absrel": 0.0, "rmse": 0.0, "delta1": 1.0, "drift": 0.0}
 

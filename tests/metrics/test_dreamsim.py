@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from persist_cli.metrics import METRICS, dreamsim
-from tests.metrics.predictions import cache_random, noise, prediction, setup, still
+from tests.support.predictions import cache_random, noise, prediction, setup, still
 
 DREAMSIM = METRICS["dreamsim"]
 

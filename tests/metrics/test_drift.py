@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.cameras import Cameras
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.drift import VOXEL
-from persist_cli.world.cameras import Cameras
-from tests.metrics.predictions import prediction, seen
-from tests.rooms import Room, look, walk
+from tests.support.predictions import prediction, seen
+from tests.support.rooms import Room, look, walk
 
 DRIFT = METRICS["drift"]
 

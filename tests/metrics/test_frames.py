@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from persist_cli.metrics import METRICS
-from tests.metrics.predictions import noise, prediction, setup, still
+from tests.support.predictions import noise, prediction, setup, still
 
 
 @pytest.mark.parametrize(("name", "best"), [("psnr", 100.0), ("ssim", 1.0)])

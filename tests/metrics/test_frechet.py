@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from persist_cli.metrics.frechet import frechet_distance
-from persist_cli.world.errors import DataError
+from persist_cli.errors import DataError
+from persist_cli.metrics.fvd import frechet_distance
 
 
 def drawn(seed: int, samples: int, channels: int) -> torch.Tensor:

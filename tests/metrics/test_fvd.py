@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import torch
 
+from persist_cli.errors import DataError
+from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS, i3d
 from persist_cli.metrics.fvd import WEIGHTS, resized
 from persist_cli.metrics.networks import network_weights, run_network
-from persist_cli.world.errors import DataError
-from persist_cli.world.weights import cached_weight
-from tests.metrics.predictions import cache_random, noise, setup
+from tests.support.predictions import cache_random, noise, setup
 
 FVD = METRICS["fvd"]
 here = pytest.mark.skipif(cached_weight(WEIGHTS) is None, reason=f"no weights {WEIGHTS}")

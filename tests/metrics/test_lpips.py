@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_tensors, write_tensors
+from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.lpips import LpipsAlex, LpipsVgg, tensor_shapes
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_tensors, write_tensors
-from persist_cli.world.weights import cached_weight
-from tests.metrics.predictions import cache_random, noise, prediction, setup, still
+from tests.support.predictions import cache_random, noise, prediction, setup, still
 
 NETWORKS = [LpipsAlex, LpipsVgg]
 HERE = [

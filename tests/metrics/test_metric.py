@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from persist_cli.errors import DataError
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, SetMetric
 from persist_cli.rollout.outputs import compare
-from persist_cli.world.errors import DataError
-from tests.metrics.predictions import noise, prediction, setup, still, there_and_back
+from tests.support.predictions import noise, prediction, setup, still, there_and_back
 
 
 def test_every_metric_is_there_by_its_name_and_says_what_it_is():
@@ -33,7 +33,7 @@ def test_what_needs_weights_names_the_command_that_brings_them(tmp_path, monkeyp
 
 
 def test_importing_the_metrics_imports_no_network_and_no_heavy_library():
-    heavy = ("transformers", "torchmetrics", "scipy", "diffusers", "persist_memory", "persist_cli.registry")
+    heavy = ("transformers", "torchmetrics", "scipy", "diffusers", "persist_memory", "persist_cli.plugins")
     code = f"import sys, persist_cli.metrics; print([name for name in {heavy} if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout == "[]\n"
 

@@ -3,12 +3,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from persist_cli.io.files import write_json
+from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS
-from persist_cli.metrics.returns import farthest
-from persist_cli.metrics.src import BACKBONES
-from persist_cli.world.files import write_json
-from persist_cli.world.weights import cached_weight
-from tests.metrics.predictions import setup, there_and_back
+from persist_cli.metrics.src import BACKBONES, farthest
+from tests.support.predictions import setup, there_and_back
 
 SRC, AWAY = METRICS["src"], METRICS["src-away"]
 any_encoder = pytest.mark.skipif(

@@ -3,15 +3,15 @@ import json
 import pytest
 import torch
 
-from persist_cli.registry import make_encoder, make_memory
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.memory import FrameOfReference
+from persist_cli.data.clips import interactions_of
+from persist_cli.data.store import Store
+from persist_cli.errors import PersistError
+from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.world_model import WorldModel, recall_together, step_together
-from persist_cli.trajectories.clips import interactions_of
-from persist_cli.trajectories.store import Store
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.errors import PersistError
-from persist_cli.world.memory import FrameOfReference
-from persist_memory.views import Views
-from tests.backbones.micro import micro, shaken
+from persist_memory.grid.visibility import Views
+from tests.support.micro_model import micro, shaken
 
 WAYS = (["left"] * 8, ["left"] * 4 + ["forward"] * 4, ["right"] * 8)
 

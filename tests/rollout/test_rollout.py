@@ -5,16 +5,16 @@ import pytest
 import torch
 from PIL import Image
 
-from persist_cli.memorizing.memory_file import load_memory
-from persist_cli.registry import make_encoder, make_memory
+from persist_cli.api.actions import rotation_about
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.memory import FrameOfReference
+from persist_cli.data.store import Store
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.plugins import make_encoder, make_memory
+from persist_cli.rollout.outputs import quaternion
 from persist_cli.rollout.world_model import WorldModel
-from persist_cli.trajectories.store import Store
-from persist_cli.trajectories.tum import quaternion
 from persist_cli.viewing.video import read_video
-from persist_cli.world.actions import rotation_about
-from persist_cli.world.backbone import Sampling
-from persist_cli.world.memory import FrameOfReference
-from tests.walking import SIZE
+from tests.support.walking import SIZE
 
 
 def roll(persist, run, walks, out, *options):
@@ -108,7 +108,7 @@ def test_a_run_that_moved_with_its_base_still_loads(persist, voxel, walks, tmp_p
 
 
 def test_the_loop_memorizes_what_it_imagines(walks):
-    from tests.backbones.micro import micro
+    from tests.support.micro_model import micro
 
     trajectory = Store(walks)[0].read([0])
     encoder = make_encoder("patches", {})

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from persist_cli.registry import make_simulator
+from persist_cli.api.simulator import random_ground
+from persist_cli.errors import PluginError
+from persist_cli.plugins import make_simulator
 from persist_cli.simulators.miniworld import MiniWorld
-from persist_cli.world.errors import PluginError
-from persist_cli.world.simulator import random_ground
 
 
 def make_world(**settings: Any) -> MiniWorld:

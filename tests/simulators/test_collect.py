@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from persist_cli.data.store import Store
+from persist_cli.errors import DataError, PersistError
 from persist_cli.simulators.collect import TEST_SEEDS, CollectPlan, claim_folder, run_collect
-from persist_cli.trajectories.store import Store
-from persist_cli.world.errors import DataError, PersistError
 
 from .conftest import make_world
 

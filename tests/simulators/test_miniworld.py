@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from persist_cli.registry import make_simulator
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import camera_rays, project, unproject
+from persist_cli.api.observations import Frame
+from persist_cli.errors import DataError, RecipeError
+from persist_cli.plugins import make_simulator
 from persist_cli.simulators.miniworld import MiniWorld
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.errors import DataError, RecipeError
-from persist_cli.world.geometry import camera_rays, project, unproject
-from persist_cli.world.observations import Frame
 
 from .conftest import make_world, put_somewhere
 
 FINGERPRINT = """
 import hashlib, sys
-from persist_cli.registry import make_simulator
+from persist_cli.plugins import make_simulator
 world = make_simulator("miniworld", {})
 world.open_scene(3)
 world.place((float(sys.argv[1]), float(sys.argv[2])), 0.3)
@@ -30,8 +30,8 @@ print(hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest())
 """
 OPEN = """
 import sys
-from persist_cli.registry import make_simulator
-from persist_cli.world.errors import PersistError
+from persist_cli.plugins import make_simulator
+from persist_cli.errors import PersistError
 for missing in sys.argv[1:] or [""]:
     sys.modules[missing] = None
     try:

@@ -6,11 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from persist_cli.api.observations import Frame
+from persist_cli.simulators.collect import Tour, tour_frames
 from persist_cli.simulators.miniworld import MiniWorld
-from persist_cli.simulators.policies import POLICIES, walk
-from persist_cli.simulators.routes import FreeGrid, clear_distance
-from persist_cli.simulators.work import Tour, tour_frames
-from persist_cli.world.observations import Frame
+from persist_cli.simulators.policies import POLICIES, FreeGrid, clear_distance, walk
 
 from .conftest import put_somewhere
 
@@ -128,7 +127,7 @@ def test_a_walk_does_not_go_on_where_the_agent_cannot_move(world: MiniWorld) -> 
         while True:
             yield "drop"
 
-    from persist_cli.world.errors import DataError
+    from persist_cli.errors import DataError
 
     with pytest.raises(DataError, match="miniworld/house-3: the agent cannot move"):
         list(walk(world, stubborn, np.random.default_rng(0), 3))

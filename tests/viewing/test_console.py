@@ -6,9 +6,9 @@ import math
 import pytest
 from rich.console import Console
 
+from persist_cli.io.files import write_json
 from persist_cli.viewing import console
 from persist_cli.viewing.console import print_json, print_table
-from persist_cli.world.files import write_json
 
 FIGURES = {"psnr": [20.0, math.nan], "rmse": (math.inf, {"low": -math.inf})}
 PLAIN = {"psnr": [20.0, None], "rmse": [None, {"low": None}]}

@@ -3,10 +3,10 @@ import pytest
 import torch
 from PIL import Image
 
+from persist_cli.api.memory import MapPoints
 from persist_cli.viewing.map import draw_map, ground_axes, paint
-from persist_cli.world.memory import MapPoints
-from tests.memory.views_of_room import walked, written
-from tests.rooms import UP
+from tests.support.room_views import walked, written
+from tests.support.rooms import UP
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 

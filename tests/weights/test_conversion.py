@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_tensors
+from persist_cli.io.hub import cached_weight
 from persist_cli.weights.conversion import CONVERSIONS
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import read_tensors
-from persist_cli.world.weights import cached_weight
-from tests.weights.small import alex_tree
+from tests.support.small_weights import alex_tree
 
 
 def converted(name, tree, folder):

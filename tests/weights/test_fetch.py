@@ -4,13 +4,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.io.files import read_tensors
+from persist_cli.io.hub import cached_weight, weights_home
 from persist_cli.weights.catalog import WEIGHTS, HubRepository
 from persist_cli.weights.conversion import CONVERSIONS
 from persist_cli.weights.fetch import DOWNLOADS, fetch_weight
-from persist_cli.world.errors import CheckpointError, PersistError
-from persist_cli.world.files import read_tensors
-from persist_cli.world.weights import cached_weight, weights_home
-from tests.weights.small import NAME, SOURCE_NAME, original, weight_of, write_archive
+from tests.support.small_weights import NAME, SOURCE_NAME, original, weight_of, write_archive
 
 BOTH = pytest.mark.parametrize("name", [NAME, SOURCE_NAME])
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from persist_cli.errors import CheckpointError
 from persist_cli.weights.onnx import linear_weights, read_onnx_weights
-from persist_cli.world.errors import CheckpointError
 
 
 def varint(number: int) -> bytes:

@@ -6,8 +6,8 @@ import struct
 import numpy as np
 import pytest
 
+from persist_cli.errors import CheckpointError
 from persist_cli.weights.unpickling import read_pickled_arrays
-from persist_cli.world.errors import CheckpointError
 
 
 class Calls:

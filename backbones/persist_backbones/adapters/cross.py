@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapters.adapter import Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import Adapter, PreparedMemory, VideoShape
 from persist_backbones.adapters.memory_block import AttentionSettings, memory_blocks, position_code
-from persist_cli.world.cameras import Cameras, invert_rigid
-from persist_cli.world.geometry import transform
-from persist_cli.world.tokens import MemoryTokens
+from persist_cli.api.cameras import Cameras, invert_rigid
+from persist_cli.api.geometry import transform
+from persist_cli.api.tokens import MemoryTokens
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from persist_backbones.adapters.adapter import Adapter, VideoShape
+from persist_backbones.adapters.base import Adapter, VideoShape
 from persist_backbones.adapters.canvas import CanvasAdapter
 from persist_backbones.adapters.cross import CrossAdapter
 from persist_backbones.adapters.projected import ProjectedAdapter
-from persist_backbones.weights.parts import load_exactly
-from persist_cli.world.errors import CheckpointError, hint
-from persist_cli.world.files import read_json, read_tensors, write_json, write_tensors
-from persist_cli.world.settings import parse_settings
+from persist_cli.errors import CheckpointError, hint
+from persist_cli.io.files import load_exactly, read_json, read_tensors, write_json, write_tensors
+from persist_cli.io.settings import parse_settings
 
 FORMS: dict[str, type[Adapter[Any]]] = {"cross": CrossAdapter, "projected": ProjectedAdapter, "canvas": CanvasAdapter}
 DEFAULT = "cross"

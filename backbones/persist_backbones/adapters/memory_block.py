@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.adapters.adapter import AdapterSettings, VideoShape
-from persist_backbones.zero_init import zero_init
-from persist_cli.world.errors import CheckpointError
+from persist_backbones.adapters.base import AdapterSettings, VideoShape
+from persist_backbones.tensors import zero_init
+from persist_cli.errors import CheckpointError
 
 SHORTEST, LONGEST = 0.5, 128.0  # wavelengths of the position code in metres: two cells, twice the paper's map
 

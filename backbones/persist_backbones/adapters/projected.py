@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from persist_backbones.adapters.adapter import NEAR, Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import NEAR, Adapter, PreparedMemory, VideoShape
 from persist_backbones.adapters.memory_block import AttentionSettings, memory_blocks, position_code
-from persist_backbones.conditioning import fold_frames
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.geometry import pixel_centers, project
-from persist_cli.world.tokens import MemoryTokens
+from persist_backbones.tensors import fold_frames
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import pixel_centers, project
+from persist_cli.api.tokens import MemoryTokens
 
 WAVELENGTHS = (1 / 16, 2.0)  # in images; twice an image tells both sides of it and a margin apart
 MARGIN = 0.25  # of the image: a token's cell reaches into view before its middle does

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from persist_backbones.adapters.adapter import NEAR
-from persist_cli.world.cameras import Cameras
-from persist_cli.world.geometry import nearest_at, project
+from persist_backbones.adapters.base import NEAR
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import nearest_at, project
 
 TIE = 1e-4  # of the depth: a wall seen face on is one depth up to rounding, whichever way the world is turned
 SNAP = 1e-6  # pixels: a token on the border of two pixels stays in one of them whatever the rounding

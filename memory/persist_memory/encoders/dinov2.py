@@ -15,12 +15,10 @@ from pydantic import PositiveInt
 from safetensors import SafetensorError
 from torch import Tensor
 
-from persist_cli.world.encoder import Encoder
-from persist_cli.world.errors import CheckpointError
-from persist_cli.world.files import reallocate
-from persist_cli.world.hub import hub_obstacle, in_hub_cache
-from persist_cli.world.quiet import without_bars
-from persist_cli.world.weights import cached_weight
+from persist_cli.api.encoder import Encoder
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import reallocate
+from persist_cli.io.hub import cached_weight, hub_obstacle, in_hub_cache, without_bars
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

@@ -14,10 +14,10 @@ from pydantic import PositiveInt
 from torch import Tensor
 from torch.nn import functional
 
-from persist_cli.world.encoder import Encoder
-from persist_cli.world.errors import CheckpointError, RecipeError
-from persist_cli.world.files import read_tensors
-from persist_cli.world.weights import cached_weight
+from persist_cli.api.encoder import Encoder
+from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.io.files import read_tensors
+from persist_cli.io.hub import cached_weight
 
 WEIGHTS: Final = "efficientnet-lite0"
 EPSILON: Final = 1e-3  # of the batch norms

@@ -10,8 +10,8 @@ from jaxtyping import Float, UInt8
 from pydantic import PositiveInt
 from torch import Tensor
 
-from persist_cli.world.encoder import Encoder
-from persist_cli.world.errors import RecipeError
+from persist_cli.api.encoder import Encoder
+from persist_cli.errors import RecipeError
 
 DETAIL_GAIN = 8.0  # detail is weaker than colour; brought to the same order, not whitened: noise stays small
 EXACT = 2.0**20  # weights are multiples of 1 / EXACT

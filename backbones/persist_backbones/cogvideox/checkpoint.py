@@ -1,0 +1,130 @@
+"""What of a CogVideoX world model stands in a checkpoint folder: all of it, or what LoRA changed."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from diffusers import CogVideoXTransformer3DModel
+from diffusers.loaders.lora_base import LORA_ADAPTER_METADATA_KEY, LORA_WEIGHT_NAME_SAFE
+from torch import Tensor
+
+from persist_backbones.cogvideox.build import starting_parts
+from persist_backbones.cogvideox.model import WorldTransformer
+from persist_backbones.cogvideox.pretrained import (
+    load_parts,
+)
+from persist_backbones.cogvideox.prompt import check_kept
+from persist_backbones.extensions.lora import save_lora
+from persist_cli.errors import CheckpointError
+from persist_cli.io.checkpoint_folder import what_is_changed
+from persist_cli.io.files import load_exactly, read_tensors, write_tensors
+
+if TYPE_CHECKING:
+    from persist_backbones.cogvideox.backbone import CogVideoX
+
+
+def save_whole(backbone: CogVideoX, folder: Path) -> None:
+    """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
+    with backbone.frozen.restored():
+        backbone.transformer.base.save_pretrained(folder / "transformer")
+        backbone.codec.vae.save_pretrained(folder / "vae")
+        backbone.scheduler.save_pretrained(folder / "scheduler")
+        save_world(backbone.transformer, backbone.prompt, folder)
+
+
+def save_change(backbone: CogVideoX, folder: Path) -> None:
+    """Write LoRA as diffusers' pipelines load it, and ``world.safetensors`` with what is ours."""
+    save_lora(backbone.transformer.base, folder)
+    save_world(backbone.transformer, backbone.prompt, folder)
+
+
+def load_whole(backbone: CogVideoX, folder: Path) -> None:
+    """Take what ``save_whole`` wrote, or what ``save_change`` did merged into the weights that it changes."""
+    check_kept(backbone.settings, folder)
+    changed = what_is_changed(folder)
+    if changed is None:
+        backbone.set_parts(load_parts(folder))
+    elif isinstance(changed, Path):
+        load_whole(backbone, changed)
+    else:
+        backbone.set_parts(starting_parts(dataclasses.replace(backbone.settings, **changed)))
+    if backbone.prompt.is_meta:
+        return
+    if changed is not None:
+        merge_lora(backbone.transformer.base, folder, check=not isinstance(changed, Path))  # a base has a fingerprint
+    backbone.prompt = load_world(backbone.transformer, folder)
+
+
+def save_world(transformer: WorldTransformer, prompt: Tensor, folder: Path) -> None:
+    """Write what is ours beside diffusers' parts: widening, interactions and the prompt's embedding."""
+    own = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
+    write_tensors(folder / "world.safetensors", own | {"prompt": prompt})
+
+
+def load_world(transformer: WorldTransformer, folder: Path) -> Tensor:
+    """Take what ``save_world`` wrote, in whatever precision; returns the prompt's embedding in the transformer's."""
+    path = folder / "world.safetensors"
+    tensors, _ = read_tensors(path)
+    prompt = tensors.pop("prompt", None)
+    if prompt is None:
+        raise CheckpointError(f"{path}: no prompt embedding in it")
+    own = {name for name in transformer.state_dict() if not name.startswith("base.")}
+    load_exactly(transformer, tensors, own, path)
+    return prompt.to(next(transformer.parameters()).dtype)
+
+
+PREFIX = "transformer."  # of the names in a pipeline's LoRA file
+
+DOWN, UP = ".lora_A.weight", ".lora_B.weight"
+
+SAMPLED = 256  # values of a tensor that its digest looks at
+
+
+@torch.no_grad()
+def merge_lora(transformer: CogVideoXTransformer3DModel, folder: Path, check: bool) -> None:
+    """Add what ``save_lora`` wrote to the weights that it was trained on.
+
+    Args:
+        transformer: with those weights.
+        folder: that was written into.
+        check: whether these are those weights.
+
+    Raises:
+        CheckpointError: when the file is missing or corrupt, or these are other weights.
+    """
+    path = folder / LORA_WEIGHT_NAME_SAFE
+    tensors, metadata = read_tensors(path)
+    scale = _scale(metadata, path)
+    if check and metadata.get("digest") != weights_digest(transformer):
+        raise CheckpointError(f"{path}: was trained on other weights than those that it is to change")
+    weights = dict(transformer.named_parameters())
+    for name in sorted(each for each in tensors if each.endswith(DOWN)):
+        module = name.removeprefix(PREFIX).removesuffix(DOWN)
+        down, up = tensors[name], tensors.get(name.removesuffix(DOWN) + UP)
+        weight = weights.get(f"{module}.weight")
+        if up is None or weight is None or weight.shape != (up.shape[0], down.shape[1]):
+            raise CheckpointError(f"{path}: does not fit this model at {module!r}")
+        weight.add_((scale * up.double() @ down.double()).to(weight))
+
+
+def weights_digest(transformer: CogVideoXTransformer3DModel) -> str:
+    """A hash of names, shapes and some values of each weight: tells models apart without reading all of them."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(transformer.state_dict().items()):  # tables of positions too
+        values = tensor.detach().flatten()
+        some = values[:: max(1, len(values) // SAMPLED)].float().cpu().contiguous()
+        digest.update(f"{name} {tuple(tensor.shape)}".encode() + some.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _scale(metadata: dict[str, str], path: Path) -> float:
+    try:
+        config: dict[str, Any] = json.loads(metadata[LORA_ADAPTER_METADATA_KEY])
+        return float(config[f"{PREFIX}lora_alpha"]) / int(config[f"{PREFIX}r"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise CheckpointError(f"{path}: it does not say its rank and alpha") from error

@@ -1,0 +1,264 @@
+"""What the transformer is given besides noisy latents: padding, cameras, interactions and positions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from diffusers import CogVideoXTransformer3DModel
+from diffusers.models.embeddings import get_3d_rotary_pos_embed
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from persist_backbones.cogvideox.codec import spatial_compression
+from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.tensors import fold_frames, frames_per_token, tokens_of
+from persist_cli.api.backbone import Interactions
+from persist_cli.api.cameras import Cameras, invert_rigid
+from persist_cli.api.geometry import plucker
+from persist_cli.errors import CheckpointError, DataError
+
+
+@dataclass(frozen=True)
+class ClipShape:
+    """How a clip is divided.
+
+    Args:
+        frames: latent frames of a clip, without padding.
+        height: latent pixels.
+        width: latent pixels.
+        patch: latent pixels along the edge of a video token.
+        token_frames: latent frames that a video token stands for.
+    """
+
+    frames: int
+    height: int
+    width: int
+    patch: int
+    token_frames: int
+
+    @property
+    def padded_frames(self) -> int:
+        """Latent frames that the model takes."""
+        return self.frames + -self.frames % self.token_frames
+
+    @property
+    def tokens(self) -> tuple[int, int, int]:
+        """Frames, rows and columns of video tokens."""
+        return self.padded_frames // self.token_frames, self.height // self.patch, self.width // self.patch
+
+    def pad(
+        self, latents: Float[Tensor, "batch frame channel height width"]
+    ) -> Float[Tensor, "batch padded_frame channel height width"]:
+        """Latents with the first frame repeated in front."""
+        missing = self.padded_frames - self.frames
+        return torch.cat([latents[:, :1].expand(-1, missing, -1, -1, -1), latents], dim=1) if missing else latents
+
+    def drop_padding(
+        self, latents: Float[Tensor, "batch padded_frame channel height width"]
+    ) -> Float[Tensor, "batch frame channel height width"]:
+        """The latents without what ``pad`` put in front."""
+        return latents[:, self.padded_frames - self.frames :]
+
+    def image_condition(
+        self, first: Float[Tensor, "batch 1 channel height width"]
+    ) -> Float[Tensor, "batch padded_frame channel height width"]:
+        """The latents of the first frame alone at the very first place, zeros at all others."""
+        zeros = first.new_zeros(first.shape[0], self.padded_frames - 1, *first.shape[2:])
+        return torch.cat([first, zeros], dim=1)
+
+
+def clip_shape(transformer: Any, vae: Any, settings: CogVideoXSettings) -> ClipShape:
+    """The shape of the settings' clips for diffusers' transformer and VAE."""
+    spatial, config = spatial_compression(vae), transformer.config
+    return ClipShape(
+        frames=(settings.frames - 1) // int(vae.config.temporal_compression_ratio) + 1,
+        height=settings.height // spatial,
+        width=settings.width // spatial,
+        patch=config.patch_size,
+        token_frames=frames_per_token(config),
+    )
+
+
+RAY_CHANNELS = 6
+
+
+def camera_latents(
+    cameras: Cameras, spatial: int, temporal: int, printed: bool, multiple: int = 1
+) -> Float[Tensor, "batch latent_frame channel height width"]:
+    """Plücker rays relative to each clip's first camera, at the VAE's compression.
+
+    Mean-pooled in space, which for rays is the ray through the middle; in time frames are folded into channels
+    (unpixelshuffle). As for the VAE, the first frame stands alone in the first latent frame, here repeated to fill
+    its channels: 9×512×512×6 → 3×64×64×24.
+
+    Args:
+        cameras: ``[batch, frame]``, one frame and a multiple of ``temporal``.
+        spatial: compression in height and width.
+        temporal: compression in time.
+        printed: directions as the paper prints them.
+        multiple: what the number of latent frames is padded to in front, like the latents (see ``clip_shape``).
+    """
+    first = invert_rigid(cameras.world_from_camera[:, :1].double())
+    local = Cameras(first @ cameras.world_from_camera.double(), cameras.intrinsics, cameras.height, cameras.width)
+    rays = plucker(local.resized(local.height // spatial, local.width // spatial), printed)
+    return fold_frames(rays.permute(0, 1, 4, 2, 3).float(), temporal, multiple)
+
+
+def camera_tokens(
+    latents: Float[Tensor, "batch frame channel height width"], patch: int, frames: int = 1
+) -> Float[Tensor, "batch token folded"]:
+    """The camera embedding at each video token: the mean over its patch, its latent frames folded into channels."""
+    means = F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, (len(latents), -1, frames))
+    return tokens_of(means.flatten(2, 3))
+
+
+def interaction_rows(clips: Sequence[Interactions], names: Sequence[str], steps: int) -> Int[Tensor, "batch step"]:
+    """Rows of the interaction embedding for each step of each clip, 0 where nothing but motion happens.
+
+    Raises:
+        DataError: for an interaction that the model has no embedding for.
+    """
+    rows = torch.zeros(len(clips), steps, dtype=torch.long)
+    for sample, interactions in enumerate(clips):
+        for step, name in enumerate(interactions[:steps]):
+            if name is None:
+                continue
+            if name not in names:
+                raise DataError(f"the model knows no interaction {name!r}; it has {', '.join(names) or 'none'}")
+            rows[sample, step] = 1 + step * len(names) + list(names).index(name)
+    return rows
+
+
+def model_input(noisy: Tensor, image: Tensor, camera: Tensor, depth: bool) -> Tensor:
+    """All channels that the transformer sees: noisy RGB, RGB image, noisy depth, depth image and camera.
+
+    Args:
+        noisy: latents ``[batch, frame, channel, height, width]`` of RGB and depth.
+        image: those of the image condition.
+        camera: camera latents.
+        depth: false gives zeros for both parts of depth.
+    """
+    (color, metres), (color_image, metres_image) = noisy.chunk(2, dim=2), image.chunk(2, dim=2)
+    if not depth:
+        metres, metres_image = torch.zeros_like(metres), torch.zeros_like(metres_image)
+    return torch.cat([color, color_image, metres, metres_image, camera.to(noisy.dtype)], dim=2)
+
+
+Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the first place, and one past those of the last
+
+
+def rotary_positions(config: Any, grid: tuple[int, int, int], device: torch.device) -> tuple[Tensor, Tensor] | None:
+    """Cosines and sines for every video token, ``None`` for models with absolute positions only.
+
+    CogVideoX 1.0 fits a clip's grid into the middle of the one it was trained on; 1.5 counts its rows and columns.
+
+    Args:
+        config: of diffusers' transformer; its sample size is the one it was trained on.
+        grid: frames, rows and columns of video tokens.
+        device: where they are wanted.
+    """
+    if not config.use_rotary_positional_embeddings:
+        return None
+    if config.patch_size_t is not None:
+        return _kept(_counted, config.attention_head_dim, grid, str(device))
+    trained = (config.sample_height // config.patch_size, config.sample_width // config.patch_size)
+    return _kept(_fitted, config.attention_head_dim, grid, middle_region(grid[1:], trained), str(device))
+
+
+def _kept(positions: Any, *given: Any) -> tuple[Tensor, Tensor]:
+    """What the cached function gives; not from nor into its cache while tensors have no values, to count memory."""
+    real = type(torch.empty(0)) is torch.Tensor
+    found: tuple[Tensor, Tensor] = positions(*given) if real else positions.__wrapped__(*given)
+    return found
+
+
+def middle_region(shape: tuple[int, int], trained: tuple[int, int]) -> Region:
+    """The largest region with the aspect of ``shape`` in the middle of a trained grid, both in rows and columns."""
+    rows, columns = trained
+    if shape[0] / shape[1] > rows / columns:
+        columns = round(trained[0] / shape[0] * shape[1])
+    else:
+        rows = round(trained[1] / shape[1] * shape[0])
+    top, left = round((trained[0] - rows) / 2), round((trained[1] - columns) / 2)
+    return (top, left), (top + rows, left + columns)
+
+
+@lru_cache(maxsize=4)
+def _fitted(channels: int, grid: tuple[int, int, int], region: Region, device: str) -> tuple[Tensor, Tensor]:
+    cosines, sines = get_3d_rotary_pos_embed(
+        embed_dim=channels,
+        crops_coords=region,
+        grid_size=grid[1:],
+        temporal_size=grid[0],
+        device=torch.device(device),
+    )
+    return cosines, sines
+
+
+@lru_cache(maxsize=4)
+def _counted(channels: int, grid: tuple[int, int, int], device: str) -> tuple[Tensor, Tensor]:
+    cosines, sines = get_3d_rotary_pos_embed(
+        embed_dim=channels,
+        crops_coords=None,
+        grid_size=grid[1:],
+        temporal_size=grid[0],
+        grid_type="slice",
+        max_size=grid[1:],  # what is sliced away does not change the rest
+        device=torch.device(device),
+    )
+    return cosines, sines
+
+
+def fit_positions(transformer: CogVideoXTransformer3DModel, size: tuple[int, int, int]) -> None:
+    """Make the table of a transformer one for clips of this size, where it has a table of another.
+
+    diffusers computes a sinusoidal table again at every call; here it is computed once. It refuses a learned table
+    for images of another size (CogVideoX-5b-I2V) and leaves it out for clips of another length: here its first frames
+    are taken, and of each the middle of the images' shape, resampled. The configuration then has the new size.
+
+    Args:
+        transformer: diffusers'.
+        size: frames, rows and columns of the latents.
+
+    Raises:
+        CheckpointError: for clips longer than a learned table.
+    """
+    table = transformer.patch_embed
+    shown = dict(zip(("sample_frames", "sample_height", "sample_width"), size, strict=True))
+    shown["sample_frames"] = (size[0] - 1) * table.temporal_compression_ratio + 1
+    if all(getattr(table, name) == value for name, value in shown.items()):
+        return
+    if table.use_learned_positional_embeddings:
+        table.pos_embedding = _resampled(transformer, size)
+        transformer.register_to_config(**shown)
+    elif table.use_positional_embeddings:
+        rows, columns, frames = size[1], size[2], shown["sample_frames"]
+        device = table.pos_embedding.device
+        table.pos_embedding = table._get_positional_embeddings(rows, columns, frames, device=device)
+    else:
+        return
+    for name, value in shown.items():
+        setattr(table, name, value)
+
+
+def _resampled(
+    transformer: CogVideoXTransformer3DModel, size: tuple[int, int, int]
+) -> Float[Tensor, "1 word+token channel"]:
+    """The learned table for latents of this size."""
+    table, patch = transformer.patch_embed, transformer.config.patch_size
+    words, frames, rows, columns = table.max_text_seq_length, size[0], size[1] // patch, size[2] // patch
+    trained = (table.sample_height // patch, table.sample_width // patch)
+    video = table.pos_embedding[0, words:].unflatten(0, (-1, *trained))
+    if frames > len(video):
+        longest = (len(video) - 1) * table.temporal_compression_ratio + 1
+        raise CheckpointError(f"learned positions are for clips of {longest} frames at most; ask for fewer frames")
+    (top, left), (bottom, right) = middle_region((rows, columns), trained)
+    middle = video[:frames, top:bottom, left:right].permute(0, 3, 1, 2)
+    if middle.shape[2:] != (rows, columns):
+        middle = F.interpolate(middle.float(), (rows, columns), mode="bilinear").to(video.dtype)
+    return torch.cat([table.pos_embedding[:, :words], middle.permute(0, 2, 3, 1).flatten(0, 2)[None]], dim=1)

@@ -1,0 +1,1 @@
+"""What is optional: LoRA, caches over denoising steps, offloading, memory savings."""

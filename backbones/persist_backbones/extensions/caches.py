@@ -1,0 +1,132 @@
+"""diffusers' caches over the denoising steps of a clip, with memory blocks between the cached blocks.
+
+diffusers hangs hooks on the blocks of its transformer (``enable_cache``). What these do not know of is ours: the
+memory's blocks between, the second output layer, and that a step may ask twice, with memory and without.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from diffusers.hooks import (
+    FasterCacheConfig,
+    FirstBlockCacheConfig,
+    HookRegistry,
+    MagCacheConfig,
+    PyramidAttentionBroadcastConfig,
+    TaylorSeerCacheConfig,
+    apply_taylorseer_cache,
+)
+from diffusers.hooks.taylorseer_cache import _TAYLORSEER_CACHE_HOOK, TaylorSeerState
+from diffusers.models.cache_utils import CacheMixin
+from torch import Tensor, nn
+
+from persist_cli.errors import PersistError
+
+if TYPE_CHECKING:
+    from persist_backbones.cogvideox.model import WorldTransformer
+
+
+CACHES = (
+    FirstBlockCacheConfig, TaylorSeerCacheConfig, MagCacheConfig, PyramidAttentionBroadcastConfig, FasterCacheConfig,
+)  # fmt: skip
+
+ATTENTION = r"transformer_blocks\.\d+\.attn1"
+
+
+def with_layers(config: Any) -> Any:
+    """A cache's configuration that names the layers: what TaylorSeer takes by default fits none of CogVideoX."""
+    if not isinstance(config, TaylorSeerCacheConfig) or config.use_lite_mode:
+        return config
+    if config.cache_identifiers or config.skip_predict_identifiers:
+        return config
+    return dataclasses.replace(config, cache_identifiers=[ATTENTION])
+
+
+def check_cache(config: Any) -> None:
+    """Raise ``PersistError`` for a cache that does not work with two outputs and two predictions a step."""
+    if not isinstance(config, CACHES):
+        known = ", ".join(kind.__name__ for kind in CACHES)
+        raise PersistError(f"{type(config).__name__} does not work with this transformer; known: {known}")
+    if isinstance(config, FasterCacheConfig) and not config.is_guidance_distilled:
+        raise PersistError(
+            "FasterCacheConfig skips a guidance whose two predictions are one batch, and memory's are not; give it "
+            "is_guidance_distilled=True"
+        )
+
+
+def rest_is_cached(block: nn.Module) -> bool:
+    """Whether a cache put into the output of the first block what the others and the memory between them would add."""
+    registry = getattr(block, "_diffusers_hook", None)
+    hooks = registry.hooks.values() if registry is not None else ()
+    return any(_skips(hook.state_manager.get_state()) for hook in hooks if hasattr(hook, "state_manager"))
+
+
+def _skips(state: Any) -> bool:
+    if isinstance(state, TaylorSeerState):
+        return bool(state.is_inactive and state.last_update_step != state.current_step)
+    return not getattr(state, "should_compute", True)
+
+
+class ClipCaches:
+    """The caches over one clip: they begin empty, and the predictions of a step do not see each other's.
+
+    Args:
+        transformer: whose base may have a cache enabled.
+
+    Raises:
+        PersistError: when that cache does not work here.
+    """
+
+    def __init__(self, transformer: WorldTransformer) -> None:
+        self.transformer = transformer
+        self.hooks = [hook for part in transformer.modules() for hook in hooks_of(part)]
+        self.states: dict[tuple[Any, str], Any] = {}  # of caches that know no contexts
+        config = transformer.base._cache_config
+        if config is not None:
+            check_cache(config)
+            if not self.hooks:
+                raise PersistError(f"{type(config).__name__} fits no layer; attention is {ATTENTION!r} here")
+        if self.hooks:
+            self._begin(config)
+
+    def _begin(self, config: Any) -> None:
+        base, second = self.transformer.base, HookRegistry.check_if_exists_or_initialize(self.transformer.extra_out)
+        second.remove_hook(_TAYLORSEER_CACHE_HOOK)
+        if any(_TAYLORSEER_CACHE_HOOK in registry.hooks for registry in registries_of(base.proj_out)):
+            alike = {"use_lite_mode": False, "cache_identifiers": ["extra_out"], "skip_predict_identifiers": None}
+            apply_taylorseer_cache(self.transformer, dataclasses.replace(config, **alike))
+        self.transformer.__dict__.pop("_diffusers_hook", None)  # it remembers which parts had hooks
+        self.transformer.reset_cache()
+
+    @contextlib.contextmanager
+    def prediction(self, name: str, timesteps: Tensor) -> Iterator[None]:
+        """Within it the transformer predicts under this name.
+
+        Args:
+            name: of one of the predictions that every step makes.
+            timesteps: of the step.
+        """
+        if not self.hooks:
+            yield
+            return
+        self.transformer.timestep = int(timesteps[0])
+        for hook in self.hooks:
+            if hasattr(hook, "state"):
+                hook.state = self.states.setdefault((hook, name), type(hook.state)())
+        with CacheMixin.cache_context(self.transformer, name):
+            yield
+
+
+def hooks_of(module: nn.Module) -> list[Any]:
+    """The hooks that diffusers hung on a module itself."""
+    return [hook for registry in registries_of(module) for hook in registry.hooks.values()]
+
+
+def registries_of(module: nn.Module) -> list[Any]:
+    """The registry of a module's hooks, if it has one."""
+    registry = getattr(module, "_diffusers_hook", None)
+    return [] if registry is None else [registry]

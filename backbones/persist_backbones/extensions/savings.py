@@ -1,0 +1,60 @@
+"""Cheaper training steps: recomputed and compiled blocks, frozen weights in half the bytes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from persist_backbones.extensions.lora import has_lora
+from persist_cli.api.stages import Economy, Stage
+
+if TYPE_CHECKING:
+    from persist_backbones.cogvideox.backbone import CogVideoX
+
+
+class FrozenWeights:
+    """Weights that are not trained, held in another precision.
+
+    Args:
+        module: whose frozen parameters are converted in place.
+        dtype: the precision; ``None`` leaves them as they are.
+        saved: whether they will be saved; their exact values are then kept in the memory of the CPU.
+    """
+
+    def __init__(self, module: nn.Module, dtype: torch.dtype | None, saved: bool = True) -> None:
+        self.exact: list[tuple[nn.Parameter, Tensor]] = []
+        for parameter in module.parameters() if dtype else ():
+            if parameter.requires_grad or parameter.dtype == dtype:
+                continue
+            if saved:
+                self.exact.append((parameter, parameter.data.cpu()))
+            parameter.data = parameter.data.to(dtype)
+
+    @contextlib.contextmanager
+    def restored(self) -> Iterator[None]:
+        """Within the block the weights are what they were, on the CPU."""
+        held = [parameter.data for parameter, _ in self.exact]
+        try:
+            for parameter, exact in self.exact:
+                parameter.data = exact
+            yield
+        finally:
+            for (parameter, _), low in zip(self.exact, held, strict=True):
+                parameter.data = low
+
+
+def economize(backbone: CogVideoX, stage: Stage, economy: Economy) -> FrozenWeights:
+    """Make steps cheaper as asked; exact values of frozen weights are kept where the stage saves them."""
+    transformer, adapter = backbone.transformer.base, backbone.adapter
+    if economy.gradient_checkpointing:
+        transformer.enable_gradient_checkpointing()
+    if economy.compile:  # block by block, as diffusers' compile_repeated_blocks; the names of weights stay
+        for block in (*transformer.transformer_blocks, *(adapter.blocks.values() if adapter else ())):
+            block.compile()
+    if economy.vae_slicing:
+        backbone.codec.vae.enable_slicing()
+    return FrozenWeights(backbone, economy.frozen, saved=stage != "2" and not has_lora(transformer))

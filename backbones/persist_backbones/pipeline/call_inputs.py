@@ -1,0 +1,101 @@
+"""What a pipeline is called with, as diffusers' users have it, made a batch of clips."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from persist_cli.api.backbone import Clips, Interactions
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import DataError
+
+
+def make_clips(
+    images: Tensor,
+    depth: Any,
+    cameras: Cameras | Sequence[Cameras],
+    interactions: Sequence[Interactions] | None,
+    tokens: MemoryTokens | Sequence[MemoryTokens] | None,
+    frames: int,
+) -> Clips:
+    """The batch that begins with these images.
+
+    Args:
+        images: uint8 ``[batch, height, width, 3]``.
+        depth: metres ``[height, width]``, a batch or a list of it; ``None`` where nothing is known.
+        cameras: of every frame of a clip, the image's first; a batch of them or a list.
+        interactions: one sequence a sample; ``None`` for none.
+        tokens: what ``Memory.read`` gave, of one sample, a batch or a list.
+        frames: of a clip.
+
+    Raises:
+        DataError: one line when they do not go together.
+    """
+    batch, height, width = images.shape[:3]
+    path = batch_of_cameras(cameras)
+    metres = torch.zeros(batch, height, width) if depth is None else batch_of_depth(depth)
+    if path.world_from_camera.shape[1] != frames:
+        raise DataError(f"cameras of {path.world_from_camera.shape[1]} frames; a clip of this model has {frames}")
+    if (path.height, path.width) != (height, width) or metres.shape[1:] != (height, width):
+        raise DataError(
+            f"an image of {height}x{width} pixels, depth of {metres.shape[1]}x{metres.shape[2]} and cameras of "
+            f"{path.height}x{path.width}; they must be one size"
+        )
+    memory = None if tokens is None else batch_of_tokens(tokens)
+    steps = interactions or [(None,) * (frames - 1)] * batch
+    counts = {"depth": len(metres), "cameras": len(path), "interactions": len(steps)}
+    counts |= {} if memory is None else {"memory_tokens": len(memory.mask)}
+    for name, count in counts.items():
+        if count != batch:
+            raise DataError(f"{name} of {count} samples, but {batch} images")
+    return Clips(images[:, None], metres[:, None], path, steps, memory, seeds=range(batch))
+
+
+def batch_of_images(images: Any) -> Tensor:
+    """uint8 ``[batch, height, width, 3]`` of a PIL image, an array or a tensor, or of a list of them.
+
+    Integers are uint8 ``[height, width, 3]``; what is not an integer is diffusers' ``pt``, ``[3, height, width]`` in
+    [0, 1]; both may have a batch axis.
+    """
+    if isinstance(images, (list, tuple)):
+        return torch.cat([batch_of_images(each) for each in images])
+    if not isinstance(images, Tensor):
+        whole = images.convert("RGB") if hasattr(images, "convert") else images
+        images = torch.from_numpy(np.array(whole))
+    if images.is_floating_point():
+        images = (images.movedim(-3, -1) * 255).round().clamp(0, 255).to(torch.uint8)
+    if images.ndim not in (3, 4) or images.shape[-1] != 3 or images.dtype != torch.uint8:
+        raise DataError(f"an image of shape {list(images.shape)} and {images.dtype}; give a PIL image or 3 channels")
+    batch: Tensor = images.reshape(-1, *images.shape[-3:])
+    return batch
+
+
+def batch_of_depth(depth: Any) -> Tensor:
+    """Metres ``[batch, height, width]``."""
+    if isinstance(depth, (list, tuple)):
+        return torch.cat([batch_of_depth(each) for each in depth])
+    metres = torch.as_tensor(depth).float()
+    return metres.reshape(-1, *metres.shape[-2:])
+
+
+def batch_of_cameras(cameras: Cameras | Sequence[Cameras]) -> Cameras:
+    """Cameras ``[batch, frame]``."""
+    if not isinstance(cameras, Cameras):
+        return Cameras.concatenate([batch_of_cameras(each) for each in cameras])
+    poses, matrices = cameras.world_from_camera, cameras.intrinsics
+    frames = poses.shape[-3]
+    return Cameras(
+        poses.reshape(-1, frames, 4, 4), matrices.reshape(-1, frames, 3, 3), cameras.height, cameras.width
+    )  # fmt: skip
+
+
+def batch_of_tokens(tokens: MemoryTokens | Sequence[MemoryTokens]) -> MemoryTokens:
+    """Tokens with a batch axis."""
+    if not isinstance(tokens, MemoryTokens):
+        return MemoryTokens.stack(list(tokens))
+    return tokens if tokens.mask.ndim == 2 else MemoryTokens.stack([tokens])

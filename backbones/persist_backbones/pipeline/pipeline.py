@@ -1,0 +1,274 @@
+"""A world model as a pipeline of diffusers' kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import torch
+from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel, DiffusionPipeline
+from diffusers.utils import BaseOutput
+from diffusers.video_processor import VideoProcessor
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.diffusion import SAMPLERS, Denoiser, Step, denoising, make_denoiser, noise_like
+from persist_backbones.cogvideox.pretrained import DiffusersParts
+from persist_backbones.pipeline.call_inputs import batch_of_images, make_clips
+from persist_backbones.pipeline.components import MemoryAdapter, WorldModules, assemble
+from persist_cli.api.backbone import Clips, Interactions, Sampling
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import CheckpointError, DataError, PersistError
+from persist_cli.io.files import reallocate
+
+Callback = Callable[["WorldPipeline", int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
+
+OUTPUTS = ("pil", "np", "pt", "latent")
+
+
+@dataclass
+class WorldPipelineOutput(BaseOutput):  # type: ignore[misc]
+    """What a call gives.
+
+    Args:
+        frames: videos that begin with the given images, in the form asked for; latents for ``latent``.
+        depth: metres, 0 after the first frame where the model gives none; ``None`` with latents.
+    """
+
+    frames: Any
+    depth: Float[Tensor, "batch frame height width"] | None
+
+
+class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
+    """From an image, its depth and a path of cameras to the RGB-D clip that is seen along it.
+
+    What a pipeline of diffusers can do, this one can: ``to``, CPU offload, ``vae.enable_slicing()`` and
+    ``vae.enable_tiling()``, ``transformer.enable_cache(config)``, another scheduler of those that ``SAMPLERS`` has,
+    callbacks and ``interrupt``, saving and loading (safetensors only). Guidance is that over memory.
+
+    Args:
+        transformer: diffusers' own.
+        vae: diffusers' own.
+        scheduler: one of ``SAMPLERS``.
+        world: what makes the transformer a world model.
+        adapter: a memory adapter; ``None`` is plain stage 1.
+    """
+
+    model_cpu_offload_seq = "transformer->vae"
+    _optional_components: ClassVar = ["adapter"]
+    _callback_tensor_inputs: ClassVar = ["latents"]
+
+    def __init__(
+        self,
+        transformer: CogVideoXTransformer3DModel,
+        vae: AutoencoderKLCogVideoX,
+        scheduler: CogVideoXDDIMScheduler,
+        world: WorldModules,
+        adapter: MemoryAdapter | None = None,
+    ) -> None:
+        super().__init__()
+        self.register_modules(transformer=transformer, vae=vae, scheduler=scheduler, world=world, adapter=adapter)
+        self._assembled: tuple[CogVideoX, tuple[Any, ...]] | None = None
+        self._guidance_scale = 1.0
+        self._current_timestep: Tensor | None = None
+        self._num_timesteps = 0
+        self._interrupt = False
+
+    @classmethod
+    def of(cls, backbone: CogVideoX) -> Self:
+        """The pipeline of a backbone with the adapter in use, which shares its weights."""
+        adapter = None if backbone.adapter is None else MemoryAdapter.of(backbone.adapter)
+        parts = (backbone.transformer.base, backbone.codec.vae, backbone.scheduler)
+        pipeline = cls(*parts, WorldModules.of(backbone), adapter)
+        pipeline._assembled = backbone, pipeline._parts()
+        return pipeline
+
+    @property
+    def backbone(self) -> CogVideoX:
+        """The backbone of the present components, for all that a ``Backbone`` can do."""
+        parts = self._parts()
+        if self._assembled is None or any(a is not b for a, b in zip(self._assembled[1], parts, strict=True)):
+            transformer, vae, scheduler, world, adapter = parts
+            trained = CogVideoXDDIMScheduler.from_config(scheduler.config)
+            self._assembled = assemble(DiffusersParts(transformer, vae, trained), world, adapter), parts
+        backbone = self._assembled[0]
+        backbone.prompt = self.world.prompt  # moved as a component, not as the backbone's
+        return backbone
+
+    def _parts(self) -> tuple[Any, ...]:
+        return self.transformer, self.vae, self.scheduler, self.world, self.adapter
+
+    @property
+    def guidance_scale(self) -> float:
+        """Weight of guidance over memory at the present step."""
+        return self._guidance_scale
+
+    @property
+    def num_timesteps(self) -> int:
+        """Denoising steps of the present call."""
+        return self._num_timesteps
+
+    @property
+    def current_timestep(self) -> Tensor | None:
+        """The noise level of the present step, ``None`` between calls."""
+        return self._current_timestep
+
+    @property
+    def interrupt(self) -> bool:
+        """Whether the present call shall make no further step."""
+        return self._interrupt
+
+    def enable_sequential_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
+        """As diffusers' own: every layer of every component is on the accelerator while it runs."""
+        self._exclude_from_cpu_offload: list[str] = []
+        super().enable_sequential_cpu_offload(gpu_id, device)
+
+    def enable_model_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
+        """As diffusers' own; what runs between the transformer's blocks stays on the accelerator."""
+        self._exclude_from_cpu_offload = ["world", "adapter"]
+        super().enable_model_cpu_offload(gpu_id, device)
+
+    def save_pretrained(self, save_directory: str | Path, safe_serialization: bool = True, **options: Any) -> None:
+        """As diffusers' own, safetensors only."""
+        if not safe_serialization:
+            raise CheckpointError(f"{save_directory}: weights are saved as safetensors only")
+        super().save_pretrained(save_directory, **options)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> Self:
+        """As diffusers' own, safetensors only."""
+        pipeline: Self = super().from_pretrained(pretrained_model_name_or_path, **options | {"use_safetensors": True})
+        for part in pipeline.components.values():
+            if isinstance(part, nn.Module):
+                reallocate(part)
+        return pipeline
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        image: Any,
+        depth: Any,
+        cameras: Cameras | Sequence[Cameras],
+        interactions: Sequence[Interactions] | None = None,
+        memory_tokens: MemoryTokens | Sequence[MemoryTokens] | None = None,
+        num_inference_steps: int = 50,
+        guidance_scale: float = 1.0,
+        generator: torch.Generator | list[torch.Generator] | None = None,
+        latents: Tensor | None = None,
+        output_type: str = "pil",
+        return_dict: bool = True,
+        callback_on_step_end: Callback | None = None,
+        callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
+    ) -> WorldPipelineOutput | tuple[Any, ...]:
+        """The clips that begin with the given images.
+
+        Args:
+            image: PIL image, uint8 ``[height, width, 3]`` or diffusers' ``pt``; a list or batch of them.
+            depth: its planar depth in metres, 0 = missing; ``None`` where nothing is known.
+            cameras: of every frame of the clip, the image's first.
+            interactions: what the agent does to the world at each step, one sequence a sample.
+            memory_tokens: what a memory says to these cameras, as ``Memory.read`` gives it.
+            num_inference_steps: denoising steps.
+            guidance_scale: weight of classifier-free guidance over memory; 1 means none.
+            generator: of the noise, on the CPU; one, or one a sample.
+            latents: the noise itself.
+            output_type: ``pil``, ``np``, ``pt`` or ``latent``.
+            return_dict: false gives a plain tuple.
+            callback_on_step_end: called with the pipeline, the step's number, its timestep and the tensors asked for;
+                what it returns of them replaces them.
+            callback_on_step_end_tensor_inputs: tensors that it is given.
+
+        Raises:
+            PersistError: one line for inputs that do not go together or do not fit the model.
+        """
+        sampling, backbone = Sampling(num_inference_steps, self._sampler(), guidance_scale), self.backbone
+        self._check(sampling, output_type, callback_on_step_end_tensor_inputs)
+        images = self._images(image)
+        first = make_clips(images, depth, cameras, interactions, memory_tokens, backbone.frames_per_clip)
+        condition = backbone.encode_first(first)
+        generators = generators_for(generator, len(images))
+        noise = noise_like(condition, generators) if latents is None else latents.to(condition)
+        predict = self._noting(make_denoiser(backbone, first, condition, lambda: self._guidance_scale))
+        steps = denoising(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
+        found = self._run(steps, sampling, callback_on_step_end, callback_on_step_end_tensor_inputs)
+        output = self._output(found, first, output_type)
+        self.maybe_free_model_hooks()
+        return output if return_dict else output.to_tuple()
+
+    def _images(self, given: Any) -> Tensor:
+        """The images as one batch, of the model's size."""
+        images = batch_of_images(given)
+        if images.shape[1:3] != self.backbone.image_size:
+            size, wanted = ("x".join(map(str, each)) for each in (images.shape[1:3], self.backbone.image_size))
+            raise DataError(f"an image of {size} pixels; this model takes {wanted}, depth and cameras alike")
+        return images
+
+    def _sampler(self) -> str:
+        name = next((name for name, kind in SAMPLERS.items() if type(self.scheduler) is kind), None)
+        if name is None:
+            known = ", ".join(kind.__name__ for kind in SAMPLERS.values())
+            raise CheckpointError(
+                f"scheduler {type(self.scheduler).__name__} does not keep to training's noise; use {known}"
+            )
+        return name
+
+    def _check(self, sampling: Sampling, output_type: str, tensors: Sequence[str]) -> None:
+        self.backbone.check_sampling(sampling)
+        if output_type not in OUTPUTS:
+            raise PersistError(f"unknown output_type {output_type!r}; known: {', '.join(OUTPUTS)}")
+        unknown = set(tensors) - set(self._callback_tensor_inputs)
+        if unknown:
+            known = ", ".join(self._callback_tensor_inputs)
+            raise PersistError(f"callback_on_step_end_tensor_inputs has {', '.join(sorted(unknown))}; known: {known}")
+
+    def _noting(self, predict: Denoiser) -> Denoiser:
+        """The same denoiser, which notes the timestep first: caches ask for it."""
+
+        def noting(latents: Tensor, timesteps: Tensor) -> Tensor:
+            self._current_timestep = timesteps[0]
+            return predict(latents, timesteps)
+
+        return noting
+
+    def _run(
+        self, steps: Iterator[Step], sampling: Sampling, callback: Callback | None, tensors: Sequence[str]
+    ) -> Tensor:
+        """Latents after all steps, or after the one that was interrupted."""
+        self._guidance_scale, self._num_timesteps, self._interrupt = sampling.memory_guidance, sampling.steps, False
+        with self.progress_bar(total=self._num_timesteps) as bar:
+            for step in steps:
+                if callback is not None:
+                    given = {name: step.latents for name in tensors}
+                    step.latents = callback(self, step.number, step.timestep, given).pop("latents", step.latents)
+                bar.update()
+                if self._interrupt:
+                    break
+        self._current_timestep = None
+        return step.latents
+
+    def _output(self, latents: Tensor, first: Clips, output_type: str) -> WorldPipelineOutput:
+        if output_type == "latent":
+            return WorldPipelineOutput(latents, None)
+        backbone = self.backbone
+        latents = backbone.shape.drop_padding(latents)
+        color, metres = backbone.codec.decode_images(latents, backbone.gives_depth)
+        color[:, :, 0] = first.rgb[:, 0].movedim(-1, 1).to(color) / 127.5 - 1
+        metres[:, 0] = first.depth[:, 0]
+        return WorldPipelineOutput(VideoProcessor().postprocess_video(color, output_type), metres)
+
+
+def generators_for(given: torch.Generator | list[torch.Generator] | None, batch: int) -> list[torch.Generator]:
+    """One generator a sample; a single one is drawn from in turn, without any torch's own.
+
+    Raises:
+        PersistError: when a list has not one for each sample.
+    """
+    if isinstance(given, list):
+        if len(given) != batch:
+            raise PersistError(f"{len(given)} generators for {batch} images; give one, or one for each")
+        return given
+    return [given or torch.default_generator] * batch

@@ -1,0 +1,152 @@
+"""Actions: a named vocabulary with units; each action is a relative camera pose or an interaction."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from persist_cli.errors import DataError, hint
+
+FREE = "free"  # a motion that no named action describes; the poses say what it was
+
+STAY = "stay"
+
+WORD = re.compile(r"^(?P<name>[a-z_]+)(?:\*(?P<count>\d+))?$")
+
+
+@dataclass(frozen=True)
+class Action:
+    """One action of an agent that walks on the ground.
+
+    Args:
+        name: lower case, as in ``"forward"``.
+        forward: metres along the heading.
+        turn: degrees to the left, about the world's up axis.
+        reverse: the name of the action that undoes it, if one does.
+        interaction: changes the world rather than the camera (pick up, drop, toggle).
+    """
+
+    name: str
+    forward: float = 0.0
+    turn: float = 0.0
+    reverse: str | None = None
+    interaction: bool = False
+
+
+@dataclass(frozen=True)
+class ActionVocabulary:
+    """The actions of one data set or agent, in a fixed order."""
+
+    actions: tuple[Action, ...]
+
+    def __getitem__(self, name: str) -> Action:
+        for action in self.actions:
+            if action.name == name:
+                return action
+        raise DataError(f"unknown action {name!r}; {hint(name, (action.name for action in self.actions))}")
+
+    def parse(self, text: str) -> tuple[str, ...]:
+        """Action names of the text form ``"forward*4 left*2"``."""
+        names: list[str] = []
+        for word in text.split():
+            match = WORD.match(word)
+            if match is None:
+                raise DataError(f"cannot read action {word!r}; write NAME or NAME*COUNT, as in 'forward*4 left*2'")
+            names += [self[match["name"]].name] * int(match["count"] or 1)
+        if not names:
+            raise DataError("no action given; write them as 'forward*4 left*2'")
+        return tuple(names)
+
+    def reversed(self, names: Sequence[str]) -> tuple[str, ...]:
+        """The actions that lead back: each one's reverse, last first."""
+        back = []
+        for name in reversed(names):
+            reverse = self[name].reverse
+            if reverse is None:
+                raise DataError(f"action {name!r} has no reverse")
+            back.append(reverse)
+        return tuple(back)
+
+    def move(
+        self, world_from_camera: Float[Tensor, "4 4"], name: str, world_up: Float[Tensor, " 3"]
+    ) -> Float[Tensor, "4 4"]:
+        """The camera's pose after the action: walk along the heading, turn about the up axis, float64.
+
+        Raises:
+            DataError: for an unknown action and for ``free``, whose motion only the data knows.
+        """
+        if name == FREE:
+            raise DataError("the action 'free' has no motion of its own; follow the trajectory's poses instead")
+        action = self[name]
+        pose = world_from_camera.double().clone()
+        up = world_up.double() / world_up.double().norm()
+        heading = pose[:3, 2] - up * (up @ pose[:3, 2])
+        if action.forward:
+            pose[:3, 3] += action.forward * heading / heading.norm().clamp_min(1e-9)
+        pose[:3, :3] = rotation_about(up, math.radians(action.turn)) @ pose[:3, :3]
+        return pose
+
+    def follow(
+        self, world_from_camera: Float[Tensor, "4 4"], names: Sequence[str], world_up: Float[Tensor, " 3"]
+    ) -> Float[Tensor, "frame 4 4"]:
+        """Poses after each of the actions, the start not included."""
+        poses = []
+        for name in names:
+            world_from_camera = self.move(world_from_camera, name, world_up)
+            poses.append(world_from_camera)
+        return torch.stack(poses)
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """A form that ``from_json`` reads back."""
+        return [vars(action).copy() for action in self.actions]
+
+    @staticmethod
+    def from_json(rows: list[dict[str, Any]]) -> ActionVocabulary:
+        """The vocabulary that ``to_json`` wrote."""
+        return ActionVocabulary(tuple(Action(**row) for row in rows))
+
+
+def format_actions(names: Sequence[str]) -> str:
+    """The text form of action names: runs are counted, as in ``"forward*4 left*2"``."""
+    runs: list[list[Any]] = []
+    for name in names:
+        if runs and runs[-1][0] == name:
+            runs[-1][1] += 1
+        else:
+            runs.append([name, 1])
+    return " ".join(name if count == 1 else f"{name}*{count}" for name, count in runs)
+
+
+def walking_actions(step: float = 0.25, turn: float = 15.0) -> ActionVocabulary:
+    """The usual vocabulary of an embodied agent: steps of ``step`` metres, turns of ``turn`` degrees."""
+    return ActionVocabulary(
+        (
+            Action(STAY, reverse=STAY),
+            Action("forward", forward=step, reverse="backward"),
+            Action("backward", forward=-step, reverse="forward"),
+            Action("left", turn=turn, reverse="right"),
+            Action("right", turn=-turn, reverse="left"),
+            Action("pick_up", interaction=True, reverse="drop"),
+            Action("drop", interaction=True, reverse="pick_up"),
+            Action("toggle", interaction=True, reverse="toggle"),
+        )
+    )
+
+
+def free_motion() -> ActionVocabulary:
+    """The vocabulary of captures whose motion has no names."""
+    return ActionVocabulary((Action(FREE),))
+
+
+def rotation_about(axis: Float[Tensor, " 3"], angle: float) -> Float[Tensor, "3 3"]:
+    """Rotation by ``angle`` radians about a unit axis, right-handed (Rodrigues)."""
+    x, y, z = (float(value) for value in axis)
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross

@@ -1,0 +1,115 @@
+"""Pinhole cameras in the one convention of the project.
+
+OpenCV axes (x right, y down, z forward), ``world_from_camera`` in metres, intrinsics in pixels with the
+centre of the top-left pixel at (0.5, 0.5). Geometry is float64: a map's cells must not depend on where the
+world's origin lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from persist_cli.errors import DataError
+
+RIGID_TOLERANCE = 1e-2  # real captures store poses with three to four digits
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Posed pinhole cameras of one image size; any leading axes, usually one: the frame.
+
+    Args:
+        world_from_camera: rigid transforms in metres.
+        intrinsics: pixels, top-left pixel centre at (0.5, 0.5).
+        height: image height in pixels.
+        width: image width in pixels.
+    """
+
+    world_from_camera: Float[Tensor, "*batch 4 4"]
+    intrinsics: Float[Tensor, "*batch 3 3"]
+    height: int
+    width: int
+
+    @property
+    def centers(self) -> Float[Tensor, "*batch 3"]:
+        """Camera centres in world metres."""
+        return self.world_from_camera[..., :3, 3]
+
+    def __len__(self) -> int:
+        return self.world_from_camera.shape[0]
+
+    def __getitem__(self, index: int | slice | Tensor | list[int]) -> Cameras:
+        return replace(self, world_from_camera=self.world_from_camera[index], intrinsics=self.intrinsics[index])
+
+    def to(self, device: torch.device | str) -> Cameras:
+        """The same cameras on ``device``."""
+        return replace(
+            self,
+            world_from_camera=self.world_from_camera.to(device),
+            intrinsics=self.intrinsics.to(device),
+        )
+
+    def relative_to(self, reference: Float[Tensor, "4 4"]) -> Cameras:
+        """The same cameras in a world whose origin is the camera ``reference`` (world_from_camera)."""
+        return replace(self, world_from_camera=invert_rigid(reference) @ self.world_from_camera)
+
+    def resized(self, height: int, width: int) -> Cameras:
+        """The same views sampled at another size: intrinsics scaled with the pixels."""
+        scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
+        return replace(self, intrinsics=self.intrinsics * scale[:, None], height=height, width=width)
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> Cameras:
+        """The window of ``height`` × ``width`` pixels at (``top``, ``left``): only the principal point moves."""
+        intrinsics = self.intrinsics.clone()
+        intrinsics[..., 0, 2] -= left
+        intrinsics[..., 1, 2] -= top
+        return replace(self, intrinsics=intrinsics, height=height, width=width)
+
+    @staticmethod
+    def concatenate(parts: Sequence[Cameras]) -> Cameras:
+        """One camera path of several, all of one image size."""
+        return replace(
+            parts[0],
+            world_from_camera=torch.cat([part.world_from_camera for part in parts]),
+            intrinsics=torch.cat([part.intrinsics for part in parts]),
+        )
+
+
+def invert_rigid(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """The inverse of a rigid transform, by transposing its rotation."""
+    rotation = transform[..., :3, :3].transpose(-1, -2)
+    inverse = torch.zeros_like(transform)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -(rotation @ transform[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def check_poses(poses: Float[Tensor, "frame 4 4"], where: str) -> None:
+    """Raise ``DataError`` naming ``where`` when a pose is not a finite rigid transform."""
+    if not torch.isfinite(poses).all():
+        frame = int((~torch.isfinite(poses).all(-1).all(-1)).nonzero()[0])
+        raise DataError(f"{where}: the pose of frame {frame} is not finite")
+    rotation = poses[:, :3, :3]
+    identity = torch.eye(3, dtype=poses.dtype)
+    skew = (rotation @ rotation.transpose(1, 2) - identity).abs().amax((1, 2))
+    bottom = (poses[:, 3] - poses.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(1)
+    bad = (skew > RIGID_TOLERANCE) | (bottom > RIGID_TOLERANCE) | (torch.linalg.det(rotation) < 0)
+    if bad.any():
+        raise DataError(
+            f"{where}: the pose of frame {int(bad.nonzero()[0])} is not rigid (rotation and translation "
+            "only, no scale or mirror)"
+        )
+
+
+def check_intrinsics(intrinsics: Float[Tensor, "3 3"], where: str) -> None:
+    """Raise ``DataError`` naming ``where`` when the matrix is no invertible pinhole matrix."""
+    finite = bool(torch.isfinite(intrinsics).all())
+    if not finite or intrinsics[0, 0] <= 0 or intrinsics[1, 1] <= 0 or abs(float(intrinsics[2, 2]) - 1) > 1e-6:
+        values = [round(float(value), 3) for value in intrinsics.flatten()]
+        raise DataError(f"{where}: the intrinsics {values} are singular or not a pinhole matrix")

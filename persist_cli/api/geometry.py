@@ -1,0 +1,99 @@
+"""Points, pixels and rays of posed cameras: unprojection, projection, Plücker embedding."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from persist_cli.api.cameras import Cameras, invert_rigid
+
+
+def pixel_centers(height: int, width: int, device: torch.device | None = None) -> Float[Tensor, "height width 2"]:
+    """Pixel centres (u, v) in pixels, the top-left one at (0.5, 0.5), float64."""
+    rows = torch.arange(height, dtype=torch.float64, device=device) + 0.5
+    columns = torch.arange(width, dtype=torch.float64, device=device) + 0.5
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack([u, v], dim=-1)
+
+
+def camera_rays(cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
+    """K⁻¹ (u, v, 1)ᵀ of every pixel: rays in the camera's frame with z = 1."""
+    pixels = pixel_centers(cameras.height, cameras.width, cameras.intrinsics.device)
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
+    inverse = torch.linalg.inv(cameras.intrinsics.double())
+    return torch.einsum("...ij,hwj->...hwi", inverse, homogeneous)
+
+
+def transform(matrix: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Points moved by rigid transforms; the leading axes of ``matrix`` match the first of ``points``."""
+    extra = points.ndim - 1 - (matrix.ndim - 2)
+    matrix = matrix.reshape(*matrix.shape[:-2], *([1] * extra), 4, 4)
+    return (matrix[..., :3, :3] @ points[..., None])[..., 0] + matrix[..., :3, 3]
+
+
+def unproject(depth: Float[Tensor, "*batch height width"], cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
+    """World points of every pixel, float64 metres.
+
+    Args:
+        depth: planar z in metres; where it is 0 (missing) the point is the camera centre.
+        cameras: one for each depth image.
+    """
+    points = camera_rays(cameras) * depth.double()[..., None]
+    rotation = cameras.world_from_camera.double()[..., :3, :3]
+    return torch.einsum("...ij,...hwj->...hwi", rotation, points) + cameras.centers.double()[..., None, None, :]
+
+
+def project(
+    points: Float[Tensor, "*batch point 3"], cameras: Cameras
+) -> tuple[Float[Tensor, "*batch point 2"], Float[Tensor, "*batch point"]]:
+    """Pixels (u, v) and planar depth z in metres of world points, float64.
+
+    Points behind a camera have z ≤ 0; their pixels mean nothing.
+    """
+    local = transform(invert_rigid(cameras.world_from_camera.double()), points.double())
+    depth = local[..., 2]
+    image = torch.einsum("...ij,...pj->...pi", cameras.intrinsics.double(), local)
+    safe = torch.where(depth.abs() < 1e-9, torch.full_like(depth, 1e-9), depth)
+    return image[..., :2] / safe[..., None], depth
+
+
+def nearest_at(places: Int64[Tensor, " point"], depth: Float[Tensor, " point"], count: int) -> Float[Tensor, " place"]:
+    """A z-buffer: the least depth that falls on each of ``count`` places, infinite where none does."""
+    return depth.new_full((count,), torch.inf).scatter_reduce(0, places, depth, "amin")
+
+
+def pose_differences(
+    first: Float[Tensor, "*pose 4 4"], second: Float[Tensor, "*pose 4 4"]
+) -> tuple[Float[Tensor, "*pose"], Float[Tensor, "*pose"]]:
+    """Metres between the origins of poses, and degrees of the turn from one to the other."""
+    metres = (first[..., :3, 3] - second[..., :3, 3]).norm(dim=-1)
+    relative = first[..., :3, :3].transpose(-1, -2) @ second[..., :3, :3]
+    cosine = (relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return metres, torch.rad2deg(cosine.clamp(-1, 1).acos())
+
+
+def plucker(cameras: Cameras, printed: bool = False) -> Float[Tensor, "*batch height width 6"]:
+    """Plücker embedding (o × d, d) of every pixel's ray, d = R K⁻¹ (u, v, 1)ᵀ (PEWM, camera condition).
+
+    Args:
+        cameras: in the frame in which the rays are wanted.
+        printed: add the translation to the direction as the paper prints it; a direction must not contain it.
+    """
+    rotation = cameras.world_from_camera.double()[..., :3, :3]
+    origin = cameras.centers.double()[..., None, None, :]
+    direction = torch.einsum("...ij,...hwj->...hwi", rotation, camera_rays(cameras))
+    if printed:
+        direction = direction + origin
+    moment = torch.linalg.cross(origin.expand_as(direction), direction)
+    return torch.cat([moment, direction], dim=-1)
+
+
+def in_view(
+    points: Float[Tensor, "point 3"], camera: Cameras, near: float = 0.0
+) -> tuple[Tensor, Float[Tensor, "point 2"], Float[Tensor, " point"]]:
+    """Which points fall into the image of one camera, with their pixels and planar depths."""
+    pixels, depth = project(points, camera)
+    u, v = pixels.unbind(-1)
+    visible = (depth > near) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return visible, pixels, depth

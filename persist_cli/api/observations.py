@@ -1,0 +1,118 @@
+"""Observations and trajectories: posed RGB-D frames, the actions between them, where they came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from persist_cli.api.actions import ActionVocabulary
+from persist_cli.api.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed RGB-D image as a simulator or importer gives it.
+
+    Args:
+        rgb: ``[height, width, 3]`` uint8.
+        depth: ``[height, width]`` float32 metres, planar z, 0 = missing.
+        world_from_camera: ``[4, 4]`` float64, OpenCV axes, metres.
+        action: what the agent does at this frame, leading to the next; ``None`` at the last.
+        timestamp: seconds.
+    """
+
+    rgb: np.ndarray[Any, Any]
+    depth: np.ndarray[Any, Any]
+    world_from_camera: np.ndarray[Any, Any]
+    action: str | None = None
+    timestamp: float = 0.0
+
+
+@dataclass(frozen=True)
+class TrajectoryInfo:
+    """What holds for every frame of a trajectory.
+
+    Args:
+        scene: names the frame of reference; trajectories of one scene share the world's origin.
+        intrinsics: ``[3, 3]`` float64, pixels, top-left pixel centre at (0.5, 0.5).
+        height: pixels.
+        width: pixels.
+        world_up: unit vector in the world.
+        vocabulary: the agent's actions with their units.
+        source: where it came from, JSON values.
+    """
+
+    scene: str
+    intrinsics: np.ndarray[Any, Any]
+    height: int
+    width: int
+    world_up: tuple[float, float, float]
+    vocabulary: ActionVocabulary
+    source: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Posed RGB-D frames as tensors.
+
+    Args:
+        rgb: uint8.
+        depth: float32 metres, planar z, 0 = missing.
+        cameras: one for each frame.
+    """
+
+    rgb: UInt8[Tensor, "frame height width 3"]
+    depth: Float[Tensor, "frame height width"]
+    cameras: Cameras
+
+    def __len__(self) -> int:
+        return self.rgb.shape[0]
+
+    def __getitem__(self, index: slice | Tensor | list[int]) -> Observations:
+        return replace(self, rgb=self.rgb[index], depth=self.depth[index], cameras=self.cameras[index])
+
+    def to(self, device: torch.device | str) -> Observations:
+        """The same frames on ``device``."""
+        return Observations(self.rgb.to(device), self.depth.to(device), self.cameras.to(device))
+
+    @staticmethod
+    def concatenate(parts: Sequence[Observations]) -> Observations:
+        """One sequence of several, all of one image size."""
+        return Observations(
+            torch.cat([part.rgb for part in parts]),
+            torch.cat([part.depth for part in parts]),
+            Cameras.concatenate([part.cameras for part in parts]),
+        )
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Some consecutive frames of a trajectory, with the actions taken at each of them.
+
+    Args:
+        name: unique within its data set.
+        observations: the frames.
+        actions: one for each frame; ``actions[i]`` leads from frame i to i + 1, the last may be ``None``.
+        info: what holds for every frame.
+        first: number of the first of these frames in the whole trajectory.
+    """
+
+    name: str
+    observations: Observations
+    actions: tuple[str | None, ...]
+    info: TrajectoryInfo
+    first: int = 0
+
+    @property
+    def world_up(self) -> Float[Tensor, " 3"]:
+        """Unit vector, float64."""
+        return torch.tensor(self.info.world_up, dtype=torch.float64)
+
+    def __len__(self) -> int:
+        return len(self.observations)

@@ -1,0 +1,1 @@
+"""Checkpoints: found, loaded, saved and exported, with what they came from."""

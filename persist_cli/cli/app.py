@@ -1,0 +1,301 @@
+"""The command line: signatures only; each command imports its work when it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from persist_cli.api.inference import Placement
+from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.cli.doctor import doctor
+from persist_cli.cli.listings import plugins, recipes
+from persist_cli.cli.options import (
+    ActionsOption,
+    Commands,
+    CompareOption,
+    ControlsOption,
+    DtypeOption,
+    GuidanceOption,
+    JsonOption,
+    SamplerOption,
+    SaveMemoryOption,
+    StepsOption,
+    names_in,
+    show_version,
+)
+from persist_cli.cli.weights import weights_app
+from persist_cli.errors import PersistError
+
+app = typer.Typer(
+    name="persist",
+    cls=Commands,
+    help="Persistent embodied world models: a video diffusion model with a memory of the scene.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; what the user can mend ends in one line and exit code 1."""
+    try:
+        app(args=arguments)
+    except PersistError as error:
+        typer.secho(f"error: {error}", fg=typer.colors.RED, err=True)
+        sys.exit(1)
+
+
+@app.callback()
+def common(
+    version: Annotated[bool, typer.Option("--version", callback=show_version, is_eager=True)] = False,
+) -> None:
+    """Persistent embodied world models."""
+
+
+@app.command()
+def collect(
+    simulator: Annotated[str, typer.Argument(help="A simulator; `persist plugins` lists them.")],
+    out: Annotated[Path, typer.Option(help="Data set folder; what is there already is kept.")],
+    scenes: Annotated[str, typer.Option(help="Scene seeds A:B, B not included.")],
+    frames: Annotated[int, typer.Option(min=2, help="Frames a trajectory.")] = 96,
+    size: Annotated[str, typer.Option(help="Image size HxW in pixels.")] = "64x64",
+    seed: Annotated[int, typer.Option(help="Seed of the paths through the scenes.")] = 0,
+    split: Annotated[str, typer.Option(help="train or test: scenes of one never appear in the other.")] = "train",
+    policy: Annotated[str, typer.Option(help="explore, path or there-and-back.")] = "explore",
+    step: Annotated[float, typer.Option(min=0.01, help="Metres of a step.")] = 0.25,
+    turn: Annotated[float, typer.Option(min=0.1, max=180.0, help="Degrees of a turn.")] = 15.0,
+    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one a core.")] = 0,
+    json: JsonOption = False,
+) -> None:
+    """Collect trajectories in a simulator.
+
+    persist collect miniworld --out runs/houses --scenes 0:100 --frames 96 --size 64x64
+    """
+    from persist_cli.simulators.collect import CollectPlan, run_collect
+
+    plan = CollectPlan(
+        simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split,
+        policy=policy, step=step, turn=turn,
+    )  # fmt: skip
+    run_collect(plan, out, workers, json)
+
+
+@app.command("import")
+def import_(
+    format: Annotated[str, typer.Argument(help="A format; `persist plugins` lists them.")],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder or file of that format.")],
+    out: Annotated[Path, typer.Option(help="Data set folder.")],
+    size: Annotated[str | None, typer.Option(help="Resize (after cropping to the aspect) to HxW.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Keep every n-th frame.")] = 1,
+    json: JsonOption = False,
+) -> None:
+    """Import posed RGB-D of another format.
+
+    persist import 7scenes captures/kitchen --out runs/kitchen --size 64x64
+    """
+    from persist_cli.data.importers.importing import run_import
+
+    run_import(format, source, out, size, every, json)
+
+
+@app.command()
+def inspect(
+    data: Annotated[str, typer.Argument(metavar="DATA", help="DATA or DATA#trajectory or DATA#trajectory:frames.")],
+    pairs: Annotated[int, typer.Option(min=1, help="Frame pairs to reproject.")] = 64,
+    json: JsonOption = False,
+) -> None:
+    """Say what a data set holds and check its cameras, depth and poses against each other."""
+    from persist_cli.data.check.inspect import run_inspect
+
+    run_inspect(data, pairs, json)
+
+
+@app.command(context_settings={"allow_interspersed_args": True})
+def finetune(
+    recipe: Annotated[str, typer.Argument(help="A recipe's name (`persist recipes`) or a YAML file.")],
+    overrides: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change.")] = None,
+    data: Annotated[list[Path] | None, typer.Option(help="Data set folder; may be given again.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Run folder.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on from the run's last checkpoint.")] = False,
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder for latents and memory tokens; set data.clips_per_trajectory too.")
+    ] = None,
+    cache_gigabytes: Annotated[float | None, typer.Option(min=0, help="Most that the cache may hold; 20.")] = None,
+    profile: Annotated[bool, typer.Option("--profile", help="Say where the time of a step goes.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count parameters; no data, no weights.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
+
+    persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
+    """
+    if dry_run:
+        from persist_cli.doctor.dry_run import run_dry_run
+
+        run_dry_run(recipe, overrides or [], json)
+        return
+    if json:
+        raise PersistError("--json prints the table of --dry-run; give both, or read the run folder's log.jsonl")
+    from persist_cli.train.clip_cache import CacheSettings
+    from persist_cli.train.finetune import FinetunePlan, run_finetune
+
+    if cache is None and cache_gigabytes is not None:
+        raise PersistError("--cache-gigabytes bounds a cache; give --cache DIR too")
+    bounded = None if cache is None else CacheSettings(cache, 20 if cache_gigabytes is None else cache_gigabytes)
+    run_finetune(FinetunePlan(recipe, overrides or [], data or [], out, resume, bounded, profile))
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[Path, typer.Argument(help="A stage-1 run, or a checkpoint folder.")],
+    out: Annotated[Path, typer.Option(help="Checkpoint folder to write.")],
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="[[NAME=]RUN]...", help="Stage-2 runs on that base.")
+    ] = None,
+    dtype: Annotated[str, typer.Option(help="Of the weights: float16, bfloat16 or float32.")] = "float16",
+    default: Annotated[str | None, typer.Option(help="Adapter that is meant when none is named.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps when none are named.")] = None,
+    sampler: Annotated[str | None, typer.Option(help="Sampler when none is named.")] = None,
+    guidance: Annotated[float | None, typer.Option(min=0, help="Guidance over memory when none is named.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Write a base and memory adapters as one checkpoint folder that stands alone.
+
+    persist export runs/stage1 runs/none runs/voxel canvas=runs/voxel-canvas --default voxel --out runs/model
+    """
+    from persist_cli.checkpoints.export import ExportPlan, run_export
+
+    sampling = SamplingOverrides(steps, sampler, guidance)
+    run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling), out, json)
+
+
+@app.command()
+def memorize(
+    data: Annotated[list[str] | None, typer.Argument(metavar="DATA[#trajectory[:frames]]")] = None,
+    out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
+    memory: Annotated[
+        str | None, typer.Option(help="A memory (`persist plugins`); the checkpoint's, else voxel.")
+    ] = None,
+    encoder: Annotated[str | None, typer.Option(help="An encoder; `persist plugins` lists them.")] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", help="As in memory.cell=[0.25,1,0.25].")] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="Whose adapter shall read it; the reference model when no setting is given.")
+    ] = None,
+    merge: Annotated[list[Path] | None, typer.Option(help="Memory files to join: --merge A B.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Build a memory from posed RGB-D, or join memories of one frame of reference.
+
+    persist memorize runs/houses#0:0-48 --memory voxel --out house.safetensors
+    """
+    from persist_cli.memorize.build import run_memorize, run_merge
+    from persist_cli.memorize.memory_config import MemorizePlan
+
+    if merge:
+        if checkpoint or memory or encoder or settings:
+            raise PersistError(
+                "--merge joins memories as they are; leave out --checkpoint, --memory, --encoder and --set"
+            )
+        run_merge([*merge, *(Path(name) for name in data or [])], out, json)
+    else:
+        run_memorize(data or [], MemorizePlan(memory, encoder, settings or [], checkpoint), out, json)
+
+
+@app.command()
+def rollout(
+    start: Annotated[str, typer.Option(help="Where to start: DATA#trajectory:frame.")],
+    out: Annotated[Path, typer.Option(help="Folder for videos, sheets, maps and poses.")],
+    checkpoint: Annotated[
+        Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
+    ] = None,
+    actions: ActionsOption = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Take the trajectory's own actions.")] = False,
+    frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
+    memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
+    adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
+    write: Annotated[bool, typer.Option(help="Write what is generated into the memory.")] = True,
+    seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
+    steps: StepsOption = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Roll out a world model from a start frame along actions, clip by clip.
+
+    Several --actions are branches of one start, imagined together, each with its own memory: OUT/0, OUT/1, …
+
+    persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
+    """
+    from persist_cli.rollout.camera_path import RolloutPlan
+    from persist_cli.rollout.rollout import run_rollout
+
+    plan = RolloutPlan(
+        start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
+        write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance),
+        placement=Placement.of(dtype, save_memory),
+    )  # fmt: skip
+    run_rollout(checkpoint, plan, out, json)
+
+
+@app.command("eval")
+def evaluate(
+    checkpoints: Annotated[
+        list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Runs or checkpoints; else the reference.")
+    ] = None,
+    data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
+    protocol: Annotated[str, typer.Option(help="revisit, return, long or unseen.")] = "revisit",
+    memories: Annotated[str, typer.Option(help="Memories to compare, the first as reference.")] = "none,voxel",
+    controls: ControlsOption = "copy,nearest,warp,codec,shuffled,emptied",
+    metrics: Annotated[str, typer.Option(help="Metrics separated by commas, or all.")] = "all",
+    frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
+    clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
+    seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
+    steps: StepsOption = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
+    batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
+    pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
+    out: Annotated[Path, typer.Option(help="Folder for metrics.json; a stopped run goes on.")] = Path("runs/eval"),
+    report: Annotated[Path | None, typer.Option(help="Folder for report.html, tables, curves, clips.")] = None,
+    compare: CompareOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Compare checkpoints, memories and controls on equal clips of held-out scenes.
+
+    persist eval runs/none runs/voxel --data runs/houses-test --memories none,voxel --report runs/report
+
+    persist eval --compare runs/a/metrics.json runs/b/metrics.json
+    """
+    if compare is not None:
+        from persist_cli.evaluate.report.compare import run_compare
+
+        run_compare(*compare, json, report)
+        return
+    if not data:
+        raise PersistError("give --data DATA (--data sample comes with persist), or --compare A.json B.json")
+    from persist_cli.evaluate.evaluate import run_eval
+    from persist_cli.evaluate.plan import EvalPlan
+
+    plan = EvalPlan(
+        data=tuple(data), protocol=protocol, memories=names_in(memories), controls=names_in(controls),
+        metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds,
+        sampling=SamplingOverrides(steps, sampler, guidance), batch=batch, noise=pose_noise,
+        placement=Placement.of(dtype, save_memory),
+    )  # fmt: skip
+    run_eval(checkpoints or [], plan, out, report, json)
+
+
+app.command(context_settings={"allow_interspersed_args": True})(doctor)
+
+app.add_typer(weights_app, name="weights")
+
+app.command()(plugins)
+
+app.command()(recipes)

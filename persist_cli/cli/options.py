@@ -1,0 +1,82 @@
+"""What several commands share: options, and how Ctrl-C ends them."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+from typer.core import TyperGroup
+
+from persist_cli import __version__
+from persist_cli.errors import INTERRUPTED, PersistError
+
+OF_THE_DISK: Final = {  # what a command cannot help
+    errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM,
+    errno.EROFS,
+}  # fmt: skip
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+
+StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
+
+SamplerOption = Annotated[
+    str | None, typer.Option("--sampler", help="ddim, dpm, unipc or dpm++; the checkpoint's, else ddim.")
+]
+
+GuidanceOption = Annotated[
+    float | None,
+    typer.Option("--guidance", min=0, help="Of guidance over memory; the checkpoint's, else 1: none."),
+]
+
+ControlsOption = Annotated[
+    str, typer.Option("--controls", help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy.")
+]
+
+CompareOption = Annotated[
+    tuple[Path, Path] | None,
+    typer.Option("--compare", metavar="A.json B.json", help="Compare two results instead."),
+]
+
+DtypeOption = Annotated[
+    str | None, typer.Option("--dtype", help="float32, bfloat16 or float16; the checkpoint's, float32 as a rule.")
+]
+
+SaveMemoryOption = Annotated[
+    str | None,
+    typer.Option("--save-memory", help="Of model-offload, sequential-offload, vae-slicing, vae-tiling, with commas."),
+]
+
+ActionsOption = Annotated[
+    list[str] | None, typer.Option("--actions", help='Actions, as in "left*4 forward*6"; given again, another branch.')
+]
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """The names of a list separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def show_version(wanted: bool) -> None:
+    """Say the version and end, when wanted."""
+    if wanted:
+        typer.echo(f"persist {__version__}")
+        raise typer.Exit
+
+
+class Commands(TyperGroup):
+    """Commands that Ctrl-C ends in one line, with exit code 130, and a disk that is full or closed with 1."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was asked for."""
+        try:
+            return super().invoke(ctx)
+        except OSError as error:
+            if error.errno not in OF_THE_DISK:
+                raise
+            place, cause = error.filename or "a file cannot be written", error.strerror
+            raise PersistError(f"{place}: {cause}; make room there, or choose another place") from error
+        except KeyboardInterrupt:
+            typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
+            raise typer.Exit(INTERRUPTED) from None

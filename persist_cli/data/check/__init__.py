@@ -1,0 +1,1 @@
+"""What ``persist inspect`` runs."""

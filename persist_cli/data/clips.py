@@ -1,0 +1,228 @@
+"""Clips of trajectories for training: sample number n is the same whoever asks, whenever."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.data import BatchSampler, Dataset
+
+from persist_cli.api.actions import ActionVocabulary
+from persist_cli.api.backbone import Interactions
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.errors import DataError, RecipeError
+
+
+@dataclass(frozen=True)
+class ClipChoice:
+    """Which frames a sample is made of, nothing of them read yet.
+
+    Args:
+        file: the trajectory.
+        frames: numbers of the clip's frames.
+        context: numbers of the context's frames; none when no context is asked for.
+        seed: for everything random about the sample.
+    """
+
+    file: TrajectoryFile
+    frames: range
+    context: tuple[int, ...]
+    seed: int
+
+
+@dataclass(frozen=True)
+class ClipSample:
+    """One clip with what came before it.
+
+    Args:
+        observations: the clip's frames; no images where none were asked for, the cameras always.
+        interactions: what the agent did to the world in each step of the clip.
+        context: earlier frames of the same trajectory, the clip's first one included; ``None`` when not asked for.
+        info: of the trajectory.
+        seed: for everything random about the sample.
+    """
+
+    observations: Observations
+    interactions: Interactions
+    context: Observations | None
+    info: TrajectoryInfo
+    seed: int
+
+
+@dataclass(frozen=True)
+class ClipPlan:
+    """Which clips to draw.
+
+    Args:
+        frames: frames a clip.
+        strides: one is drawn for each clip, among those that fit the trajectory; a negative one plays it backwards.
+        context_frames: most earlier frames to give along; 0 gives none.
+        seed: of the draws.
+        image_size: height and width that the frames must have.
+        clips_per_trajectory: how many fixed clips each trajectory offers; 0 draws from all there are.
+    """
+
+    frames: int
+    strides: tuple[int, ...]
+    context_frames: int
+    seed: int
+    image_size: tuple[int, int]
+    clips_per_trajectory: int = 0
+
+
+class ClipDataset(Dataset[ClipSample]):
+    """Endless clips of some data sets; item n depends on the seed and n only.
+
+    Args:
+        folders: of the data sets, in this order.
+        plan: which clips.
+    """
+
+    def __init__(self, folders: Sequence[Path], plan: ClipPlan) -> None:
+        self.plan = plan
+        store = [file for folder in folders for file in Store(folder)]
+        shortest = min(map(abs, plan.strides))
+        self.files = [file for file in store if len(file) > (plan.frames - 1) * shortest]
+        if not self.files:
+            longest = max(len(file) for file in store)
+            needed = (plan.frames - 1) * shortest + 1
+            where = " and ".join(map(str, folders))
+            raise DataError(f"{where}: a clip needs {needed} frames, the longest trajectory has {longest}")
+        for file in self.files:
+            check_size(file.info, plan.image_size, f"{file.path.parent}#{file.name}")
+
+    def __getitem__(self, number: int) -> ClipSample:
+        return self.read(self.choose(number))
+
+    def choose(self, number: int) -> ClipChoice:
+        """The frames of sample ``number``."""
+        random = np.random.default_rng((self.plan.seed, number))
+        place = int(random.integers(len(self.files)))
+        file = self.files[place]
+        if not self.plan.clips_per_trajectory:
+            frames, context = self._draw(file, random)
+            return ClipChoice(file, frames, context, int(random.integers(2**31)))
+        clip = int(random.integers(self.plan.clips_per_trajectory))
+        # plus one: numpy reads missing numbers as zeros, and (seed, place) is a sample's own
+        frames, context = self._draw(file, np.random.default_rng((self.plan.seed, place, clip + 1)))
+        return ClipChoice(file, frames, context, int(random.integers(2**31)))
+
+    def read(self, choice: ClipChoice, images: bool = True, context: bool = True) -> ClipSample:
+        """The sample of this choice.
+
+        Args:
+            choice: which frames.
+            images: false leaves the clip's images unread and gives its cameras only.
+            context: false leaves the context unread.
+        """
+        file, frames = choice.file, choice.frames
+        actions = file.actions()[frames[0] : frames[-1]]  # none backwards: what was done to the world is not undone
+        done = strided_interactions(actions, abs(frames.step), file.info.vocabulary)
+        wanted = choice.context if context else ()
+        return ClipSample(
+            observations=file.read(list(frames)).observations if images else unseen(file, frames),
+            interactions=done or (None,) * (len(frames) - 1),
+            context=file.read(wanted).observations if wanted else None,
+            info=file.info,
+            seed=choice.seed,
+        )
+
+    def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:
+        """Frames of a random clip and of its context."""
+        steps = self.plan.frames - 1
+        stride = int(random.choice([stride for stride in self.plan.strides if steps * abs(stride) < len(file)]))
+        start = int(random.integers(len(file) - steps * abs(stride)))
+        frames = range(start, start + steps * abs(stride) + 1, abs(stride))[:: 1 if stride > 0 else -1]
+        return frames, tuple(self._context_frames(frames[0], random)) if self.plan.context_frames else ()
+
+    def _context_frames(self, start: int, random: np.random.Generator) -> list[int]:
+        """The clip's first frame and a random choice of those before it, in order."""
+        count = min(start, self.plan.context_frames - 1)
+        earlier = random.permutation(start)[:count]
+        return [*sorted(int(frame) for frame in earlier), start]
+
+
+def check_sharing(batch: int, accumulation: int, processes: int) -> None:
+    """Raise ``RecipeError`` when processes cannot have equal parts of a batch in so many micro-batches.
+
+    Args:
+        batch: samples of an optimizer step.
+        accumulation: micro-batches of it.
+        processes: that share each.
+    """
+    if batch % (accumulation * processes) == 0:
+        return
+    share = batch // processes
+    if batch % processes:
+        advice = f"training.batch={max(1, share) * processes} training.accumulation={max(1, share)}"
+    else:
+        most = max(parts for parts in range(1, min(accumulation, share) + 1) if share % parts == 0)
+        advice = f"training.accumulation={most}"
+    raise RecipeError(
+        f"training.batch {batch} cannot be shared by {processes} processes with {accumulation} micro-batches; "
+        f"give {advice}"
+    )
+
+
+class SharedBatches(BatchSampler):
+    """This process's micro-batches of sample numbers, from any step on; together the processes see all numbers.
+
+    Args:
+        first_step: optimizer step to begin with.
+        last_step: optimizer step to stop before.
+        batch: samples a step, over all processes and micro-batches.
+        accumulation: micro-batches a step.
+        process: number of this process.
+        processes: how many there are.
+    """
+
+    def __init__(
+        self, first_step: int, last_step: int, batch: int, accumulation: int, process: int, processes: int
+    ) -> None:
+        check_sharing(batch, accumulation, processes)
+        self.first_step, self.last_step, self.batch = first_step, last_step, batch
+        self.accumulation, self.process, self.processes = accumulation, process, processes
+
+    def __len__(self) -> int:
+        return (self.last_step - self.first_step) * self.accumulation
+
+    def __iter__(self) -> Iterator[list[int]]:
+        micro = self.batch // (self.accumulation * self.processes)
+        for step in range(self.first_step, self.last_step):
+            for part in range(self.accumulation):
+                first = step * self.batch + (part * self.processes + self.process) * micro
+                yield list(range(first, first + micro))
+
+
+def strided_interactions(actions: Sequence[str | None], stride: int, vocabulary: ActionVocabulary) -> Interactions:
+    """For each step of ``stride`` frames the first interaction that happened in it, if one did."""
+    done = interactions_of(actions, vocabulary)
+    steps = (done[first : first + stride] for first in range(0, len(done), stride))
+    return tuple(next((name for name in step if name is not None), None) for step in steps)
+
+
+def unseen(file: TrajectoryFile, frames: Sequence[int]) -> Observations:
+    """The cameras of some frames, without their images: rgb and depth have no frames."""
+    height, width = file.info.height, file.info.width
+    images = torch.zeros(0, height, width, 3, dtype=torch.uint8), torch.zeros(0, height, width)
+    return Observations(*images, file.cameras(frames))
+
+
+def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:
+    """What of the actions changes the world rather than the camera."""
+    return tuple(name if name is not None and vocabulary[name].interaction else None for name in actions)
+
+
+def check_size(info: TrajectoryInfo, image_size: tuple[int, int], where: str) -> None:
+    """Raise ``DataError`` when images are not of the size that a model takes."""
+    if (info.height, info.width) != image_size:
+        height, width = image_size
+        raise DataError(
+            f"{where}: images are {info.height}x{info.width}, the model takes {height}x{width}; collect "
+            f"or import them with --size {height}x{width}, or take a model of theirs (finetune: "
+            f"backbone.settings.height={info.height} backbone.settings.width={info.width})"
+        )

@@ -1,0 +1,67 @@
+"""Files of foreign formats read with one-line errors: colour images, depth images, matrices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from persist_cli.errors import DataError
+
+
+def read_color(path: Path) -> np.ndarray[Any, Any]:
+    """The uint8 ``[height, width, 3]`` image of a file.
+
+    Raises:
+        DataError: when it is missing, truncated or no image.
+    """
+    return np.array(_read_image(path).convert("RGB"))
+
+
+def read_depth(path: Path, units_per_metre: float, missing: tuple[int, ...] = (0,)) -> np.ndarray[Any, Any]:
+    """The float32 ``[height, width]`` depth in metres of an integer image, 0 = missing.
+
+    Args:
+        path: a one-channel image.
+        units_per_metre: 1000 for millimetres.
+        missing: raw values that mean no depth.
+
+    Raises:
+        DataError: when it is missing, truncated or has several channels.
+    """
+    raw = np.array(_read_image(path))
+    if raw.ndim != 2 or not np.issubdtype(raw.dtype, np.integer):
+        raise DataError(f"{path}: a depth image must have one integer channel, this has {raw.dtype} {list(raw.shape)}")
+    depth = raw.astype(np.float32) / np.float32(units_per_metre)
+    depth[np.isin(raw, missing)] = 0.0
+    return depth
+
+
+def read_matrix(path: Path, rows: int, columns: int) -> np.ndarray[Any, Any]:
+    """The float64 matrix of a text file of that many numbers.
+
+    Raises:
+        DataError: when it is missing or holds anything else.
+    """
+    try:
+        numbers = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file") from error
+    except (ValueError, OSError) as error:
+        raise DataError(f"{path}: not a text file of numbers ({error})") from error
+    if numbers.size != rows * columns:
+        raise DataError(f"{path}: {numbers.size} numbers, not the {rows}×{columns} of the matrix")
+    return numbers.reshape(rows, columns)
+
+
+def _read_image(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file") from error
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: not a whole image ({error})") from error

@@ -1,0 +1,151 @@
+"""References to data on the command line: ``DATA``, ``DATA#trajectory``, ``DATA#trajectory:frames``."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from persist_cli.data.store import SUFFIX
+from persist_cli.errors import DataError
+from persist_cli.io.bundled import bundled_folder
+
+if TYPE_CHECKING:
+    from persist_cli.api.observations import Trajectory
+    from persist_cli.data.store import Store, TrajectoryFile
+
+
+FRAMES = re.compile(r"^(?P<first>\d+)(?:-(?P<end>\d+))?$")
+
+SAMPLE = "sample"
+
+FORM = "write DATA, DATA#trajectory or DATA#trajectory:frames, as in runs/houses#0:0-48"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A data set, one trajectory of it, or some frames of one.
+
+    Args:
+        folder: of the data set.
+        trajectory: a name, or a number in the order of names; ``None`` for all.
+        frames: ``None`` for all.
+        text: as the user wrote it.
+    """
+
+    folder: Path
+    trajectory: str | None = None
+    frames: slice | None = None
+    text: str = ""
+
+    def store(self) -> Store:
+        """The data set.
+
+        Raises:
+            DataError: when the folder is missing or empty.
+        """
+        from persist_cli.data.store import Store
+
+        return Store(self.folder)
+
+    def trajectories(self) -> list[TrajectoryFile]:
+        """Every trajectory meant, in the order of names.
+
+        Raises:
+            DataError: when one is not there.
+        """
+        store = self.store()
+        if self.trajectory is None:
+            return list(store)
+        by_number = self.trajectory.isdecimal() and self.trajectory not in store.names
+        return [store[int(self.trajectory) if by_number else self.trajectory]]
+
+    def single(self) -> TrajectoryFile:
+        """The one trajectory meant; the only one of a data set need not be named.
+
+        Raises:
+            DataError: when several are meant.
+        """
+        files = self.trajectories()
+        if len(files) > 1:
+            raise DataError(
+                f"{self.text or self.folder}: holds {len(files)} trajectories; name one, as in {self.folder}#0"
+            )
+        return files[0]
+
+    @property
+    def frame(self) -> int:
+        """The one frame meant; 0 when none is named.
+
+        Raises:
+            DataError: when a range of frames is meant.
+        """
+        if self.frames is None:
+            return 0
+        first, end = int(self.frames.start), int(self.frames.stop)
+        if end - first != 1:
+            raise DataError(
+                f"{self.text}: names {end - first} frames where one is wanted, as in {self.folder}#0:{first}"
+            )
+        return first
+
+    def read(self) -> list[Trajectory]:
+        """The frames of every trajectory meant, in memory."""
+        return [file.read(self.frames or slice(None)) for file in self.trajectories()]
+
+
+def parse_reference(text: str) -> Reference:
+    """What ``text`` means; nothing is opened yet.
+
+    Args:
+        text: DATA is a folder, or ``sample``; the trajectory is a name or a number (a name that is a number wins);
+            frames are ``12``, or ``0-48`` where frame 48 is not included.
+
+    Raises:
+        DataError: when it is not of this form, or means the packaged sample and there is none.
+    """
+    folder, sharp, rest = text.rpartition("#")
+    if not sharp:
+        folder, rest = text, ""
+    trajectory, colon, frames = rest.rpartition(":")
+    if not colon:
+        trajectory, frames = rest, ""
+    if not folder or (sharp and not trajectory) or (colon and not frames):
+        raise DataError(f"cannot read {text!r}; {FORM}")
+    return Reference(data_folder(folder), trajectory or None, _frames(frames, text) if frames else None, text)
+
+
+def data_folder(text: str) -> Path:
+    """The folder of a data set; ``sample`` is the one that comes with the package unless such a folder is here.
+
+    Raises:
+        DataError: when the packaged sample is meant and this installation has none.
+    """
+    folder = Path(text)
+    if text == SAMPLE and not folder.is_dir():
+        return sample_data()
+    return folder
+
+
+def _frames(frames: str, text: str) -> slice:
+    match = FRAMES.match(frames)
+    if match is None:
+        raise DataError(f"cannot read the frames {frames!r} of {text!r}; write 12, or 0-48 (48 not included)")
+    first = int(match["first"])
+    end = int(match["end"]) if match["end"] else first + 1
+    if end <= first:
+        raise DataError(f"the frames {frames!r} of {text!r} are none; the end is not included")
+    return slice(first, end)
+
+
+def sample_data() -> Path:
+    """The folder of the sample data set: held-out houses, there and back.
+
+    Raises:
+        DataError: when this installation has none.
+    """
+    folder = bundled_folder("sample")
+    if not any(folder.glob(f"*{SUFFIX}")):
+        raise DataError(f"no sample data in {folder}: it comes with the package; give the folder of a data set")
+    return folder

@@ -1,0 +1,115 @@
+"""What ``persist eval`` does from its options to its table, results and report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from persist_cli.checkpoints.checkpoint import reference_checkpoint
+from persist_cli.data.reference import data_folder
+from persist_cli.evaluate.aggregate import RowResults, Table
+from persist_cli.evaluate.cases import cases_json
+from persist_cli.evaluate.columns import column_json, make_columns
+from persist_cli.evaluate.example_clips import make_pictures
+from persist_cli.evaluate.journal import Processes
+from persist_cli.evaluate.measure_rows import measure_rows
+from persist_cli.evaluate.plan import EvalPlan, Evaluation, prepare
+from persist_cli.evaluate.provenance import checkpoint_json, command, environment, metric_json, scenes_json
+from persist_cli.evaluate.report.page import write_report
+from persist_cli.evaluate.report.text import print_tables
+from persist_cli.io.files import check_folder, write_json
+from persist_cli.viewing.console import print_json, say
+
+RESULTS = "metrics.json"
+
+
+def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | None, json: bool) -> None:
+    """Measure rows and leave ``metrics.json``, and a report where one is asked for; see ``persist eval --help``.
+
+    Without paths it is the reference model's; the data set ``sample`` is that of the package.
+    """
+    for folder in (out, report):
+        if folder is not None:
+            check_folder(folder)
+    processes = Processes()
+    plan = replace(plan, data=tuple(data_folder(str(folder)) for folder in plan.data))
+    run, backbones = prepare(paths or [reference_checkpoint()], plan, out, processes)
+    measure_rows(run, backbones, processes)
+    if not processes.main:
+        return
+    results = describe(run, processes.count)
+    write_json(out / RESULTS, results)
+    if report is not None:
+        write_report(results, make_pictures(run, domains(run), backbones), report)
+    if json:
+        print_json(results)
+        return
+    print_tables(results)
+    say(motion_line(results["measured"]["clips"]))
+    say(f"written to {out / RESULTS}" + (f" and {report / 'report.html'}" if report else ""))
+
+
+def motion_line(clips: Sequence[dict[str, Any]]) -> str:
+    """How much the clips move and how much of what they look at was seen before: a frozen video scores well on some."""
+    way, away, turned = (
+        sum(clip[key] for clip in clips) / len(clips) for key in ("path_metres", "farthest_metres", "turned_degrees")
+    )
+    shares = [share for clip in clips for share in clip["seen_before"][1:] if share is not None]
+    seen = f"; {sum(shares) / len(shares):.0%} of what they look at was seen before" if shares else ""
+    return f"{len(clips)} clips, on average {way:.1f} m long, {away:.1f} m away, {turned:.0f}° of turns{seen}"
+
+
+def describe(run: Evaluation, processes: int) -> dict[str, Any]:
+    """The results with all that is needed to measure them again, JSON values."""
+    info = run.cases[0].file.info
+    protocol = {
+        "name": run.protocol.name,
+        "title": run.protocol.title,
+        "definition": run.protocol.definition,
+        "frames": run.cases[0].frames,
+    }
+    return {
+        "format": "persist-evaluation",
+        "version": 1,
+        "measured": {
+            "protocol": protocol,
+            "data": run.journal.data(),
+            "image_size": [info.height, info.width],
+            "clips": cases_json(run.cases),
+            "metrics": metric_json(run.metrics),
+        },
+        "sampling": {
+            "steps": run.sampling.steps,
+            "sampler": run.sampling.sampler,
+            "memory_guidance": run.sampling.memory_guidance,
+            "seeds": list(range(run.plan.seeds)),
+            "batch": run.plan.batch,
+        }
+        | run.plan.placement.changes(),
+        "environment": environment(processes),
+        "command": command(),
+        "checkpoints": [checkpoint_json(each) | scenes_json(each) for each in run.checkpoints],
+        "columns": column_json(make_columns(run.metrics, run.protocol)),
+        "tables": tables(run),
+        "first_row": run.rows[0].name,
+    }
+
+
+def tables(run: Evaluation) -> list[dict[str, Any]]:
+    """One table of all clips, or one for each data set where the protocol says so."""
+    rows = [RowResults(run, number) for number in range(len(run.rows))]
+    return [Table(run, name, clips).to_json(rows) for name, clips in domains(run).items()]
+
+
+def domains(run: Evaluation) -> dict[str, list[int]]:
+    """Numbers of the clips of each table."""
+    if not run.protocol.domains:
+        return {"all": list(range(len(run.cases)))}
+    found: dict[str, list[int]] = {}
+    for number, case in enumerate(run.cases):
+        source = case.file.info.source
+        origin = source.get("simulator") or source.get("format") or "unknown origin"
+        found.setdefault(f"{case.data} ({origin})", []).append(number)
+    return found

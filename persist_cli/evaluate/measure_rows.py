@@ -1,0 +1,79 @@
+"""Measuring an evaluation: every batch of every row once, by one process or several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from rich.progress import Progress
+from torch import Tensor
+
+from persist_cli.api.backbone import Backbone
+from persist_cli.evaluate.bases import Backbones
+from persist_cli.evaluate.cases import CaseFrames, read_case
+from persist_cli.evaluate.journal import TRUTH, Processes, Unit
+from persist_cli.evaluate.measure import VIDEO
+from persist_cli.evaluate.plan import Evaluation
+from persist_cli.evaluate.rows.row import Row
+from persist_cli.rollout.world_model import clip_seed
+from persist_cli.viewing.console import add_task, progress
+
+SHOWN = 3  # clips whose videos are kept of every row, for the contact sheets
+
+
+def measure_rows(run: Evaluation, backbones: Backbones, processes: Processes) -> None:
+    """Measure every batch that the journal does not have, this process its share."""
+    todo = [
+        [unit for unit in run.units(number) if processes.mine(unit.batch) and not run.journal.has(unit)]
+        for number in range(len(run.rows))
+    ]
+    with progress() as bar:
+        bar.disable = not processes.main
+        measure_truth(run, processes, bar)
+        task = add_task(bar, "eval", sum(len(run.batch(unit.batch)) for units in todo for unit in units), "clip")
+        for row, units in zip(run.rows, todo, strict=True):
+            if not units:
+                continue
+            backbone = backbones.ready(row)
+            bar.update(task, note=row.name)
+            for unit in units:
+                measure_unit(run, row, backbone, unit)
+                bar.advance(task, len(run.batch(unit.batch)))
+    processes.wait()
+
+
+def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
+    """Keep the features of the true videos, which sets of videos are compared with."""
+    measurer = run.measurers[True]  # features of colours, which every row has
+    units = [Unit(TRUTH, 0, batch) for batch in range(run.batches) if processes.mine(batch)]
+    todo = [unit for unit in units if measurer.by_set and not run.journal.has(unit)]
+    if todo:
+        task = add_task(bar, "true videos", sum(len(run.batch(unit.batch)) for unit in todo), "clip")
+    for unit in todo:
+        run.journal.write(unit, measurer.true_features(run.batch(unit.batch)))
+        bar.advance(task, len(run.batch(unit.batch)))
+
+
+def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> None:
+    """Measure one batch and keep it, with the videos of the clips to be shown."""
+    clips = [read_case(case) for case in run.batch(unit.batch)]
+    rgb, depth = predict(row, backbone, clips, unit.seed, unit.batch * run.plan.batch)
+    kept = run.measurer(row).measure(rgb, depth, clips, f"row {row.name!r}")
+    shown = max(0, SHOWN - unit.batch * run.plan.batch) if unit.seed == 0 else 0
+    if shown:
+        kept[VIDEO] = rgb[:shown].cpu()
+    run.journal.write(unit, kept)
+
+
+def predict(row: Row, backbone: Backbone, clips: Sequence[CaseFrames], seed: int, first: int) -> tuple[Tensor, Tensor]:
+    """The row's videos of consecutive clips; a clip's noise is the same for every row, so that rows are paired.
+
+    Args:
+        row: prepared.
+        backbone: of the row.
+        clips: to predict.
+        seed: of the sampling.
+        first: number of the first clip.
+    """
+    with torch.no_grad():
+        return row.videos(backbone, clips, [clip_seed(seed, first + number) for number in range(len(clips))])

@@ -1,0 +1,106 @@
+"""What an evaluation was made of: versions, machine, checkpoints and weights."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from persist_cli import __version__
+from persist_cli.checkpoints import lineage
+from persist_cli.checkpoints.checkpoint import Checkpoint
+from persist_cli.io.files import file_sha256, read_json
+from persist_cli.io.hub import cached_weight
+from persist_cli.metrics.metric import Metric
+from persist_cli.viewing.console import warn
+
+PACKAGES = ("accelerate", "diffusers", "numpy", "safetensors", "scipy", "torch", "torchmetrics", "transformers")
+
+
+def environment(processes: int) -> dict[str, Any]:
+    """Versions and machine, JSON values."""
+    cuda = torch.cuda.is_available()
+    return {
+        "persist": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "platform": platform.platform(),
+        "device": torch.cuda.get_device_name() if cuda else platform.processor() or platform.machine(),
+        "packages": {name: version(name) for name in PACKAGES},
+        "processes": processes,
+    }
+
+
+def command() -> list[str]:
+    """The command line as it was given."""
+    return ["persist", *sys.argv[1:]]
+
+
+def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
+    """A checkpoint with the hashes of its base, recipes and adapters, JSON values."""
+    adapters = {name: file_sha256(folder / "adapter.safetensors") for name, folder in checkpoint.adapters.items()}
+    return {
+        "name": checkpoint.name,
+        "path": str(checkpoint.folder),
+        "fingerprint": checkpoint.fingerprint,
+        "recipe_sha256": recipe_sha256(checkpoint.folder),
+        "adapters": adapters,
+    }
+
+
+def scenes_json(checkpoint: Checkpoint) -> dict[str, Any]:
+    """How many scenes it is known to have been trained on, which may change with what lies about; JSON values."""
+    scenes = lineage.training_scenes(checkpoint)
+    return {"training_scenes": {"known": len(scenes.names), "complete": scenes.complete}}
+
+
+def recipe_sha256(folder: Path) -> str | None:
+    """SHA-256 of the recipe that a run kept in its checkpoint, or over the names and texts of all those of an export.
+
+    ``None`` when there is none.
+    """
+    if (folder / lineage.RECIPE).is_file():
+        return file_sha256(folder / lineage.RECIPE)
+    home = folder / lineage.RECIPES
+    texts = {path.relative_to(home).as_posix(): path.read_bytes() for path in home.rglob("*.yaml")}
+    digest = hashlib.sha256()
+    for name, text in sorted(texts.items()):
+        digest.update(name.encode() + b"\0" + hashlib.sha256(text).digest())
+    return digest.hexdigest() if texts else None
+
+
+def training_scenes(checkpoints: Sequence[Checkpoint]) -> frozenset[str]:
+    """Names of the scenes that the checkpoints are known to have been trained on; a line says where some are not."""
+    found: frozenset[str] = frozenset()
+    for each in checkpoints:
+        scenes = lineage.training_scenes(each)
+        found |= scenes.names
+        if not scenes.complete:
+            some = f" ({len(scenes.names)} are)" if scenes.names else ""
+            warn(f"{each.folder}: not all scenes that it was trained on are known{some}")
+    return found
+
+
+def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:
+    """What every metric is, with the hashes of the weights it used, JSON values."""
+    return {
+        name: {
+            "title": metric.title,
+            "better": metric.better,
+            "definition": metric.definition,
+            "weights": weight_hashes(metric.weights),
+        }
+        for name, metric in metrics.items()
+    }
+
+
+def weight_hashes(names: Sequence[str]) -> dict[str, str]:
+    """SHA-256 of the converted weights that are there."""
+    found = {name: cached_weight(name) for name in names}
+    return {name: str(read_json(folder / "weight.json")["sha256"]) for name, folder in found.items() if folder}

@@ -1,0 +1,107 @@
+"""Rows of a model: with a memory adapter, with a disturbed memory, or with none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.inference import Placement
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations
+from persist_cli.checkpoints.checkpoint import Checkpoint, load_adapter
+from persist_cli.evaluate.cases import CaseFrames
+from persist_cli.evaluate.rows.interventions import Faithful, Recall
+from persist_cli.evaluate.rows.row import Row
+from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.rollout.world_model import WorldModel, imagine_together
+
+
+@dataclass(frozen=True)
+class Remembering:
+    """What a model row remembers with.
+
+    Args:
+        maker: of its memories; ``None`` without a memory.
+        recall: what they are made of.
+        writes: whether the protocol writes the model's own output.
+    """
+
+    maker: MemoryMaker | None
+    recall: Recall
+    writes: bool
+
+
+class ModelRow(Row):
+    """The model with one memory adapter, or with none.
+
+    Args:
+        name: in the table.
+        checkpoint: that has the adapter.
+        adapter: its name; ``None`` is plain stage 1.
+        sampling: how clips are drawn.
+        remembering: with which memory.
+        gives_depth: whether the model does.
+    """
+
+    random = True
+
+    def __init__(
+        self,
+        name: str,
+        checkpoint: Checkpoint,
+        adapter: str | None,
+        sampling: Sampling,
+        remembering: Remembering,
+        gives_depth: bool = True,
+    ) -> None:
+        super().__init__(name, checkpoint)
+        self.checkpoint, self.adapter, self.sampling, self.remembering = checkpoint, adapter, sampling, remembering
+        self.gives_depth = gives_depth
+        self.kind = "model" if isinstance(remembering.recall, Faithful) else "memory control"
+
+    @property
+    def definition(self) -> str:
+        """Checkpoint, adapter and what the memory holds."""
+        if self.adapter is None:
+            return f"{self.checkpoint.name} without an adapter (stage 1)"
+        return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.remembering.recall.definition}"
+
+    def prepare(self, backbone: Backbone, placement: Placement) -> None:
+        """Load the adapter."""
+        load_adapter(backbone, self.checkpoint, self.adapter)
+        super().prepare(backbone, placement)
+
+    def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Rollouts from each clip's first frame along its cameras."""
+        models = [self.start(backbone, clip, seed) for clip, seed in zip(clips, seeds, strict=True)]
+        cameras = [clip.observations.cameras[1:] for clip in clips]
+        parts = [[clip.observations[:1] for clip in clips]]
+        parts += imagine_together(models, cameras, [clip.interactions for clip in clips])
+        return (
+            torch.stack([torch.cat([part[number].rgb for part in parts]) for number in range(len(clips))]),
+            torch.stack([torch.cat([part[number].depth for part in parts]) for number in range(len(clips))]),
+        )
+
+    def start(self, backbone: Backbone, clip: CaseFrames, seed: int) -> WorldModel:
+        """A world model at the clip's first frame."""
+        recall = self.remembering.recall
+        disturb = partial(recall.disturb, draws=torch.Generator().manual_seed(seed))
+        writes = self.remembering.writes and recall.writes
+        model = WorldModel(backbone, self.memory(clip, disturb), self.sampling, seed, writes, disturb)
+        model.reset(clip.observations[:1], clip.info)
+        return model
+
+    def memory(self, clip: CaseFrames, disturb: Callable[[Observations], Observations]) -> Memory | None:
+        """The clip's memory before it begins."""
+        if self.remembering.maker is None:
+            return None
+        memory = self.remembering.maker.empty(clip.info)
+        context = self.remembering.recall.context(clip)
+        if context is not None:
+            memory.write(disturb(context))
+        return memory

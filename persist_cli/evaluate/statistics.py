@@ -1,0 +1,128 @@
+"""Means, deviations over seeds, and bootstrap intervals over clips, paired between rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+RESAMPLES = 1000  # of clips, for figures that are means over clips
+
+SET_RESAMPLES = 200  # for distances between sets of videos, which cost more
+
+SEED = 0
+
+Array = NDArray[np.float64]
+
+Distance = Callable[[NDArray[np.int64], int], float]  # of the clips of these numbers, at a seed
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One cell of the table.
+
+    Args:
+        mean: over seeds, clips and frames.
+        std: standard deviation over sampling seeds of the mean over clips; ``None`` for fewer than two.
+        low: of the 95 % interval over clips.
+        high: likewise.
+        count: clips that have the figure.
+        per_clip: the figure of each clip over seeds; ``None`` where only a set of clips has one.
+        resampled: the mean of every bootstrap sample, for paired differences.
+    """
+
+    mean: float
+    std: float | None
+    low: float
+    high: float
+    count: int
+    per_clip: Array | None
+    resampled: Array
+
+    def to_json(self) -> dict[str, Any]:
+        """The figure as JSON values, undefined ones as ``None``."""
+        return {
+            "mean": number(self.mean), "std": number(self.std), "low": number(self.low), "high": number(self.high),
+            "count": self.count,
+            "per_clip": None if self.per_clip is None else [number(each) for each in self.per_clip],
+        }  # fmt: skip
+
+
+def resamples(clips: int, count: int) -> NDArray[np.int64]:
+    """Clip numbers of every bootstrap sample, the same for every row, ``[resample, clip]``."""
+    return np.random.default_rng((SEED, clips)).integers(clips, size=(count, clips))
+
+
+def mean_figure(values: Array) -> Figure:
+    """The figure of a metric that every clip has.
+
+    Args:
+        values: ``[seed, clip]``; NaN where a clip has none.
+    """
+    by_seed = mean(values, axis=1)
+    per_clip = mean(values, axis=0)
+    drawn = mean(per_clip[resamples(len(per_clip), RESAMPLES)], axis=1)
+    low, high = interval(drawn)
+    return Figure(
+        mean=float(mean(by_seed)),
+        std=float(np.nanstd(by_seed, ddof=1)) if np.isfinite(by_seed).sum() > 1 else None,
+        low=low,
+        high=high,
+        count=int(np.isfinite(per_clip).sum()),
+        per_clip=per_clip,
+        resampled=drawn,
+    )
+
+
+def set_figure(distance: Distance, clips: int, seeds: int) -> Figure:
+    """The figure of a distance between sets of videos.
+
+    A resampled set holds some videos twice, which shifts such a distance; its interval is therefore that of the
+    resampled distances moved so that their mean is the distance itself.
+
+    Args:
+        distance: of the clips of some numbers, at a seed.
+        clips: how many there are.
+        seeds: how many there are; bootstrap samples take turns over them.
+    """
+    by_seed = np.array([distance(np.arange(clips), seed) for seed in range(seeds)])
+    draws = resamples(clips, SET_RESAMPLES)
+    drawn = np.array([distance(draw, turn % seeds) for turn, draw in enumerate(draws)])
+    drawn += float(mean(by_seed)) - float(mean(drawn))
+    low, high = interval(drawn)
+    std = float(by_seed.std(ddof=1)) if seeds > 1 else None
+    return Figure(float(mean(by_seed)), std, low, high, clips, None, drawn)
+
+
+def difference(figure: Figure, first: Figure) -> dict[str, float | None] | None:
+    """Paired difference to the first row's figure with its 95 % interval, from the same bootstrap samples."""
+    if len(figure.resampled) != len(first.resampled):
+        return None
+    value = figure.mean - first.mean
+    low, high = interval(figure.resampled - first.resampled)
+    return {"mean": number(value), "low": number(low), "high": number(high)}
+
+
+def interval(drawn: Array) -> tuple[float, float]:
+    """The 2.5 and 97.5 % quantiles of what is defined."""
+    known = drawn[np.isfinite(drawn)]
+    if not len(known):
+        return float("nan"), float("nan")
+    low, high = np.quantile(known, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def mean(values: Array, axis: int | None = None) -> Any:
+    """The mean of what is defined, NaN without a warning where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def number(value: float | None) -> float | None:
+    """A JSON number, ``None`` for what is undefined."""
+    return None if value is None or not np.isfinite(value) else float(value)

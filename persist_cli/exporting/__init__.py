@@ -1,1 +1,0 @@
-"""Whole checkpoints to give away, made of runs."""

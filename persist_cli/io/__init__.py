@@ -1,0 +1,1 @@
+"""Files, settings, the hub and checkpoint folders."""

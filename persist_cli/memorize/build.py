@@ -1,0 +1,123 @@
+"""``persist memorize``: posed RGB-D into a memory file, or several memory files into one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from persist_cli.api.memory import Memory
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import check_folder, remove_leftovers
+from persist_cli.memorize.memory_config import MemorizePlan, choose_memory
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.memorize.sources import Source, common_reference, find_sources
+from persist_cli.plugins import make_encoder, make_memory
+from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
+from persist_cli.viewing.map import draw_map
+
+
+def run_memorize(data: list[str], plan: MemorizePlan, out: Path, json: bool) -> None:
+    """Write the memory of some frames and its map from above, and say what is in it.
+
+    Args:
+        data: references to frames of one scene.
+        plan: which memory, and what it is made of.
+        out: memory file; the map is written beside it as PNG.
+        json: print JSON instead of a table.
+    """
+    _check_out(out)
+    chosen, origin = choose_memory(plan)
+    sources = find_sources(data)
+    encoder = make_encoder(chosen.encoder, chosen.encoder_settings)
+    made = make_memory(chosen.name, chosen.settings, encoder, common_reference(sources))
+    seconds = write_sources(made, sources)
+    frames = sum(len(source.frames) for source in sources)
+    paths = {source.file.name: source.file.poses()[source.frames.start : source.frames.stop] for source in sources}
+    _finish(made, paths, out, json, {"frames": frames, "frames_per_second": frames / seconds, "settings_of": origin})
+
+
+def run_merge(paths: list[Path], out: Path, json: bool) -> None:
+    """Write what several memory files of one frame of reference hold together, with its map from above.
+
+    Args:
+        paths: memory files.
+        out: memory file to write.
+        json: print JSON instead of a table.
+    """
+    if len(paths) < 2:
+        raise CheckpointError("nothing to merge; name two memory files or more, as in --merge A B")
+    _check_out(out)
+    merged = load_memory(paths[0])
+    for path in paths[1:]:
+        try:
+            merged.merge(load_memory(path))
+        except CheckpointError as error:
+            raise CheckpointError(f"{paths[0]} and {path}: {error}") from error
+    _finish(merged, {}, out, json, {"merged": len(paths)})
+
+
+def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
+    """Write all frames into the memory, a few at a time, and return the seconds that it took."""
+    start = time.perf_counter()
+    with progress() as bar:
+        task = add_task(bar, "memorizing", sum(len(source.frames) for source in sources), "frames")
+        for source in sources:
+            bar.update(task, note=source.file.name)
+            for piece in source.pieces():
+                memory.write(piece)
+                bar.advance(task, len(piece))
+    return time.perf_counter() - start
+
+
+def _finish(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, extra: dict[str, Any]) -> None:
+    picture = out.with_suffix(".png")
+    for path in (out, picture):
+        remove_leftovers(path.parent, path.name)
+    memory.save(out)
+    draw_map(memory.points(), memory.reference.world_up, paths, picture)
+    figures = memory.figures()
+    result = {
+        "file": str(out),
+        "map": str(picture),
+        "memory": memory.name,
+        "encoder": memory.encoder.name,
+        "channels": memory.encoder.channels,
+        "scene": memory.reference.name,
+        "cells": figures.cells,
+        "bytes": figures.bytes,
+        "bounds": figures.bounds,
+        **extra,
+    }
+    if json:
+        print_json(result)
+    else:
+        print_table(f"memory of {memory.reference.name}", ["", "value"], _rows(result))
+        if extra.get("settings_of"):
+            say(f"settings and encoder: those of {extra['settings_of']}")
+        say(f"memory: {out}\nmap: {picture}")
+
+
+def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The result for people: large numbers grouped, bounds as ranges, paths left for a line of their own."""
+    shown = {name: value for name, value in result.items() if name not in ("file", "map", "settings_of")}
+    shown["bytes"] = f"{result['bytes']:,}"
+    shown["cells"] = f"{result['cells']:,}"
+    if result["bounds"] is None:
+        shown["bounds"] = "empty"
+    else:
+        shown["bounds"] = (
+            " × ".join(f"{low:.2f}…{high:.2f}" for low, high in zip(*result["bounds"], strict=True)) + " m"
+        )
+    if "frames_per_second" in result:
+        shown["frames_per_second"] = f"{result['frames_per_second']:.3g}"
+    return [(name.replace("_per_second", "/s"), str(value)) for name, value in shown.items()]
+
+
+def _check_out(out: Path) -> None:
+    check_folder(out.parent)
+    if out.is_dir() or out.suffix == ".png":
+        raise CheckpointError(f"{out}: name a file to write, as in memory.safetensors (its map is drawn to .png)")

@@ -1,0 +1,95 @@
+"""Memory files: a safetensors file whose header says which memory and encoder made it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from persist_cli.api.memory import FORMAT_VERSION, FrameOfReference, Memory
+from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.io.files import read_tensors
+from persist_cli.plugins import make_encoder, make_memory
+
+FORMAT = "persist-memory"
+
+FIELDS: dict[str, type | tuple[type, ...]] = {
+    "memory": str,
+    "settings": dict,
+    "encoder": str,
+    "encoder_settings": dict,
+    "channels": int,
+    "reference": str,
+    "world_up": list,
+    "cells": int,
+}
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """What a memory file says about itself, without reading its tensors.
+
+    Raises:
+        CheckpointError: when the file is missing, truncated, of something else, of a newer version, or its header
+            is damaged.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such memory file; `persist memorize` writes one")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+    except (SafetensorError, ValueError, OSError) as error:
+        raise CheckpointError(f"{path}: not a whole memory file ({str(error).splitlines()[0]})") from error
+    return _checked_header(metadata, path)
+
+
+def load_memory(path: Path) -> Memory:
+    """The memory that ``Memory.save`` wrote, with its encoder, on the CPU.
+
+    Raises:
+        CheckpointError: one line naming the file and why it cannot be used.
+        PluginError: when its memory or encoder is not installed.
+    """
+    header = read_header(path)
+    tensors, _ = read_tensors(path)
+    x, y, z = header["world_up"]
+    try:
+        encoder = make_encoder(header["encoder"], header["encoder_settings"])
+        reference = FrameOfReference(header["reference"], (x, y, z))
+        memory = make_memory(header["memory"], header["settings"], encoder, reference)
+        if encoder.channels != header["channels"]:
+            raise CheckpointError(
+                f"written with {header['channels']} channels, but encoder {header['encoder']!r} now has "
+                f"{encoder.channels}; build the memory anew"
+            )
+        memory.restore(tensors)
+    except PersistError as error:
+        raise type(error)(f"{path}: {error}") from error
+    if memory.figures().cells != header["cells"]:
+        raise CheckpointError(f"{path}: holds {memory.figures().cells} cells, its header says {header['cells']}")
+    return memory
+
+
+def _checked_header(metadata: dict[str, str], path: Path) -> dict[str, Any]:
+    if "persist" not in metadata:
+        raise CheckpointError(f"{path}: a safetensors file, but no memory of persist (it has no 'persist' header)")
+    try:
+        header = json.loads(metadata["persist"])
+    except ValueError as error:
+        raise CheckpointError(f"{path}: its header is damaged ({error})") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: written by persist, but not as a memory file")
+    version = header.get("version")
+    if not isinstance(version, int) or version > FORMAT_VERSION:
+        raise CheckpointError(f"{path}: of version {version}; this persist reads versions up to {FORMAT_VERSION}")
+    wrong = [name for name, kind in FIELDS.items() if not isinstance(header.get(name), kind)]
+    if not wrong and not _is_direction(header["world_up"]):
+        wrong = ["world_up"]
+    if wrong:
+        raise CheckpointError(f"{path}: its header is damaged (see {', '.join(wrong)})")
+    return header
+
+
+def _is_direction(values: list[Any]) -> bool:
+    return len(values) == 3 and all(isinstance(value, int | float) for value in values) and any(values)

@@ -1,0 +1,75 @@
+"""What is to be memorized: frames of trajectories that share one scene, read piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from persist_cli.api.memory import FrameOfReference
+from persist_cli.api.observations import Observations
+from persist_cli.data.reference import parse_reference
+from persist_cli.data.store import TrajectoryFile
+from persist_cli.errors import DataError
+
+PIXELS_AT_ONCE = 1 << 22
+
+FRAMES_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class Source:
+    """Some frames of one trajectory.
+
+    Args:
+        file: the trajectory.
+        frames: their numbers.
+        text: how the user named it.
+    """
+
+    file: TrajectoryFile
+    frames: range
+    text: str
+
+    def pieces(self) -> Iterator[Observations]:
+        """The frames in order, a few megabytes at a time."""
+        pixels = self.file.info.height * self.file.info.width
+        step = max(1, min(FRAMES_AT_ONCE, PIXELS_AT_ONCE // pixels))
+        for begin in range(self.frames.start, self.frames.stop, step):
+            end = min(begin + step, self.frames.stop)
+            yield self.file.read(slice(begin, end)).observations
+
+
+def find_sources(data: Sequence[str]) -> list[Source]:
+    """The trajectories of references ``DATA``, ``DATA#trajectory`` or ``DATA#trajectory:frames``.
+
+    Raises:
+        DataError: when one is missing or frames lie outside it.
+    """
+    if not data:
+        raise DataError("nothing to memorize; name the data, as in runs/houses#0:0-48")
+    sources = []
+    for text in data:
+        reference = parse_reference(text)
+        for file in reference.trajectories():
+            wanted = reference.frames or slice(0, file.length)
+            if wanted.stop > file.length:
+                raise DataError(f"{text}: {file.path} has {file.length} frames (0-{file.length - 1}) only")
+            sources.append(Source(file, range(wanted.start, wanted.stop), text))
+    return sources
+
+
+def common_reference(sources: Sequence[Source]) -> FrameOfReference:
+    """The one world that all the trajectories are of.
+
+    Raises:
+        DataError: when they are of several.
+    """
+    first = sources[0].file.info
+    for source in sources[1:]:
+        info = source.file.info
+        if (info.scene, info.world_up) != (first.scene, first.world_up):
+            raise DataError(
+                f"{source.file.path} is of scene {info.scene!r} and {sources[0].file.path} of {first.scene!r}; "
+                "a memory holds one scene: name one trajectory, as in DATA#0"
+            )
+    return FrameOfReference(first.scene, first.world_up)

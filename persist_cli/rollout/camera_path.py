@@ -1,0 +1,113 @@
+"""Where a rollout goes and what comes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from persist_cli.api.actions import format_actions
+from persist_cli.api.backbone import Interactions
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.inference import Placement
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
+from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.data.clips import interactions_of
+from persist_cli.data.reference import parse_reference
+from persist_cli.data.store import TrajectoryFile
+from persist_cli.errors import DataError
+
+
+@dataclass(frozen=True)
+class RolloutPlan:
+    """The options of ``persist rollout``; see its help."""
+
+    start: str
+    actions: tuple[str, ...]
+    follow: bool
+    frames: int
+    memory: Path | None
+    adapter: str | None
+    write: bool
+    seed: int
+    sampling: SamplingOverrides
+    placement: Placement
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Where a rollout goes.
+
+    Args:
+        start: the first frame, observed.
+        cameras: of the frames to imagine.
+        interactions: one for each of them.
+        actions: in text form.
+        truth: what is really seen there, when the trajectory is followed.
+        info: of the trajectory.
+    """
+
+    start: Observations
+    cameras: Cameras
+    interactions: Interactions
+    actions: str
+    truth: Observations | None
+    info: TrajectoryInfo
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout gave.
+
+    Args:
+        walk: where it went.
+        seen: the frames imagined.
+        before: the memory as it was, ``None`` without one.
+        memory: the memory as it is now.
+        seconds: that it took, without loading; all branches together.
+        gives_depth: whether the depth of the imagined frames is one.
+    """
+
+    walk: Walk
+    seen: Observations
+    before: Memory | None
+    memory: Memory | None
+    seconds: float
+    gives_depth: bool
+
+
+def plan_walks(plan: RolloutPlan) -> list[Walk]:
+    """The start frame and the cameras to come: by each of the texts of actions, or by the trajectory's own poses."""
+    reference = parse_reference(plan.start)
+    file = reference.single()
+    if plan.follow:
+        return [follow_trajectory(file, reference.frame, plan.frames)]
+    start = file.read([reference.frame])
+    return [walk_by(start, text) for text in plan.actions]
+
+
+def walk_by(start: Trajectory, text: str) -> Walk:
+    """The way from a single frame along actions."""
+    vocabulary, camera = start.info.vocabulary, start.observations.cameras
+    names = vocabulary.parse(text)
+    poses = vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
+    cameras = Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
+    interactions = interactions_of(names, vocabulary)
+    return Walk(start.observations, cameras, interactions, format_actions(names), None, start.info)
+
+
+def follow_trajectory(file: TrajectoryFile, first: int, frames: int) -> Walk:
+    """The trajectory's own way from a frame on, with what is really seen there."""
+    last = min(len(file), first + 1 + frames) if frames else len(file)
+    if last - first < 2:
+        raise DataError(f"{file.name}: frame {first} is the last; there is nothing to follow")
+    span = file.read(slice(first, last))
+    names = tuple(name or "stay" for name in span.actions[:-1])
+    return Walk(
+        start=span.observations[:1],
+        cameras=span.observations.cameras[1:],
+        interactions=interactions_of(span.actions[:-1], file.info.vocabulary),
+        actions=format_actions(names),
+        truth=span.observations[1:],
+        info=file.info,
+    )

@@ -1,0 +1,133 @@
+"""``persist rollout``: from a start frame along actions, to videos, maps, poses and a memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.checkpoints.checkpoint import (
+    Checkpoint,
+    find_checkpoint,
+    load_adapter,
+    load_backbone,
+    reference_checkpoint,
+)
+from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.data.clips import check_size
+from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.io.files import check_folder
+from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.rollout.camera_path import Rollout, RolloutPlan, Walk, plan_walks
+from persist_cli.rollout.outputs import write_outputs
+from persist_cli.rollout.world_model import WorldModel, imagine_together
+from persist_cli.viewing.console import add_task, print_json, progress, say
+
+
+def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> None:
+    """Roll out a checkpoint, or else the reference model, and leave a folder for each branch; see its help."""
+    if bool(plan.actions) == plan.follow:
+        raise PersistError("give either --actions TEXT or --follow")
+    plan.placement.device()  # what cannot be is told before anything is loaded
+    checkpoint = find_checkpoint(path or reference_checkpoint())
+    adapter = plan.adapter or checkpoint.default_adapter()
+    walks = plan_walks(plan)
+    folders = check_folders(out, len(walks))
+    info = walks[0].info
+    backbone = load_backbone(checkpoint)
+    check_size(info, backbone.image_size, plan.start)
+    sampling = plan.sampling.over(checkpoint.sampling)
+    backbone.check_sampling(sampling)
+    plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(sampling)))
+    load_adapter(backbone, checkpoint, adapter)
+    backbone.place(plan.placement)
+    memory = open_memory(checkpoint, adapter, plan, info)
+    model = WorldModel(backbone, memory and memory.to(backbone.device), sampling, plan.seed, plan.write)
+    rollouts = roll(model, walks)
+    pairs = list(zip(rollouts, folders, strict=True))
+    figures = [write_outputs(each, folder, describe(checkpoint, adapter, plan, each)) for each, folder in pairs]
+    if json:
+        print_json(figures if len(figures) > 1 else figures[0])
+        return
+    for rollout, folder in pairs:
+        say(
+            f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {rollout.walk.actions!r}; written to {folder}"
+        )
+
+
+def check_folders(out: Path, branches: int) -> list[Path]:
+    """Where the branches go: ``out`` for one, 0, 1, … in it for several.
+
+    Raises:
+        PersistError: when no folder can be made there, or several find rollouts there that they would not replace.
+    """
+    check_folder(out)
+    if branches == 1:
+        return [out]
+    folders = [out / str(number) for number in range(branches)]
+    found = [path.parent for path in (*out.glob("rollout.json"), *out.glob("*/rollout.json"))]
+    left = sorted(each for each in found if each not in folders and (each == out or each.name.isdigit()))
+    if left:
+        raise PersistError(f"{left[0]}: holds a rollout that these {branches} would not replace; take another --out")
+    return folders
+
+
+def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
+    """The memory file given, or an empty memory of the adapter's kind; none without adapter."""
+    if adapter is None:
+        if plan.memory is not None:
+            raise CheckpointError(f"{checkpoint.folder}: has no memory adapter that could read {plan.memory}")
+        return None
+    maker = MemoryMaker.of(checkpoint.memory_choice(adapter))
+    empty = maker.empty(info)
+    if plan.memory is None:
+        return empty
+    memory = load_memory(plan.memory)
+    check_memory(memory, empty, plan.memory)
+    return memory
+
+
+def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
+    """Raise ``CheckpointError`` when a memory file is not what the adapter was trained to read here."""
+    has, wants = memory.header(), wanted.header()
+    for key in ("memory", "encoder", "encoder_settings", "channels", "reference"):
+        if has[key] != wants[key]:
+            raise CheckpointError(f"{path}: its {key.replace('_', ' ')} is {has[key]!r}, wanted here is {wants[key]!r}")
+
+
+def roll(model: WorldModel, walks: Sequence[Walk]) -> list[Rollout]:
+    """Imagine walks from one start together, clip by clip, with a progress bar."""
+    before, began = None if model.memory is None else model.memory.copy(), time.monotonic()
+    model.reset(walks[0].start, walks[0].info)
+    models = model.branches(len(walks)) if len(walks) > 1 else [model]
+    cameras, parts = [walk.cameras for walk in walks], []
+    with progress() as bar:
+        task = add_task(bar, "rollout", sum(len(path) for path in cameras), "frame")
+        for part in imagine_together(models, cameras, [walk.interactions for walk in walks]):
+            parts.append(part)
+            bar.advance(task, sum(len(seen) for seen in part))
+    seconds, depth = time.monotonic() - began, model.backbone.gives_depth
+    seen = [Observations.concatenate(each) for each in zip(*parts, strict=True)]
+    triples = zip(walks, seen, models, strict=True)
+    return [Rollout(walk, frames, before, each.memory, seconds, depth) for walk, frames, each in triples]
+
+
+def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
+    """What is needed to roll out again, JSON values."""
+    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
+    options |= {"sampling": plan.sampling.given(), "placement": dataclasses.asdict(plan.placement)}
+    memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
+    together = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
+    return {
+        "checkpoint": str(checkpoint.folder),
+        "fingerprint": checkpoint.fingerprint,
+        "plan": options | {"adapter": adapter, "actions": rollout.walk.actions},
+        "frames": len(rollout.seen),
+        "seconds": rollout.seconds,
+        "memory": memory,
+    } | together

@@ -1,0 +1,70 @@
+"""What makes a training step cheaper, of a recipe's settings: for the backbone, the optimizer and the average."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+
+import torch
+from diffusers.training_utils import EMAModel
+from torch import nn
+
+from persist_cli.api.stages import Economy
+from persist_cli.errors import PersistError
+from persist_cli.recipe import TrainingSettings
+
+COMPILERS = ("c++", "g++", "clang++")  # what torch.compile looks for on a CPU
+
+
+def economy_of(settings: TrainingSettings, device: torch.device) -> Economy:
+    """What the settings ask of the backbone.
+
+    Raises:
+        PersistError: when blocks shall be compiled on a CPU and there is no compiler.
+    """
+    compilers = (os.environ["CXX"],) if os.environ.get("CXX") else COMPILERS
+    if settings.compile and device.type == "cpu" and not any(map(shutil.which, compilers)):
+        raise PersistError(
+            f"training.compile needs a C++ compiler on a CPU ({' or '.join(compilers)}); install one or leave it out"
+        )
+    return Economy(
+        gradient_checkpointing=settings.gradient_checkpointing,
+        compile=settings.compile,
+        frozen=torch.bfloat16 if settings.frozen_precision == "bf16" else None,
+        vae_slicing=settings.vae_slicing,
+    )
+
+
+def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> torch.optim.Optimizer:
+    """AdamW, its moments in 32 bits, or in 8.
+
+    Raises:
+        PersistError: when 8 bits are asked for and bitsandbytes is not installed.
+    """
+    rate, decay = settings.learning_rate, settings.weight_decay
+    if settings.optimizer == "adamw":
+        return torch.optim.AdamW(parameters, lr=rate, weight_decay=decay)
+    try:
+        from bitsandbytes.optim import AdamW8bit
+    except ImportError as error:
+        raise PersistError(
+            "training.optimizer=adamw-8bit needs the package bitsandbytes: pip install 'persist-cli[bitsandbytes]'"
+        ) from error
+    optimizer: torch.optim.Optimizer = AdamW8bit(parameters, lr=rate, weight_decay=decay)
+    return optimizer
+
+
+def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> EMAModel:
+    """The moving average of the parameters, beside them or where the settings want it."""
+    average = EMAModel(parameters, decay=settings.ema, use_ema_warmup=True)
+    if settings.ema_device == "cpu":
+        average.to("cpu")
+    return average
+
+
+def update_average(average: EMAModel, parameters: Iterable[nn.Parameter]) -> None:
+    """Take a step of the average, which may be on another device than the parameters."""
+    device = average.shadow_params[0].device
+    # requires_grad tells the average what is trained; what is not it copies
+    average.step([each if each.device == device else each.detach().to(device).requires_grad_() for each in parameters])

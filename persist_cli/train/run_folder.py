@@ -1,0 +1,92 @@
+"""The folder of a run: its recipe, its logs and its newest checkpoint."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from safetensors import SafetensorError
+
+from persist_cli.api.backbone import Backbone
+from persist_cli.checkpoints.checkpoint import Checkpoint, save_adapter, save_base, save_lora
+from persist_cli.checkpoints.lineage import RECIPE, stage_recipes, training_scenes, write_recipes
+from persist_cli.data.scenes import TrainingScenes
+from persist_cli.errors import PersistError
+from persist_cli.io.files import remove_leftovers, write_text
+from persist_cli.recipe import to_yaml
+from persist_cli.train.log import SpeedLog, StepLog
+from persist_cli.train.state import model_folder, save_state
+from persist_cli.train.trainer import Trainer
+
+CODEC_BATCHES = 4  # batches that the scale of the codec's latents is measured on
+
+
+class RunFolder:
+    """What a run leaves, written by the main process; where the training is sharded, by all of them.
+
+    Args:
+        path: of the folder, made when missing.
+        trainer: in the state of the folder's newest checkpoint, where there is one.
+        base: what the run was started from; what it came from is asked now, while its runs are there.
+    """
+
+    def __init__(self, path: Path, trainer: Trainer, base: Checkpoint | None) -> None:
+        self.path, self.trainer, self.base = path, trainer, base
+        self.saved = trainer.state.step
+        self.scenes, self.recipes = TrainingScenes(trainer.scenes), dict[str, str]()
+        if trainer.accelerator.is_main_process:
+            remove_leftovers(path)
+            if base is not None:
+                self.scenes |= training_scenes(base)
+                self.recipes = stage_recipes(base.base_folder) if trainer.recipe.memory is None else {}
+            path.mkdir(parents=True, exist_ok=True)
+            write_text(path / RECIPE, to_yaml(trainer.recipe))
+        with trainer.accelerator.main_process_first():  # it makes the folder
+            self.log = StepLog(path / "log.jsonl", self.saved)
+        self.speed = SpeedLog(path / "speed.jsonl", self.saved, trainer.recipe.training.batch)
+
+    def save(self) -> None:
+        """Leave a checkpoint of this step, unless it is there.
+
+        Raises:
+            PersistError: when it cannot be written.
+        """
+        step = self.trainer.state.step
+        if step == self.saved:
+            return
+        try:
+            self._save()
+        except (OSError, SafetensorError) as error:  # the latter of what a backbone writes by itself
+            raise PersistError(f"{self.path}: a checkpoint cannot be written there ({error})") from error
+        self.trainer.accelerator.wait_for_everyone()
+        self.saved = step
+
+    def _save(self) -> None:
+        state, encoder = self.trainer.state, self.trainer.encoder
+        main = self.trainer.accelerator.is_main_process
+        if main:
+            self.speed.add(state.step, encoder.figures() if encoder else {})
+        save_state(self.path, state, partial(self.save_model, home=model_folder(self.path, state.step)))
+        if main:
+            self.log.draw(self.path / "loss.png")
+
+    def save_model(self, folder: Path, home: Path) -> None:
+        """Write the model into a folder that will stand at ``home``."""
+        with self.trainer.model_to_save() as backbone:
+            if self.trainer.accelerator.is_main_process:
+                self._write_model(backbone, folder, home)
+
+    def _write_model(self, backbone: Backbone, folder: Path, home: Path) -> None:
+        trainer, recipe = self.trainer, self.trainer.recipe
+        folder.mkdir()
+        size = recipe.training.batch
+        samples = ([trainer.clips[number * size + row] for row in range(size)] for number in range(CODEC_BATCHES))
+        backbone.finish_stage(recipe.stage, (trainer.to_batch(each) for each in samples))
+        if recipe.memory is not None and self.base is not None:
+            save_adapter(backbone, self.base, recipe.memory, folder, home, self.scenes)
+        elif recipe.lora is not None:
+            save_lora(backbone, self.base, folder, home, self.scenes)
+        else:
+            save_base(backbone, folder, self.scenes)
+        write_text(folder / RECIPE, to_yaml(recipe))
+        write_recipes(folder, self.recipes)

@@ -1,0 +1,91 @@
+"""tests.api.test_geometry."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from persist_cli.api.actions import rotation_about
+from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses, invert_rigid
+from persist_cli.api.geometry import nearest_at, pixel_centers, plucker, project, transform, unproject
+from persist_cli.errors import DataError
+
+K = torch.tensor([[40.0, 0.0, 33.0], [0.0, 42.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def rigid(seed: int) -> torch.Tensor:
+    draw = torch.Generator().manual_seed(seed)
+    axis = torch.randn(3, generator=draw, dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation_about(axis / axis.norm(), float(torch.rand(1, generator=draw)) * 6)
+    pose[:3, 3] = torch.randn(3, generator=draw, dtype=torch.float64) * 3
+    return pose
+
+
+def cameras(count: int = 3) -> Cameras:
+    return Cameras(torch.stack([rigid(seed) for seed in range(count)]), K.expand(count, 3, 3), 40, 64)
+
+
+def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_back():
+    views = cameras()
+    depth = torch.rand(3, 40, 64, dtype=torch.float64) * 10 + 0.1
+    pixels, z = project(unproject(depth, views).flatten(1, 2), views)
+    assert torch.allclose(pixels, pixel_centers(40, 64).flatten(0, 1).expand(3, -1, -1), atol=1e-5)
+    assert torch.allclose(z, depth.flatten(1), atol=1e-5)
+
+
+def test_the_top_left_pixel_has_its_centre_at_one_half():
+    assert pixel_centers(2, 2)[0, 0].tolist() == [0.5, 0.5]
+
+
+def test_plucker_rays_of_a_moved_origin_transform_as_lines_do():
+    views, motion = cameras(), rigid(9)
+    moved = Cameras(motion @ views.world_from_camera, views.intrinsics, 40, 64)
+    moment, direction = plucker(views).split(3, dim=-1)
+    rotation, offset = motion[:3, :3], motion[:3, 3]
+    turned = direction @ rotation.T
+    lifted = moment @ rotation.T + torch.linalg.cross(offset.expand_as(turned), turned)
+    assert torch.allclose(plucker(moved), torch.cat([lifted, turned], -1), atol=1e-9)
+
+
+def test_a_direction_contains_no_translation_unless_printed_as_in_the_paper():
+    views = cameras(1)
+    difference = plucker(views, printed=True)[..., 3:] - plucker(views)[..., 3:]
+    assert torch.allclose(difference, views.centers[:, None, None].expand_as(difference))
+
+
+def test_a_resized_camera_sees_the_same_points_at_scaled_pixels():
+    views = cameras(1)
+    points = unproject(torch.full((1, 40, 64), 2.0), views).flatten(1, 2)
+    small, _ = project(points, views.resized(20, 16))
+    full, _ = project(points, views)
+    assert torch.allclose(small, full * torch.tensor([0.25, 0.5], dtype=torch.float64), atol=1e-6)
+
+
+def test_a_rigid_transform_and_its_inverse_cancel():
+    points = torch.randn(1, 5, 3, dtype=torch.float64)
+    pose = rigid(4)[None]
+    assert torch.allclose(transform(invert_rigid(pose), transform(pose, points)), points)
+
+
+@pytest.mark.parametrize(
+    ("broken", "cause"),
+    [(torch.full((4, 4), math.nan), "not finite"), (torch.diag(torch.tensor([1.0, 1, -1, 1])), "not rigid"),
+     (torch.eye(4) * 2, "not rigid")],
+)  # fmt: skip
+def test_a_pose_that_is_no_rigid_motion_is_named(broken, cause):
+    with pytest.raises(DataError, match=rf"walk: the pose of frame 1 is {cause}"):
+        check_poses(torch.stack([torch.eye(4), broken]).double(), "walk")
+
+
+def test_singular_intrinsics_are_named():
+    with pytest.raises(DataError, match=r"kitchen: the intrinsics .* singular"):
+        check_intrinsics(torch.zeros(3, 3), "kitchen")
+
+
+def test_a_z_buffer_has_the_nearest_depth_of_each_place_and_nothing_elsewhere():
+    places, depth = torch.tensor([0, 2, 0, 2, 2]), torch.tensor([3.0, 1.0, 2.0, 4.0, 1.5])
+    assert nearest_at(places, depth, 4).tolist() == [2.0, math.inf, 1.0, math.inf]
+    assert nearest_at(places[:0], depth[:0], 2).tolist() == [math.inf] * 2

@@ -1,0 +1,74 @@
+"""Objectives: clean latents or velocities, and what an error counts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_backbones.cogvideox.diffusion import loss_weights, predicted_target
+from persist_cli.api.backbone import Sampling
+from persist_cli.errors import CheckpointError, RecipeError
+from tests.support.micro_model import micro, random_clips, shaken
+
+STEPS = torch.tensor([10, 300, 990])
+
+
+@pytest.mark.parametrize("weighting", ["uniform", "min-snr", "min-snr-plus-one"])
+def test_an_error_counts_the_same_said_as_velocity_or_as_clean_latents(weighting: str) -> None:
+    draw = torch.Generator().manual_seed(0)
+    latents, noise, wrong = (torch.randn(3, 2, 4, 8, 8, generator=draw) for _ in range(3))
+    losses = {}
+    for kind in ("v_prediction", "sample"):
+        scheduler = micro(prediction=kind).scheduler
+        signal = scheduler.alphas_cumprod[STEPS][:, None, None, None, None]
+        target = predicted_target(scheduler, latents, noise, STEPS)
+        noisy = scheduler.add_noise(latents, noise, STEPS)
+        said = wrong if kind == "sample" else (signal.sqrt() * noisy - wrong) / (1 - signal).sqrt()
+        weights = loss_weights(scheduler, STEPS, weighting, 5.0)
+        losses[kind] = weights * (said - target).square().mean((1, 2, 3, 4))
+    assert torch.allclose(losses["sample"].double(), losses["v_prediction"].double(), rtol=1e-3)
+
+
+def test_the_clean_latents_survive_saving_and_loading(tmp_path: Path) -> None:
+    backbone, clips = micro(prediction="sample"), random_clips(1)
+    shaken(backbone)
+    backbone.save_base(tmp_path)
+    other = micro()
+    other.load_base(tmp_path)
+    assert torch.equal(backbone.generate(clips, Sampling(2))[0], other.generate(clips, Sampling(2))[0])
+
+
+def test_a_card_says_what_the_weights_predict(tmp_path: Path) -> None:
+    kinds = {kind: micro(prediction=kind).checkpoint_settings()["prediction"] for kind in ("v_prediction", "sample")}
+    assert all(kind == said for kind, said in kinds.items())
+    micro(prediction="sample").save_base(tmp_path)
+    other = micro()
+    assert other.checkpoint_settings()["prediction"] == "v_prediction"
+    other.load_base(tmp_path)
+    assert other.checkpoint_settings()["prediction"] == "sample"
+    assert micro(pretrained=str(tmp_path)).checkpoint_settings()["prediction"] == "sample"
+
+
+def test_weights_cannot_be_asked_for_another_prediction(tmp_path: Path) -> None:
+    micro(prediction="sample").save_base(tmp_path)
+    cause = "^prediction is 'v_prediction', but the weights were trained for 'sample'; leave it out$"
+    with pytest.raises(CheckpointError, match=cause):
+        micro(prediction="v_prediction").load_base(tmp_path)
+    with pytest.raises(CheckpointError, match=cause):
+        micro(prediction="v_prediction", pretrained=str(tmp_path))
+
+
+def test_a_scheduler_that_predicts_noise_is_refused(tmp_path: Path) -> None:
+    micro().save_base(tmp_path)
+    config = tmp_path / "scheduler" / "scheduler_config.json"
+    config.write_text(config.read_text().replace("v_prediction", "epsilon"))
+    with pytest.raises(CheckpointError, match=r"^the scheduler predicts 'epsilon'; known: v_prediction, sample$"):
+        micro(pretrained=str(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "value"), [("snr_gamma", 0.0), ("snr_gamma", -5.0), ("kl_weight", -1e-6)])
+def test_a_weight_that_would_turn_the_loss_around_is_refused(name: str, value: float) -> None:
+    with pytest.raises(RecipeError, match=f"{name}: Input should be greater than"):
+        micro(**{name: value})

@@ -1,0 +1,84 @@
+"""A placed backbone gives the clips that it gave before, wherever its weights rest."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from persist_backbones.extensions.offload import overlap, place
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.inference import Placement
+from persist_cli.errors import PersistError
+from tests.support.micro_model import equal, random_clips, random_tokens, trained, with_adapter
+
+CLIPS, SAMPLING = random_clips(2, random_tokens(2, 5)), Sampling(2, "ddim", 1.5)
+
+CPU = torch.device("cpu")
+
+
+def test_slices_of_the_codec_change_no_colour_and_are_undone_by_another_placement():
+    backbone = trained()
+    rgb, depth = backbone.generate(CLIPS, SAMPLING)
+    backbone.place(Placement(slicing=True, tiling=True))
+    assert backbone.codec.vae.use_slicing
+    assert backbone.codec.vae.use_tiling
+    backbone.place(Placement(slicing=True))
+    sliced = backbone.generate(CLIPS, SAMPLING)
+    assert (sliced[0].int() - rgb.int()).abs().max() <= 1
+    assert torch.allclose(sliced[1], depth, rtol=1e-3)
+    backbone.place(Placement())
+    assert not backbone.codec.vae.use_slicing
+    assert equal(backbone.generate(CLIPS, SAMPLING), (rgb, depth))
+
+
+def test_lower_precision_is_kept_and_comes_near():
+    backbone = trained()
+    rgb, _ = backbone.generate(CLIPS, SAMPLING)
+    backbone.place(Placement("bfloat16"))
+    assert {each.dtype for each in backbone.parameters()} == {torch.bfloat16}
+    found, depth = backbone.generate(CLIPS, SAMPLING)
+    assert (found.dtype, depth.dtype) == (torch.uint8, torch.float32)
+    assert 0 < (found.float() - rgb.float()).abs().mean() < 0.05 * 255
+    assert backbone.reconstruct(CLIPS)[0].dtype == torch.uint8
+
+
+def test_whole_parts_that_rest_elsewhere_give_the_same_clip_again_and_after_another_adapter():
+    backbone = trained()
+    before = backbone.generate(CLIPS, SAMPLING)
+    for _ in range(2):
+        backbone.offloaded = place(backbone, Placement(offload="model"), CPU)
+        assert equal(backbone.generate(CLIPS, SAMPLING), before)
+        assert equal(backbone.generate(CLIPS, SAMPLING), before)
+    with_adapter(backbone, form="canvas")
+    backbone.offloaded = place(backbone, Placement(offload="model"), CPU)
+    backbone.generate(CLIPS, SAMPLING)
+    backbone.use_adapter("voxel")
+    backbone.place(Placement())
+    assert backbone.offloaded is None
+    assert not any(hasattr(each, "_hf_hook") for each in backbone.modules())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("offload", ["model", "sequential"])
+def test_an_offloaded_backbone_leaves_the_gpu_empty_between_clips(offload):
+    backbone = trained()
+    backbone.place(Placement())
+    rgb, _ = backbone.generate(CLIPS, SAMPLING)
+    for _ in range(2):
+        backbone.place(Placement(offload=offload))
+        found, _ = backbone.generate(CLIPS, SAMPLING)
+        assert (found.int() - rgb.int()).abs().max() <= 2
+    assert backbone.transformer.base.device.type != "cuda"
+    backbone.place(Placement())
+    assert backbone.transformer.base.device.type == "cuda"
+
+
+@pytest.mark.parametrize("scale", [1, 4, 8])
+def test_tiles_overlap_by_whole_latent_pixels(scale):
+    for tile in range(2, 120):
+        share = overlap(tile, scale)
+        blend, step = int(tile * share), int(tile * scale * (1 - share))
+        assert step == scale * (tile - blend)
+        assert 0 < blend < tile
+    with pytest.raises(PersistError, match=r"tiles of 1 latent pixels are too small to overlap; leave it out$"):
+        overlap(1, scale)

@@ -1,0 +1,151 @@
+"""Training steps of both stages, beside the plain loop."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from functools import partial
+from itertools import repeat
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from persist_cli.api.backbone import Clips
+from persist_cli.api.stages import Stage
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
+from persist_cli.train.trainer import Trainer
+from tests.benchmarks.full_scale import flops
+from tests.benchmarks.full_scale.measuring import Timing, Turns, Work, release
+from tests.benchmarks.full_scale.plain import Plain, share_moments
+from tests.benchmarks.full_scale.rows import Row, Target
+from tests.benchmarks.full_scale.shapes import ADAPTER, Bench
+
+RECIPES: dict[Stage, str] = {"1": "tiny-stage1", "2": "tiny-stage2-voxel"}
+
+ENDLESS = 1_000_000
+
+UTILISATION = 0.45
+
+
+class NoClips(Dataset[Any]):
+    """No data: the batch is given."""
+
+    files: tuple[()] = ()
+
+
+class FixedBatchTrainer(Trainer):
+    """The training loop on one batch over and over, its latents known.
+
+    Args:
+        bench: the model.
+        stage: which.
+        batch: the clips.
+    """
+
+    def __init__(self, bench: Bench, stage: Stage, batch: Clips) -> None:
+        self.batch = batch
+        changes = [
+            "base=none", f"training.batch={len(batch.seeds)}", f"training.steps={ENDLESS}", "training.warmup=0",
+            "training.cooldown=0", "training.ema=0", f"training.precision={'bf16' if bench.mixed else 'no'}",
+            "data.clips_per_trajectory=0", *bench.changes,
+        ]  # fmt: skip
+        recipe = make_recipe(apply_overrides(read_recipe(RECIPES[stage]), changes), "the benchmark")
+        accelerator = Accelerator(cpu=bench.device.type == "cpu", mixed_precision=recipe.training.precision)
+        super().__init__(recipe, bench.backbone, None, accelerator)
+
+    def all_clips(self) -> Any:
+        return NoClips()
+
+    def loader(self) -> Iterator[Clips]:
+        return repeat(self.batch)
+
+
+def make_batch(bench: Bench, batch: int, tokens: int) -> Clips:
+    """Clips whose latents are known, and random ones, with so many tokens of a memory."""
+    backbone, (frames, height, width) = bench.backbone, bench.size
+    codec = backbone.codec
+    times = (frames - 1) // codec.temporal + 1 + (not backbone.frames_alone)  # behind it that of the first image alone
+    shape = (batch, times, 2 * codec.channels, height // codec.spatial, width // codec.spatial)
+    features = torch.randn(batch, tokens, bench.model.channels)
+    memory = MemoryTokens(features, 2 * torch.randn(batch, tokens, 3).double(), torch.ones(batch, tokens).bool())
+    latents = torch.randn(shape, device=bench.device, dtype=bench.precision)
+    return dataclasses.replace(bench.clips(batch, 0), latents=latents, tokens=memory if tokens else None)
+
+
+def plain_batch(bench: Bench, clips: Clips) -> tuple[Tensor, Tensor, Tensor]:
+    """Latents, image latents and camera latents of the clips, for the plain loop."""
+    backbone, kept = bench.backbone, clips.latents
+    assert kept is not None
+    latents, first = (kept, kept[:, :1]) if backbone.frames_alone else (kept[:, :-1], kept[:, -1:])
+    image, camera = backbone.image_condition(first), backbone.camera_latents(clips)
+    return latents, image.to(bench.precision), camera.to(bench.precision)
+
+
+def stage1_works(bench: Bench, batch: int) -> dict[str, Work]:
+    """A step of ours and of the plain loop; both train the same blocks, whose moments are held once."""
+    bench.backbone.use_adapter(None)
+    clips = make_batch(bench, batch, 0)
+    trainer = FixedBatchTrainer(bench, "1", clips)
+    settings, plain = trainer.recipe.training, Plain(bench)
+    if settings.gradient_checkpointing:
+        plain.transformer.enable_gradient_checkpointing()
+    rest = {"lr": settings.learning_rate, "weight_decay": settings.weight_decay}
+    optimizer = torch.optim.AdamW(plain.transformer.parameters(), **rest)
+    given, steps = plain_batch(bench, clips), trainer.steps()
+
+    def ours() -> None:
+        next(steps)
+        if not optimizer.state:
+            blocks = plain.transformer.transformer_blocks
+            share_moments(trainer.state.moments, optimizer.state, list(blocks.parameters()))
+
+    return {"ours": ours, "plain": partial(plain.step, given, optimizer, settings.clip)}
+
+
+def stage2_works(bench: Bench, batch: int) -> dict[str, Work]:
+    """A step of ours with as many tokens as the adapter takes."""
+    bench.backbone.use_adapter(ADAPTER)
+    trainer = FixedBatchTrainer(bench, "2", make_batch(bench, batch, bench.backbone.token_budget))
+    return {"ours": partial(next, trainer.steps())}
+
+
+def fitting(bench: Bench, stage: Stage) -> tuple[int, dict[str, Timing | None]]:
+    """The timings of steps with the greatest batch that fits, halved until it does, and that batch."""
+    make, batch = stage1_works if stage == "1" else stage2_works, bench.model.batch
+    while True:
+        bench.backbone.train()
+        try:
+            with bench.training():
+                timings = Turns(bench.device, bench.rounds).measure(make(bench, batch))
+        except torch.OutOfMemoryError:
+            timings = {"ours": None}
+        bench.backbone.zero_grad(set_to_none=True)
+        bench.backbone.eval().requires_grad_(False)
+        release(bench.device)
+        if timings["ours"] is not None or batch == 1:
+            return batch, timings
+        batch //= 2
+
+
+def step_rows(bench: Bench) -> Iterator[Row]:
+    """A step of stage 1 beside the plain loop's, and a step of stage 2."""
+    batch, timings = fitting(bench, "1")
+    video, size = flops.video_sizes(bench.backbone, batch), "×".join(map(str, bench.size))
+    row = Row(
+        bench.model.name, f"stage-1 step, {batch} × {size}", timings["ours"], "plain diffusers", timings.get("plain"),
+        batch, flops.stage1_step(video), bench.peak,
+    )  # fmt: skip
+    targets = [Target("no slower than plain", row.ratio, 1.0)]
+    if bench.model.name == "5b":
+        targets.append(Target(f"utilisation ≥ {UTILISATION:.0%}", row.utilisation, UTILISATION, at_most=False))
+    yield row.with_targets(*targets) if bench.model.published else row
+    batch, timings = fitting(bench, "2")
+    tokens = bench.backbone.token_budget
+    memory = flops.memory_sizes(bench.backbone, tokens)
+    total = flops.stage2_step(flops.video_sizes(bench.backbone, batch), memory)
+    what = f"stage-2 step, {batch} × {size}, {tokens} tokens"
+    yield Row(bench.model.name, what, timings["ours"], samples=batch, flops=total, peak=bench.peak)

@@ -1,0 +1,237 @@
+"""tests.checkpoints.test_export."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import pytest
+import torch
+
+from persist_cli.api.backbone import Sampling
+from persist_cli.checkpoints.checkpoint import find_checkpoint, load_adapter, load_backbone
+from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import load_exactly, read_tensors, write_tensors
+from tests.support.disk import file_limit
+from tests.support.export_runs import write_adapter, write_base, write_runs
+from tests.support.micro_model import random_clips, random_tokens
+from tests.support.walking import stage
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    return write_runs(tmp_path_factory.mktemp("exporting"))
+
+
+@pytest.fixture
+def export(persist, runs):
+    """``persist export`` of the stage-1 run."""
+
+    def run(out, *arguments):
+        ended = persist("export", runs / "stage1", *arguments, "--out", out)
+        assert ended.code == 0, ended.err
+        return ended.out
+
+    return run
+
+
+def generated(path, adapter, original=None):
+    """A clip with memory tokens, from the checkpoint's base and one of its adapters."""
+    checkpoint = find_checkpoint(path)
+    backbone = load_backbone(checkpoint).eval()
+    load_adapter(backbone, checkpoint, adapter)
+    return backbone.generate(random_clips(1, random_tokens(1, 5)), Sampling(2))
+
+
+def test_a_float32_export_generates_bit_for_bit_what_the_runs_do(export, runs, tmp_path):
+    export(tmp_path / "m", runs / "voxel", f"fine={runs / 'canvas'}", "--dtype", "float32")
+    for run, adapter, name in (("stage1", None, None), ("voxel", "voxel", "voxel"), ("canvas", "voxel", "fine")):
+        for expected, found in zip(generated(runs / run, adapter), generated(tmp_path / "m", name), strict=True):
+            assert torch.equal(expected, found)
+    rgb = [generated(tmp_path / "m", name)[0] for name in (None, "voxel", "fine")]
+    assert not torch.equal(rgb[0], rgb[1])
+    assert not torch.equal(rgb[1], rgb[2])
+
+
+@pytest.mark.parametrize(("dtype", "kind"), [("float16", torch.float16), ("bfloat16", torch.bfloat16)])
+def test_weights_equal_the_originals_to_the_precision_asked_for(export, runs, tmp_path, dtype, kind):
+    export(tmp_path / "m", runs / "voxel", "--dtype", dtype)
+    files = list((tmp_path / "m").rglob("*.safetensors"))
+    assert len(files) == 4
+    for path in files:
+        owner = runs / ("voxel" if "adapters" in path.parts else "stage1")
+        original, metadata = read_tensors(owner / path.relative_to(tmp_path / "m"))
+        found, kept = read_tensors(path)
+        assert metadata == kept
+        assert found.keys() == original.keys()
+        assert all(torch.equal(found[name], original[name].to(kind)) for name in original)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_half_precision_files_give_float32_parameters(export, runs, tmp_path, dtype):
+    export(tmp_path / "m", runs / "voxel", "--dtype", dtype)
+    checkpoint = find_checkpoint(tmp_path / "m")
+    backbone = load_backbone(checkpoint)
+    load_adapter(backbone, checkpoint, "voxel")
+    assert {value.dtype for value in backbone.state_dict().values() if value.is_floating_point()} == {torch.float32}
+    expected, _ = read_tensors(runs / "stage1/world.safetensors")
+    assert torch.allclose(backbone.prompt, expected["prompt"], atol=1e-2)
+
+
+def test_tensors_assigned_to_a_module_without_storage_take_its_precision(tmp_path):
+    with torch.device("meta"):
+        module = torch.nn.Linear(2, 2)
+    tensors = {"weight": torch.ones(2, 2).half(), "bias": torch.ones(2).bfloat16()}
+    load_exactly(module, tensors, {"weight", "bias"}, tmp_path)
+    assert (module.weight.dtype, module.bias.dtype) == (torch.float32, torch.float32)
+    assert module(torch.ones(1, 2)).tolist() == [[3, 3]]
+
+
+def test_an_export_of_an_export_is_the_same(export, persist, runs, tmp_path):
+    export(tmp_path / "m", runs / "none", runs / "voxel", "--default", "voxel")
+    assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
+    assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
+    assert find_checkpoint(tmp_path / "again").default_adapter() == "voxel"
+
+
+def test_a_stage_2_run_stands_for_its_base_and_adapter(persist, export, runs, tmp_path):
+    assert persist("export", runs / "voxel", "--out", tmp_path / "a").code == 0
+    export(tmp_path / "b", runs / "voxel")
+    assert (tmp_path / "a/SHA256SUMS").read_bytes() == (tmp_path / "b/SHA256SUMS").read_bytes()
+
+
+def test_the_sampling_of_the_card_is_meant_where_nothing_is_asked_for(export, runs, tmp_path):
+    export(tmp_path / "m", "--steps", "7", "--sampler", "unipc", "--guidance", "1.5")
+    exported, run = find_checkpoint(tmp_path / "m"), find_checkpoint(runs / "stage1")
+    assert SamplingOverrides().over(exported.sampling) == Sampling(7, "unipc", 1.5)
+    assert SamplingOverrides(3, "ddim").over(exported.sampling) == Sampling(3, "ddim", 1.5)
+    assert SamplingOverrides(memory_guidance=1.0).over(exported.sampling) == Sampling(7, "unipc", 1.0)
+    assert (run.sampling, SamplingOverrides().over(run.sampling)) == (None, Sampling(50, "ddim", 1.0))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"steps": "many"},
+        {"steps": 0},
+        {"steps": True},
+        {"stpes": 7},
+        {"sampler": 1},
+        True,
+        {"memory_guidance": -1},
+        {"memory_guidance": float("nan")},
+        {"memory_guidance": "1"},
+    ],
+)
+def test_a_card_with_a_sampling_that_is_none_is_refused(export, tmp_path, value):
+    export(tmp_path / "m")
+    card = json.loads((tmp_path / "m/persist.json").read_text())
+    (tmp_path / "m/persist.json").write_text(json.dumps(card | {"sampling": value}))
+    with pytest.raises(CheckpointError, match=r"persist\.json: its sampling is"):
+        find_checkpoint(tmp_path / "m")
+
+
+def test_the_sums_are_those_of_all_files(export, runs, tmp_path):
+    export(tmp_path / "m", runs / "voxel")
+    lines = [line.split("  ") for line in (tmp_path / "m/SHA256SUMS").read_text().splitlines()]
+    files = {path.relative_to(tmp_path / "m").as_posix() for path in (tmp_path / "m").rglob("*") if path.is_file()}
+    assert files == {name for _, name in lines} | {"SHA256SUMS"}
+    assert all(hashlib.sha256((tmp_path / "m" / name).read_bytes()).hexdigest() == sum_ for sum_, name in lines)
+
+
+def test_the_table_and_json_tell_the_size_of_every_file(export, runs, tmp_path):
+    assert "adapters/voxel/adapter.safetensors" in export(tmp_path / "m", runs / "voxel")
+    told = json.loads(export(tmp_path / "n", runs / "voxel", "--json"))
+    sizes = {name: (tmp_path / "n" / name).stat().st_size for name in told["files"]}
+    assert sizes == {name: each["bytes"] for name, each in told["files"].items()}
+    assert told["bytes"] == sum(sizes.values())
+    assert told["fingerprint"] == find_checkpoint(tmp_path / "n").fingerprint
+    assert told["default_adapter"] == "voxel"
+
+
+def test_an_adapter_trained_on_the_export_joins_it(export, persist, runs, tmp_path):
+    export(tmp_path / "m")
+    model = find_checkpoint(tmp_path / "m")
+    later = write_adapter(load_backbone(model), tmp_path / "m", tmp_path / "later", "voxel")
+    assert persist("export", tmp_path / "m", later, "--out", tmp_path / "n").code == 0
+    assert (find_checkpoint(tmp_path / "n").fingerprint, find_checkpoint(later).fingerprint) == (model.fingerprint,) * 2
+
+
+def test_recipes_of_all_stages_are_kept_without_places_of_this_machine(persist, codec, stage1, voxel, tmp_path):
+    assert persist("export", stage1, f"codec={voxel}", "--out", tmp_path / "m").code == 0
+    home = tmp_path / "m/recipes"
+    kept = {path.relative_to(home).as_posix(): path.read_text() for path in home.rglob("*.yaml")}
+    assert sorted(kept) == ["adapters/codec.yaml", "codec.yaml", "stage1.yaml"]
+    assert "base: stage1" in kept["adapters/codec.yaml"]
+    assert "stage: codec" in kept["codec.yaml"]
+    assert not any(str(codec.parent) in text for text in kept.values())
+    assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
+    assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
+
+
+def test_no_configuration_tells_where_it_was_loaded_from(persist, walks, codec, tmp_path):
+    settings = ["training.steps=1", "training.ema=0"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *settings)).code == 0
+    run = tmp_path / "run"
+    assert "_name_or_path" in json.loads(next(run.glob("step-*/model/vae/config.json")).read_text())
+    assert persist("export", run, "--out", tmp_path / "out").code == 0
+    assert not [path for path in (tmp_path / "out").rglob("*.json") if str(codec) in path.read_text()]
+
+
+def test_an_export_may_be_called_model(persist, walks, stage1, tmp_path):
+    model = tmp_path / "runs/model"
+    assert persist("export", stage1, "--out", model).code == 0
+    assert find_checkpoint(model).name == "model"
+    run = persist(*stage("stage2-none", walks, tmp_path / "runs/none", f"base={model}", "training.steps=1"))
+    assert run.code == 0, run.err
+    assert find_checkpoint(tmp_path / "runs/none").base_folder == model
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
+    with file_limit(5000):
+        ended = persist("export", runs / "stage1", "--out", tmp_path / "m")
+    assert (ended.code, "cannot be exported" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
+    (tmp_path / "here").mkdir()
+    base, voxel, canvas, out = runs / "stage1", runs / "voxel", runs / "canvas", tmp_path / "m"
+    for arguments, cause in (
+        ((base, runs / "other", "--out", out), "is of another base than"),
+        ((base, voxel, canvas, "--out", out), "adapter 'voxel' is there already, from"),
+        ((base, f"a={voxel}", f"a={canvas}", "--out", out), "name this one, as in a-other="),
+        ((base, f"stage1={voxel}", "--out", out), "choose another name"),
+        ((base, base, "--out", out), "has no memory adapter"),
+        ((base, tmp_path / "gone", "--out", out), "no checkpoint there"),
+        ((tmp_path / "here", "--out", out), "no checkpoint there"),
+        ((base, "--out", tmp_path / "here"), "exists already"),
+        ((base, "--dtype", "float61", "--out", out), "did you mean 'float16'"),
+        ((base, voxel, "--default", "voxels", "--out", out), "did you mean 'voxel'"),
+        ((base, "--sampler", "nonsense", "--out", out), "unknown sampler 'nonsense'"),
+        ((base, "--steps", "1001", "--out", out), "1001"),
+    ):
+        ended = persist("export", *arguments)
+        assert (ended.code, cause in ended.err) == (1, True), ended.err
+        assert len(ended.err.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
+def test_a_value_beyond_float16_is_refused_by_name_and_bfloat16_takes_it(persist, tmp_path):
+    write_base(tmp_path / "stage1")
+    path = tmp_path / "stage1/world.safetensors"
+    tensors, metadata = read_tensors(path)
+    write_tensors(path, tensors | {"prompt": tensors["prompt"] + 1e5}, metadata)
+    refused = persist("export", tmp_path / "stage1", "--out", tmp_path / "m")
+    assert refused.code == 1
+    assert "world.safetensors: 'prompt' holds 1e+05, more than float16 can (6.55e+04)" in refused.err
+    assert [path.name for path in tmp_path.iterdir()] == ["stage1"]
+    assert persist("export", tmp_path / "stage1", "--dtype", "bfloat16", "--out", tmp_path / "m").code == 0
+
+
+def test_several_adapters_without_a_default_must_be_chosen_from(export, runs, tmp_path):
+    export(tmp_path / "m", runs / "voxel", runs / "none")
+    with pytest.raises(CheckpointError, match="choose an adapter of none, voxel with --adapter"):
+        find_checkpoint(tmp_path / "m").default_adapter()

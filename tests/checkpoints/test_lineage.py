@@ -1,0 +1,116 @@
+"""What checkpoints know of the recipes and scenes behind them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from persist_cli.checkpoints.checkpoint import find_checkpoint
+from persist_cli.checkpoints.lineage import stage_recipes, training_scenes
+from persist_cli.data.scenes import TrainingScenes
+from persist_cli.evaluate.provenance import checkpoint_json, scenes_json
+from persist_cli.evaluate.provenance import training_scenes as scenes_to_avoid
+from tests.support.walking import stage
+
+ROOMS = TrainingScenes(frozenset({"room-0", "room-1"}))
+
+
+@pytest.fixture
+def halves(walks, tmp_path):
+    """Data sets of one trajectory each, whose scenes are room-0 and room-1."""
+    for number in (0, 1):
+        (tmp_path / f"half-{number}").mkdir()
+        shutil.copy(walks / f"walk-{number}.parquet", tmp_path / f"half-{number}")
+    return tmp_path / "half-0", tmp_path / "half-1"
+
+
+def forget(run):
+    """The run as a version left it that wrote no scenes and no earlier recipes down."""
+    model = next(run.glob("step-*")) / "model"
+    card = json.loads((model / "persist.json").read_text())
+    del card["training_scenes"]
+    (model / "persist.json").write_text(json.dumps(card))
+    shutil.rmtree(model / "recipes", ignore_errors=True)
+
+
+def test_scenes_of_every_base_are_known_when_neither_runs_nor_data_are_there_any_more(persist, codec, halves, tmp_path):
+    made, short = [], ["training.steps=1", f"base={tmp_path / 'codec'}"]
+    shutil.copytree(codec, tmp_path / "codec")
+    for name, data in zip(("one", "two"), halves, strict=True):
+        assert persist(*stage("stage1", data, tmp_path / name, *short)).code == 0
+        made.append(training_scenes(find_checkpoint(tmp_path / name)))
+        shutil.rmtree(data)
+    assert made == [ROOMS, ROOMS]  # the codec saw both
+
+
+def test_an_adapters_scenes_are_also_those_of_its_base(persist, codec, halves, tmp_path):
+    shutil.copytree(codec, tmp_path / "codec")
+    card = next((tmp_path / "codec").glob("step-*")) / "model/persist.json"
+    card.write_text(json.dumps(json.loads(card.read_text()) | {"training_scenes": TrainingScenes().to_json()}))
+    base = f"base={tmp_path / 'codec'}"
+    assert persist(*stage("stage1", halves[0], tmp_path / "one", base, "training.steps=1")).code == 0
+    base = f"base={tmp_path / 'one'}"
+    assert persist(*stage("stage2-none", halves[1], tmp_path / "none", base, "training.steps=1")).code == 0
+    assert training_scenes(find_checkpoint(tmp_path / "one")) == TrainingScenes(frozenset({"room-0"}))
+    assert training_scenes(find_checkpoint(tmp_path / "none")) == ROOMS
+    for runs in ((tmp_path / "one", tmp_path / "none"), (tmp_path / "none",)):
+        assert persist("export", *runs, "--out", tmp_path / "m").code == 0
+        assert training_scenes(find_checkpoint(tmp_path / "m")) == ROOMS
+        shutil.rmtree(tmp_path / "m")
+
+
+def test_what_no_card_says_is_what_the_recipes_data_hold_as_far_as_they_are_there(
+    persist, walks, codec, tmp_path, capsys
+):
+    shutil.copytree(codec, tmp_path / "codec")
+    shutil.copytree(walks, tmp_path / "walks")
+    base = f"base={tmp_path / 'codec'}"
+    assert persist(*stage("stage1", tmp_path / "walks", tmp_path / "one", base, "training.steps=1")).code == 0
+    for name in ("codec", "one"):
+        forget(tmp_path / name)
+    checkpoint = find_checkpoint(tmp_path / "one")
+    assert training_scenes(checkpoint) == ROOMS
+    shutil.rmtree(tmp_path / "codec")
+    assert training_scenes(checkpoint) == TrainingScenes(ROOMS.names, complete=False)
+    assert scenes_to_avoid([checkpoint]) == ROOMS.names
+    assert "not all scenes that it was trained on are known" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "walks")
+    assert training_scenes(checkpoint) == TrainingScenes(complete=False)
+    assert scenes_json(checkpoint)["training_scenes"] == {"known": 0, "complete": False}
+
+
+def test_an_exports_recipes_have_a_hash_that_depends_on_each(persist, stage1, voxel, tmp_path):
+    assert persist("export", stage1, voxel, "--out", tmp_path / "m").code == 0
+    before = checkpoint_json(find_checkpoint(tmp_path / "m"))["recipe_sha256"]
+    assert len(before) == 64
+    recipe = tmp_path / "m/recipes/adapters/voxel.yaml"
+    recipe.write_text(recipe.read_text() + "# changed\n")
+    assert checkpoint_json(find_checkpoint(tmp_path / "m"))["recipe_sha256"] != before
+
+
+def test_recipes_of_all_stages_before_are_kept_when_training_starts(persist, walks, codec, tmp_path):
+    shutil.copytree(codec, tmp_path / "codec")
+    for name, base in (("one", "codec"), ("two", "one")):
+        options = [f"base={tmp_path / base}", "training.steps=1"]
+        assert persist(*stage("stage1", walks, tmp_path / name, *options, f"description={name}")).code == 0
+        shutil.rmtree(tmp_path / base)
+    recipes = stage_recipes(find_checkpoint(tmp_path / "two").folder)
+    assert list(recipes) == ["codec.yaml", "stage1.yaml", "stage1-2.yaml"]
+    assert ["description: one" in recipes["stage1.yaml"], "description: two" in recipes["stage1-2.yaml"]] == [
+        True,
+        True,
+    ]
+
+
+def test_a_run_that_kept_none_asks_its_base_and_says_when_that_is_gone(persist, walks, codec, tmp_path, capsys):
+    shutil.copytree(codec, tmp_path / "codec")
+    base = f"base={tmp_path / 'codec'}"
+    assert persist(*stage("stage1", walks, tmp_path / "one", base, "training.steps=1")).code == 0
+    forget(tmp_path / "one")
+    folder = find_checkpoint(tmp_path / "one").folder
+    assert list(stage_recipes(folder)) == ["codec.yaml", "stage1.yaml"]
+    shutil.rmtree(tmp_path / "codec")
+    assert list(stage_recipes(folder)) == ["stage1.yaml"]
+    assert "its base" in capsys.readouterr().err

@@ -1,0 +1,43 @@
+"""The reference model that comes with the package: whole, small enough for git, and better with its memory."""
+
+from __future__ import annotations
+
+import json
+import os
+from hashlib import sha256
+
+import pytest
+
+from persist_cli.checkpoints.checkpoint import reference_checkpoint
+
+MOST_BYTES = 40e6
+
+BACK = ("--start", "sample#0:32", "--follow", "--frames", 24, "--seed", 0)
+
+
+@pytest.fixture
+def packaged(monkeypatch):
+    """The folder in the package, which other tests do without."""
+    monkeypatch.delenv("PERSIST_REFERENCE")
+    return reference_checkpoint()
+
+
+def test_every_file_is_the_one_of_its_sum(packaged):
+    lines = [line.split("  ") for line in (packaged / "SHA256SUMS").read_text().splitlines()]
+    assert {name for _, name in lines} | {"SHA256SUMS", "README.md"} == {
+        os.path.relpath(path, packaged) for path in packaged.rglob("*") if path.is_file()
+    }
+    for digest, name in lines:
+        assert sha256((packaged / name).read_bytes()).hexdigest() == digest, name
+    assert sum((packaged / name).stat().st_size for _, name in lines) <= MOST_BYTES
+
+
+def test_what_was_seen_on_the_way_out_is_drawn_on_the_way_back(packaged, persist, tmp_path):
+    assert persist("memorize", "sample#0:0-33", "--out", tmp_path / "house.safetensors").code == 0
+    means = []
+    for options in (("--memory", tmp_path / "house.safetensors"), ("--adapter", "none")):
+        ended = persist("rollout", *BACK, *options, "--out", tmp_path / "back")
+        assert ended.code == 0, ended.err
+        psnr = json.loads((tmp_path / "back/rollout.json").read_text())["against_ground_truth"]["psnr"]
+        means.append(sum(psnr) / len(psnr))
+    assert means[0] > means[1] + 3

@@ -1,0 +1,71 @@
+"""tests.cli.test_app."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.support.disk import file_limit
+from tests.support.walking import MICRO_SETTINGS, stage
+
+COMMANDS = (
+    *("collect", "import", "inspect", "finetune", "doctor", "export", "memorize", "rollout", "eval"),
+    *("weights", "plugins", "recipes"),
+)
+
+
+def test_help_imports_no_torch():
+    heavy = "print([name for name in ('torch', 'numpy', 'diffusers', 'pydantic') if name in sys.modules])"
+    code = f"import sys\nfrom persist_cli.cli.app import main\ntry: main(['--help'])\nexcept SystemExit: {heavy}"
+    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert out.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(persist, command):
+    ended = persist(command, "--help")
+    assert ended.code == 0
+    assert "Usage" in ended.out
+
+
+def test_the_version_is_the_packages(persist):
+    from importlib.metadata import version
+
+    assert persist("--version").out.strip() == f"persist {version('persist-cli')}"
+
+
+def test_recipes_are_listed(persist):
+    assert "tiny-stage2-voxel" in persist("recipes", "--json").out
+
+
+def test_a_wrong_option_is_a_usage_error(persist):
+    assert persist("collect", "--nonsense").code == 2
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["finetune", "tiny-codec", "--data", "{walks}"], ["rollout", "{stage1}", "--start", "{walks}#0:0", "--follow"],
+     ["eval", "{stage1}", "--data", "{walks}"], ["export", "{stage1}"], ["memorize", "{walks}#0:0-3"]],
+)  # fmt: skip
+def test_a_file_where_a_folder_would_be_made_is_told_before_any_work_is_done(persist, walks, stage1, tmp_path, command):
+    (tmp_path / "file").touch()
+    arguments = [each.format(walks=walks, stage1=stage1) for each in command]
+    ended = persist(*arguments, "--out", tmp_path / "file" / "there" / "x")
+    assert (ended.code, f"{tmp_path / 'file'} is a file" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+
+
+def test_a_disk_that_is_full_is_one_line_whatever_writes(persist, walks, tmp_path):
+    with file_limit(2000):
+        ended = persist("memorize", f"{walks}#0:0-3", "--out", tmp_path / "memory.safetensors")
+    assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_begins_with_a_random_codec_is_told(persist, walks, codec, tmp_path):
+    told = persist(*stage("stage1", walks, tmp_path / "a", "base=null", *MICRO_SETTINGS, "training.steps=1"))
+    assert (told.code, "begins with random weights" in told.err) == (0, True)
+    told = persist(*stage("stage1", walks, tmp_path / "b", f"base={codec}", "training.steps=1"))
+    assert (told.code, "random" in told.err) == (0, False)

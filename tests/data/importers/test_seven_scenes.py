@@ -1,0 +1,162 @@
+"""7-Scenes folders come in as trajectories; what is broken in them is named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from persist_cli.data.importers.importing import run_import
+from persist_cli.data.importers.seven_scenes import SevenScenes, estimate_up
+from persist_cli.data.store import Store
+from persist_cli.errors import DataError, PluginError
+from tests.support.rooms import Room, look, walk
+
+ROOM = Room()
+
+
+def write_sequence(folder: Path, frames: int = 4, suffix: str = "png") -> Path:
+    folder.mkdir(parents=True)
+    matrix = ROOM.intrinsics
+    matrix[:2, 2] -= 0.5  # as 7-Scenes counts
+    np.savetxt(folder / "camera-intrinsics.txt", matrix)
+    for number, frame in enumerate(ROOM.frames(walk(24)[:frames])):
+        stem = folder / f"frame-{3 * number:06d}"
+        Image.fromarray(frame.rgb).save(f"{stem}.color.{suffix}")
+        millimetres = np.round(frame.depth * 1000).astype(np.uint16)
+        millimetres[0, :2] = [0, 65535]
+        Image.fromarray(millimetres).save(f"{stem}.depth.png")
+        np.savetxt(f"{stem}.pose.txt", frame.world_from_camera)
+    return folder
+
+
+@pytest.fixture
+def sequence(tmp_path: Path) -> Path:
+    return write_sequence(tmp_path / "kitchen")
+
+
+def test_a_sequence_comes_in_as_it_was(sequence: Path) -> None:
+    (trajectory,) = SevenScenes().trajectories(sequence)
+    assert (trajectory.name, trajectory.info.scene, trajectory.length) == ("kitchen", "kitchen", 4)
+    assert trajectory.info.intrinsics == pytest.approx(ROOM.intrinsics)
+    for frame, truth in zip(trajectory.frames, ROOM.frames(walk(24)[:4]), strict=True):
+        assert np.array_equal(frame.rgb, truth.rgb)
+        assert frame.world_from_camera == pytest.approx(truth.world_from_camera)
+        assert np.abs(frame.depth - truth.depth)[1:].max() < 0.00051
+        assert frame.action == truth.action
+
+
+def test_0_and_65535_are_missing_depth(sequence: Path) -> None:
+    (trajectory,) = SevenScenes().trajectories(sequence)
+    assert next(trajectory.frames).depth[0, :2].tolist() == [0, 0]
+
+
+def test_the_sequences_of_a_scene_share_its_name(tmp_path: Path) -> None:
+    for number in (2, 1):
+        write_sequence(tmp_path / "chess" / f"seq-0{number}", 2, "jpg")
+    shutil.move(tmp_path / "chess/seq-01/camera-intrinsics.txt", tmp_path / "chess")  # one for all
+    found = list(SevenScenes().trajectories(tmp_path / "chess"))
+    assert [trajectory.name for trajectory in found] == ["chess-seq-01", "chess-seq-02"]
+    assert {trajectory.info.scene for trajectory in found} == {"chess"}
+    assert next(SevenScenes().trajectories(tmp_path / "chess/seq-02")).name == "chess-seq-02"
+
+
+def test_times_follow_the_frame_numbers(sequence: Path) -> None:
+    (trajectory,) = SevenScenes().trajectories(sequence)
+    assert [frame.timestamp for frame in trajectory.frames] == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
+def test_up_is_found_although_the_camera_looks_down() -> None:
+    poses = np.stack([look((0, 1.5, 0), yaw, -35) for yaw in range(0, 120, 10)])
+    assert np.degrees(np.arccos(np.dot(estimate_up(poses), (0, 1, 0)))) < 3
+    assert np.degrees(np.arccos(np.dot(-poses[:, :3, 1].mean(0), (0, 1, 0)))) > 20  # the plain mean
+
+
+def remove(name: str):
+    return lambda folder: (folder / name).unlink()
+
+
+def truncate(name: str):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-60])
+
+
+def save(name: str, matrix: np.ndarray):
+    return lambda folder: np.savetxt(folder / name, matrix)
+
+
+def write(name: str, text: str):
+    return lambda folder: (folder / name).write_text(text)
+
+
+def draw(name: str, shape: tuple[int, ...], kind: type = np.uint8):
+    return lambda folder: Image.fromarray(np.ones(shape, kind)).save(folder / name)
+
+
+COLOR, DEPTH, POSE = (f"frame-000006.{part}" for part in ("color.png", "depth.png", "pose.txt"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "cause"),
+    [
+        (remove("camera-intrinsics.txt"), r"camera-intrinsics\.txt: no such file"),
+        (save("camera-intrinsics.txt", np.zeros((3, 3))), r"camera-intrinsics\.txt: the intrinsics .* are singular"),
+        (write("camera-intrinsics.txt", "1 2 3"), r"camera-intrinsics\.txt: 3 numbers, not the 3×3"),
+        (remove(DEPTH), "frame-000006 has no depth file"),
+        (remove(COLOR), "frame-000006 has no color file"),
+        (remove(POSE), "frame-000006 has no pose file"),
+        (truncate(COLOR), r"frame-000006\.color\.png: not a whole image"),
+        (truncate(DEPTH), r"frame-000006\.depth\.png: not a whole image"),
+        (write(COLOR, "no image"), r"frame-000006\.color\.png: not a whole image"),
+        (draw(COLOR, (10, 12, 3)), r"frame-000006\.color\.png: 10×12 pixels, the first colour image has 48×64"),
+        (draw(DEPTH, (10, 12), np.uint16), r"frame-000006\.depth\.png: 10×12 pixels"),
+        (draw(DEPTH, (48, 64, 3)), r"frame-000006\.depth\.png: a depth image must have one integer channel"),
+        (save(POSE, np.diag([2.0, 2, 2, 1])), r"frame-000006\.pose\.txt: the pose is not rigid"),
+        (save(POSE, np.full((4, 4), np.inf)), r"frame-000006\.pose\.txt: the pose is not finite"),
+        (write(POSE, "lost tracking"), r"frame-000006\.pose\.txt: not a text file of numbers"),
+    ],
+)
+def test_what_is_broken_is_named_and_nothing_half_is_left(sequence: Path, tmp_path: Path, damage, cause: str) -> None:
+    damage(sequence)
+    with pytest.raises(DataError, match=cause) as error:
+        run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
+    assert "\n" not in str(error.value)
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_a_folder_without_frames_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="neither frame-"):
+        run_import("7scenes", tmp_path, tmp_path / "out", None, 1, False)
+    with pytest.raises(DataError, match="nowhere: no such file or folder"):
+        run_import("7scenes", tmp_path / "nowhere", tmp_path / "out", None, 1, False)
+
+
+def test_an_unknown_format_gets_a_hint(tmp_path: Path) -> None:
+    with pytest.raises(PluginError, match="did you mean '7scenes'"):
+        run_import("7scene", tmp_path, tmp_path / "out", None, 1, False)
+
+
+def test_import_writes_a_store_of_the_asked_size(sequence: Path, tmp_path: Path, capsys) -> None:
+    run_import("7scenes", sequence, tmp_path / "out", "24x24", 2, True)
+    report = json.loads(capsys.readouterr().out)
+    assert report["trajectories"] == [
+        {"name": "kitchen", "frames": 2, "height": 24, "width": 24, "state": "written"},
+    ]
+    trajectory = Store(tmp_path / "out")["kitchen"].read()
+    assert trajectory.observations.rgb.shape == (2, 24, 24, 3)
+    assert trajectory.actions == ("free", None)
+    assert torch.equal(trajectory.observations.cameras.intrinsics[0, :2, 2], torch.tensor([12.0, 12.0]).double())
+
+
+def test_a_second_import_finds_its_work_done(sequence: Path, tmp_path: Path, capsys) -> None:
+    run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
+    written = (tmp_path / "out/kitchen.parquet").stat().st_mtime_ns
+    run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
+    assert "already there" in capsys.readouterr().out
+    assert (tmp_path / "out/kitchen.parquet").stat().st_mtime_ns == written
+    with pytest.raises(DataError, match="of other settings"):
+        run_import("7scenes", sequence, tmp_path / "out", "24x24", 1, False)

@@ -1,0 +1,67 @@
+"""Crop and resize keep every world point on its own pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from persist_cli.data.images import crop_resize, parse_size
+from persist_cli.errors import DataError
+
+INTRINSICS = np.array([[50.0, 0, 33.0], [0, 52.0, 22.0], [0, 0, 1]])
+
+SIZES = [(48, 64), (24, 32), (30, 30), (16, 64), (96, 128), (17, 23)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_world_point_projects_to_the_corresponding_pixel(size: tuple[int, int]) -> None:
+    crop = crop_resize((48, 64), size)
+    point = np.array([0.3, -0.2, 2.0])
+    before, after = INTRINSICS @ point / point[2], crop.intrinsics(INTRINSICS) @ point / point[2]
+    scale = np.array([size[1] / crop.window[1], size[0] / crop.window[0]])
+    assert after[:2] == pytest.approx((before[:2] - [crop.left, crop.top]) * scale)
+
+
+@pytest.mark.parametrize("size", [(24, 32), (30, 30), (96, 128)])
+def test_a_picture_of_pixel_positions_still_shows_them(size: tuple[int, int]) -> None:
+    v, u = np.mgrid[:48, :64] + 0.5
+    crop = crop_resize((48, 64), size)
+    image = np.stack([3 * u, 3 * v, np.zeros_like(u)], -1).astype(np.uint8)
+    rows, columns = np.mgrid[: size[0], : size[1]] + 0.5
+    shown = crop.rgb(image)[..., :2] / 3
+    mapped = np.stack([columns * crop.window[1] / size[1] + crop.left, rows * crop.window[0] / size[0] + crop.top], -1)
+    assert np.abs(shown - mapped)[2:-2, 2:-2].max() < 0.7  # rounding to whole levels, the nearest pixel
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_depth_is_never_mixed_across_an_edge(size: tuple[int, int]) -> None:
+    depth = np.where(np.arange(64) < 31, np.float32(1), np.float32(5)) * np.ones((48, 1), np.float32)
+    resized = crop_resize((48, 64), size).depth(depth)
+    assert resized.shape == size
+    assert set(np.unique(resized)) == {1.0, 5.0}
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_window_is_central_and_of_the_target_s_aspect(size: tuple[int, int]) -> None:
+    crop = crop_resize((48, 64), size)
+    assert crop.window[0] == 48 or crop.window[1] == 64
+    assert abs(crop.window[0] * size[1] - crop.window[1] * size[0]) <= max(size)
+    assert abs(2 * crop.top + crop.window[0] - 48) <= 1
+    assert abs(2 * crop.left + crop.window[1] - 64) <= 1
+
+
+def test_the_same_size_changes_nothing() -> None:
+    crop = crop_resize((48, 64), (48, 64))
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    assert np.array_equal(crop.rgb(image), image)
+    assert np.array_equal(crop.intrinsics(INTRINSICS), INTRINSICS)
+
+
+@pytest.mark.parametrize("text", ["", "64", "64x", "x64", "0x64", "64x-1", "64x64x3"])
+def test_what_is_no_size_is_told(text: str) -> None:
+    with pytest.raises(DataError, match="cannot read the size"):
+        parse_size(text)
+
+
+def test_a_size_is_height_by_width() -> None:
+    assert parse_size("240x320") == (240, 320)

@@ -1,0 +1,234 @@
+"""The store gives back what was written, and says in one line what it cannot read."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from persist_cli.data.store import Store, TrajectoryFile, write_trajectory
+from persist_cli.errors import DataError
+from persist_cli.io.files import ASIDE
+from tests.support.noise import INFO, INTRINSICS, make_frames
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    assert write_trajectory(tmp_path / "one.parquet", INFO, make_frames()) == 20
+    return tmp_path / "one.parquet"
+
+
+def test_a_trajectory_comes_back_as_it_was(path: Path) -> None:
+    frames, trajectory = make_frames(), TrajectoryFile(path).read()
+    assert torch.equal(trajectory.observations.rgb, torch.from_numpy(np.stack([frame.rgb for frame in frames])))
+    depth = torch.from_numpy(np.stack([frame.depth for frame in frames]))
+    assert (trajectory.observations.depth - depth).abs().max() <= 0.00051
+    poses = torch.from_numpy(np.stack([frame.world_from_camera for frame in frames]))
+    assert torch.equal(trajectory.observations.cameras.world_from_camera, poses)
+    assert trajectory.actions == tuple(frame.action for frame in frames)
+    assert trajectory.name == "one"
+
+
+def test_the_header_comes_back_as_it_was(path: Path) -> None:
+    info = TrajectoryFile(path).info
+    assert np.array_equal(info.intrinsics, INTRINSICS)
+    assert replace(info, intrinsics=INTRINSICS) == INFO
+
+
+@pytest.mark.parametrize("frames", [slice(3, 5), slice(5, 17), slice(-3, None), [0, 19], [17, 2, 2, 9]])
+def test_any_choice_of_frames_equals_that_choice_of_all(path: Path, frames: slice | list[int]) -> None:
+    part, whole = TrajectoryFile(path).read(frames), TrajectoryFile(path).read()
+    assert torch.equal(part.observations.rgb, whole.observations.rgb[frames])
+    assert torch.equal(part.observations.cameras.centers, whole.observations.cameras.centers[frames])
+    assert part.first == np.arange(20)[frames][0]
+
+
+def test_poses_actions_and_times_need_no_image(path: Path) -> None:
+    file = TrajectoryFile(path)
+    assert torch.equal(file.poses(), file.read().observations.cameras.world_from_camera)
+    assert file.actions() == file.read().actions
+    assert file.timestamps().tolist() == [number / 10 for number in range(20)]
+
+
+def test_depth_that_is_no_distance_is_missing(tmp_path: Path) -> None:
+    frame = make_frames(1)[0]
+    frame.depth[0, :7] = [np.nan, -1, np.inf, -np.inf, 65.54, 65.53, 0]
+    write_trajectory(tmp_path / "one.parquet", INFO, [frame])
+    depth = Store(tmp_path)[0].read().observations.depth[0, 0, :7]
+    assert torch.equal(depth, torch.tensor([0, 0, 0, 0, 0, 65.53, 0]))
+
+
+def test_a_trajectory_file_travels_to_other_processes(path: Path) -> None:
+    file = TrajectoryFile(path)
+    file.read([1])
+    again = pickle.loads(pickle.dumps(file))
+    assert torch.equal(again.poses(), file.poses())
+
+
+def test_images_and_metadata_have_the_form_of_hugging_face_datasets(path: Path) -> None:
+    schema = pq.read_schema(path)
+    for name in ("rgb", "depth"):
+        assert schema.field(name).type == pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    assert b'"_type": "Image"' in schema.metadata[b"huggingface"]
+
+
+def test_a_store_lists_its_trajectories_by_name_and_number(tmp_path: Path) -> None:
+    for name in ("b", "a", "c"):
+        write_trajectory(tmp_path / f"{name}.parquet", INFO, make_frames(2))
+    store = Store(tmp_path)
+    assert store.names == ["a", "b", "c"]
+    assert [file.name for file in store] == store.names
+    assert store[1] is store["b"]
+
+
+def test_a_folder_of_data_sets_is_none_and_they_are_named(tmp_path: Path) -> None:
+    (tmp_path / "cache").mkdir()
+    for name in ("train/a", "test/b"):
+        write_trajectory(tmp_path / f"{name}.parquet", INFO, make_frames(2))
+    with pytest.raises(DataError, match=rf"no trajectory in it .*; name {tmp_path}/test and {tmp_path}/train$"):
+        Store(tmp_path)
+
+
+def test_cameras_are_those_of_the_frames_that_are_read(path: Path) -> None:
+    file = TrajectoryFile(path)
+    frames, cameras = [7, 3, 3], file.read([7, 3, 3]).observations.cameras
+    assert torch.equal(file.cameras(frames).world_from_camera, cameras.world_from_camera)
+    assert torch.equal(file.cameras(frames).intrinsics, cameras.intrinsics)
+
+
+@pytest.mark.parametrize("frames", [slice(0, 21), [20], [-1], [], slice(4, 4)])
+def test_frames_outside_a_trajectory_are_named(path: Path, frames: slice | list[int]) -> None:
+    with pytest.raises(DataError, match=r"one\.parquet: (has 20 frames|no frames asked for)"):
+        TrajectoryFile(path).read(frames)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"rgb": np.zeros((8, 24, 3), np.uint8)}, r"frame 3: rgb is uint8 \[8, 24, 3\], not uint8 \[16, 24, 3\]"),
+        ({"rgb": np.zeros((16, 24, 3), np.float32)}, "frame 3: rgb is float32"),
+        ({"depth": np.ones((16, 25), np.float32)}, "frame 3: depth is float32"),
+        ({"depth": np.ones((16, 24), np.uint16)}, "frame 3: depth is uint16"),
+        ({"world_from_camera": np.eye(3)}, r"frame 3: the pose has shape \[3, 3\]"),
+        ({"world_from_camera": np.full((4, 4), np.nan)}, "the pose of frame 3 is not finite"),
+        ({"world_from_camera": np.diag([2.0, 2, 2, 1])}, "the pose of frame 3 is not rigid"),
+        ({"world_from_camera": np.diag([1.0, 1, -1, 1])}, "the pose of frame 3 is not rigid"),
+    ],
+)
+def test_a_wrong_frame_is_named_and_leaves_nothing(tmp_path: Path, change: dict[str, np.ndarray], cause: str) -> None:
+    frames = make_frames(5)
+    frames[3] = replace(frames[3], **change)
+    with pytest.raises(DataError, match=cause):
+        write_trajectory(tmp_path / "one.parquet", INFO, frames)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"intrinsics": np.zeros((3, 3))}, "singular"),
+        ({"intrinsics": np.full((3, 3), np.nan)}, "singular"),
+        ({"intrinsics": np.eye(4)}, "shape"),
+        ({"world_up": (0.0, 0.0, 0.0)}, "unit vector"),
+        ({"height": 0}, "image size"),
+    ],
+)
+def test_a_wrong_camera_is_refused(tmp_path: Path, change: dict[str, object], cause: str) -> None:
+    with pytest.raises(DataError, match=cause):
+        write_trajectory(tmp_path / "one.parquet", replace(INFO, **change), make_frames(2))
+
+
+def test_a_trajectory_without_frames_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="without frames"):
+        write_trajectory(tmp_path / "one.parquet", INFO, [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_truncated_file_is_told_from_a_whole_one(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DataError, match=r"one\.parquet: not a whole Parquet file"):
+        TrajectoryFile(path).read()
+
+
+def test_damage_inside_a_file_is_noticed(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"one\.parquet: "):
+        TrajectoryFile(path).read()
+
+
+def test_a_foreign_parquet_file_is_no_trajectory(tmp_path: Path) -> None:
+    pq.write_table(pa.table({"x": [1, 2]}), tmp_path / "foreign.parquet")
+    with pytest.raises(DataError, match=r"foreign\.parquet: a Parquet file, but no trajectory of persist"):
+        Store(tmp_path)["foreign"].read()
+    with pytest.raises(DataError, match="no trajectory of persist"):
+        Store(tmp_path)["foreign"].poses()
+
+
+def test_a_newer_version_is_refused(path: Path) -> None:
+    table = pq.read_table(path)
+    header = table.schema.metadata[b"persist"].replace(b'"version": 1', b'"version": 2')
+    pq.write_table(table.replace_schema_metadata({b"persist": header}), path)
+    with pytest.raises(DataError, match="version 2; this persist reads"):
+        TrajectoryFile(path).read()
+
+
+def test_a_vanished_file_is_named(path: Path) -> None:
+    file = TrajectoryFile(path)
+    path.unlink()
+    with pytest.raises(DataError, match=r"one\.parquet: no such file"):
+        file.read()
+
+
+def test_a_missing_or_empty_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="nowhere: no such data set folder"):
+        Store(tmp_path / "nowhere")
+    (tmp_path / f"{ASIDE}abc-one.parquet").touch()
+    with pytest.raises(DataError, match="no trajectory in it"):
+        Store(tmp_path)
+
+
+def test_an_unknown_trajectory_gets_a_hint(path: Path) -> None:
+    with pytest.raises(DataError, match="no trajectory 'on'; did you mean 'one'"):
+        Store(path.parent)["on"]
+    with pytest.raises(DataError, match="there is no number 1"):
+        Store(path.parent)[1]
+
+
+WRITER = """
+import sys, pathlib
+sys.path.insert(0, {here!r})
+from persist_cli.data.store import write_trajectory
+from tests.support.noise import INFO, make_frames
+def forever():
+    while True:
+        yield from make_frames(50)
+write_trajectory(pathlib.Path({path!r}), INFO, forever())
+"""
+
+
+def test_a_killed_writer_leaves_no_half_trajectory(path: Path) -> None:
+    script = WRITER.format(here=str(Path(__file__).parents[2]), path=str(path.parent / "two.parquet"))
+    writer = subprocess.Popen([sys.executable, "-c", script])
+    deadline = time.monotonic() + 60
+    while not _has_bytes_aside(path.parent) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    writer.send_signal(signal.SIGKILL)
+    writer.wait()
+    assert _has_bytes_aside(path.parent)
+    assert Store(path.parent).names == ["one"]
+
+
+def _has_bytes_aside(folder: Path) -> bool:
+    return any(leftover.stat().st_size > 1000 for leftover in folder.glob(f"{ASIDE}*"))

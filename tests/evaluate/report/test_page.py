@@ -1,0 +1,73 @@
+"""The report in a real browser."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+
+import pytest
+
+from persist_cli.evaluate.report.page import write_report
+from tests.support.browser import CHROMIUM, LOOK, POLICY, open_page
+from tests.support.example_results import ROWS, example_pictures, example_results
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium or Chrome on this machine")
+
+HOSTILE = "</style><script>alert(1)</script><img src=x onerror=alert(1)>"
+
+
+def look(folder, tmp_path, width=1280):
+    """What the browser makes of the report, told by a script in a copy of the page."""
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    copy = tmp_path / "copy.html"
+    copy.write_text(POLICY.sub("", text, count=1).replace("</body>", f"{LOOK}</body>"), encoding="utf-8")
+    dom, said = open_page(copy, tmp_path / "profile", width)
+    truths = re.search(r'<pre id="truths">(.*?)</pre>', dom, re.DOTALL)
+    assert truths, said
+    return json.loads(html.unescape(truths.group(1)))
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    results = example_results()
+    write_report(results, example_pictures(results), folder)
+    return folder
+
+
+def test_a_browser_shows_every_row_plot_picture_and_video(report, tmp_path):
+    seen = look(report, tmp_path)
+    assert seen["rows"] == list(ROWS)
+    assert (seen["images"], seen["broken"]) == (3 * len(ROWS) + 1, 0)
+    assert seen["videos"] == seen["playable"] == 3 * len(ROWS)
+    assert seen["drawn"] == 8  # four metrics, against frames and against what was seen before
+
+
+@pytest.mark.parametrize("width", [500, 1280])
+def test_the_page_is_never_wider_than_the_window(report, tmp_path, width):
+    assert look(report, tmp_path, width)["across"] <= 0
+
+
+def test_the_page_asks_for_nothing_and_its_console_is_silent(report, tmp_path):
+    dom, said = open_page(report / "report.html", tmp_path / "profile")
+    assert said == []
+    assert "codec reconstruction" in dom
+    assert look(report, tmp_path)["fetched"] == []
+
+
+def test_a_page_with_fifty_rows_keeps_its_layout(tmp_path):
+    rows = {f"a rather long name of row number {number}": "model" for number in range(50)}
+    write_report(example_results(rows=rows), example_pictures(example_results(rows={})), tmp_path / "report")
+    seen = look(tmp_path / "report", tmp_path)
+    assert (len(seen["rows"]), seen["across"] <= 0) == (50, True)
+
+
+def test_a_hostile_name_is_text_and_nothing_else(tmp_path):
+    results = example_results(rows={"none": "model", HOSTILE: "control"})
+    results["measured"]["protocol"]["title"] = HOSTILE
+    results["tables"][0]["rows"][HOSTILE]["columns"]["psnr"] = {"na": HOSTILE}
+    write_report(results, example_pictures(results), tmp_path / "report")
+    seen = look(tmp_path / "report", tmp_path)
+    assert seen["rows"] == ["none", HOSTILE]
+    assert (seen["scripts"], seen["broken"]) == (1, 0)  # the one script is the test's own

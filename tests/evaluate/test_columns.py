@@ -1,0 +1,40 @@
+"""Columns: over which frames a figure is the mean."""
+
+from __future__ import annotations
+
+import pytest
+
+from persist_cli.evaluate.cases import Case
+from persist_cli.evaluate.columns import chosen_frames, make_columns
+from persist_cli.evaluate.measure import choose_metrics
+from persist_cli.evaluate.protocols import PROTOCOLS
+from persist_cli.metrics import METRICS
+
+
+def case(seen_before, first_visits=(-1, -1, -1, -1)):
+    return Case("data", "walk", "room", 0, 4, 0, seen_before, first_visits)
+
+
+@pytest.mark.parametrize(("frames", "chosen"), [("all", [1, 2, 3]), ("last", [3]), ("return", [2]), ("new", [1, 2])])
+def test_a_column_is_over_its_frames_and_never_over_the_given_one(frames, chosen):
+    cases = [case((0.0, 0.1, 0.89, 0.9), (-1, -1, 0, -1))]
+    assert chosen_frames(cases, frames)[0].nonzero()[:, 0].tolist() == chosen
+
+
+def test_views_of_which_nothing_is_known_are_not_new():
+    assert not chosen_frames([case((None, None, None, None))], "new").any()
+
+
+def test_psnr_is_shown_where_the_view_is_new_too_and_only_where_the_protocol_tells():
+    chosen = choose_metrics(("psnr", "ssim"), METRICS)
+    names = [column.name for column in make_columns(chosen, PROTOCOLS["revisit"])]
+    assert names == ["psnr", "psnr-last", "psnr-new", "ssim", "ssim-last"]
+    new = make_columns(chosen, PROTOCOLS["revisit"])[2]
+    assert (new.title, new.definition) == (
+        "PSNR where new", "as PSNR, at frames of whose view less than 90% was seen before only",
+    )  # fmt: skip
+    assert "psnr-new" not in [column.name for column in make_columns(chosen, PROTOCOLS["return"])]
+
+
+def test_scene_consistency_is_never_shown_without_its_guard():
+    assert list(choose_metrics(("src",), METRICS)) == ["src", "src-away"]

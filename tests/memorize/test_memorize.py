@@ -1,0 +1,146 @@
+"""tests.memorize.test_memorize."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+from PIL import Image
+
+from persist_cli.cli.app import main
+from persist_cli.data.store import Store, write_trajectory
+from persist_cli.errors import RecipeError
+from persist_cli.memorize.memory_config import plugin_settings
+from persist_cli.memorize.memory_file import load_memory
+from tests.support.room_views import MEMORIES, same_bits
+from tests.support.rooms import Room, walk
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Two walks through the room, and one through another scene."""
+    folder = tmp_path_factory.mktemp("rooms")
+    room = Room(32, 32)
+    room.write(folder / "a.parquet", walk(12))
+    room.write(folder / "b.parquet", walk(5))
+    write_trajectory(folder / "c.parquet", replace(room.info, scene="cellar"), room.frames(walk(2)))
+    return folder
+
+
+def memorize(capsys, *arguments) -> dict:
+    """What ``persist memorize --json`` prints."""
+    capsys.readouterr()
+    succeed("--json", *arguments)
+    return json.loads(capsys.readouterr().out)
+
+
+def succeed(*arguments) -> None:
+    """Run ``persist memorize`` in this process."""
+    with pytest.raises(SystemExit) as end:
+        main(["memorize", *map(str, arguments)])
+    assert end.value.code == 0
+
+
+def failure(capsys, *arguments) -> str:
+    """The one line that ``persist memorize`` ends with."""
+    with pytest.raises(SystemExit) as end:
+        main(["memorize", *map(str, arguments)])
+    assert end.value.code == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_memorize_writes_the_memory_of_the_frames_and_its_map(data, tmp_path, capsys, name):
+    out = tmp_path / "room.safetensors"
+    result = memorize(capsys, f"{data}#a:2-9", "--memory", name, "--out", out)
+    memory = load_memory(out)
+    assert (result["cells"], result["frames"]) == (memory.figures().cells, 7)
+    again = type(memory)(memory.settings, memory.encoder, memory.reference)
+    again.write(Store(data)["a"].read(slice(2, 9)).observations)
+    assert same_bits(memory, again)
+    assert Image.open(tmp_path / "room.png").width > 300
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["room.png", "room.safetensors"]
+
+
+def test_settings_reach_memory_and_encoder(data, tmp_path, capsys):
+    out = tmp_path / "room.safetensors"
+    settings = ["--set", "memory.cell=[0.5, 2, 0.5]", "--set", "encoder.channels=12"]
+    result = memorize(capsys, f"{data}#a", *settings, "--out", out)
+    assert result["channels"] == 12
+    assert load_memory(out).settings.cell == (0.5, 2.0, 0.5)
+
+
+def test_several_trajectories_of_one_scene_make_one_memory(data, tmp_path, capsys):
+    both = memorize(capsys, f"{data}#a", f"{data}#b", "--out", tmp_path / "both.safetensors")
+    for name in "ab":
+        memorize(capsys, f"{data}#{name}", "--out", tmp_path / f"{name}.safetensors")
+    merged = memorize(
+        capsys, "--merge", tmp_path / "a.safetensors", tmp_path / "b.safetensors", "--out", tmp_path / "m.safetensors"
+    )
+    assert merged["cells"] == both["cells"]
+    assert (tmp_path / "m.safetensors").read_bytes() == (tmp_path / "both.safetensors").read_bytes()
+
+
+def test_the_table_for_people_says_cells_bytes_bounds_and_rate(data, tmp_path, capsys):
+    succeed(f"{data}#b", "--out", tmp_path / "room.safetensors")
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("cells", "bytes", "bounds", "frames/s", "room.png"))
+
+
+def test_what_cannot_be_memorized_ends_in_one_line(data, tmp_path, capsys):
+    out = ["--out", tmp_path / "room.safetensors"]
+    assert "a memory holds one scene" in failure(capsys, data, *out)
+    assert "has 12 frames (0-11)" in failure(capsys, f"{data}#a:0-13", *out)
+    assert "no trajectory 'd'" in failure(capsys, f"{data}#d", *out)
+    assert "nothing to memorize" in failure(capsys, *out)
+    assert "did you mean 'cell'" in failure(capsys, f"{data}#a", "--set", "memory.cells=1", *out)
+    assert "greater than 0" in failure(capsys, f"{data}#a", "--set", "memory.cell=[0, 1, 1]", *out)
+    assert "did you mean 'voxel'" in failure(capsys, f"{data}#a", "--memory", "voxels", *out)
+    assert "name a file" in failure(capsys, f"{data}#a", "--out", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_merged_ends_in_one_line(data, tmp_path, capsys):
+    for name in "ac":
+        memorize(capsys, f"{data}#{name}", "--out", tmp_path / name)
+    (tmp_path / "broken").write_bytes((tmp_path / "a").read_bytes()[:99])
+    out = ["--out", tmp_path / "merged"]
+    assert "room and cellar" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "c", *out)
+    assert "not a whole memory file" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "broken", *out)
+    assert "two memory files" in failure(capsys, "--merge", tmp_path / "a", *out)
+    for option in (("--checkpoint", tmp_path), ("--memory", "voxel"), ("--set", "memory.cell=1")):
+        assert "leave out" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "a", *option, *out)
+    assert not (tmp_path / "merged").exists()
+
+
+def test_settings_are_told_apart_by_their_first_word():
+    parsed = plugin_settings(["memory.cell=[1, 2, 3]", "encoder.seed=4", "memory.max_depth=null"])
+    assert parsed == {"memory": {"cell": [1, 2, 3], "max_depth": None}, "encoder": {"seed": 4}}
+    for wrong in ("cell=1", "memory.cell", "memory.=1", "camera.cell=1", "memory.cell=[1,"):
+        with pytest.raises(RecipeError):
+            plugin_settings([wrong])
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.01, 0.2])
+def test_killing_memorize_while_it_writes_leaves_no_half_file_and_a_state_that_goes_on(data, tmp_path, capsys, delay):
+    memorize(capsys, f"{data}#a", "--out", tmp_path / "expected" / "room.safetensors")
+    expected = (tmp_path / "expected" / "room.safetensors").read_bytes()
+    out = tmp_path / "killed" / "room.safetensors"
+    out.parent.mkdir()
+    command = [sys.executable, "-c", "from persist_cli.cli.app import main; main()", "memorize", f"{data}#a"]
+    process = subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while process.poll() is None and not any(out.parent.iterdir()):
+        time.sleep(0.0005)
+    time.sleep(delay)
+    process.kill()
+    process.wait()
+    assert not out.exists() or out.read_bytes() == expected
+    memorize(capsys, f"{data}#a", "--out", out)
+    assert out.read_bytes() == expected
+    assert sorted(path.name for path in out.parent.iterdir()) == ["room.png", "room.safetensors"]

@@ -1,0 +1,112 @@
+"""tests.memorize.test_memory_file."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.io.files import read_tensors
+from persist_cli.memorize.memory_file import load_memory, read_header
+from tests.support.room_views import MEMORIES, same_bits, walked, written
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "room.safetensors"
+    written("voxel", walked(3), cell=(0.5, 1.0, 0.5), encoder={"channels": 8}).save(path)
+    return path
+
+
+def with_header(path, **changes):
+    """The same file with another header."""
+    tensors, metadata = read_tensors(path)
+    header = json.loads(metadata["persist"]) | changes
+    save_file(tensors, path, {"persist": json.dumps(header)})
+    return path
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_a_memory_survives_save_and_load_bit_for_bit(tmp_path, name):
+    memory = written(name, walked())
+    memory.save(tmp_path / "memory.safetensors")
+    loaded = load_memory(tmp_path / "memory.safetensors")
+    assert same_bits(memory, loaded)
+    assert (type(loaded), loaded.settings, loaded.reference) == (type(memory), memory.settings, memory.reference)
+    cameras = walked().cameras
+    assert torch.equal(memory.read(cameras, 99).features, loaded.read(cameras, 99).features)
+
+
+def test_the_file_does_not_depend_on_the_order_of_writing(tmp_path):
+    forward, backward = walked(4), walked(4)[[3, 2, 1, 0]]
+    for name, observations in (("a", forward), ("b", backward)):
+        written("voxel", observations).save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_the_header_is_read_without_the_tensors(saved):
+    header = read_header(saved)
+    assert (header["memory"], header["encoder"], header["channels"], header["reference"]) == (
+        "voxel", "patches", 8, "room",
+    )  # fmt: skip
+    assert header["settings"]["cell"] == [0.5, 1.0, 0.5]
+
+
+def test_settings_come_back_from_the_file(saved):
+    assert load_memory(saved).settings.cell == (0.5, 1.0, 0.5)
+
+
+@pytest.mark.parametrize("keep", [0, 4, 60, -1])
+def test_a_truncated_file_is_refused_in_one_line(saved, keep):
+    saved.write_bytes(saved.read_bytes()[:keep])
+    with pytest.raises(CheckpointError, match="not a whole") as caught:
+        load_memory(saved)
+    assert str(saved) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_a_foreign_one_are_told_apart(tmp_path):
+    with pytest.raises(CheckpointError, match="no such memory file"):
+        load_memory(tmp_path / "none.safetensors")
+    save_file({"weight": torch.zeros(3)}, tmp_path / "model.safetensors")
+    with pytest.raises(CheckpointError, match="no memory of persist"):
+        load_memory(tmp_path / "model.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"format": "persist-checkpoint"}, "not as a memory file"),
+        ({"version": 99}, "of version 99"),
+        ({"world_up": [0, 0, 0]}, "header is damaged .see world_up"),
+        ({"channels": None}, "header is damaged .see channels"),
+        ({"channels": 16}, "written with 16 channels"),
+        ({"cells": 3}, "its header says 3"),
+        ({"encoder": "gone"}, "unknown encoder 'gone'"),
+        ({"memory": "map2d"}, "cell"),
+        ({"settings": {"cells": 1}}, "did you mean 'cell'"),
+        ({"encoder_settings": {"channels": 9}}, "written with 8 channels"),
+    ],
+)
+def test_a_header_that_does_not_fit_is_refused_in_one_line_naming_the_file(saved, changes, cause):
+    with pytest.raises(PersistError, match=cause) as caught:
+        load_memory(with_header(saved, **changes))
+    assert str(caught.value).startswith(str(saved))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("damage", ["unsorted", "twice", "beyond"])
+def test_cells_that_no_map_writes_are_refused(saved, damage):
+    tensors, metadata = read_tensors(saved)
+    if damage == "beyond":
+        tensors["cells"][0, 0] = 1 << 22
+    else:
+        tensors["cells"] = tensors["cells"].flip(0) if damage == "unsorted" else tensors["cells"].roll(1, 0)
+    if damage == "twice":
+        tensors["cells"][0] = tensors["cells"][1]
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, saved, metadata)
+    with pytest.raises(CheckpointError, match=r"not in order|beyond"):
+        load_memory(saved)

@@ -1,0 +1,52 @@
+"""A real browser, headless and offline, to look at pages."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+QUIET = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--virtual-time-budget=10000", "--enable-logging=stderr",
+)  # fmt: skip
+
+# Run inside a copy of the page, which its own rules would forbid: what a reader's browser makes of it.
+LOOK = """<script>
+addEventListener("load", () => {
+  const whole = image => image.complete && image.naturalWidth > 0;
+  const truths = {
+    rows: [...document.querySelectorAll(".scores th[scope=row]")].map(cell => cell.firstChild.textContent),
+    images: document.images.length, broken: [...document.images].filter(image => !whole(image)).length,
+    videos: document.querySelectorAll("video").length,
+    drawn: [...document.querySelectorAll(".plot")].filter(plot => plot.getBBox().width > 300).length,
+    across: document.documentElement.scrollWidth - innerWidth,
+    scripts: document.scripts.length,
+    fetched: performance.getEntriesByType("resource").map(each => each.name).filter(name => !name.startsWith("data:")),
+  };
+  const videos = [...document.querySelectorAll("video")];
+  const ready = videos.map(video => video.readyState ? 1 : new Promise(done => {
+    video.onloadedmetadata = () => done(1); video.onerror = () => done(0);
+  }));
+  Promise.all(ready).then(playable => {
+    truths.playable = playable.reduce((sum, each) => sum + each, 0);
+    const said = document.createElement("pre");
+    said.id = "truths"; said.textContent = JSON.stringify(truths); document.body.append(said);
+  });
+});
+</script>"""
+
+POLICY = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
+
+
+def open_page(page: Path, profile: Path, width: int = 1280) -> tuple[str, list[str]]:
+    """The page's DOM after loading, and what the browser complained about in its console."""
+    ended = subprocess.run(
+        [str(CHROMIUM), *QUIET, f"--window-size={width},900", f"--user-data-dir={profile}", "--dump-dom",
+         page.as_uri()],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    return ended.stdout, [line for line in ended.stderr.splitlines() if "CONSOLE" in line]

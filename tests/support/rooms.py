@@ -1,0 +1,114 @@
+"""A furnished room in closed form: textured boxes seen by rays, so that depth and colour are exact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from persist_cli.api.actions import FREE, free_motion
+from persist_cli.api.observations import Frame, TrajectoryInfo
+
+UP = (0.0, 1.0, 0.0)
+
+ROOM = (np.array([-2.5, 0.0, -2.0]), np.array([2.5, 2.6, 2.0]))  # lowest and highest corner, metres
+
+FURNITURE = (
+    (np.array([0.6, 0.0, 0.4]), np.array([1.4, 0.8, 1.1])),
+    (np.array([-1.7, 0.0, 0.9]), np.array([-1.1, 1.6, 1.5])),
+    (np.array([-0.4, 0.0, -1.6]), np.array([0.3, 0.5, -1.0])),
+)
+
+
+@dataclass(frozen=True)
+class Room:
+    """Images of the room.
+
+    Args:
+        height: pixels.
+        width: pixels.
+        field_of_view: degrees across.
+    """
+
+    height: int = 48
+    width: int = 64
+    field_of_view: float = 70.0
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """Square pixels, principal point in the middle."""
+        focal = self.width / 2 / math.tan(math.radians(self.field_of_view) / 2)
+        return np.array([[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1]])
+
+    @property
+    def info(self) -> TrajectoryInfo:
+        return TrajectoryInfo("room", self.intrinsics, self.height, self.width, UP, free_motion(), {"format": "room"})
+
+    def see(self, pose: np.ndarray, action: str | None = None, timestamp: float = 0.0) -> Frame:
+        """What a camera at this world_from_camera sees."""
+        v, u = np.mgrid[: self.height, : self.width] + 0.5
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(self.intrinsics).T @ pose[:3, :3].T
+        depth = _hit(rays, pose[:3, 3])
+        points = pose[:3, 3] + rays * depth[..., None]
+        return Frame(_texture(points), depth.astype(np.float32), pose, action, timestamp)
+
+    def frames(self, poses: np.ndarray) -> Iterator[Frame]:
+        """What a camera on this path sees."""
+        for number, pose in enumerate(poses):
+            yield self.see(pose, FREE if number + 1 < len(poses) else None, number / 10)
+
+    def write(self, path: Path, poses: np.ndarray | None = None) -> Path:
+        """A trajectory file; by default of a walk through the room."""
+        from persist_cli.data.store import write_trajectory
+
+        write_trajectory(path, self.info, self.frames(walk() if poses is None else poses))
+        return path
+
+
+def look(position: tuple[float, float, float], yaw: float, pitch: float = -10.0) -> np.ndarray:
+    """World_from_camera at a position; yaw in degrees to the left of -z, negative pitch looks down."""
+    yaw, pitch = math.radians(yaw), math.radians(pitch)
+    forward = np.array([-math.sin(yaw) * math.cos(pitch), math.sin(pitch), -math.cos(yaw) * math.cos(pitch)])
+    right = np.cross(forward, UP)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = position
+    return pose
+
+
+def walk(frames: int = 24) -> np.ndarray:
+    """A path once around the middle of the room that looks about: every axis moves and turns."""
+    angles = np.linspace(0, 2 * math.pi, frames, endpoint=False)
+    return np.stack(
+        [
+            look(
+                (0.8 * math.sin(angle), 1.4 + 0.1 * math.sin(3 * angle), 0.6 * math.cos(angle)),
+                math.degrees(angle) + 20 * math.sin(2 * angle),
+                -12 + 8 * math.cos(2 * angle),
+            )
+            for angle in angles
+        ]
+    )
+
+
+def _hit(rays: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Multiples of the rays at which they meet the nearest surface."""
+    rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+    ends = np.maximum((ROOM[0] - origin) / rays, (ROOM[1] - origin) / rays)
+    nearest = ends.min(-1)
+    for low, high in FURNITURE:
+        one, other = (low - origin) / rays, (high - origin) / rays
+        enter, leave = np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
+        nearest = np.where((enter > 0) & (enter < leave) & (enter < nearest), enter, nearest)
+    return nearest
+
+
+def _texture(points: np.ndarray) -> np.ndarray:
+    """Colours that change smoothly with the place, differently along each axis."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    waves = [np.sin(5 * x + 2 * z), np.sin(4 * y + 3 * x + 1), np.sin(6 * z - 3 * y + 2)]
+    return np.round(127.5 + 110 * np.stack(waves, -1)).astype(np.uint8)

@@ -1,0 +1,152 @@
+"""tests.test_recipe."""
+
+from __future__ import annotations
+
+import pytest
+
+from persist_cli.errors import RecipeError
+from persist_cli.recipe import TrainingSettings, apply_overrides, make_recipe, read_recipe, recipe_names, to_yaml
+from persist_cli.train.trainer import learning_rate
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_recipe_reads_and_says_how_to_run_it(name):
+    from importlib import resources
+
+    assert make_recipe(read_recipe(name), name).description
+    text = (resources.files("persist_recipes") / f"{name}.yaml").read_text()
+    assert text.startswith(f"# persist finetune {name} ")
+
+
+def test_a_resolved_recipe_reads_back_as_itself(tmp_path):
+    recipe = make_recipe(read_recipe("tiny-stage2-voxel"), "x")
+    (tmp_path / "a.yaml").write_text(to_yaml(recipe))
+    assert make_recipe(read_recipe(str(tmp_path / "a.yaml")), "x") == recipe
+
+
+def test_overrides_reach_nested_settings():
+    values = apply_overrides(
+        read_recipe("tiny-stage1"), ["training.steps=7", "data.strides=[1, 2]", "backbone.settings.rays=printed"]
+    )
+    recipe = make_recipe(values, "x")
+    assert (recipe.training.steps, recipe.data.strides) == (7, (1, 2))
+    assert recipe.backbone.settings["rays"] == "printed"
+
+
+def test_the_word_no_is_a_precision_though_yaml_reads_it_as_false():
+    values = apply_overrides(read_recipe("tiny-codec"), ["training.precision=no"])
+    assert make_recipe(values, "recipe").training.precision == "no"
+
+
+def test_one_data_folder_may_stand_alone():
+    for text, folders in (("a", ("a",)), ("[a, b/c]", ("a", "b/c")), ("''", ()), ("[]", ())):
+        values = apply_overrides(read_recipe("tiny-stage1"), [f"data.path={text}"])
+        assert make_recipe(values, "x").data.path == folders
+
+
+@pytest.mark.parametrize(
+    ("overrides", "cause"),
+    [(["training.stpes=3"], "did you mean 'training.steps'"), (["training.steps=soon"], "training.steps"),
+     (["steps"], "KEY=VALUE"), (["stage=2"], "stage 2 needs a memory"), (["data.strides=[0]"], "data.strides"),
+     (["training.precision=fp8"], "training.precision"), (["data.path=3"], "data.path"),
+     (["training.batch=5", "training.accumulation=2"], "multiple of accumulation"),
+     (["training.steps=200", "training.cooldown=201"], "set both, as in training.steps=200 training.cooldown=66"),
+     (["a=[1"], "cannot read the value")],
+)  # fmt: skip
+def test_what_is_wrong_with_a_recipe_is_one_line(overrides, cause):
+    with pytest.raises(RecipeError, match=cause) as error:
+        make_recipe(apply_overrides(read_recipe("tiny-stage1"), overrides), "tiny-stage1")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["steps=0", "batch=0", "accumulation=0", "learning_rate=0", "learning_rate=.inf", "learning_rate=.nan",
+     "warmup=-1", "cooldown=-1", "weight_decay=-1", "clip=0", "ema=1", "ema=.nan", "seed=-1", "seed=4294967296",
+     "checkpoint_every=0", "checkpoint_minutes=-1", "checkpoint_minutes=.nan", "workers=-1", "threads=-1"],
+)  # fmt: skip
+def test_a_setting_out_of_its_bounds_is_named(override):
+    with pytest.raises(RecipeError, match=f"training.{override.split('=')[0]}: Input should be"):
+        make_recipe(apply_overrides(read_recipe("tiny-stage1"), [f"training.{override}"]), "x")
+    for override in ("data.context_frames=-1", "data.clips_per_trajectory=-1"):
+        with pytest.raises(RecipeError, match=f"{override.split('=')[0]}: Input should be"):
+            make_recipe(apply_overrides(read_recipe("tiny-stage1"), [override]), "x")
+
+
+def test_a_recipe_says_only_what_differs_from_the_one_it_extends(tmp_path):
+    (tmp_path / "a.yaml").write_text("extends: b.yaml\ntraining: {steps: 7}\nadapter: {form: cross}\n")
+    (tmp_path / "b.yaml").write_text("extends: tiny-stage2-voxel\nmemory: {name: none}\n")
+    found, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
+    assert found["training"] == extended["training"] | {"steps": 7}
+    assert found["memory"] == {"name": "none"}
+    assert found["adapter"] == {"form": "cross"}
+    assert {key: found[key] for key in ("stage", "base", "data")} == {
+        key: extended[key] for key in ("stage", "base", "data")
+    }
+    assert "extends" not in to_yaml(make_recipe(found, "a.yaml"))
+
+
+def test_a_recipe_changes_the_memory_and_adapter_it_extends_unless_it_names_another(tmp_path):
+    (tmp_path / "a.yaml").write_text("extends: tiny-stage2-voxel\nadapter: {every: 2}\nmemory: {encoder: dinov2}\n")
+    found, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
+    assert found["adapter"] == extended["adapter"] | {"every": 2}
+    assert found["memory"] == extended["memory"] | {"encoder": "dinov2"}
+
+
+def test_a_recipe_changes_one_setting_of_the_backbone_and_keeps_the_others(tmp_path):
+    (tmp_path / "a.yaml").write_text(
+        "extends: cogvideox-5b-i2v-stage1\nbackbone: {settings: {pretrained: DIR, transformer: {num_layers: 2}}}\n"
+    )
+    (tmp_path / "b.yaml").write_text("extends: a.yaml\nbackbone: {settings: {transformer: {dropout: 0.1}}}\n")
+    names = (str(tmp_path / "b.yaml"), "cogvideox-5b-i2v-stage1")
+    found, extended = (make_recipe(read_recipe(name), name) for name in names)
+    changed = {"pretrained": "DIR", "transformer": {"num_layers": 2, "dropout": 0.1}}
+    assert found.backbone.settings == extended.backbone.settings | changed
+
+
+def test_an_encoder_that_is_named_begins_without_the_settings_of_the_one_before(tmp_path):
+    (tmp_path / "a.yaml").write_text("extends: cogvideox-5b-i2v-stage2-voxel\nmemory: {encoder: patches}\n")
+    found, extended = read_recipe(str(tmp_path / "a.yaml"))["memory"], read_recipe("cogvideox-5b-i2v-stage2-voxel")
+    assert "encoder_settings" in extended["memory"]
+    assert found == {"name": "voxel", "encoder": "patches"}
+
+
+@pytest.mark.parametrize("change", ["memory.encoder=patches", "memory={encoder: patches}"])
+def test_another_encoder_on_the_command_line_begins_without_settings_too(change):
+    recipe = read_recipe("cogvideox-5b-i2v-stage2-voxel")
+    found = make_recipe(apply_overrides(recipe, ["memory.encoder_settings.patch=2", change]), "x").memory
+    same = make_recipe(apply_overrides(recipe, ["memory.encoder=dinov2", "memory.settings.cell=[1, 1, 1]"]), "x").memory
+    assert found.encoder_settings == ({"patch": 2} if "." in change else {})
+    assert same.encoder_settings == recipe["memory"]["encoder_settings"]
+
+
+def test_a_recipe_cannot_extend_itself_nor_what_there_is_not(tmp_path):
+    (tmp_path / "a.yaml").write_text("extends: b.yaml")
+    (tmp_path / "b.yaml").write_text("extends: a.yaml")
+    (tmp_path / "c.yaml").write_text("extends: tiny-stage3")
+    (tmp_path / "d.yaml").write_text("extends: [a.yaml]")
+    for name, cause in (("a", "a.yaml: extends itself"), ("c", "did you mean 'tiny-stage"), ("d", "is the name of")):
+        with pytest.raises(RecipeError, match=cause):
+            read_recipe(str(tmp_path / f"{name}.yaml"))
+
+
+def test_the_learning_rate_falls_to_zero_over_the_cooldown():
+    settings = TrainingSettings(steps=100, warmup=10, cooldown=20, learning_rate=2.0)
+    rates = [learning_rate(settings, step) for step in range(100)]
+    assert rates[0] == pytest.approx(0.2)
+    assert set(rates[9:80]) == {2.0}
+    assert rates[80:] == pytest.approx([2 * left / 21 for left in range(20, 0, -1)])
+
+
+def test_unknown_missing_and_broken_recipes_are_one_line(tmp_path):
+    (tmp_path / "a.yaml").write_text("stage: [")
+    (tmp_path / "b.yaml").write_text("- 1")
+    for name, cause in (
+        ("tiny-stage3", "did you mean"),
+        ("c.yaml", "no such recipe file"),
+        (str(tmp_path / "a.yaml"), "not YAML"),
+        (str(tmp_path / "b.yaml"), "a recipe is a mapping"),
+    ):
+        with pytest.raises(RecipeError, match=cause) as error:
+            read_recipe(name)
+        assert "\n" not in str(error.value)

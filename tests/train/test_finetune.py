@@ -1,0 +1,242 @@
+"""tests.train.test_finetune."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import signal
+import subprocess
+import time
+
+import pytest
+import torch
+
+from persist_cli.checkpoints.checkpoint import find_checkpoint
+from persist_cli.io.files import read_tensors
+from persist_cli.train.trainer import Trainer
+from tests.support.disk import file_limit
+from tests.support.walking import (
+    MICRO_SETTINGS,
+    PERSIST,
+    end_of,
+    ended_alike,
+    first_gradients,
+    losses,
+    stage,
+    train_here,
+)
+
+
+def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
+    left = {"recipe.yaml", "log.jsonl", "loss.png", "speed.jsonl", "step-00000004"}
+    assert {path.name for path in codec.iterdir()} == left
+    assert json.loads((codec / "speed.jsonl").read_text())["samples_per_second"] > 0
+    rows = [json.loads(line) for line in (codec / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    assert rows[0]["learning_rate"] < rows[-1]["learning_rate"]
+
+
+@pytest.mark.parametrize("number", ["codec", "stage1", "stage2-voxel"])
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, codec, stage1, tmp_path, number):
+    base = {"codec": MICRO_SETTINGS, "stage1": [f"base={codec}"], "stage2-voxel": [f"base={stage1}"]}[number]
+    assert persist(*stage(number, walks, tmp_path / "whole", *base)).code == 0
+    assert persist(*stage(number, walks, tmp_path / "halves", *base, "training.steps=1")).code == 0
+    assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base, "training.steps=2")).code == 0
+    assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base)).code == 0
+    assert ended_alike(tmp_path / "whole", tmp_path / "halves")
+
+
+def test_a_run_of_a_version_without_a_setting_resumes(persist, walks, codec, tmp_path):
+    assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=1")).code == 0
+    recipe = tmp_path / "run/recipe.yaml"
+    recipe.write_text(recipe.read_text().replace("  clips_per_trajectory: 0\n", ""))
+    assert persist(*stage("stage1", walks, tmp_path / "run", "--resume", f"base={codec}")).code == 0
+
+
+def test_stage_two_leaves_every_stage_one_weight_untouched_to_the_bit(persist, walks, stage1, tmp_path):
+    before = find_checkpoint(stage1).fingerprint
+    assert persist(*stage("stage2-voxel", walks, tmp_path / "voxel", f"base={stage1}")).code == 0
+    assert all(name.split("/")[-1].startswith(("adapters.", "torch")) for name in end_of(tmp_path / "voxel")[0])
+    assert find_checkpoint(tmp_path / "voxel").fingerprint == before
+    assert find_checkpoint(stage1).fingerprint == before
+
+
+@pytest.mark.parametrize("weighting", ["uniform", "min-snr"])
+@pytest.mark.parametrize("parts", [2, 4])
+def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_path, weighting, parts):
+    base = [f"base={codec}", "training.batch=4", f"backbone.settings.weighting={weighting}", "training.steps=2"]
+    assert persist(*stage("stage1", walks, tmp_path / "one", *base)).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "two", *base, f"training.accumulation={parts}")).code == 0
+    assert losses(tmp_path / "one") == pytest.approx(losses(tmp_path / "two"), rel=1e-4)
+    whole, parted = (end_of(tmp_path / name)[0] for name in ("one", "two"))
+    moments = [name for name in whole if "exp_avg/" in name]
+    assert all(torch.allclose(whole[name], parted[name], rtol=1e-3, atol=1e-6) for name in moments)
+    differences = [(whole[name] - parted[name]).flatten() for name in whole if name.startswith("parameter/")]
+    assert torch.cat(differences).abs().mean() < 1e-2 * 4e-4  # a hundredth of a step
+
+
+def test_gradients_are_clipped_by_the_norm_of_all_of_them(persist, walks, codec, tmp_path):
+    changes = [f"base={codec}", "training.steps=1", "training.clip=0.001"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
+    assert first_gradients(end_of(tmp_path / "run")[0]).norm() == pytest.approx(0.001, rel=1e-3)
+
+
+def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
+    changes = ["training.steps=40", "training.learning_rate=3e-3", "training.batch=4", f"base={codec}"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
+    found = losses(tmp_path / "run")
+    assert sum(found[-10:]) < 0.9 * sum(found[:10])
+
+
+def test_the_saved_weights_are_the_moving_average_of_those_after_each_step(persist, walks, codec, tmp_path):
+    states = []
+    for changes in (["training.steps=1"], ["training.steps=2", "--resume"]):
+        assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)).code == 0
+        states.append(end_of(tmp_path / "run")[0])
+    model = next((tmp_path / "run").glob("step-*")) / "model/transformer/diffusion_pytorch_model.safetensors"
+    kept = 2 ** (-2 / 3)  # what is new weighs so much in the second step of diffusers' warm-up
+    for name, saved in read_tensors(model)[0].items():
+        first, second = (state[f"parameter/transformer.base.{name}"] for state in states)
+        assert torch.allclose(saved, first + kept * (second - first), atol=1e-7)
+    assert not torch.equal(first, second)
+
+
+SIX = ["training.checkpoint_every=1", "training.steps=6"]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(walks, codec, tmp_path_factory):
+    run = tmp_path_factory.mktemp("whole") / "run"
+    train_here(*stage("stage1", walks, run, f"base={codec}", *SIX))
+    return run
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_run_killed_at_a_random_moment_goes_on_and_ends_like_one_that_was_not(
+    persist, uninterrupted, walks, codec, tmp_path, seed
+):
+    run = tmp_path / "killed"
+    arguments = stage("stage1", walks, run, "--resume", f"base={codec}", *SIX)
+    child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(run.glob("step-*")) and time.monotonic() < deadline and child.poll() is None:
+        time.sleep(0.02)
+    time.sleep(random.Random(seed).random() * 0.3)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    find_checkpoint(run)
+    assert persist(*arguments).code == 0
+    assert ended_alike(run, uninterrupted)
+    assert not list(run.glob(".partial-*"))
+
+
+def test_each_step_is_saved_once_and_no_speed_is_that_of_nothing(persist, walks, codec, tmp_path):
+    changes = [f"base={codec}", "training.checkpoint_minutes=0", "training.steps=3"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
+    rows = [json.loads(line) for line in (tmp_path / "run/speed.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3]
+    assert all(row["samples_per_second"] > 0 for row in rows)
+
+
+@pytest.mark.parametrize("step", [3, 5])
+def test_a_signal_that_comes_after_the_look_at_it_loses_no_step(persist, walks, codec, tmp_path, monkeypatch, step):
+    look = Trainer.agreed
+
+    def look_too_early(trainer, *found):
+        agreed = look(trainer, *found)
+        if trainer.state.step == step:
+            signal.raise_signal(signal.SIGTERM)
+        return agreed
+
+    monkeypatch.setattr(Trainer, "agreed", look_too_early)
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=5"))
+    told = {3: "stopped at step 4 of 5", 5: "trained 5 steps"}[step]
+    assert (ended.code, told in ended.out) == (0, True)
+    assert [path.name for path in (tmp_path / "run").glob("step-*")] == [f"step-0000000{min(step + 1, 5)}"]
+
+
+def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(persist, walks, codec, tmp_path):
+    changes = ["--resume", f"base={codec}"]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes, "training.steps=1")).code == 0
+    with file_limit(20_000):
+        ended = persist(*stage("stage1", walks, tmp_path / "run", *changes))
+    assert (ended.code, "a checkpoint cannot be written there" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+    assert [path.name for path in (tmp_path / "run").glob("*step*")] == ["step-00000001"]
+
+
+def test_several_data_sets_train_like_one_of_all_their_trajectories(persist, walks, codec, tmp_path):
+    for number in (0, 1):
+        (tmp_path / str(number)).mkdir()
+        shutil.copy(walks / f"walk-{number}.parquet", tmp_path / str(number))
+    changes = [f"base={codec}", "training.steps=2"]
+    assert persist(*stage("stage1", walks, tmp_path / "one", *changes)).code == 0
+    assert persist(*stage("stage1", tmp_path / "0", tmp_path / "two", "--data", tmp_path / "1", *changes)).code == 0
+    assert ended_alike(tmp_path / "one", tmp_path / "two")
+
+
+def test_the_packaged_sample_is_data_to_train_on(persist, walks, codec, tmp_path, monkeypatch):
+    shutil.copytree(walks, tmp_path / "home/sample")
+    monkeypatch.setenv("PERSIST_REFERENCE", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    ended = persist(*stage("stage1", "sample", "run", f"base={codec}", "training.steps=1"))
+    assert ended.code == 0, ended.err
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_ctrl_c_and_preemption_save_and_say_how_to_go_on(walks, codec, tmp_path, sent, code):
+    arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=100000")
+    child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        deadline = time.monotonic() + 300
+        log = tmp_path / "run/log.jsonl"
+        while not (log.is_file() and log.stat().st_size) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        child.send_signal(sent)
+        out, _ = child.communicate(timeout=300)
+    finally:
+        child.kill()  # of a run without end nothing stays behind, whatever failed
+    assert child.returncode == code
+    assert "go on with --resume" in out
+    find_checkpoint(tmp_path / "run")
+
+
+def test_what_a_run_cannot_do_is_one_line(persist, walks, codec, stage1, tmp_path):
+    base = f"base={codec}"
+    for arguments, cause in (
+        (stage("stage1", walks, codec), "holds a run already"),
+        (
+            stage("codec", walks, codec, "--resume", *MICRO_SETTINGS, "training.learning_rate=1"),
+            "training.learning_rate changed",
+        ),
+        (stage("stage1", walks, tmp_path / "a", f"base={tmp_path}"), "no checkpoint there"),
+        (stage("stage1", tmp_path, tmp_path / "a", base), "no trajectory"),
+        (
+            stage("stage2-voxel", walks, tmp_path / "a", f"base={stage1}", "memory.encoder=patchs"),
+            "did you mean 'patches'",
+        ),
+        (stage("stage2-voxel", walks, tmp_path / "a", f"base={stage1}", "adapter.widht=3"), "did you mean 'width'"),
+        (stage("stage1", walks, tmp_path / "a", base, "backbone.name=cogvideo"), "is of backbone 'cogvideox'"),
+    ):
+        ended = persist(*arguments)
+        assert ended.code == 1
+        assert cause in ended.err
+        assert len(ended.err.strip().splitlines()) == 1
+    assert not list((tmp_path / "a").glob("step-*"))
+
+
+def test_a_damaged_checkpoint_or_another_base_is_one_line(persist, walks, codec, tmp_path):
+    run = tmp_path / "base"
+    assert persist(*stage("stage1", walks, run, f"base={codec}", "training.steps=1")).code == 0
+    assert persist(*stage("stage2-none", walks, tmp_path / "none", f"base={run}", "training.steps=1")).code == 0
+    assert persist(*stage("stage1", walks, run, "--resume", f"base={codec}", "training.steps=2")).code == 0
+    ended = persist("rollout", tmp_path / "none", "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
+    assert (ended.code, "another base" in ended.err) == (1, True)
+    model = next(run.glob("step-*")) / "model"
+    (model / "world.safetensors").write_bytes(b"0" * 20)
+    ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
+    assert (ended.code, "world.safetensors" in ended.err) == (1, True)
+    (model / "persist.json").write_text("{}")
+    ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
+    assert (ended.code, "not the card of a persist checkpoint" in ended.err) == (1, True)

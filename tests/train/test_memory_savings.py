@@ -1,0 +1,174 @@
+"""Settings that make a step cheaper: what they leave as it was, and what they cannot do."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+
+import pytest
+import torch
+from diffusers.training_utils import EMAModel
+from torch.autograd.graph import saved_tensors_hooks
+
+from persist_cli.api.stages import Economy
+from persist_cli.io.files import read_tensors, write_json
+from persist_cli.train.optimizer import update_average
+from persist_cli.train.state import TrainingState
+from tests.support.micro_model import micro, random_clips, random_tokens, with_adapter
+from tests.support.walking import end_of, ended_alike, losses, stage, train_here
+
+BASE = {"stage1": "codec", "stage2-voxel": "stage1"}
+
+
+def saved(run, part):
+    return read_tensors(next(run.glob(f"step-*/model/{part}/*.safetensors")))[0]
+
+
+@pytest.fixture
+def usual(persist, walks, codec, stage1, tmp_path, request):
+    """A run without any of these settings, and the arguments of another that differs by them."""
+    number = request.param
+    base = f"base={ {'codec': codec, 'stage1': stage1}[BASE[number]] }"
+    assert persist(*stage(number, walks, tmp_path / "usual", base)).code == 0
+    return tmp_path / "usual", lambda *changes: stage(number, walks, tmp_path / "cheap", base, *changes)
+
+
+@pytest.mark.parametrize("usual", list(BASE), indirect=True)
+def test_checkpointed_steps_and_an_average_on_the_cpu_are_the_usual_ones_to_the_bit(persist, usual, tmp_path):
+    run, cheap = usual
+    assert persist(*cheap("training.gradient_checkpointing=true", "training.ema_device=cpu")).code == 0
+    assert ended_alike(run, tmp_path / "cheap")
+
+
+@pytest.mark.parametrize("usual", ["stage1"], indirect=True)
+def test_clips_encoded_one_by_one_train_the_same(persist, usual, tmp_path):
+    run, cheap = usual
+    assert persist(*cheap("training.vae_slicing=true")).code == 0
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=1e-4)
+
+
+@pytest.mark.parametrize("stage_", ["1", "2"])
+def test_checkpointing_keeps_little_of_the_forward_pass_memory_blocks_included(stage_):
+    held = {}
+    for checkpointing in (False, True):
+        backbone = with_adapter(micro()).train()
+        backbone.use_adapter("voxel" if stage_ == "2" else None)
+        backbone.trained_parameters(stage_)
+        backbone.economize(stage_, Economy(gradient_checkpointing=checkpointing))
+        sizes = []
+        with saved_tensors_hooks(lambda tensor, sizes=sizes: sizes.append(tensor.nbytes) or tensor, lambda each: each):
+            backbone(random_clips(tokens=random_tokens(2, 5)), stage_)
+        held[checkpointing] = sum(sizes)
+    assert held[True] < held[False] / 3
+
+
+@pytest.mark.usefixtures("fresh_accelerator")
+@pytest.mark.parametrize("number", BASE)
+def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, tmp_path, number):
+    base = [f"base={codec if number == 'stage1' else codec.parent / 'stage1'}", "training.precision=bf16"]
+    train_here(*stage(number, walks, tmp_path / "usual", *base))
+    train_here(*stage(number, walks, tmp_path / "cheap", *base, "training.frozen_precision=bf16"))
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(tmp_path / "usual"), rel=0.05)
+    assert all(weight.dtype != torch.bfloat16 for weight in end_of(tmp_path / "cheap")[0].values())
+    if number == "stage1":
+        exact = saved(codec, "vae").items()
+        assert all(torch.equal(weight, saved(tmp_path / "cheap", "vae")[name]) for name, weight in exact)
+        assert all(weight.dtype == torch.float32 for weight in saved(tmp_path / "cheap", "transformer").values())
+
+
+def test_what_a_stage_does_not_train_takes_half_the_bytes():
+    backbone = with_adapter(micro())
+    trained = backbone.trained_parameters("2")
+    backbone.economize("2", Economy(frozen=torch.bfloat16))
+    assert {each.dtype for each in trained.values()} == {torch.float32}
+    assert {each.dtype for each in backbone.parameters() if not each.requires_grad} == {torch.bfloat16}
+
+
+def test_an_average_moves_towards_copies_of_the_parameters_too():
+    trained = [torch.nn.Parameter(torch.ones(3))]
+    here, there = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
+    trained[0].data += 1
+    for _ in range(3):
+        here.step(trained)
+        update_average(there, trained)
+    assert torch.equal(here.shadow_params[0], there.shadow_params[0])
+
+
+def test_the_state_of_an_8_bit_optimizer_is_kept(tmp_path):
+    weights, table = {name: torch.nn.Parameter(torch.ones(3)) for name in ("one", "two")}, torch.arange(4.0)
+    states = [TrainingState(weights, torch.optim.AdamW([*weights.values()]).state, None) for _ in range(2)]
+    for parameter in weights.values():  # it counts by plain numbers, and all share the table that bytes stand for
+        states[0].moments[parameter] = {"step": 7, "state1": torch.arange(3, dtype=torch.uint8), "qmap1": table}
+    write_json(tmp_path / "training.json", states[0].write(tmp_path, main=True))
+    states[1].read(tmp_path)
+    for parameter in weights.values():
+        kept = states[1].moments[parameter]
+        assert (type(kept["step"]), kept["step"], kept["state1"].dtype) == (int, 7, torch.uint8)
+        assert torch.equal(kept["qmap1"], table)
+
+
+@pytest.mark.gpu
+def test_an_average_on_the_cpu_follows_parameters_on_the_gpu():
+    trained = [torch.nn.Parameter(torch.ones(3, device="cuda"))]
+    here, there = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
+    there.to("cpu")
+    trained[0].data += 1
+    for average in (here, there):
+        update_average(average, trained)
+        update_average(average, trained)
+    assert torch.equal(here.shadow_params[0].cpu(), there.shadow_params[0])
+
+
+@pytest.mark.parametrize("usual", ["stage1"], indirect=True)
+def test_a_run_goes_on_with_other_settings_of_what_a_step_costs(persist, usual, tmp_path):
+    run, cheap = usual
+    assert persist(*cheap("training.steps=2")).code == 0
+    ended = persist(*cheap("--resume", "training.gradient_checkpointing=true", "training.ema_device=cpu"))
+    assert ended.code == 0, ended.err
+    assert ended_alike(run, tmp_path / "cheap")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("g++"), reason="no compiler")
+@pytest.mark.parametrize("usual", ["stage2-voxel"], indirect=True)
+def test_compiled_blocks_train_alike_and_keep_the_names_of_their_weights(persist, usual, tmp_path):
+    run, cheap = usual
+    ended = persist(*cheap("training.compile=true"))
+    assert ended.code == 0, ended.err
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=1e-3)
+    assert end_of(run)[0].keys() == end_of(tmp_path / "cheap")[0].keys()
+
+
+def test_what_cannot_be_made_cheaper_is_one_line(persist, walks, codec, tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    cases = [("training.compile=true", "training.compile needs a C++ compiler on a CPU (no-such-compiler)")]
+    cases += [("training.frozen_precision=bf16", "needs training.precision bf16")]
+    if importlib.util.find_spec("bitsandbytes") is None:
+        cases += [("training.optimizer=adamw-8bit", "bitsandbytes: pip install 'persist-cli[bitsandbytes]'")]
+    for change, cause in cases:
+        ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", change))
+        assert (ended.code, cause in ended.err, len(ended.err.strip().splitlines())) == (1, True, 1)
+
+
+def test_a_backbone_that_has_no_cheaper_steps_says_so():
+    from persist_cli.api.backbone import Backbone
+    from persist_cli.errors import PersistError
+
+    Backbone.economize(micro(), "1", Economy())
+    with pytest.raises(PersistError, match="backbone 'cogvideox' has no cheaper steps"):
+        Backbone.economize(micro(), "1", Economy(compile=True))
+
+
+@pytest.mark.parametrize("usual", ["stage1"], indirect=True)
+def test_an_8_bit_optimizer_trains_nearly_alike_and_resumes_to_the_bit(persist, usual, tmp_path):
+    pytest.importorskip("bitsandbytes")
+    run, cheap = usual
+    eight = "training.optimizer=adamw-8bit"
+    assert persist(*cheap(eight)).code == 0
+    assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=0.02)
+    assert torch.uint8 in {each.dtype for each in end_of(tmp_path / "cheap")[0].values()}
+    halves = tmp_path / "halves"
+    for steps, more in ((2, []), (4, ["--resume"])):
+        arguments = [halves if each == str(tmp_path / "cheap") else each for each in cheap(eight)]
+        assert persist(*map(str, arguments), f"training.steps={steps}", *more).code == 0
+    assert ended_alike(tmp_path / "cheap", halves)

@@ -1,0 +1,299 @@
+"""Two processes with gloo on the CPU: DDP and FSDP2 come to what one process comes to."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
+from persist_cli.io.files import read_tensors
+from persist_cli.train.state import read_shards
+from tests.support.two_processes import job, run_pair
+from tests.support.walking import (
+    MICRO_SETTINGS,
+    end_of,
+    ended_alike,
+    first_gradients,
+    in_two,
+    losses,
+    stage,
+    train_here,
+)
+from tests.train.test_clip_cache import FEW, found
+
+FSDP = {"ACCELERATE_USE_FSDP": "true", "FSDP_VERSION": "2"}
+
+KINDS = {"ddp": {}, "fsdp": FSDP}
+
+BATCH = "training.batch=4"
+
+CLIP = 0.01  # less than the norm of any step's gradients here
+
+NEAR = 2e-5  # of weights, which four steps of these learning rates can move by 1.4e-3
+
+BF16 = "training.precision=bf16"
+
+PATIENCE = 300  # seconds, on a machine that has other things to do
+
+CHEAP = ["training.gradient_checkpointing=true", "training.frozen_precision=bf16", "training.ema_device=cpu", BF16]
+
+
+def sharded_state(run: Path) -> dict[str, torch.Tensor]:
+    """The training state of a run's newest checkpoint, of the parts of all processes."""
+    folder = max(run.glob("step-*")) / "training"
+    return read_shards(folder, lambda _, shape, dtype: torch.empty(shape, dtype=dtype))
+
+
+def saved_model(run: Path) -> dict[str, torch.Tensor]:
+    """All weights of a run's newest checkpoint by file and name."""
+    files = sorted(max(run.glob("step-*")).glob("model/**/*.safetensors"))
+    return {f"{path.name} {name}": each for path in files for name, each in read_tensors(path)[0].items()}
+
+
+def furthest(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> float:
+    """Largest difference between weights of the same names."""
+    assert one.keys() == two.keys()
+    return max(float((one[name].float() - two[name].float()).abs().max()) for name in one if one[name].numel())
+
+
+def begun(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[..., list[str]]:
+    """What makes a run's command line, with both stages trained by one process as ``one-1`` and ``one-2``."""
+
+    def of(number: str, name: str, *changes: str) -> list[str]:
+        base = f"base={codec if number == 'stage1' else stage1}"
+        return stage(number, walks, folder / name, base, BATCH, f"training.clip={CLIP}", *changes)
+
+    train_here(*of("stage1", "one-1"))
+    train_here(*of("stage2-voxel", "one-2"))
+    return of
+
+
+@pytest.fixture(scope="module")
+def runs(walks, codec, stage1, tmp_path_factory):
+    """Runs of one process and of two, some of them interrupted and gone on with by one and by two again."""
+    folder = tmp_path_factory.mktemp("pair")
+    of = begun(folder, walks, codec, stage1)
+    low_rank = [f"base={stage1}", "lora.rank=2"]
+    train_here(*of("stage1", "one-lora", *low_rank))
+    train_here(*of("stage2-voxel", "one-few", FEW))
+    first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage1", f"{kind}-parts", "training.steps=1"), **how) for kind, how in KINDS.items()]
+    first += [job(*of("stage2-voxel", f"{kind}-cheap", *CHEAP), **how) for kind, how in KINDS.items()]
+    first.append(job(*of("stage1", "fsdp-lora", *low_rank), **FSDP))
+    first.append(job(*of("stage1", "fsdp-offloaded", BF16), **FSDP, FSDP_OFFLOAD_PARAMS="true"))
+    cached = [FEW, "--cache", str(folder / "cache")]
+    first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
+    wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
+    ended = run_pair(folder, *first, wrong)
+    assert [code for code, _ in ended[:-1]] == [0] * len(first), ended
+    shutil.copytree(folder / "fsdp-parts", folder / "fsdp-first")
+    for kind in KINDS:
+        train_here(*of("stage1", f"{kind}-parts", "--resume", "training.steps=2"))
+    later = [job(*of("stage1", f"{kind}-parts", "--resume", "training.steps=3"), **how) for kind, how in KINDS.items()]
+    assert [code for code, _ in run_pair(folder, *later)] == [0, 0]
+    for kind in KINDS:
+        train_here(*of("stage1", f"{kind}-parts", "--resume"))
+    train_here(*of("stage2-voxel", "one-warm", *cached))
+    (folder / "wrong.txt").write_text(f"{ended[-1][0]} {ended[-1][1]}")
+    return folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("number", [1, 2])
+def test_two_processes_come_to_the_losses_and_weights_of_one(runs, kind, number):
+    """Stage 2 also sums two micro-batches on each process."""
+    one, two = runs / f"one-{number}", runs / f"{kind}-{number}"
+    assert losses(two) == pytest.approx(losses(one), rel=1e-5)
+    assert furthest(saved_model(one), saved_model(two)) < NEAR
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_of_two_then_one_then_two_then_one_ends_like_one_of_one(runs, kind):
+    assert losses(runs / f"{kind}-parts") == pytest.approx(losses(runs / "one-1"), rel=1e-5)
+    one, parts = (end_of(runs / name)[0] for name in ("one-1", f"{kind}-parts"))
+    assert torch.equal(one.pop("random/torch"), parts.pop("random/torch"))
+    assert furthest(one, parts) < NEAR
+    assert furthest(saved_model(runs / "one-1"), saved_model(runs / f"{kind}-parts")) < NEAR
+
+
+def test_a_sharded_checkpoint_is_a_file_a_process_with_its_half_and_no_pickle(runs):
+    step = max((runs / "fsdp-1").glob("step-*"))
+    sizes = [path.stat().st_size for path in sorted((step / "training").glob("*.safetensors"))]
+    assert max(sizes) < 0.6 * sum(sizes)
+    kinds = {path.suffix for path in step.rglob("*") if path.is_file()}
+    assert kinds == {".safetensors", ".json", ".yaml"}
+    assert sharded_state(runs / "fsdp-1").keys() == end_of(runs / "one-1")[0].keys()
+
+
+def test_sharded_gradients_are_clipped_by_the_norm_of_all_of_them(runs):
+    assert first_gradients(sharded_state(runs / "fsdp-first")).norm() == pytest.approx(CLIP, rel=1e-3)
+
+
+def test_a_sharded_run_saves_the_model_that_others_load(runs):
+    backbone = load_backbone(find_checkpoint(runs / "fsdp-1"))
+    assert not any(parameter.is_meta for parameter in backbone.parameters())
+
+
+def test_bf16_is_as_near_to_one_process_sharded_as_not(runs):
+    exact, ddp, fsdp = (losses(runs / name) for name in ("one-1", "ddp-bf16", "fsdp-bf16"))
+    assert ddp == pytest.approx(exact, rel=1e-2)
+    assert fsdp == pytest.approx(ddp, rel=2e-3)
+    weights = saved_model(runs / "fsdp-bf16")
+    assert losses(runs / "fsdp-offloaded") == fsdp
+    assert furthest(saved_model(runs / "fsdp-offloaded"), weights) == 0
+    assert {each.dtype for each in weights.values()} == {torch.float32}
+
+
+def test_cheap_steps_train_alike_sharded_and_not(runs):
+    """Recomputed blocks, frozen weights in bf16, averages in the memory of the CPU."""
+    assert losses(runs / "ddp-cheap") == pytest.approx(losses(runs / "one-2"), rel=1e-2)
+    assert losses(runs / "fsdp-cheap") == pytest.approx(losses(runs / "ddp-cheap"), rel=2e-3)
+
+
+def test_a_change_of_low_rank_trains_sharded_as_in_one_process(runs):
+    assert losses(runs / "fsdp-lora") == pytest.approx(losses(runs / "one-lora"), rel=1e-5)
+    one, sharded = (saved_model(runs / name) for name in ("one-lora", "fsdp-lora"))
+    assert any("lora_B" in name for name in one)
+    assert furthest(one, sharded) < NEAR
+
+
+def test_processes_share_a_cache_that_one_alone_finds_whole(runs):
+    for name in ("cold-few", "warm-few", "one-warm"):
+        assert losses(runs / name) == pytest.approx(losses(runs / "one-few"), rel=1e-5)
+    assert ended_alike(runs / "cold-few", runs / "warm-few")
+    assert [found(runs / name) for name in ("warm-few", "one-warm")] == [1, 1]
+    assert found(runs / "cold-few") < 1
+
+
+def test_a_missing_or_damaged_part_of_a_checkpoint_is_one_line(persist, walks, codec, runs, tmp_path):
+    run = shutil.copytree(runs / "fsdp-first", tmp_path / "run")
+    arguments = stage("stage1", walks, run, f"base={codec}", BATCH, f"training.clip={CLIP}", "--resume")
+    part = min(next(run.glob("step-*")).glob("training/*.safetensors"))
+    content = part.read_bytes()
+    for left, cause in (
+        (content[:-9], "its parts cannot be read"),
+        (b"", "its parts cannot be read"),
+        (None, "missing"),
+    ):
+        part.unlink()
+        if left is not None:
+            part.write_bytes(left)
+        ended = persist(*arguments)
+        assert (ended.code, cause in ended.err, len(ended.err.strip().splitlines())) == (1, True, 1), ended.err
+
+
+def test_what_cannot_be_sharded_is_one_line(persist, walks, codec, runs, tmp_path, monkeypatch):
+    said = (runs / "wrong.txt").read_text()
+    assert said.startswith("1 ")
+    assert "stage codec trains codec, which is not sharded" in said
+    monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))
+    assert (ended.code, "add --fsdp_version 2" in ended.err) == (1, True)
+
+
+class Started:
+    """A run of two processes without end."""
+
+    def __init__(self, run: Path, arguments: list[str], kind: tuple[str, ...]) -> None:
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
+        self.run, self.launcher = run, subprocess.Popen(**in_two(*arguments, kind=kind), **pipes)
+        self.processes: list[int] = []
+
+    def wait(self) -> None:
+        """Until its first checkpoint."""
+        deadline = time.monotonic() + PATIENCE
+        while not list(self.run.glob("step-*")) and time.monotonic() < deadline and self.launcher.poll() is None:
+            time.sleep(0.05)
+        children = Path(f"/proc/{self.launcher.pid}/task/{self.launcher.pid}/children").read_text().split()
+        self.processes = [int(child) for child in children]
+        assert len(self.processes) == 2, self.end()
+
+    def end(self) -> tuple[int, str]:
+        """The launcher's exit code and all that was said."""
+        said, _ = self.launcher.communicate(timeout=PATIENCE)
+        return self.launcher.returncode, said
+
+    def kill(self) -> None:
+        """Leave nothing behind."""
+        for process in self.processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        self.launcher.kill()
+        self.launcher.wait()
+
+
+@pytest.fixture
+def start(walks, codec, tmp_path):
+    """What starts a run as ``run`` by a launcher's options, and returns it after its first checkpoint."""
+    started = []
+
+    def of(*kind: str) -> Started:
+        changes = [f"base={codec}", "training.steps=100000", "training.checkpoint_every=2"]
+        started.append(Started(tmp_path / "run", stage("stage1", walks, tmp_path / "run", *changes), kind))
+        started[-1].wait()
+        return started[-1]
+
+    yield of
+    for each in started:
+        each.kill()
+
+
+@pytest.fixture
+def go_on(persist, walks, codec, tmp_path):
+    """What takes two more steps from the run's checkpoint by one process, which must be whole."""
+
+    def of() -> None:
+        run = tmp_path / "run"
+        step = int(find_checkpoint(run).folder.parent.name.removeprefix("step-"))
+        ended = persist(*stage("stage1", walks, run, "--resume", f"base={codec}", f"training.steps={step + 2}"))
+        assert ended.code == 0, ended.err
+        assert len(losses(run)) == step + 2
+        assert not list(run.glob(".partial-*"))
+
+    return of
+
+
+@pytest.mark.parametrize("killed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_killed_process_ends_the_run_with_a_line_and_a_checkpoint_to_go_on_from(start, go_on, killed):
+    started = start("--use_fsdp", "--fsdp_version", "2")
+    os.kill(started.processes[killed], signal.SIGKILL)
+    code, said = started.end()
+    lines = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert (code, len(lines)) == (1, 1), said
+    assert re.search(rf"process {1 - killed} of 2 lost another one.*step-\d+ is whole, go on with --resume", lines[0])
+    assert re.search(rf"rank +: {killed} .*\n.*exitcode +: -9", said)  # the launcher's table
+    go_on()
+
+
+@pytest.mark.parametrize(
+    ("told", "code"), [("rank", 0), pytest.param("launcher", 1, marks=pytest.mark.slow)], ids=["rank", "launcher"]
+)
+def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(start, go_on, told, code):
+    """The exit code of a launcher that was told to stop is torchrun's own."""
+    started = start("--use_fsdp", "--fsdp_version", "2")
+    os.kill({"rank": started.processes[1], "launcher": started.launcher.pid}[told], signal.SIGTERM)
+    ended, said = started.end()
+    assert ended == code, said
+    assert said.count("go on with --resume") == 1, said
+    go_on()
+
+
+@pytest.mark.slow
+def test_ctrl_c_saves_on_all(start, go_on):
+    started = start("--multi_gpu")
+    os.killpg(started.launcher.pid, signal.SIGINT)  # as a terminal does
+    _, said = started.end()
+    assert said.count("go on with --resume") == 1, said
+    go_on()

@@ -1,0 +1,37 @@
+"""The recipes of the published models train, from diffusers' layout to a memory, on twins of a few layers."""
+
+from __future__ import annotations
+
+import pytest
+
+from persist_cli.checkpoints.checkpoint import find_checkpoint
+from tests.support.twins import write_twin
+from tests.support.walking import SIZE, end_of
+
+TWINS = {"cogvideox-2b": "2b", "cogvideox-5b-i2v": "5b-i2v"}
+
+SMALL = [
+    f"backbone.settings.height={SIZE}", f"backbone.settings.width={SIZE}", "training.steps=2", "training.batch=2",
+    "training.accumulation=1", "training.workers=0", "training.warmup=1",
+]  # fmt: skip
+
+BLOCKS = ["memory.encoder=patches", "adapter={width: 16, heads: 2, token_budget: 32}", "data.context_frames=4"]
+
+
+@pytest.mark.usefixtures("fresh_accelerator")
+@pytest.mark.parametrize("family", TWINS)
+def test_a_familys_recipes_train_one_after_the_other(persist, walks, tmp_path, family):
+    twin = f"backbone.settings.pretrained={write_twin(TWINS[family], tmp_path / 'twin')}"
+
+    def train(name, out, *changes):
+        ended = persist("finetune", f"{family}-{name}", "--data", walks, "--out", tmp_path / out, *SMALL, *changes)
+        assert ended.code == 0, ended.err
+        assert end_of(tmp_path / out)[1].count("loss") == 2
+        return find_checkpoint(tmp_path / out)
+
+    train("stage1", "whole", twin)
+    train("stage1-lora", "lora", twin, "lora.rank=2")
+    for base in ("whole", "lora"):
+        for memory in ("voxel", "map2d", "snapshots"):
+            changes = [f"base={tmp_path / base}", f"memory.name={memory}", *BLOCKS]
+            assert [*train("stage2-voxel", f"{base}-{memory}", *changes).adapters] == [memory]

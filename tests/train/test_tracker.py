@@ -1,0 +1,29 @@
+"""Losses for a tracker beside the run's own log."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+
+import pytest
+
+from tests.support.walking import stage
+
+
+def test_tensorboard_gets_the_losses_of_the_log(persist, walks, codec, tmp_path):
+    loading = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.tracker=tensorboard")
+    assert persist(*arguments).code == 0
+    events = loading.EventAccumulator(str(tmp_path / "run" / "persist")).Reload()
+    logged = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    found = [(each.step, each.value) for each in events.Scalars("loss")]
+    assert found == [(each["step"], pytest.approx(each["loss"], rel=1e-5)) for each in logged]
+
+
+def test_a_tracker_that_is_not_installed_is_one_line(persist, walks, codec, tmp_path):
+    if importlib.util.find_spec("tensorboard") is not None:
+        pytest.skip("tensorboard is installed")
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.tracker=tensorboard"))
+    assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
+    assert "needs the package tensorboard: pip install 'persist-cli[tensorboard]'" in ended.err
+    assert not (tmp_path / "run").exists()
