@@ -96,7 +96,7 @@ SETTINGS_OF = {"backbone.name": "settings", "memory.name": "settings", "memory.e
 
 
 @dataclass(frozen=True)
-class BackboneChoice:
+class BackboneConfig:
     """Which video model.
 
     Args:
@@ -109,7 +109,7 @@ class BackboneChoice:
 
 
 @dataclass(frozen=True)
-class MemoryChoice:
+class MemoryConfig:
     """Which memory and what it is made of.
 
     Args:
@@ -170,8 +170,8 @@ class Recipe:
     stage: Stage
     description: str = ""
     base: str | None = None
-    backbone: BackboneChoice = field(default_factory=BackboneChoice)
-    memory: MemoryChoice | None = None
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    memory: MemoryConfig | None = None
     adapter: dict[str, Any] = field(default_factory=dict)
     lora: Lora | None = None
     data: DataSettings = field(default_factory=DataSettings)

@@ -12,10 +12,10 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.cli.app import main
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.store import Store
-from persist_cli.memorize.factory import MemoryMaker, recall
+from persist_cli.memorize.factory import MemoryFactory, recall
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder
-from persist_cli.recipe import MemoryChoice
+from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import WorldModel, step_together
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
 from tests.support.room_views import empty, same_bits, walked
@@ -56,7 +56,7 @@ def test_a_memory_is_built_and_read_where_its_frames_lie_and_is_that_of_the_cpu(
 @pytest.mark.parametrize("name", MAPS)
 def test_what_a_clip_remembers_is_made_where_it_trains(name, walks):
     clip = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))[5]
-    here, there = (recall(clip, MemoryMaker.of(MemoryChoice(name), device), 64) for device in ("cpu", DEVICE))
+    here, there = (recall(clip, MemoryFactory.of(MemoryConfig(name), device), 64) for device in ("cpu", DEVICE))
     assert everywhere([there.features, there.positions, there.mask])
     assert len(here) > 0
     assert close(here.features, there.features)

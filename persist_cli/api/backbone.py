@@ -15,8 +15,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from persist_cli.api.cameras import Cameras
-from persist_cli.api.inference import Placement
-from persist_cli.api.stages import Economy, Lora, Part, Stage
+from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.stages import Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PersistError
 from persist_cli.io.settings import NoSettings
@@ -74,7 +74,7 @@ class Backbone(nn.Module, ABC):
 
     settings_type: ClassVar[type] = NoSettings
     sharded_blocks: ClassVar[tuple[str, ...]] = ()  # classes of blocks that a sharded model puts together one by one
-    kept_whole: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
+    never_sharded: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:
@@ -115,7 +115,7 @@ class Backbone(nn.Module, ABC):
         """Whether clips have depth after their first frame."""
         return True
 
-    def place(self, placement: Placement) -> None:
+    def prepare_inference(self, placement: InferenceOptions) -> None:
         """Get ready to sample, on the accelerator where there is one; it may be placed again, also with other adapters.
 
         Raises:
@@ -128,15 +128,15 @@ class Backbone(nn.Module, ABC):
             self.to(getattr(torch, placement.dtype))
         self.to(device).eval()
 
-    def parts(self) -> list[Part]:
+    def parameter_groups(self) -> list[ParameterGroup]:
         """Every parameter, each in one part, in the order in which people think of them."""
-        return [Part(self.name, dict(self.named_parameters()))]
+        return [ParameterGroup(self.name, dict(self.named_parameters()))]
 
-    def whole_parameters(self) -> list[nn.Parameter]:
+    def never_sharded_parameters(self) -> list[nn.Parameter]:
         """Those of the submodules that are never sharded."""
-        return [each for name in self.kept_whole for each in self.get_submodule(name).parameters()]
+        return [each for name in self.never_sharded for each in self.get_submodule(name).parameters()]
 
-    def shorten(self, groups: int) -> float:
+    def truncate_layers(self, groups: int) -> float:
         """Keep so many groups of like layers of what is trained in depth, for estimates; returns how many there were.
 
         What a step takes must grow linearly with the groups. By default there is one and it stays.
@@ -147,13 +147,13 @@ class Backbone(nn.Module, ABC):
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Freeze all that the stage does not train and return the rest by name."""
 
-    def economize(self, stage: Stage, economy: Economy) -> None:
+    def apply_memory_savings(self, stage: Stage, savings: MemorySavings) -> None:
         """Make the steps of a stage cheaper, once ``trained_parameters`` has frozen what it does not train.
 
         Raises:
             PersistError: when this backbone cannot.
         """
-        if economy != Economy():
+        if savings != MemorySavings():
             raise PersistError(f"backbone {self.name!r} has no cheaper steps; leave out what training.* asks of it")
 
     @abstractmethod
@@ -173,7 +173,7 @@ class Backbone(nn.Module, ABC):
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
     @property
-    def frames_alone(self) -> bool:
+    def framewise(self) -> bool:
         """Whether ``encode`` gives one row a frame, each of its frame alone.
 
         The latents of a whole trajectory then serve all clips of it.

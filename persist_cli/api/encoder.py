@@ -31,7 +31,7 @@ class Encoder(ABC):
         """Number of feature channels."""
 
     @property
-    def planned_channels(self) -> int:
+    def channels_by_name(self) -> int:
         """The same for a plan, without the weights where their width is known by their name."""
         return self.channels
 

@@ -19,7 +19,7 @@ SAVINGS = ("model-offload", "sequential-offload", "vae-slicing", "vae-tiling")
 
 
 @dataclass(frozen=True)
-class Placement:
+class InferenceOptions:
     """How a backbone is placed for sampling.
 
     Args:

@@ -93,7 +93,7 @@ class Memory(ABC):
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """At most ``budget`` tokens of what the cameras will look at, the most relevant first."""
 
-    def read_together(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
+    def read_batch(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
         """What ``read`` gives each of several askers, each with the whole budget of its own.
 
         A memory that can look once for all of them overrides this; every asker gets what it would get alone.

@@ -16,7 +16,7 @@ STAGES: tuple[Stage, ...] = ("codec", "1", "2")
 
 
 @dataclass(frozen=True)
-class Part:
+class ParameterGroup:
     """Some of a backbone's parameters under a name that people know.
 
     Args:
@@ -31,7 +31,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Economy:
+class MemorySavings:
     """What makes a training step cheaper and changes nothing but rounding.
 
     Args:

@@ -25,7 +25,7 @@ from persist_cli.io.checkpoint_folder import VERSION, adapter_folder, default_ad
 from persist_cli.io.checkpoint_folder import step_folders as step_folders
 from persist_cli.io.files import file_sha256, read_json, write_json
 from persist_cli.io.settings import parse_settings
-from persist_cli.recipe import BackboneChoice, MemoryChoice, Recipe
+from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone, Sampling
@@ -59,10 +59,10 @@ class Checkpoint:
     sampling: Sampling | None = None
     training_scenes: TrainingScenes | None = None
 
-    def memory_choice(self, adapter: str) -> MemoryChoice:
+    def memory_config(self, adapter: str) -> MemoryConfig:
         """What the adapter's memory is made of."""
         path = self.adapter_folder(adapter) / "memory.json"
-        return parse_settings(MemoryChoice, read_json(path), str(path))
+        return parse_settings(MemoryConfig, read_json(path), str(path))
 
     def adapter_folder(self, adapter: str) -> Path:
         """The adapter's folder; a one-line error that names the others when there is none."""
@@ -101,7 +101,7 @@ def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None
     return backbone
 
 
-def start_backbone(choice: BackboneChoice, base: Checkpoint | None) -> Backbone:
+def start_backbone(choice: BackboneConfig, base: Checkpoint | None) -> Backbone:
     """The backbone that a training begins with: fresh, or the base's with the choice's settings on top.
 
     Raises:
@@ -116,7 +116,7 @@ def start_backbone(choice: BackboneChoice, base: Checkpoint | None) -> Backbone:
     return load_backbone(base, choice.settings)
 
 
-def starts_from_nothing(recipe: Recipe, backbone: Backbone) -> bool:
+def starts_from_random_codec(recipe: Recipe, backbone: Backbone) -> bool:
     """Whether the video model would be trained on the latents of a codec with random weights."""
     return recipe.stage == "1" and recipe.base is None and not backbone.origin()
 
@@ -176,7 +176,7 @@ def write_card(folder: Path, card: dict[str, Any], scenes: TrainingScenes | None
 def save_adapter(
     backbone: Backbone,
     base: Checkpoint,
-    choice: MemoryChoice,
+    choice: MemoryConfig,
     folder: Path,
     home: Path,
     scenes: TrainingScenes | None = None,

@@ -25,10 +25,10 @@ from persist_cli.checkpoints.checkpoint import (
     load_backbone,
     write_card,
 )
-from persist_cli.checkpoints.lineage import RECIPE, RECIPES, stage_recipes, training_scenes, write_recipes
+from persist_cli.checkpoints.lineage import RECIPE, RECIPES, save_stage_recipes, stage_recipes, training_scenes
 from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
 from persist_cli.errors import CheckpointError, PersistError, hint
-from persist_cli.io.checkpoint_folder import what_is_changed
+from persist_cli.io.checkpoint_folder import lora_base
 from persist_cli.io.files import (
     check_folder,
     empty_folder_aside,
@@ -89,7 +89,7 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     show(out, {"fingerprint": card["fingerprint"]} | said, files, json)
 
 
-def default_of(base: Checkpoint, parts: dict[str, Part], asked: str | None) -> str | None:
+def default_of(base: Checkpoint, parts: dict[str, AdapterExport], asked: str | None) -> str | None:
     """The adapter that is meant when none is named: the one asked for, the checkpoint's, or the only one."""
     if asked is None:
         return base.default if base.default in parts else next(iter(parts)) if len(parts) == 1 else None
@@ -111,7 +111,9 @@ def chosen_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, Any] | None
     return asdict(sampling)
 
 
-def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dtype: torch.dtype) -> dict[str, Any]:
+def write_checkpoint(
+    folder: Path, base: Checkpoint, parts: dict[str, AdapterExport], dtype: torch.dtype
+) -> dict[str, Any]:
     """Write base, adapters and recipes into the folder, weights in this precision; returns what the card must say."""
     with whole_base(base, folder) as home:
         return _write_checkpoint(folder, home, base, parts, dtype)
@@ -120,7 +122,7 @@ def write_checkpoint(folder: Path, base: Checkpoint, parts: dict[str, Part], dty
 @contextlib.contextmanager
 def whole_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
     """A folder with all of a base's own files; that of LoRA, merged, is made beside and removed again."""
-    if what_is_changed(base.base_folder) is None:
+    if lora_base(base.base_folder) is None:
         yield base.base_folder
         return
     with empty_folder_aside(beside) as folder:
@@ -129,7 +131,7 @@ def whole_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
 
 
 def _write_checkpoint(
-    folder: Path, home: Path, base: Checkpoint, parts: dict[str, Part], dtype: torch.dtype
+    folder: Path, home: Path, base: Checkpoint, parts: dict[str, AdapterExport], dtype: torch.dtype
 ) -> dict[str, Any]:
     own = [path for path in base_files(home, "*") if belongs(path.relative_to(home))]
     jobs = [(path, folder / path.relative_to(home)) for path in own]
@@ -142,7 +144,7 @@ def _write_checkpoint(
             convert(source, target, dtype) if source.suffix == ".safetensors" else copy(source, target)
         except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
             raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
-    write_recipes(folder, known_recipes(base, parts))
+    save_stage_recipes(folder, known_recipes(base, parts))
     return {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(folder)}
 
 
@@ -209,7 +211,7 @@ NAMED = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9_-]*)=(?P<run>.+)")
 
 
 @dataclass(frozen=True)
-class Part:
+class AdapterExport:
     """One adapter of an export.
 
     Args:
@@ -226,7 +228,7 @@ class Part:
         return self.checkpoint.adapter_folder(self.adapter)
 
 
-def adapter_parts(base: Checkpoint, runs: Sequence[str]) -> dict[str, Part]:
+def adapter_parts(base: Checkpoint, runs: Sequence[str]) -> dict[str, AdapterExport]:
     """The base's own adapters and those of the runs, by the names that they get.
 
     Args:
@@ -236,7 +238,7 @@ def adapter_parts(base: Checkpoint, runs: Sequence[str]) -> dict[str, Part]:
     Raises:
         CheckpointError: for an adapter of another base, and for one name twice.
     """
-    parts = {name: Part(base, name) for name in base.adapters}
+    parts = {name: AdapterExport(base, name) for name in base.adapters}
     for text in runs:
         for name, part in _parts_of_run(text).items():
             if part.checkpoint.fingerprint != base.fingerprint:
@@ -250,21 +252,21 @@ def adapter_parts(base: Checkpoint, runs: Sequence[str]) -> dict[str, Part]:
     return parts
 
 
-def _parts_of_run(text: str) -> dict[str, Part]:
+def _parts_of_run(text: str) -> dict[str, AdapterExport]:
     match = None if Path(text).exists() else NAMED.fullmatch(text)
     found = find_checkpoint(Path(match["run"] if match else text))
     if not found.adapters:
         raise CheckpointError(f"{found.folder}: has no memory adapter; name stage-2 runs after the CHECKPOINT")
     if match is None:
-        return {name: Part(found, name) for name in found.adapters}
+        return {name: AdapterExport(found, name) for name in found.adapters}
     if len(found.adapters) > 1:
         raise CheckpointError(f"{found.folder}: NAME=RUN names one adapter, there are {', '.join(found.adapters)}")
     if match["name"] == PLAIN:
         raise CheckpointError(f"{text}: {PLAIN!r} is the base without an adapter; choose another name")
-    return {match["name"]: Part(found, next(iter(found.adapters)))}
+    return {match["name"]: AdapterExport(found, next(iter(found.adapters)))}
 
 
-def known_recipes(base: Checkpoint, parts: dict[str, Part]) -> dict[str, str]:
+def known_recipes(base: Checkpoint, parts: dict[str, AdapterExport]) -> dict[str, str]:
     """Texts of the recipes behind an export by file name: those of the base's stages and ``adapters/NAME.yaml``.
 
     Absolute paths are cut to their last part: they say nothing elsewhere.

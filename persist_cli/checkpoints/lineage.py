@@ -40,7 +40,7 @@ def stage_recipes(folder: Path) -> dict[str, str]:
     return found | {_free_name("codec" if values.get("stage") == "codec" else "stage1", found): text}
 
 
-def write_recipes(folder: Path, recipes: dict[str, str]) -> None:
+def save_stage_recipes(folder: Path, recipes: dict[str, str]) -> None:
     """Keep recipes by their paths in the checkpoint folder's ``recipes``."""
     for name, text in recipes.items():
         write_text(folder / RECIPES / name, text)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
 from persist_cli.cli.doctor import doctor
 from persist_cli.cli.listings import plugins, recipes
@@ -237,7 +237,7 @@ def rollout(
     plan = RolloutPlan(
         start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
         write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance),
-        placement=Placement.of(dtype, save_memory),
+        placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 
@@ -287,7 +287,7 @@ def evaluate(
         data=tuple(data), protocol=protocol, memories=names_in(memories), controls=names_in(controls),
         metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=SamplingOverrides(steps, sampler, guidance), batch=batch, noise=pose_noise,
-        placement=Placement.of(dtype, save_memory),
+        placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

@@ -18,7 +18,7 @@ from persist_cli.errors import DataError, RecipeError
 
 
 @dataclass(frozen=True)
-class ClipChoice:
+class ClipFrames:
     """Which frames a sample is made of, nothing of them read yet.
 
     Args:
@@ -98,20 +98,20 @@ class ClipDataset(Dataset[ClipSample]):
     def __getitem__(self, number: int) -> ClipSample:
         return self.read(self.choose(number))
 
-    def choose(self, number: int) -> ClipChoice:
+    def choose(self, number: int) -> ClipFrames:
         """The frames of sample ``number``."""
         random = np.random.default_rng((self.plan.seed, number))
         place = int(random.integers(len(self.files)))
         file = self.files[place]
         if not self.plan.clips_per_trajectory:
             frames, context = self._draw(file, random)
-            return ClipChoice(file, frames, context, int(random.integers(2**31)))
+            return ClipFrames(file, frames, context, int(random.integers(2**31)))
         clip = int(random.integers(self.plan.clips_per_trajectory))
         # plus one: numpy reads missing numbers as zeros, and (seed, place) is a sample's own
         frames, context = self._draw(file, np.random.default_rng((self.plan.seed, place, clip + 1)))
-        return ClipChoice(file, frames, context, int(random.integers(2**31)))
+        return ClipFrames(file, frames, context, int(random.integers(2**31)))
 
-    def read(self, choice: ClipChoice, images: bool = True, context: bool = True) -> ClipSample:
+    def read(self, choice: ClipFrames, images: bool = True, context: bool = True) -> ClipSample:
         """The sample of this choice.
 
         Args:

@@ -13,8 +13,8 @@ from persist_cli.data.clips import check_sharing
 from persist_cli.doctor.changes import OFFLOADED, SHARDED, STAGE2, Strategy, changes_of, smallest
 from persist_cli.doctor.dry_run import dry_run
 from persist_cli.doctor.machine import Machine, gib
-from persist_cli.doctor.memory_estimate import Estimator, Launch, Need
-from persist_cli.doctor.meta_model import Planned, plan, plan_recipe, plan_stage2
+from persist_cli.doctor.memory_estimate import Estimator, Launch, MemoryEstimate
+from persist_cli.doctor.meta_model import MetaModel, build_meta_model, build_stage2_meta_model, plan
 from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
 from persist_cli.train.distributed import check_sharded
@@ -42,7 +42,7 @@ class Finding:
 
     recipe: str
     strategy: Strategy
-    need: Need
+    need: MemoryEstimate
     fits: bool
 
 
@@ -56,7 +56,7 @@ class Doctor:
         stage2: the plan of a stage 2 on this stage 1, to compare with.
     """
 
-    def __init__(self, planned: Planned, machine: Machine, sharded: bool, stage2: Planned | None = None) -> None:
+    def __init__(self, planned: MetaModel, machine: Machine, sharded: bool, stage2: MetaModel | None = None) -> None:
         self.planned, self.machine, self.sharded = planned, machine, sharded
         self.stage2 = stage2
         self.estimators = {planned.recipe.lora: Estimator(planned.backbone, planned.channels)}
@@ -97,7 +97,7 @@ class Doctor:
             works.append(partial(self.examine_stage2, self.stage2))
         return [work() for work in watched(works, "each alone", "strategy")]
 
-    def examine_stage2(self, planned: Planned) -> Finding:
+    def examine_stage2(self, planned: MetaModel) -> Finding:
         """What a stage 2 needs."""
         found = Doctor(planned, self.machine, self.sharded).examine(Strategy())
         return dataclasses.replace(found, strategy=STAGE2)
@@ -116,7 +116,7 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     """
     if sharded and machine.devices == 1:
         raise PersistError("--fsdp shares a model out over several GPUs; give --gpus N too")
-    planned = plan_recipe(name, overrides)
+    planned = build_meta_model(name, overrides)
     training = planned.recipe.training
     check_sharing(training.batch, training.accumulation, machine.devices)
     samples = training.samples_at_once(machine.devices)
@@ -125,7 +125,7 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     if sharded:
         planned.backbone.trained_parameters(planned.recipe.stage)
         check_sharded(planned.recipe, planned.backbone)
-    doctor = Doctor(planned, machine, sharded, plan_stage2(planned, overrides))
+    doctor = Doctor(planned, machine, sharded, build_stage2_meta_model(planned, overrides))
     parts, found, best = dry_run(planned), doctor.each(), doctor.smallest()
     if json:
         print_json(_record(machine, parts, found, best))

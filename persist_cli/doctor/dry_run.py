@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from persist_cli.api.stages import Part, Stage
+from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.doctor.machine import gib
-from persist_cli.doctor.meta_model import Planned, plan_recipe
+from persist_cli.doctor.meta_model import MetaModel, build_meta_model
 from persist_cli.viewing.console import print_json, print_table
 
 
 def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:
     """Print every part's parameters, how many are new and how many each stage trains; nothing is read or written."""
-    planned = plan_recipe(recipe, overrides)
+    planned = build_meta_model(recipe, overrides)
     record = dry_run(planned)
     if json:
         print_json({"recipe": recipe} | record)
@@ -24,9 +24,9 @@ def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:
     print_table(title, columns, [_row(part) for part in [*record["parts"], record["total"]]])
 
 
-def dry_run(planned: Planned) -> dict[str, Any]:
+def dry_run(planned: MetaModel) -> dict[str, Any]:
     """The same as plain values, with the name and shape of every parameter; sizes are those of the weights alone."""
-    parts = planned.backbone.parts()
+    parts = planned.backbone.parameter_groups()
     trained = {stage: _trained(planned, stage) for stage in _stages(planned)}
     records = [_record(part, trained) for part in parts]
     total = {
@@ -43,15 +43,15 @@ def dry_run(planned: Planned) -> dict[str, Any]:
     }
 
 
-def _stages(planned: Planned) -> tuple[Stage, ...]:
+def _stages(planned: MetaModel) -> tuple[Stage, ...]:
     return ("codec", "1") if planned.recipe.memory is None else ("codec", "1", "2")
 
 
-def _trained(planned: Planned, stage: Stage) -> set[str]:
+def _trained(planned: MetaModel, stage: Stage) -> set[str]:
     return set(planned.backbone.trained_parameters(stage))
 
 
-def _record(part: Part, trained: dict[Stage, set[str]]) -> dict[str, Any]:
+def _record(part: ParameterGroup, trained: dict[Stage, set[str]]) -> dict[str, Any]:
     sizes = {name: parameter.numel() for name, parameter in part.parameters.items()}
     parameters = sum(sizes.values())
     return {

@@ -45,7 +45,7 @@ class Launch:
 
 
 @dataclass(frozen=True)
-class Need:
+class MemoryEstimate:
     """Bytes on one device.
 
     Weights, moments and averages are always there. Beside them there are at most, one after the other: what encoding
@@ -106,7 +106,7 @@ class Estimator:
         self._encodings: dict[tuple[object, ...], Encoding] = {}
         self._steps: dict[tuple[object, ...], Activations] = {}
 
-    def need(self, recipe: Recipe, launch: Launch) -> Need:
+    def need(self, recipe: Recipe, launch: Launch) -> MemoryEstimate:
         """What one process of a run needs."""
         training = recipe.training
         batch = training.samples_at_once(launch.devices)
@@ -115,7 +115,7 @@ class Estimator:
         least = self.at_least(recipe, launch)
         return dataclasses.replace(least, encoding=encoding, activations=step.peak, shallow=step.shallow)
 
-    def at_least(self, recipe: Recipe, launch: Launch) -> Need:
+    def at_least(self, recipe: Recipe, launch: Launch) -> MemoryEstimate:
         """The same without what a step takes, which need not be run for that."""
         training = recipe.training
         trained = [each.numel() for each in self.backbone.trained_parameters(recipe.stage).values()]
@@ -124,7 +124,7 @@ class Estimator:
         buckets = 2 if launch.devices > 1 and not launch.sharded else 1
         averaged = training.ema and not (launch.cuda and training.ema_device == "cpu")
         at_once = count * share if launch.cuda and training.optimizer == "adamw" else 2 * largest * share
-        return Need(
+        return MemoryEstimate(
             weights=self.weights(recipe, launch),
             gradients=round(count * FLOAT32 * share * buckets),
             optimizer=round(count * MOMENTS[training.optimizer] * share),
@@ -178,13 +178,13 @@ class Estimator:
         def size(parameters: list[nn.Parameter]) -> int:
             return sum(each.numel() * (FLOAT32 if id(each) in trained else frozen) for each in parameters)
 
-        whole = backbone.whole_parameters()
+        whole = backbone.never_sharded_parameters()
         kept = {id(each) for each in whole}
         return size(whole), size([each for each in backbone.parameters() if id(each) not in kept])
 
     def gathered(self, recipe: Recipe) -> int:
         """Bytes that FSDP puts together at once."""
-        kept = {id(each) for each in self.backbone.whole_parameters()}
+        kept = {id(each) for each in self.backbone.never_sharded_parameters()}
         width = HALF if recipe.training.precision == "bf16" else FLOAT32
         blocks = [each for each in self.backbone.modules() if type(each).__name__ in self.backbone.sharded_blocks]
         sizes = [sum(each.numel() for each in block.parameters()) for block in blocks]

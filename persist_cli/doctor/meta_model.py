@@ -14,15 +14,15 @@ from persist_cli.checkpoints.checkpoint import (
     Checkpoint,
     find_checkpoint,
     start_backbone,
-    starts_from_nothing,
+    starts_from_random_codec,
 )
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import warn
 
 
 @dataclass(frozen=True)
-class Planned:
+class MetaModel:
     """A recipe and the backbone that it trains.
 
     Args:
@@ -42,10 +42,10 @@ class Planned:
     @property
     def from_nothing(self) -> bool:
         """Whether the training begins with random weights, its codec's too."""
-        return starts_from_nothing(self.recipe, self.backbone)
+        return starts_from_random_codec(self.recipe, self.backbone)
 
 
-def plan_recipe(name: str, overrides: Sequence[str]) -> Planned:
+def build_meta_model(name: str, overrides: Sequence[str]) -> MetaModel:
     """The plan of a recipe with KEY=VALUE changes.
 
     A base that is not there yet stands for one of the recipe's own backbone settings; a line on standard error says so.
@@ -60,7 +60,7 @@ def plan_recipe(name: str, overrides: Sequence[str]) -> Planned:
     return plan(name, recipe, base)
 
 
-def plan_stage2(planned: Planned, overrides: Sequence[str]) -> Planned | None:
+def build_stage2_meta_model(planned: MetaModel, overrides: Sequence[str]) -> MetaModel | None:
     """The plan of the voxel memory's recipe on a stage-1 recipe, ``None`` where none comes with persist.
 
     Args:
@@ -74,7 +74,7 @@ def plan_stage2(planned: Planned, overrides: Sequence[str]) -> Planned | None:
     return plan(name, make_recipe(values, name), None)
 
 
-def plan(name: str, recipe: Recipe, base: Checkpoint | None) -> Planned:
+def plan(name: str, recipe: Recipe, base: Checkpoint | None) -> MetaModel:
     """The plan of a recipe on its base, where there is one."""
     channels = None
     with torch.device("meta"):
@@ -82,6 +82,6 @@ def plan(name: str, recipe: Recipe, base: Checkpoint | None) -> Planned:
         if recipe.lora is not None:
             backbone.add_lora(recipe.lora)
         if recipe.memory is not None:
-            channels = MemoryMaker.of(recipe.memory).encoder.planned_channels
+            channels = MemoryFactory.of(recipe.memory).encoder.channels_by_name
             backbone.add_adapter(recipe.memory.name, channels, recipe.adapter)
-    return Planned(name, recipe, backbone, channels, base)
+    return MetaModel(name, recipe, backbone, channels, base)

@@ -21,7 +21,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.doctor.tracing import LiveBytes, imagined, kernels
 from persist_cli.recipe import Recipe
-from persist_cli.train.optimizer import economy_of
+from persist_cli.train.optimizer import requested_savings
 
 SHALLOW, DEEPER = 2, 4  # groups of layers; one alone is first and last at once
 
@@ -79,9 +79,9 @@ class Twins:
 
     def __init__(self, backbone: Backbone, channels: int | None) -> None:
         self.deeper, self.channels = copy.deepcopy(backbone), channels
-        self.groups = self.deeper.shorten(DEEPER)
+        self.groups = self.deeper.truncate_layers(DEEPER)
         self.shallow = copy.deepcopy(self.deeper)
-        self.shallow.shorten(SHALLOW)
+        self.shallow.truncate_layers(SHALLOW)
 
     def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
         """What encoding takes; nothing where the stage encodes nothing before its step."""
@@ -120,7 +120,7 @@ class Twins:
         with imagined():
             backbone.to_empty(device="cpu")
             parameters = backbone.trained_parameters(recipe.stage)
-            backbone.economize(recipe.stage, economy_of(settings, torch.device("cpu")))
+            backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
             if kind.sharded:
                 _halve(backbone)
             threads = None if kind.cuda else settings.threads or torch.get_num_threads()
@@ -137,7 +137,7 @@ def autocast(recipe: Recipe) -> torch.autocast:
 
 
 def _halve(backbone: Backbone) -> None:
-    whole = {id(each) for each in backbone.whole_parameters()}
+    whole = {id(each) for each in backbone.never_sharded_parameters()}
     for parameter in backbone.parameters():
         if id(parameter) not in whole:
             parameter.data = parameter.data.to(torch.bfloat16)

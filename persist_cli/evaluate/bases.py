@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from persist_cli.api.backbone import Backbone, Sampling
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.checkpoints.checkpoint import Checkpoint, load_backbone
 from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
 from persist_cli.data.clips import check_size
@@ -23,7 +23,7 @@ class Backbones:
         placement: how they sample.
     """
 
-    def __init__(self, placement: Placement = Placement()) -> None:
+    def __init__(self, placement: InferenceOptions = InferenceOptions()) -> None:
         self.placement = placement
         self.backbone: Backbone | None = None
         self.loaded = ""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.checkpoints.checkpoint import Checkpoint, find_checkpoint
 from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
 from persist_cli.errors import PersistError, hint
@@ -19,7 +19,7 @@ from persist_cli.evaluate.journal import Journal, Processes, Unit
 from persist_cli.evaluate.measure import Measurer, choose_metrics, make_setup
 from persist_cli.evaluate.protocols import PROTOCOLS, Protocol, Selected
 from persist_cli.evaluate.provenance import checkpoint_json, metric_json, training_scenes
-from persist_cli.evaluate.rows.build_rows import RowChoice, check_choice, make_rows
+from persist_cli.evaluate.rows.build_rows import RowConfig, check_choice, make_rows
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
@@ -41,7 +41,7 @@ class EvalPlan:
     sampling: SamplingOverrides
     batch: int
     noise: tuple[float, float]
-    placement: Placement
+    placement: InferenceOptions
 
     def once(self) -> EvalPlan:
         """The same plan without repeated names: a memory named twice would be two rows of one name."""
@@ -109,7 +109,7 @@ def prepare(paths: Sequence[Path], plan: EvalPlan, out: Path, processes: Process
     plan, backbones = plan.once(), Backbones(plan.placement)
     checkpoints = list({each.folder.resolve(): each for each in map(find_checkpoint, paths)}.values())
     sampling = common_sampling(checkpoints, plan.sampling)
-    choice = RowChoice(plan.memories, plan.controls, sampling, plan.noise)
+    choice = RowConfig(plan.memories, plan.controls, sampling, plan.noise)
     check_choice(choice)
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")

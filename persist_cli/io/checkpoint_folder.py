@@ -55,7 +55,7 @@ def open_checkpoint(path: Path) -> CheckpointFolder:
     return CheckpointFolder(folder, card, base, base_card)
 
 
-def what_is_changed(folder: Path) -> Path | dict[str, Any] | None:
+def lora_base(folder: Path) -> Path | dict[str, Any] | None:
     """What the LoRA in a base's folder changes, ``None`` for a base that is whole.
 
     Returns:

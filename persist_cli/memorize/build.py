@@ -12,7 +12,7 @@ from torch import Tensor
 from persist_cli.api.memory import Memory
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import check_folder, remove_leftovers
-from persist_cli.memorize.memory_config import MemorizePlan, choose_memory
+from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.plugins import make_encoder, make_memory
@@ -30,7 +30,7 @@ def run_memorize(data: list[str], plan: MemorizePlan, out: Path, json: bool) -> 
         json: print JSON instead of a table.
     """
     _check_out(out)
-    chosen, origin = choose_memory(plan)
+    chosen, origin = resolve_memory_config(plan)
     sources = find_sources(data)
     encoder = make_encoder(chosen.encoder, chosen.encoder_settings)
     made = make_memory(chosen.name, chosen.settings, encoder, common_reference(sources))

@@ -15,7 +15,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import ClipSample
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import load_plugin, make_encoder
-from persist_cli.recipe import MemoryChoice
+from persist_cli.recipe import MemoryConfig
 
 if TYPE_CHECKING:
     import torch
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class MemoryMaker:
+class MemoryFactory:
     """Makes empty memories of one choice; plugin, settings and encoder are loaded once.
 
     Args:
@@ -39,12 +39,12 @@ class MemoryMaker:
     device: torch.device | str = "cpu"
 
     @staticmethod
-    def of(choice: MemoryChoice, device: torch.device | str = "cpu") -> MemoryMaker:
+    def of(choice: MemoryConfig, device: torch.device | str = "cpu") -> MemoryFactory:
         """The maker of this choice, computing there."""
         kind = load_plugin("memory", choice.name)
         settings = parse_settings(kind.settings_type, choice.settings, f"memory {choice.name!r}")
         encoder = make_encoder(choice.encoder, choice.encoder_settings).to(device)
-        return MemoryMaker(kind, settings, encoder, device)
+        return MemoryFactory(kind, settings, encoder, device)
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """An empty memory in the frame of reference of a trajectory."""
@@ -72,14 +72,14 @@ def collate(samples: Sequence[ClipSample], tokens: MemoryTokens | None = None, l
     )
 
 
-def recall_all(samples: Sequence[ClipSample], maker: MemoryMaker | None, budget: int) -> MemoryTokens | None:
+def recall_all(samples: Sequence[ClipSample], maker: MemoryFactory | None, budget: int) -> MemoryTokens | None:
     """What each sample's own memory says to its clip, as a batch; ``None`` without a maker."""
     if maker is None:
         return None
     return MemoryTokens.stack([recall(sample, maker, budget) for sample in samples])
 
 
-def recall(sample: ClipSample, maker: MemoryMaker, budget: int) -> MemoryTokens:
+def recall(sample: ClipSample, maker: MemoryFactory, budget: int) -> MemoryTokens:
     """What a memory of the sample's context says to the clip's cameras."""
     memory = maker.empty(sample.info)
     if sample.context is not None:

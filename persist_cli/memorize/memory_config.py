@@ -11,7 +11,7 @@ import yaml
 
 from persist_cli.checkpoints.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
-from persist_cli.recipe import MemoryChoice
+from persist_cli.recipe import MemoryConfig
 
 USUAL = "voxel"  # the memory that is meant when neither a user nor a checkpoint names one
 
@@ -33,7 +33,7 @@ class MemorizePlan:
     checkpoint: Path | None = None
 
 
-def choose_memory(plan: MemorizePlan) -> tuple[MemoryChoice, str | None]:
+def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
     """The memory's kind, settings and encoder, and whose adapter they are of; ``None`` where they are the plan's own.
 
     Raises:
@@ -49,10 +49,10 @@ def choose_memory(plan: MemorizePlan) -> tuple[MemoryChoice, str | None]:
     if reference and memories and (plan.memory is None or plan.memory in memories):
         return adapter_of(reference, plan.memory)
     chosen = plugin_settings(plan.settings)
-    return MemoryChoice(plan.memory or USUAL, chosen["memory"], plan.encoder or "patches", chosen["encoder"]), None
+    return MemoryConfig(plan.memory or USUAL, chosen["memory"], plan.encoder or "patches", chosen["encoder"]), None
 
 
-def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryChoice, str]:
+def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig, str]:
     """What the adapter for a memory reads, and that adapter in words.
 
     Args:
@@ -73,12 +73,12 @@ def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryChoice
         asked = "a memory" if memory is None else f"a memory {memory!r}"
         raise CheckpointError(f"{checkpoint.folder}: no adapter reads {asked}; it has {', '.join(memories) or 'none'}")
     name = str([*first, *wanted][0])
-    return checkpoint.memory_choice(name), f"adapter {name!r} of {checkpoint.folder}"
+    return checkpoint.memory_config(name), f"adapter {name!r} of {checkpoint.folder}"
 
 
 def _memories(checkpoint: Checkpoint) -> dict[str, str]:
     """The memory that each adapter reads."""
-    return {name: checkpoint.memory_choice(name).name for name in checkpoint.adapters}
+    return {name: checkpoint.memory_config(name).name for name in checkpoint.adapters}
 
 
 def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:

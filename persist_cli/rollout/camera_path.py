@@ -8,7 +8,7 @@ from pathlib import Path
 from persist_cli.api.actions import format_actions
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
 from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
@@ -31,11 +31,11 @@ class RolloutPlan:
     write: bool
     seed: int
     sampling: SamplingOverrides
-    placement: Placement
+    placement: InferenceOptions
 
 
 @dataclass(frozen=True)
-class Walk:
+class CameraPath:
     """Where a rollout goes.
 
     Args:
@@ -68,7 +68,7 @@ class Rollout:
         gives_depth: whether the depth of the imagined frames is one.
     """
 
-    walk: Walk
+    walk: CameraPath
     seen: Observations
     before: Memory | None
     memory: Memory | None
@@ -76,34 +76,34 @@ class Rollout:
     gives_depth: bool
 
 
-def plan_walks(plan: RolloutPlan) -> list[Walk]:
+def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:
     """The start frame and the cameras to come: by each of the texts of actions, or by the trajectory's own poses."""
     reference = parse_reference(plan.start)
     file = reference.single()
     if plan.follow:
-        return [follow_trajectory(file, reference.frame, plan.frames)]
+        return [path_of_trajectory(file, reference.frame, plan.frames)]
     start = file.read([reference.frame])
-    return [walk_by(start, text) for text in plan.actions]
+    return [path_along_actions(start, text) for text in plan.actions]
 
 
-def walk_by(start: Trajectory, text: str) -> Walk:
+def path_along_actions(start: Trajectory, text: str) -> CameraPath:
     """The way from a single frame along actions."""
     vocabulary, camera = start.info.vocabulary, start.observations.cameras
     names = vocabulary.parse(text)
     poses = vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
     cameras = Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
     interactions = interactions_of(names, vocabulary)
-    return Walk(start.observations, cameras, interactions, format_actions(names), None, start.info)
+    return CameraPath(start.observations, cameras, interactions, format_actions(names), None, start.info)
 
 
-def follow_trajectory(file: TrajectoryFile, first: int, frames: int) -> Walk:
+def path_of_trajectory(file: TrajectoryFile, first: int, frames: int) -> CameraPath:
     """The trajectory's own way from a frame on, with what is really seen there."""
     last = min(len(file), first + 1 + frames) if frames else len(file)
     if last - first < 2:
         raise DataError(f"{file.name}: frame {first} is the last; there is nothing to follow")
     span = file.read(slice(first, last))
     names = tuple(name or "stay" for name in span.actions[:-1])
-    return Walk(
+    return CameraPath(
         start=span.observations[:1],
         cameras=span.observations.cameras[1:],
         interactions=interactions_of(span.actions[:-1], file.info.vocabulary),

@@ -21,9 +21,9 @@ from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import check_folder
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_file import load_memory
-from persist_cli.rollout.camera_path import Rollout, RolloutPlan, Walk, plan_walks
+from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
 from persist_cli.rollout.outputs import write_outputs
 from persist_cli.rollout.world_model import WorldModel, imagine_together
 from persist_cli.viewing.console import add_task, print_json, progress, say
@@ -36,7 +36,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     plan.placement.device()  # what cannot be is told before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = plan.adapter or checkpoint.default_adapter()
-    walks = plan_walks(plan)
+    walks = plan_camera_paths(plan)
     folders = check_folders(out, len(walks))
     info = walks[0].info
     backbone = load_backbone(checkpoint)
@@ -45,7 +45,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     backbone.check_sampling(sampling)
     plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(sampling)))
     load_adapter(backbone, checkpoint, adapter)
-    backbone.place(plan.placement)
+    backbone.prepare_inference(plan.placement)
     memory = open_memory(checkpoint, adapter, plan, info)
     model = WorldModel(backbone, memory and memory.to(backbone.device), sampling, plan.seed, plan.write)
     rollouts = roll(model, walks)
@@ -83,7 +83,7 @@ def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, 
         if plan.memory is not None:
             raise CheckpointError(f"{checkpoint.folder}: has no memory adapter that could read {plan.memory}")
         return None
-    maker = MemoryMaker.of(checkpoint.memory_choice(adapter))
+    maker = MemoryFactory.of(checkpoint.memory_config(adapter))
     empty = maker.empty(info)
     if plan.memory is None:
         return empty
@@ -100,7 +100,7 @@ def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
             raise CheckpointError(f"{path}: its {key.replace('_', ' ')} is {has[key]!r}, wanted here is {wants[key]!r}")
 
 
-def roll(model: WorldModel, walks: Sequence[Walk]) -> list[Rollout]:
+def roll(model: WorldModel, walks: Sequence[CameraPath]) -> list[Rollout]:
     """Imagine walks from one start together, clip by clip, with a progress bar."""
     before, began = None if model.memory is None else model.memory.copy(), time.monotonic()
     model.reset(walks[0].start, walks[0].info)

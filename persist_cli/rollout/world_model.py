@@ -18,7 +18,7 @@ from persist_cli.errors import PersistError
 
 
 @dataclass(frozen=True)
-class Question:
+class ClipRequest:
     """What a backbone is asked for one clip.
 
     Args:
@@ -99,18 +99,18 @@ class WorldModel:
             yield self.next_clip(cameras[part], interactions[part])
 
     def next_clip(self, cameras: Cameras, interactions: Interactions) -> Observations:
-        """Recall, denoise, observe, memorize."""
-        question = self.recall(cameras, interactions)
-        rgb, depth = self.denoise(question)
+        """MemoryIntervention, denoise, observe, memorize."""
+        request = self.recall(cameras, interactions)
+        rgb, depth = self.denoise(request)
         return self.observe(rgb, depth, cameras)
 
-    def recall(self, cameras: Cameras, interactions: Interactions) -> Question:
+    def recall(self, cameras: Cameras, interactions: Interactions) -> ClipRequest:
         """What the backbone is asked for the next clip, with what the memory says to its cameras."""
         return recall_together([self], [cameras], [interactions])[0]
 
-    def denoise(self, question: Question) -> tuple[torch.Tensor, torch.Tensor]:
+    def denoise(self, request: ClipRequest) -> tuple[torch.Tensor, torch.Tensor]:
         """RGB and depth of the clip asked for, its present frame first."""
-        rgb, depth = self.backbone.generate(batch_of([question]), self.sampling)
+        rgb, depth = self.backbone.generate(batch_of([request]), self.sampling)
         return rgb[0].cpu(), depth[0].cpu()
 
     def observe(self, rgb: torch.Tensor, depth: torch.Tensor, cameras: Cameras) -> Observations:
@@ -184,8 +184,8 @@ def imagine_together(
         part = slice(first, first + length)
         going = [number for number, path in enumerate(cameras) if len(path) > first]
         movers, paths = [models[number] for number in going], [cameras[number][part] for number in going]
-        questions = recall_together(movers, paths, [interactions[number][part] for number in going])
-        rgb, depth = backbone.generate(batch_of(questions), sampling)
+        requests = recall_together(movers, paths, [interactions[number][part] for number in going])
+        rgb, depth = backbone.generate(batch_of(requests), sampling)
         answers = zip(movers, rgb.cpu(), depth.cpu(), paths, strict=True)
         seen = dict(zip(going, (model.observe(*answer) for model, *answer in answers), strict=True))
         yield [seen.get(number, model.now[:0]) for number, model in enumerate(models)]
@@ -193,7 +193,7 @@ def imagine_together(
 
 def recall_together(
     models: Sequence[WorldModel], cameras: Sequence[Cameras], interactions: Sequence[Interactions]
-) -> list[Question]:
+) -> list[ClipRequest]:
     """What the backbone is asked for the next clip of each model; a memory that several read is looked through once."""
     paths = [model.clip_path(each) for model, each in zip(models, cameras, strict=True)]
     readers: dict[int, list[int]] = {}
@@ -203,32 +203,32 @@ def recall_together(
     for numbers in readers.values():
         memory, budget = models[numbers[0]].memory, models[numbers[0]].backbone.token_budget
         if memory is not None:
-            told = memory.read_together([paths[number] for number in numbers], budget)
+            told = memory.read_batch([paths[number] for number in numbers], budget)
             tokens |= dict(zip(numbers, told, strict=True))
     return [
-        Question(model.now, path, done, tokens.get(number), clip_seed(model.seed, model.clips))
+        ClipRequest(model.now, path, done, tokens.get(number), clip_seed(model.seed, model.clips))
         for number, (model, path, done) in enumerate(zip(models, paths, interactions, strict=True))
     ]
 
 
-def batch_of(questions: Sequence[Question]) -> Clips:
+def batch_of(requests: Sequence[ClipRequest]) -> Clips:
     """A batch for the backbone, the given frame of each question first, or once for all that share one."""
-    tokens = [question.tokens for question in questions if question.tokens is not None]
-    first = questions[0].path
-    given = [question.now for question in questions]
+    tokens = [request.tokens for request in requests if request.tokens is not None]
+    first = requests[0].path
+    given = [request.now for request in requests]
     given = given[:1] if all(now is given[0] for now in given) else given
     return Clips(
         rgb=torch.stack([now.rgb for now in given]),
         depth=torch.stack([now.depth for now in given]),
         cameras=Cameras(
-            torch.stack([question.path.world_from_camera for question in questions]),
-            torch.stack([question.path.intrinsics for question in questions]),
+            torch.stack([request.path.world_from_camera for request in requests]),
+            torch.stack([request.path.intrinsics for request in requests]),
             first.height,
             first.width,
         ),
-        interactions=[question.interactions for question in questions],
+        interactions=[request.interactions for request in requests],
         tokens=MemoryTokens.stack(tokens) if tokens else None,
-        seeds=[question.seed for question in questions],
+        seeds=[request.seed for request in requests],
     )
 
 

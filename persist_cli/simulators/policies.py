@@ -99,9 +99,9 @@ def clear_distance(simulator: Simulator, start: Ground, heading: float, longest:
     return math.floor(longest / stride + 1e-9) * stride
 
 
-Walk = Generator[str, bool, None]
+CameraPath = Generator[str, bool, None]
 
-Policy = Callable[[Simulator, np.random.Generator, int], Walk]
+Policy = Callable[[Simulator, np.random.Generator, int], CameraPath]
 
 SIGHT = 4.0  # metres that explore looks ahead
 
@@ -135,7 +135,7 @@ def walk(simulator: Simulator, policy: Policy, random: np.random.Generator, fram
     yield replace(simulator.observe(), action=None, timestamp=float(frames - 1))
 
 
-def _next_allowed(simulator: Simulator, actions: Walk, first: bool) -> str:
+def _next_allowed(simulator: Simulator, actions: CameraPath, first: bool) -> str:
     """Do what the policy wants next that the world allows; its name."""
     action = next(actions) if first else actions.send(True)
     for _ in range(MOST_REFUSALS):
@@ -145,7 +145,7 @@ def _next_allowed(simulator: Simulator, actions: Walk, first: bool) -> str:
     raise DataError(f"{simulator.info.scene}: the agent cannot move; the last {MOST_REFUSALS} actions were refused")
 
 
-def explore(simulator: Simulator, random: np.random.Generator, count: int) -> Walk:
+def explore(simulator: Simulator, random: np.random.Generator, count: int) -> CameraPath:
     """A random walk in straight runs, towards open and rarely visited ground; it turns away from what blocks it."""
     visits: Counter[tuple[int, int]] = Counter()
     _, turn = _gait(simulator)
@@ -169,7 +169,7 @@ def _run(simulator: Simulator, most: int, visits: Counter[tuple[int, int]]) -> G
     return most
 
 
-def path(simulator: Simulator, random: np.random.Generator, count: int) -> Walk:
+def path(simulator: Simulator, random: np.random.Generator, count: int) -> CameraPath:
     """Shortest ways between random places, one after another, sometimes with a look around before setting out."""
     grid = FreeGrid(simulator)
     reachable = sorted(grid.distances(simulator.agent[0]))
@@ -183,7 +183,7 @@ def path(simulator: Simulator, random: np.random.Generator, count: int) -> Walk:
             yield from _turned(int(random.choice([-1, 1])) * int(random.integers(1, max(2, round(90 / turn)))))
 
 
-def there_and_back(simulator: Simulator, random: np.random.Generator, count: int) -> Walk:
+def there_and_back(simulator: Simulator, random: np.random.Generator, count: int) -> CameraPath:
     """Out along a path or a random walk for half of ``count`` actions, then the reversed actions back."""
     out = path if random.random() < 0.5 else explore
     outward = out(simulator, random, count // 2)
@@ -207,7 +207,7 @@ def _gait(simulator: Simulator) -> tuple[float, float]:
     return vocabulary["forward"].forward, vocabulary["left"].turn
 
 
-def _turned(turns: int) -> Walk:
+def _turned(turns: int) -> CameraPath:
     """Turns to the left, or to the right where negative."""
     for _ in range(abs(turns)):
         yield "left" if turns > 0 else "right"

@@ -28,13 +28,13 @@ from persist_cli import __version__
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.observations import Observations
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.data.clips import ClipChoice, ClipDataset, ClipSample
+from persist_cli.data.clips import ClipDataset, ClipFrames, ClipSample
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import ASIDE, file_sha256, read_tensors, write_tensors
-from persist_cli.memorize.factory import MemoryMaker, collate, recall
+from persist_cli.memorize.factory import MemoryFactory, collate, recall
 from persist_cli.memorize.sources import Source
 from persist_cli.plugins import find_plugin
-from persist_cli.recipe import MemoryChoice, Recipe
+from persist_cli.recipe import MemoryConfig, Recipe
 from persist_cli.viewing.console import say
 
 FORMAT = 1  # of the entries; another number makes every older one unknown
@@ -194,7 +194,7 @@ class CacheKeys:
     hashes: dict[Path, str] = dataclasses.field(default_factory=dict)  # of trajectories, each computed once
 
     @staticmethod
-    def of(recipe: Recipe, backbone: Backbone, maker: MemoryMaker | None, device: str) -> CacheKeys:
+    def of(recipe: Recipe, backbone: Backbone, maker: MemoryFactory | None, device: str) -> CacheKeys:
         """Those of a run.
 
         Args:
@@ -208,9 +208,9 @@ class CacheKeys:
         tokens = None
         if maker is not None and recipe.memory is not None:
             tokens = made_by | _of_memory(recipe.memory, maker, backbone)
-        return CacheKeys(latents, tokens, backbone.frames_alone)
+        return CacheKeys(latents, tokens, backbone.framewise)
 
-    def of_clip(self, choice: ClipChoice) -> ClipKeys:
+    def of_clip(self, choice: ClipFrames) -> ClipKeys:
         """The keys of a clip."""
         clip = {"trajectory": self._trajectory(choice.file.path), "frames": list(choice.frames)}
         latents = cache_key((clip | {"frames": "all"} if self.whole else clip) | self.latents)
@@ -224,7 +224,7 @@ class CacheKeys:
         return self.hashes[path]
 
 
-def _of_memory(choice: MemoryChoice, maker: MemoryMaker, backbone: Backbone) -> dict[str, Any]:
+def _of_memory(choice: MemoryConfig, maker: MemoryFactory, backbone: Backbone) -> dict[str, Any]:
     """What tokens depend on; an encoder's weights are told by the features that they give of a fixed picture."""
     height, width = backbone.image_size
     picture = torch.arange(height * width * 3).reshape(1, height, width, 3) * 37 % 256
@@ -258,26 +258,26 @@ class ClipCache:
         """Whether it takes latents of whole trajectories."""
         return self.keys.whole
 
-    def latents(self, choice: ClipChoice) -> Tensor | None:
+    def latents(self, choice: ClipFrames) -> Tensor | None:
         """Latents of the clip, ``None`` where there are none."""
         found = self.cache.get(self.keys.of_clip(choice).latents)
         return None if found is None else self.cut(found["latents"], choice)
 
-    def cut(self, latents: Tensor, choice: ClipChoice) -> Tensor:
+    def cut(self, latents: Tensor, choice: ClipFrames) -> Tensor:
         """The clip's latents of those that are stored."""
         return latents[list(choice.frames)] if self.whole else latents
 
-    def tokens(self, choice: ClipChoice) -> MemoryTokens | None:
+    def tokens(self, choice: ClipFrames) -> MemoryTokens | None:
         """Memory tokens of the clip, ``None`` where there are none."""
         key = self.keys.of_clip(choice).tokens
         found = None if key is None else self.cache.get(key)
         return None if found is None else MemoryTokens(**found)
 
-    def put_latents(self, choice: ClipChoice, latents: Tensor) -> None:
+    def put_latents(self, choice: ClipFrames, latents: Tensor) -> None:
         """Store the clip's latents, or those of its whole trajectory, while there is room."""
         self.cache.put(self.keys.of_clip(choice).latents, {"latents": latents})
 
-    def put_tokens(self, choice: ClipChoice, tokens: MemoryTokens) -> None:
+    def put_tokens(self, choice: ClipFrames, tokens: MemoryTokens) -> None:
         """Store the clip's memory tokens while there is room."""
         key = self.keys.of_clip(choice).tokens
         if key is not None:
@@ -297,7 +297,7 @@ class CachedSample:
     """
 
     clip: ClipSample
-    choice: ClipChoice
+    choice: ClipFrames
     latents: Tensor | None = None
     tokens: MemoryTokens | None = None
 
@@ -333,7 +333,7 @@ class ClipEncoder:
     """
 
     def __init__(
-        self, backbone: Backbone, maker: MemoryMaker | None, accelerator: Accelerator, cache: ClipCache | None
+        self, backbone: Backbone, maker: MemoryFactory | None, accelerator: Accelerator, cache: ClipCache | None
     ) -> None:
         self.backbone, self.maker, self.accelerator, self.cache = backbone, maker, accelerator, cache
         self.asked, self.found = 0, 0
@@ -377,7 +377,7 @@ class ClipEncoder:
         with torch.no_grad(), self.accelerator.autocast():
             return self.backbone.encode(collate([clip]))[0].cpu()
 
-    def tokens(self, sample: CachedSample, maker: MemoryMaker) -> MemoryTokens:
+    def tokens(self, sample: CachedSample, maker: MemoryFactory) -> MemoryTokens:
         """What a memory of the clip's context says, found or made."""
         if sample.tokens is not None:
             return sample.tokens

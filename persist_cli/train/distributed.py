@@ -109,7 +109,7 @@ class Sharding:
 
     def __init__(self, backbone: Backbone, recipe: Recipe, accelerator: Accelerator) -> None:
         check_sharded(recipe, backbone)
-        kept = [backbone.get_submodule(name) for name in backbone.kept_whole]
+        kept = [backbone.get_submodule(name) for name in backbone.never_sharded]
         self.backbone, self.all_saved = backbone, recipe.stage != "2" and recipe.lora is None
         self.trained = {name for name, each in backbone.named_parameters() if each.requires_grad}
         self.whole = _without_weights(backbone, kept)
@@ -153,8 +153,8 @@ class Sharding:
 
 def check_sharded(recipe: Recipe, backbone: Backbone) -> None:
     """Raise ``PersistError`` when a recipe asks for what cannot be sharded; its stage's parameters are unfrozen."""
-    settings, named = recipe.training, ", ".join(backbone.kept_whole)
-    if any(each.requires_grad for each in backbone.whole_parameters()):
+    settings, named = recipe.training, ", ".join(backbone.never_sharded)
+    if any(each.requires_grad for each in backbone.never_sharded_parameters()):
         raise PersistError(f"--use_fsdp: stage {recipe.stage} trains {named}, which is not sharded; use --multi_gpu")
     if settings.optimizer != "adamw":
         raise PersistError(f"--use_fsdp: training.optimizer={settings.optimizer} is not sharded; use adamw")

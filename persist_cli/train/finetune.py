@@ -22,12 +22,12 @@ from persist_cli.checkpoints.checkpoint import (
     Checkpoint,
     find_checkpoint,
     start_backbone,
-    starts_from_nothing,
+    starts_from_random_codec,
     step_folders,
 )
 from persist_cli.errors import INTERRUPTED, PersistError, RecipeError
 from persist_cli.io.files import check_folder
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, parse_yaml_mapping, read_recipe, to_plain
 from persist_cli.train.clip_cache import CacheSettings
 from persist_cli.train.distributed import (
@@ -134,9 +134,9 @@ def finetune(recipe: Recipe, run: Path, stop: Stop, plan: FinetunePlan) -> int |
     """
     accelerator = make_accelerator(recipe, run)
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
-    maker = MemoryMaker.of(recipe.memory, accelerator.device) if recipe.memory else None
+    maker = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, maker)
-    if accelerator.is_main_process and starts_from_nothing(recipe, backbone):
+    if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
         warn(f"{run}: {FROM_NOTHING}")
     trainer = Trainer(recipe, backbone, maker, accelerator, plan.cache)
     if plan.profile:
@@ -184,7 +184,7 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
     return accelerator
 
 
-def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryMaker | None) -> Backbone:
+def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryFactory | None) -> Backbone:
     """The backbone to train: fresh or from the base, with fresh LoRA where asked for, a fresh adapter in stage 2."""
     backbone = start_backbone(recipe.backbone, base)
     if recipe.lora is not None:

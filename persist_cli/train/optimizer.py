@@ -10,14 +10,14 @@ import torch
 from diffusers.training_utils import EMAModel
 from torch import nn
 
-from persist_cli.api.stages import Economy
+from persist_cli.api.stages import MemorySavings
 from persist_cli.errors import PersistError
 from persist_cli.recipe import TrainingSettings
 
 COMPILERS = ("c++", "g++", "clang++")  # what torch.compile looks for on a CPU
 
 
-def economy_of(settings: TrainingSettings, device: torch.device) -> Economy:
+def requested_savings(settings: TrainingSettings, device: torch.device) -> MemorySavings:
     """What the settings ask of the backbone.
 
     Raises:
@@ -28,7 +28,7 @@ def economy_of(settings: TrainingSettings, device: torch.device) -> Economy:
         raise PersistError(
             f"training.compile needs a C++ compiler on a CPU ({' or '.join(compilers)}); install one or leave it out"
         )
-    return Economy(
+    return MemorySavings(
         gradient_checkpointing=settings.gradient_checkpointing,
         compile=settings.compile,
         frozen=torch.bfloat16 if settings.frozen_precision == "bf16" else None,

@@ -9,7 +9,7 @@ from safetensors import SafetensorError
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.checkpoints.checkpoint import Checkpoint, save_adapter, save_base, save_lora
-from persist_cli.checkpoints.lineage import RECIPE, stage_recipes, training_scenes, write_recipes
+from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
 from persist_cli.data.scenes import TrainingScenes
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
@@ -89,4 +89,4 @@ class RunFolder:
         else:
             save_base(backbone, folder, self.scenes)
         write_text(folder / RECIPE, to_yaml(recipe))
-        write_recipes(folder, self.recipes)
+        save_stage_recipes(folder, self.recipes)

@@ -20,12 +20,12 @@ from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.data.clips import ClipDataset, ClipPlan, SharedBatches
 from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
-from persist_cli.memorize.factory import MemoryMaker, collate, recall_all
+from persist_cli.memorize.factory import MemoryFactory, collate, recall_all
 from persist_cli.recipe import Recipe, TrainingSettings
 from persist_cli.train.clip_cache import Cache, CachedClips, CacheKeys, CacheSettings, ClipCache, ClipEncoder
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes, timed
-from persist_cli.train.optimizer import economy_of, make_average, make_optimizer, update_average
+from persist_cli.train.optimizer import make_average, make_optimizer, requested_savings, update_average
 from persist_cli.train.state import TrainingState
 from persist_cli.viewing.console import add_task, progress
 
@@ -68,7 +68,7 @@ class Trainer:
         self,
         recipe: Recipe,
         backbone: Backbone,
-        maker: MemoryMaker | None,
+        maker: MemoryFactory | None,
         accelerator: Accelerator,
         cache: CacheSettings | None = None,
     ) -> None:
@@ -76,7 +76,7 @@ class Trainer:
         self.maker = maker
         self.times: StepTimes | None = None
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
-        backbone.economize(recipe.stage, economy_of(settings, accelerator.device))
+        backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
         self.scenes = frozenset(file.info.scene for file in clips.files)
         self.clips: Dataset[Any] = clips
@@ -120,7 +120,7 @@ class Trainer:
             raise RecipeError(
                 f"--cache: in stage {recipe.stage} backbone {backbone.name!r} keeps nothing of a clip; leave it out"
             )
-        if not again and (recipe.stage == "2" or not backbone.frames_alone):
+        if not again and (recipe.stage == "2" or not backbone.framewise):
             raise RecipeError(
                 "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
                 "data.clips_per_trajectory=32, or leave --cache out"

@@ -6,17 +6,21 @@ import pytest
 import torch
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.errors import PersistError
 from tests.support.micro_model import micro
 
 NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is an accelerator")
 
 
-def test_words_become_a_placement():
-    assert Placement.of(None, None) == Placement()
-    assert Placement.of("float16", "vae-tiling, model-offload") == Placement("float16", "model", tiling=True)
-    assert Placement.of(None, "sequential-offload,vae-slicing") == Placement(None, "sequential", slicing=True)
+def test_options_by_name_become_inference_options():
+    assert InferenceOptions.of(None, None) == InferenceOptions()
+    assert InferenceOptions.of("float16", "vae-tiling, model-offload") == InferenceOptions(
+        "float16", "model", tiling=True
+    )
+    assert InferenceOptions.of(None, "sequential-offload,vae-slicing") == InferenceOptions(
+        None, "sequential", slicing=True
+    )
 
 
 @pytest.mark.parametrize(
@@ -30,12 +34,12 @@ def test_words_become_a_placement():
 )
 def test_other_words_are_one_line(dtype, save_memory, cause):
     with pytest.raises(PersistError, match=cause):
-        Placement.of(dtype, save_memory)
+        InferenceOptions.of(dtype, save_memory)
 
 
 def test_only_what_changes_results_is_told_apart():
-    assert Placement.of(None, "model-offload,vae-slicing").changes() == {}
-    assert Placement.of("bfloat16", "vae-tiling").changes() == {"dtype": "bfloat16", "tiling": True}
+    assert InferenceOptions.of(None, "model-offload,vae-slicing").changes() == {}
+    assert InferenceOptions.of("bfloat16", "vae-tiling").changes() == {"dtype": "bfloat16", "tiling": True}
 
 
 @NO_GPU
@@ -44,13 +48,13 @@ def test_offloading_without_an_accelerator_is_one_line(offload):
     with pytest.raises(
         PersistError, match=rf"^--save-memory {offload}-offload keeps weights .* there is none; leave it"
     ):
-        micro().place(Placement(offload=offload))
+        micro().prepare_inference(InferenceOptions(offload=offload))
 
 
 def test_a_backbone_that_says_no_more_moves_and_saves_no_memory():
     backbone = micro()
-    Backbone.place(backbone.train(), Placement("bfloat16"))
+    Backbone.prepare_inference(backbone.train(), InferenceOptions("bfloat16"))
     assert backbone.prompt.dtype == torch.bfloat16
     assert not backbone.training
     with pytest.raises(PersistError, match=r"^backbone 'cogvideox' cannot save memory; leave out --save-memory$"):
-        Backbone.place(backbone, Placement(slicing=True))
+        Backbone.prepare_inference(backbone, InferenceOptions(slicing=True))

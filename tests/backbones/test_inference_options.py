@@ -7,7 +7,7 @@ import torch
 
 from persist_backbones.extensions.offload import overlap, place
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.errors import PersistError
 from tests.support.micro_model import equal, random_clips, random_tokens, trained, with_adapter
 
@@ -19,14 +19,14 @@ CPU = torch.device("cpu")
 def test_slices_of_the_codec_change_no_colour_and_are_undone_by_another_placement():
     backbone = trained()
     rgb, depth = backbone.generate(CLIPS, SAMPLING)
-    backbone.place(Placement(slicing=True, tiling=True))
+    backbone.prepare_inference(InferenceOptions(slicing=True, tiling=True))
     assert backbone.codec.vae.use_slicing
     assert backbone.codec.vae.use_tiling
-    backbone.place(Placement(slicing=True))
+    backbone.prepare_inference(InferenceOptions(slicing=True))
     sliced = backbone.generate(CLIPS, SAMPLING)
     assert (sliced[0].int() - rgb.int()).abs().max() <= 1
     assert torch.allclose(sliced[1], depth, rtol=1e-3)
-    backbone.place(Placement())
+    backbone.prepare_inference(InferenceOptions())
     assert not backbone.codec.vae.use_slicing
     assert equal(backbone.generate(CLIPS, SAMPLING), (rgb, depth))
 
@@ -34,7 +34,7 @@ def test_slices_of_the_codec_change_no_colour_and_are_undone_by_another_placemen
 def test_lower_precision_is_kept_and_comes_near():
     backbone = trained()
     rgb, _ = backbone.generate(CLIPS, SAMPLING)
-    backbone.place(Placement("bfloat16"))
+    backbone.prepare_inference(InferenceOptions("bfloat16"))
     assert {each.dtype for each in backbone.parameters()} == {torch.bfloat16}
     found, depth = backbone.generate(CLIPS, SAMPLING)
     assert (found.dtype, depth.dtype) == (torch.uint8, torch.float32)
@@ -46,14 +46,14 @@ def test_whole_parts_that_rest_elsewhere_give_the_same_clip_again_and_after_anot
     backbone = trained()
     before = backbone.generate(CLIPS, SAMPLING)
     for _ in range(2):
-        backbone.offloaded = place(backbone, Placement(offload="model"), CPU)
+        backbone.offloaded = place(backbone, InferenceOptions(offload="model"), CPU)
         assert equal(backbone.generate(CLIPS, SAMPLING), before)
         assert equal(backbone.generate(CLIPS, SAMPLING), before)
     with_adapter(backbone, form="canvas")
-    backbone.offloaded = place(backbone, Placement(offload="model"), CPU)
+    backbone.offloaded = place(backbone, InferenceOptions(offload="model"), CPU)
     backbone.generate(CLIPS, SAMPLING)
     backbone.use_adapter("voxel")
-    backbone.place(Placement())
+    backbone.prepare_inference(InferenceOptions())
     assert backbone.offloaded is None
     assert not any(hasattr(each, "_hf_hook") for each in backbone.modules())
 
@@ -62,14 +62,14 @@ def test_whole_parts_that_rest_elsewhere_give_the_same_clip_again_and_after_anot
 @pytest.mark.parametrize("offload", ["model", "sequential"])
 def test_an_offloaded_backbone_leaves_the_gpu_empty_between_clips(offload):
     backbone = trained()
-    backbone.place(Placement())
+    backbone.prepare_inference(InferenceOptions())
     rgb, _ = backbone.generate(CLIPS, SAMPLING)
     for _ in range(2):
-        backbone.place(Placement(offload=offload))
+        backbone.prepare_inference(InferenceOptions(offload=offload))
         found, _ = backbone.generate(CLIPS, SAMPLING)
         assert (found.int() - rgb.int()).abs().max() <= 2
     assert backbone.transformer.base.device.type != "cuda"
-    backbone.place(Placement())
+    backbone.prepare_inference(InferenceOptions())
     assert backbone.transformer.base.device.type == "cuda"
 
 

@@ -24,7 +24,7 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.checkpoints.checkpoint import find_checkpoint, save_adapter, save_base
 from persist_cli.errors import PersistError
-from persist_cli.recipe import MemoryChoice
+from persist_cli.recipe import MemoryConfig
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, trained
 
 CLIPS = random_clips(2, random_tokens(2, 5))
@@ -231,7 +231,7 @@ def checkpoints(tmp_path: Path) -> tuple[CogVideoX, Path, Path]:
     base.mkdir()
     stage2.mkdir()
     save_base(backbone, base)
-    save_adapter(backbone, find_checkpoint(base), MemoryChoice("voxel"), stage2, stage2)
+    save_adapter(backbone, find_checkpoint(base), MemoryConfig("voxel"), stage2, stage2)
     return backbone, base, stage2
 
 

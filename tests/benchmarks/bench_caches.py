@@ -31,7 +31,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.backbone import Backbone, Clips, Sampling
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.checkpoints.checkpoint import (
     find_checkpoint,
     load_adapter,
@@ -40,8 +40,8 @@ from persist_cli.checkpoints.checkpoint import (
 )
 from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store
-from persist_cli.memorize.factory import MemoryMaker
-from persist_cli.rollout.world_model import Question, batch_of
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.rollout.world_model import ClipRequest, batch_of
 from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 
@@ -63,9 +63,9 @@ def configs(ratios: list[float]) -> dict[str, Any]:
     }
 
 
-def make_clips(backbone: Backbone, maker: MemoryMaker | None) -> tuple[Clips, Tensor]:
+def make_clips(backbone: Backbone, maker: MemoryFactory | None) -> tuple[Clips, Tensor]:
     """A batch that goes on from each place of each sample house, and the true colours of its frames."""
-    questions, truth, frames = [], [], backbone.frames_per_clip
+    requests, truth, frames = [], [], backbone.frames_per_clip
     for number, file in enumerate(Store(sample_data())):
         for place in PLACES:
             seen = file.read(range(place)).observations
@@ -76,9 +76,9 @@ def make_clips(backbone: Backbone, maker: MemoryMaker | None) -> tuple[Clips, Te
                 memory.write(seen)
                 tokens = memory.read(clip.cameras, backbone.token_budget)
             seed = len(PLACES) * number + place
-            questions.append(Question(clip[:1], clip.cameras, (None,) * (frames - 1), tokens, seed))
+            requests.append(ClipRequest(clip[:1], clip.cameras, (None,) * (frames - 1), tokens, seed))
             truth.append(clip.rgb)
-    return batch_of(questions), torch.stack(truth)
+    return batch_of(requests), torch.stack(truth)
 
 
 def calibrate(backbone: Any, draw: Callable[[], Any], steps: int) -> list[float]:
@@ -108,7 +108,9 @@ def psnr(one: Tensor, two: Tensor) -> float:
     return float(10 * torch.log10(255**2 / error))
 
 
-def rows(backbone: Any, maker: MemoryMaker | None, name: str, sampling: Sampling, rounds: int) -> list[tuple[str, ...]]:
+def rows(
+    backbone: Any, maker: MemoryFactory | None, name: str, sampling: Sampling, rounds: int
+) -> list[tuple[str, ...]]:
     """One for each cache."""
     clips, truth = make_clips(backbone, maker)
     draw = partial(backbone.generate, clips, sampling)
@@ -141,8 +143,8 @@ if __name__ == "__main__":
         table = []
         for adapter in (None, checkpoint.default_adapter()):
             load_adapter(backbone, checkpoint, adapter)
-            backbone.place(Placement())
-            maker = MemoryMaker.of(checkpoint.memory_choice(adapter)) if adapter else None
+            backbone.prepare_inference(InferenceOptions())
+            maker = MemoryFactory.of(checkpoint.memory_config(adapter)) if adapter else None
             sampling = Sampling(steps, "ddim", options.guidance)
             table += rows(backbone, maker, adapter or "no memory", sampling, options.rounds)
         print_table(f"{steps} steps", ["memory, cache", "s a clip", "faster", "PSNR to none", "PSNR to truth"], table)

@@ -22,9 +22,9 @@ from persist_cli.api.actions import walking_actions
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.observations import Observations, TrajectoryInfo
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import make_backbone
-from persist_cli.recipe import MemoryChoice
+from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import WorldModel, step_together
 from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import Times, alternate, say_conditions
@@ -74,7 +74,7 @@ def make_world(backbone: Backbone, name: str, info: TrajectoryInfo) -> TimedWorl
     """The backbone with a memory of this name and a fresh adapter for it."""
     memory = None
     if name != NO_ADAPTER:
-        maker = MemoryMaker.of(MemoryChoice(name))
+        maker = MemoryFactory.of(MemoryConfig(name))
         memory = maker.empty(info)
         backbone.add_adapter(name, maker.encoder.channels, {})
     return TimedWorldModel(backbone, memory, Sampling(STEPS))

@@ -34,10 +34,10 @@ from persist_cli.evaluate.cases import Case, CaseFrames, read_case
 from persist_cli.evaluate.measure import Measurer, choose_metrics, make_setup
 from persist_cli.evaluate.protocols import PROTOCOLS, Selected
 from persist_cli.evaluate.provenance import checkpoint_json, environment, metric_json
-from persist_cli.evaluate.rows.build_rows import FORGETFUL, PLAIN, RowChoice, make_rows
+from persist_cli.evaluate.rows.build_rows import FORGETFUL, PLAIN, RowConfig, make_rows
 from persist_cli.evaluate.rows.model import ModelRow
 from persist_cli.io.files import write_json, written_aside
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics import METRICS
 from persist_cli.plugins import make_backbone
 from persist_cli.recipe import make_recipe, read_recipe
@@ -128,7 +128,7 @@ def fresh_model(folder: Path, settings: dict[str, Any]) -> list[Path]:
     for name in STAND_IN:
         recipe = make_recipe(read_recipe(f"tiny-stage2-{name}"), name)
         assert recipe.memory is not None
-        backbone.add_adapter(name, MemoryMaker.of(recipe.memory).encoder.channels, recipe.adapter)
+        backbone.add_adapter(name, MemoryFactory.of(recipe.memory).encoder.channels, recipe.adapter)
         (folder / name).mkdir()
         save_adapter(backbone, find_checkpoint(folder / "base"), recipe.memory, folder / name, folder / name)
     return [folder / name for name in STAND_IN]
@@ -143,7 +143,7 @@ def make_bench(options: argparse.Namespace) -> Bench:
     samplings = [Sampling(steps, sampler, options.guidance) for sampler in samplers for steps in counts]
     cases = PROTOCOL.find(Selected(options.data, 0, options.clips, backbone.frames_per_clip - 1))
     adapters = sorted({name for each in checkpoints for name in each.adapters})
-    rows = make_rows(checkpoints, RowChoice([PLAIN, *adapters], (), samplings[0]), PROTOCOL, cases)
+    rows = make_rows(checkpoints, RowConfig([PLAIN, *adapters], (), samplings[0]), PROTOCOL, cases)
     models = [row for row in rows if isinstance(row, ModelRow)]
     wanted = options.adapter or next((name for name in ("voxel", *adapters) if name in adapters), None)
     row = next((row for row in models if row.adapter == wanted), None)

@@ -25,7 +25,7 @@ from persist_backbones.tensors import fold_frames
 from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.api.geometry import plucker
 from persist_cli.data.clips import ClipDataset, ClipPlan, ClipSample
-from persist_cli.memorize.factory import MemoryMaker, collate, recall
+from persist_cli.memorize.factory import MemoryFactory, collate, recall
 from persist_cli.plugins import make_backbone
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.clip_cache import Cache, CacheSettings
@@ -120,7 +120,7 @@ def memory_pairs(sample: ClipSample, folder: Path) -> list[Pair]:
     """What keeping a clip's tokens gains over building its memory."""
     recipe = make_recipe(read_recipe("houses-64-stage2-voxel"), "voxel")
     assert recipe.memory is not None
-    maker, budget = MemoryMaker.of(recipe.memory), int(recipe.adapter["token_budget"])
+    maker, budget = MemoryFactory.of(recipe.memory), int(recipe.adapter["token_budget"])
     tokens, cache = recall(sample, maker, budget), Cache(CacheSettings(folder, 1))
     cache.put("tokens", {"features": tokens.features, "positions": tokens.positions, "mask": tokens.mask})
     return [("tokens kept: memory alone", partial(recall, sample, maker, budget), partial(cache.get, "tokens"), 1)]

@@ -20,7 +20,7 @@ from accelerate import Accelerator
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.backbone import Clips
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.train.clip_cache import CacheSettings
 from persist_cli.train.finetune import prepare_backbone
@@ -55,7 +55,7 @@ def make_trainer(words: str, data: Path, cache: CacheSettings | None = None) -> 
     name, *changes = words.split()
     given = [f"data.path={data}", f"data.clips_per_trajectory={0 if cache is None else 8}", *changes]
     recipe = make_recipe(apply_overrides(read_recipe(name), given), name)
-    maker = MemoryMaker.of(recipe.memory) if recipe.memory else None
+    maker = MemoryFactory.of(recipe.memory) if recipe.memory else None
     backbone = prepare_backbone(recipe, None, maker)
     trainer = FixedBatchTrainer(recipe, backbone, maker, Accelerator(cpu=True), cache)
     if cache is not None:

@@ -14,7 +14,7 @@ from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD
 from persist_cli.doctor.doctor import Doctor, command
 from persist_cli.doctor.machine import GIB, Machine
 from persist_cli.doctor.memory_estimate import Estimator, Launch
-from persist_cli.doctor.meta_model import plan_recipe
+from persist_cli.doctor.meta_model import build_meta_model
 from persist_cli.doctor.step import Encoding, StepKind, Twins
 from persist_cli.doctor.tracing import LiveBytes, imagined
 from persist_cli.train.distributed import check_sharded
@@ -28,7 +28,7 @@ ONE_GPU = Launch(1, True)
 
 
 def planned(*settings: str, recipe: str = "tiny-stage1"):
-    return plan_recipe(recipe, [*MICRO, *SMALL, *settings])
+    return build_meta_model(recipe, [*MICRO, *SMALL, *settings])
 
 
 @functools.cache
@@ -133,7 +133,7 @@ def test_what_is_said_can_be_run():
     line = command(doctor, [*MICRO, *SMALL], strategy)
     assert line.startswith("accelerate launch --num_processes 2 --multi_gpu --module persist_cli finetune tiny-stage1 ")
     settings = [word for word in shlex.split(line) if "=" in word and not word.endswith("=DIR")]
-    assert plan_recipe("tiny-stage1", settings).recipe == doctor.changed(strategy)
+    assert build_meta_model("tiny-stage1", settings).recipe == doctor.changed(strategy)
     for sharded, machine in ((True, Machine("cuda", 2, 1)), (False, Machine("cuda", 1, 1))):
         line = command(Doctor(planned(), machine, sharded), [], Strategy((OFFLOAD,)))
         flags = "--use_fsdp --fsdp_version 2 --fsdp_offload_params true"

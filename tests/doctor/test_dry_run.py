@@ -9,7 +9,7 @@ import pytest
 from diffusers import CogVideoXTransformer3DModel
 
 from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
-from persist_cli.doctor.meta_model import plan_recipe
+from persist_cli.doctor.meta_model import build_meta_model
 from tests.support.export_runs import write_base
 from tests.support.micro_model import micro
 from tests.support.walking import MICRO_SETTINGS
@@ -17,7 +17,7 @@ from tests.support.walking import MICRO_SETTINGS
 
 def test_a_plan_counts_what_the_trained_model_has(tmp_path):
     write_base(tmp_path / "stage1")
-    planned = plan_recipe("tiny-stage2-voxel", [f"base={tmp_path / 'stage1'}"])
+    planned = build_meta_model("tiny-stage2-voxel", [f"base={tmp_path / 'stage1'}"])
     backbone = load_backbone(find_checkpoint(tmp_path / "stage1"))
     backbone.add_adapter("voxel", planned.channels, {"form": "cross", "width": 128})
     shapes = {name: each.shape for name, each in backbone.named_parameters()}
@@ -57,7 +57,7 @@ def test_a_pretrained_folder_is_planned_from_its_configurations_alone(persist, t
 
 def test_weights_known_by_name_need_not_be_here_for_a_plan():
     changes = ["memory.encoder=dinov2", "memory.encoder_settings={weights: dinov2-base}", *MICRO_SETTINGS]
-    assert plan_recipe("tiny-stage2-voxel", changes).channels == 768
+    assert build_meta_model("tiny-stage2-voxel", changes).channels == 768
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from persist_cli.doctor.memory_estimate import Estimator, Launch
-from persist_cli.doctor.meta_model import plan_recipe
+from persist_cli.doctor.meta_model import build_meta_model
 from tests.support import resident_memory as resident
 from tests.support.measured_memory import SHORT, Run, measured_peaks, trained_bytes
 from tests.support.walking import train_here, write_walks
@@ -43,7 +43,7 @@ def walks_of(tmp_path_factory: pytest.TempPathFactory):
 
 def estimate(run: Run, cuda: bool = False) -> int:
     recipe, _, settings = run
-    planned = plan_recipe(recipe, [*SHORT, *settings])
+    planned = build_meta_model(recipe, [*SHORT, *settings])
     return Estimator(planned.backbone, planned.channels).need(planned.recipe, Launch(1, cuda)).peak
 
 

@@ -10,7 +10,7 @@ from importlib import resources
 import pytest
 
 from persist_cli.doctor.dry_run import dry_run
-from persist_cli.doctor.meta_model import plan_recipe
+from persist_cli.doctor.meta_model import build_meta_model
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe, recipe_names
 
 PUBLISHED = [name for name in recipe_names() if name.startswith("cogvideox-")]
@@ -20,7 +20,7 @@ BLOCKS_5B = 1_059_764_224
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_a_published_model_is_planned_without_it(name):
-    planned = plan_recipe(name, ["backbone.settings.pretrained=nobody/there"])
+    planned = build_meta_model(name, ["backbone.settings.pretrained=nobody/there"])
     record = dry_run(planned)
     parts = {part["name"]: part["parameters"] for part in record["parts"]}
     assert parts["transformer"] == TRANSFORMERS[name.partition("-stage")[0]]
@@ -30,7 +30,7 @@ def test_a_published_model_is_planned_without_it(name):
 
 
 def test_the_papers_memory_blocks_have_a_billion_parameters():
-    adapter = dry_run(plan_recipe("cogvideox-5b-i2v-stage2-voxel", []))["parts"][-1]
+    adapter = dry_run(build_meta_model("cogvideox-5b-i2v-stage2-voxel", []))["parts"][-1]
     assert adapter["parameters"] == BLOCKS_5B
     assert abs(BLOCKS_5B - 1e9) < 1e8
 
@@ -47,7 +47,7 @@ def test_what_stands_beside_the_preset_comes_before_it(persist):
 
 @pytest.mark.parametrize("memory", ["map2d", "snapshots", "none"])
 def test_another_memory_is_one_override(memory):
-    planned = plan_recipe("cogvideox-2b-stage2-voxel", [f"memory.name={memory}"])
+    planned = build_meta_model("cogvideox-2b-stage2-voxel", [f"memory.name={memory}"])
     assert (planned.recipe.memory.name, planned.channels) == (memory, 384)
 
 

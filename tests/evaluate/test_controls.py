@@ -11,7 +11,7 @@ from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
 from persist_cli.data.store import Store
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.protocols import PROTOCOLS, Selected
-from persist_cli.evaluate.rows.controls import Codec, Copy, Nearest, Warp
+from persist_cli.evaluate.rows.controls import CodecReconstruction, Copy, Nearest, Warp
 from persist_cli.evaluate.rows.warp import Surface, warp
 from tests.support.rooms import Room, look
 
@@ -96,7 +96,7 @@ def test_controls_know_only_what_the_memory_holds_by_then(backbone, walks):
 
 def test_the_codec_gives_as_many_frames_as_the_clip_has(backbone, walks):
     clip = read_case(PROTOCOLS["return"].find(Selected([walks], 0, 1, 8))[0])
-    rgb, depth = Codec("codec", None).videos(backbone, [clip], [0])
+    rgb, depth = CodecReconstruction("codec", None).videos(backbone, [clip], [0])
     assert rgb.shape[1] == depth.shape[1] == len(clip.observations) == 24
     assert torch.equal(rgb[0, 0], clip.observations.rgb[0])
 

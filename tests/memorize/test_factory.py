@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from persist_cli.data.clips import ClipDataset, ClipPlan
-from persist_cli.memorize.factory import MemoryMaker, recall
-from persist_cli.recipe import MemoryChoice
+from persist_cli.memorize.factory import MemoryFactory, recall
+from persist_cli.recipe import MemoryConfig
 from tests.support.walking import SIZE
 
 
@@ -15,14 +15,14 @@ def test_an_encoder_computes_where_its_maker_is_told(tmp_path):
 
     sizes = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 56, "patch_size": 14}
     Dinov2Model(Dinov2Config(**sizes)).save_pretrained(tmp_path)
-    choice = MemoryChoice("voxel", {}, "dinov2", {"weights": str(tmp_path)})
+    choice = MemoryConfig("voxel", {}, "dinov2", {"weights": str(tmp_path)})
     seen = torch.zeros(2, 28, 28, 3, dtype=torch.uint8)
-    assert MemoryMaker.of(choice, torch.device("meta")).encoder.encode(seen).is_meta
-    assert not MemoryMaker.of(choice).encoder.encode(seen).is_meta
+    assert MemoryFactory.of(choice, torch.device("meta")).encoder.encode(seen).is_meta
+    assert not MemoryFactory.of(choice).encoder.encode(seen).is_meta
 
 
 def test_a_batch_holds_tokens_of_a_memory_that_saw_something_and_of_one_that_did_not(walks):
     clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
     aware = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))
-    maker = MemoryMaker.of(MemoryChoice("voxel"), torch.device("cpu"))
+    maker = MemoryFactory.of(MemoryConfig("voxel"), torch.device("cpu"))
     assert len(recall(clips[5], maker, 64)) == 0 < len(recall(aware[5], maker, 64)) <= 64

@@ -24,21 +24,21 @@ def same(one, other):
 @pytest.mark.parametrize("name", MEMORIES)
 def test_each_of_several_askers_gets_what_it_would_get_alone(name, budget):
     memory, cameras = written(name, walked(8)), branches()
-    together = memory.read_together(cameras, budget)
+    together = memory.read_batch(cameras, budget)
     assert all(same(tokens, memory.read(each, budget)) for tokens, each in zip(together, cameras, strict=True))
     assert max(len(tokens) for tokens in together) <= budget
 
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_askers_of_an_empty_memory_get_nothing_each(name):
-    assert [len(tokens) for tokens in empty(name).read_together(branches(), 9)] == [0, 0, 0, 0]
+    assert [len(tokens) for tokens in empty(name).read_batch(branches(), 9)] == [0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_askers_with_images_of_two_sizes_get_what_they_would_get_alone(name):
     memory, cameras = written(name, walked(8)), branches()
     cameras[1] = cameras[1].resized(24, 32)
-    together = memory.read_together(cameras, 50)
+    together = memory.read_batch(cameras, 50)
     assert all(same(tokens, memory.read(each, 50)) for tokens, each in zip(together, cameras, strict=True))
 
 
@@ -47,14 +47,14 @@ def test_a_camera_that_several_have_is_looked_through_once(monkeypatch):
     monkeypatch.setattr(
         Views, "look", lambda self, *boxes: looked.append(len(self.apexes)) or look_through(self, *boxes)
     )
-    written("voxel", walked(8)).read_together(branches(), 100)
+    written("voxel", walked(8)).read_batch(branches(), 100)
     assert looked == [5, 5]  # blocks, then cells; 14 cameras, of which five differ
 
 
 def test_many_cells_are_found_for_askers_who_see_many_and_few():
     memory = written("voxel", walked(8), cell=(0.05, 0.05, 0.05))
     cameras = [*branches(), observe([look((0.0, 1.4, 0.0), 0.0, -89.0)]).cameras]
-    together = memory.read_together(cameras, 3000)
+    together = memory.read_batch(cameras, 3000)
     assert all(same(tokens, memory.read(each, 3000)) for tokens, each in zip(together, cameras, strict=True))
     assert len({len(tokens) for tokens in together}) > 1
 
@@ -92,4 +92,4 @@ def test_a_copy_takes_no_room_until_it_is_written():
 
 
 def test_nobody_asks_for_nothing():
-    assert written("voxel", walked(2)).read_together([], 5) == []
+    assert written("voxel", walked(2)).read_batch([], 5) == []

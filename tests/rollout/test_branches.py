@@ -70,10 +70,10 @@ def test_a_branch_is_told_by_the_memory_what_a_rollout_alone_is_told_to_the_bit(
     branches = start(kind).branches(3)
     cameras = [model.cameras_after(way) for model, way in zip(branches, WAYS, strict=True)]
     done = [interactions_of(way, branches[0].vocabulary) for way in WAYS]
-    for question, path, interactions in zip(recall_together(branches, cameras, done), cameras, done, strict=True):
+    for request, path, interactions in zip(recall_together(branches, cameras, done), cameras, done, strict=True):
         alone = start(kind).recall(path, interactions)
-        assert torch.equal(question.tokens.features, alone.tokens.features)
-        assert torch.equal(question.tokens.positions, alone.tokens.positions)
+        assert torch.equal(request.tokens.features, alone.tokens.features)
+        assert torch.equal(request.tokens.positions, alone.tokens.positions)
         assert question.seed == alone.seed
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.checkpoints.checkpoint import find_checkpoint, save_adapter, save_base
-from persist_cli.recipe import MemoryChoice
+from persist_cli.recipe import MemoryConfig
 from tests.support.micro_model import CHANNELS, micro, shaken
 
 ENCODER = {"channels": CHANNELS}
@@ -29,7 +29,7 @@ def write_adapter(backbone: Backbone, base: Path, folder: Path, memory: str, for
     backbone.add_adapter(memory, CHANNELS, SMALL | {"form": form})
     shaken(backbone.adapters[memory])  # type: ignore[index]
     folder.mkdir()
-    choice = MemoryChoice(memory, {"cell": (0.5, 1.0, 0.5)} if memory == "voxel" else {}, "patches", ENCODER)
+    choice = MemoryConfig(memory, {"cell": (0.5, 1.0, 0.5)} if memory == "voxel" else {}, "patches", ENCODER)
     save_adapter(backbone, find_checkpoint(base), choice, folder, folder)
     return folder
 

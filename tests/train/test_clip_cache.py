@@ -17,7 +17,7 @@ from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.errors import PersistError
 from persist_cli.io.files import ASIDE, read_tensors
 from persist_cli.memorize import sources
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import make_backbone
 from persist_cli.recipe import Recipe, TrainingSettings
 from persist_cli.train import clip_cache as keys
@@ -81,7 +81,7 @@ def test_a_long_trajectory_is_encoded_in_pieces_and_gives_the_same_latents(walks
     made = []
     for pixels in (1 << 22, 7 * SIZE * SIZE):
         monkeypatch.setattr(sources, "PIXELS_AT_ONCE", pixels)
-        cache = ClipCache(Cache(CacheSettings(tmp_path / str(pixels), 1)), CacheKeys({}, None, backbone.frames_alone))
+        cache = ClipCache(Cache(CacheSettings(tmp_path / str(pixels), 1)), CacheKeys({}, None, backbone.framewise))
         ClipEncoder(backbone, None, Accelerator(cpu=True), cache).all_latents([CachedClips(clips, cache)[0]])
         made.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["latents"])
     assert len(made[0]) == 24
@@ -122,13 +122,13 @@ def test_a_resumed_run_with_a_cache_equals_an_uninterrupted_one_without(persist,
 def keys_of(walks, voxel):
     """The keys of one clip for a stage, a budget of tokens, a codec that moves, and changes to the memory."""
     checkpoint = find_checkpoint(voxel)
-    backbone, usual = load_backbone(checkpoint), checkpoint.memory_choice("voxel")
+    backbone, usual = load_backbone(checkpoint), checkpoint.memory_config("voxel")
     choice = ClipDataset([walks], ClipPlan(9, (1,), 5, 3, (SIZE, SIZE))).choose(0)
 
     def of(stage="2", budget=7, codec=0.0, precision="no", **changes):
         memory = replace(usual, **changes) if stage == "2" else None
         backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget})
-        maker = MemoryMaker.of(memory) if memory else None
+        maker = MemoryFactory.of(memory) if memory else None
         recipe = Recipe(stage, memory=memory, training=TrainingSettings(precision=precision))
         with torch.no_grad():
             next(backbone.codec.parameters()).add_(codec)

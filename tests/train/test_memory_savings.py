@@ -10,7 +10,7 @@ import torch
 from diffusers.training_utils import EMAModel
 from torch.autograd.graph import saved_tensors_hooks
 
-from persist_cli.api.stages import Economy
+from persist_cli.api.stages import MemorySavings
 from persist_cli.io.files import read_tensors, write_json
 from persist_cli.train.optimizer import update_average
 from persist_cli.train.state import TrainingState
@@ -54,7 +54,7 @@ def test_checkpointing_keeps_little_of_the_forward_pass_memory_blocks_included(s
         backbone = with_adapter(micro()).train()
         backbone.use_adapter("voxel" if stage_ == "2" else None)
         backbone.trained_parameters(stage_)
-        backbone.economize(stage_, Economy(gradient_checkpointing=checkpointing))
+        backbone.apply_memory_savings(stage_, MemorySavings(gradient_checkpointing=checkpointing))
         sizes = []
         with saved_tensors_hooks(lambda tensor, sizes=sizes: sizes.append(tensor.nbytes) or tensor, lambda each: each):
             backbone(random_clips(tokens=random_tokens(2, 5)), stage_)
@@ -79,7 +79,7 @@ def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, 
 def test_what_a_stage_does_not_train_takes_half_the_bytes():
     backbone = with_adapter(micro())
     trained = backbone.trained_parameters("2")
-    backbone.economize("2", Economy(frozen=torch.bfloat16))
+    backbone.apply_memory_savings("2", MemorySavings(frozen=torch.bfloat16))
     assert {each.dtype for each in trained.values()} == {torch.float32}
     assert {each.dtype for each in backbone.parameters() if not each.requires_grad} == {torch.bfloat16}
 
@@ -154,9 +154,9 @@ def test_a_backbone_that_has_no_cheaper_steps_says_so():
     from persist_cli.api.backbone import Backbone
     from persist_cli.errors import PersistError
 
-    Backbone.economize(micro(), "1", Economy())
+    Backbone.apply_memory_savings(micro(), "1", MemorySavings())
     with pytest.raises(PersistError, match="backbone 'cogvideox' has no cheaper steps"):
-        Backbone.economize(micro(), "1", Economy(compile=True))
+        Backbone.apply_memory_savings(micro(), "1", MemorySavings(compile=True))
 
 
 @pytest.mark.parametrize("usual", ["stage1"], indirect=True)

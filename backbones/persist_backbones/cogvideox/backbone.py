@@ -38,14 +38,14 @@ from persist_backbones.cogvideox.inputs import (
     rotary_positions,
 )
 from persist_backbones.cogvideox.model import Conditions
-from persist_backbones.cogvideox.parameter_groups import parts_of, shorten
+from persist_backbones.cogvideox.parameter_groups import group_parameters, truncate_layers
 from persist_backbones.cogvideox.pretrained import DiffusersParts, origin_of
 from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_backbones.extensions.lora import add_lora, train_lora
-from persist_backbones.extensions.savings import FrozenWeights, economize
+from persist_backbones.extensions.savings import FrozenWeights, apply_memory_savings
 from persist_cli.api.backbone import Backbone, Clips, Sampling
-from persist_cli.api.inference import Placement
-from persist_cli.api.stages import Economy, Lora, Part, Stage
+from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.stages import Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class CogVideoX(Backbone):
 
     settings_type = CogVideoXSettings
     sharded_blocks = ("CogVideoXBlock", "MemoryBlock", "CanvasBlock")
-    kept_whole = ("codec",)
+    never_sharded = ("codec",)
     settings: CogVideoXSettings
     prompt: Tensor
 
@@ -114,7 +114,7 @@ class CogVideoX(Backbone):
         """What the settings say."""
         return self.settings.depth
 
-    def place(self, placement: Placement) -> None:
+    def prepare_inference(self, placement: InferenceOptions) -> None:
         """Get ready to sample, as diffusers' pipelines do; weights that are offloaded rest on the CPU between clips."""
         from persist_backbones.extensions.offload import place  # a pipeline is made around this class
 
@@ -130,13 +130,13 @@ class CogVideoX(Backbone):
         """Tokens that the adapter in use asks for; none without one."""
         return self.adapter.settings.token_budget if self.adapter else 0
 
-    def parts(self) -> list[Part]:
+    def parameter_groups(self) -> list[ParameterGroup]:
         """VAE, transformer, what widens it, and memory adapters."""
-        return parts_of(self.named_parameters())
+        return group_parameters(self.named_parameters())
 
-    def shorten(self, groups: int) -> float:
+    def truncate_layers(self, groups: int) -> float:
         """Keep the first transformer blocks, with the adapter's."""
-        return shorten(self.transformer.base.transformer_blocks, self.adapter, groups)
+        return truncate_layers(self.transformer.base.transformer_blocks, self.adapter, groups)
 
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """The VAE's, the transformer's, or the adapter's, everything else frozen."""
@@ -150,9 +150,9 @@ class CogVideoX(Backbone):
             train_lora(self.transformer.base)
         return {name: each for name, each in self.named_parameters() if each.requires_grad}
 
-    def economize(self, stage: Stage, economy: Economy) -> None:
+    def apply_memory_savings(self, stage: Stage, savings: MemorySavings) -> None:
         """As asked; exact values of frozen weights are kept where the stage saves them."""
-        self.frozen = economize(self, stage, economy)
+        self.frozen = apply_memory_savings(self, stage, savings)
 
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
         """The codec's loss, or that of denoising RGB and depth latents."""
@@ -161,7 +161,7 @@ class CogVideoX(Backbone):
             window, weight = self.settings.codec_window, self.settings.kl_weight
             return self.codec.loss(clips.rgb, clips.depth, window, weight, generators)
         kept = self.encode(clips) if clips.latents is None else clips.latents
-        latents, first = (kept, kept[:, :1]) if self.frames_alone else (kept[:, :-1], kept[:, -1:])
+        latents, first = (kept, kept[:, :1]) if self.framewise else (kept[:, :-1], kept[:, -1:])
         latents, image = self.shape.pad(latents), self.image_condition(first)
         timesteps = draw_timesteps(self.scheduler, generators).to(latents.device)
         noise = noise_like(latents, generators)
@@ -183,15 +183,15 @@ class CogVideoX(Backbone):
         return self.codec.fingerprint()
 
     @property
-    def frames_alone(self) -> bool:
+    def framewise(self) -> bool:
         """The codec's."""
-        return self.codec.frames_alone
+        return self.codec.framewise
 
     @torch.no_grad()
     def encode(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Latents of the clips, behind them those of the first image alone where the first latent frame is not that."""
         whole = self.codec.encode(clips.rgb, clips.depth)
-        if self.frames_alone:
+        if self.framewise:
             return whole
         return torch.cat([whole, self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1])], dim=1)
 

@@ -21,7 +21,7 @@ from persist_backbones.cogvideox.pretrained import (
     folder_here,
     load_parts,
     make_part,
-    planning,
+    on_meta_device,
     pretrained_folder,
     published_preset,
 )
@@ -38,7 +38,7 @@ def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
     """
     if settings.pretrained is None:
         return make_parts(settings)
-    if not planning():
+    if not on_meta_device():
         return load_parts(pretrained_folder(settings.pretrained))
     folder = folder_here(settings.pretrained)
     if folder is not None:

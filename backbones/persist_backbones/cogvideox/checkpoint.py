@@ -21,7 +21,7 @@ from persist_backbones.cogvideox.pretrained import (
 from persist_backbones.cogvideox.prompt import check_kept
 from persist_backbones.extensions.lora import save_lora
 from persist_cli.errors import CheckpointError
-from persist_cli.io.checkpoint_folder import what_is_changed
+from persist_cli.io.checkpoint_folder import lora_base
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def save_change(backbone: CogVideoX, folder: Path) -> None:
 def load_whole(backbone: CogVideoX, folder: Path) -> None:
     """Take what ``save_whole`` wrote, or what ``save_change`` did merged into the weights that it changes."""
     check_kept(backbone.settings, folder)
-    changed = what_is_changed(folder)
+    changed = lora_base(folder)
     if changed is None:
         backbone.set_parts(load_parts(folder))
     elif isinstance(changed, Path):

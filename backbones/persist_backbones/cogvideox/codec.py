@@ -80,7 +80,7 @@ class FramewiseConv(CogVideoXCausalConv3d):  # type: ignore[misc]
         return self.conv(inputs), inputs.expand(-1, -1, max(1, self.time_kernel_size - 1), -1, -1)
 
 
-def code_frames_alone(vae: AutoencoderKLCogVideoX) -> None:
+def make_framewise(vae: AutoencoderKLCogVideoX) -> None:
     """Make a VAE fast for videos of one frame; its parameters and their names stay as they are."""
     for module in vae.modules():
         if type(module) is CogVideoXCausalConv3d and module.pad_mode != "replicate":
@@ -171,8 +171,8 @@ class Codec(nn.Module):
         super().__init__()
         self.vae = vae
         self._fingerprint: tuple[object, str] | None = None  # with what tells whether it still holds
-        if self.frames_alone:
-            code_frames_alone(vae)
+        if self.framewise:
+            make_framewise(vae)
 
     @property
     def channels(self) -> int:
@@ -199,7 +199,7 @@ class Codec(nn.Module):
         return float(self.vae.config.scaling_factor**-2) if self.vae.config.invert_scale_latents else 1.0
 
     @property
-    def frames_alone(self) -> bool:
+    def framewise(self) -> bool:
         """Whether the latents of a frame depend on that frame only."""
         return self.temporal == 1
 
@@ -259,7 +259,7 @@ class Codec(nn.Module):
     def posterior(self, images: Float[Tensor, "stacked 3 frame height width"]) -> DiagonalGaussianDistribution:
         """Distribution of the unscaled latents ``[stacked, channel, latent_frame, rows, columns]``."""
         folded = fold_pixels(images, pixel_patch(self.vae)).to(self.vae.dtype)
-        if not self.frames_alone:
+        if not self.framewise:
             most = self.samples_at_once(self.vae.config.block_out_channels[0], folded.shape[-2:])
             return DiagonalGaussianDistribution(
                 in_parts(lambda part: self.vae.encode(part).latent_dist.parameters, folded, most)
@@ -284,7 +284,7 @@ class Codec(nn.Module):
     ) -> Float[Tensor, "stacked 3 frame height width"]:
         """The images of unscaled latents."""
         latents = latents.to(self.vae.dtype)
-        if self.frames_alone:
+        if self.framewise:
             folded = batch_to_frames(self.vae.decode(frames_to_batch(latents)).sample, latents.shape[2])
         else:
             larger = self.spatial // pixel_patch(self.vae)

@@ -8,14 +8,14 @@ from typing import Any
 from torch import nn
 
 from persist_backbones.adapters.base import Adapter
-from persist_cli.api.stages import Part
+from persist_cli.api.stages import ParameterGroup
 
 LORA = ".lora_"  # in the names that PEFT gives to what it adds
 
 ADAPTER = "memory adapter "
 
 
-def parts_of(parameters: Iterable[tuple[str, nn.Parameter]]) -> list[Part]:
+def group_parameters(parameters: Iterable[tuple[str, nn.Parameter]]) -> list[ParameterGroup]:
     """The VAE, diffusers' transformer, LoRA, what widens the transformer, and each memory adapter; empty ones left out.
 
     Args:
@@ -28,7 +28,7 @@ def parts_of(parameters: Iterable[tuple[str, nn.Parameter]]) -> list[Part]:
         found.setdefault(part, {})[name] = parameter
         fresh |= {part} if new else set()
     order = sorted(found, key=lambda part: part.startswith(ADAPTER))  # adapters stand last
-    return [Part(part, found[part], part in fresh) for part in order]
+    return [ParameterGroup(part, found[part], part in fresh) for part in order]
 
 
 def _part_of(name: str) -> tuple[str, bool]:
@@ -44,7 +44,7 @@ def _part_of(name: str) -> tuple[str, bool]:
     return "widening", True
 
 
-def shorten(blocks: nn.ModuleList, adapter: Adapter[Any] | None, groups: int) -> float:
+def truncate_layers(blocks: nn.ModuleList, adapter: Adapter[Any] | None, groups: int) -> float:
     """Drop all but the first groups of transformer blocks, a group being as many as one block of the adapter stands at.
 
     Returns:

@@ -134,7 +134,7 @@ class DiffusersParts:
     scheduler: CogVideoXDDIMScheduler
 
 
-def planning() -> bool:
+def on_meta_device() -> bool:
     """Whether what is made now is a plan: torch's default device is the meta device, so no weights are read."""
     return torch.empty(0).is_meta
 
@@ -154,7 +154,7 @@ def _load_part(folder: Path, name: str) -> Any:
             f"{folder}: no {name}/ folder; a diffusers CogVideoX directory has {', '.join(SUBFOLDERS)}"
         )
     config = _read_config(folder, name)
-    if planning():
+    if on_meta_device():
         return make_part(name, config)
     missing = missing_files(folder / name)
     if missing:

@@ -10,7 +10,7 @@ from torch import nn
 
 from persist_backbones.cogvideox.codec import pixel_patch
 from persist_backbones.pipeline.pipeline import WorldPipeline
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def overlap(tile: int, scale: int) -> float:
     raise CheckpointError(f"vae-tiling: tiles of {tile} latent pixels are too small to overlap; leave it out")
 
 
-def place(backbone: CogVideoX, placement: Placement, device: torch.device) -> WorldPipeline | None:
+def place(backbone: CogVideoX, placement: InferenceOptions, device: torch.device) -> WorldPipeline | None:
     """Place a backbone for sampling; what keeps its weights on the CPU, and lets go of them after each clip, if any.
 
     The offloading is that of diffusers' pipelines, with accelerate's hooks.

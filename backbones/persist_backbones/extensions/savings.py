@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from persist_backbones.extensions.lora import has_lora
-from persist_cli.api.stages import Economy, Stage
+from persist_cli.api.stages import MemorySavings, Stage
 
 if TYPE_CHECKING:
     from persist_backbones.cogvideox.backbone import CogVideoX
@@ -47,14 +47,14 @@ class FrozenWeights:
                 parameter.data = low
 
 
-def economize(backbone: CogVideoX, stage: Stage, economy: Economy) -> FrozenWeights:
+def apply_memory_savings(backbone: CogVideoX, stage: Stage, savings: MemorySavings) -> FrozenWeights:
     """Make steps cheaper as asked; exact values of frozen weights are kept where the stage saves them."""
     transformer, adapter = backbone.transformer.base, backbone.adapter
-    if economy.gradient_checkpointing:
+    if savings.gradient_checkpointing:
         transformer.enable_gradient_checkpointing()
-    if economy.compile:  # block by block, as diffusers' compile_repeated_blocks; the names of weights stay
+    if savings.compile:  # block by block, as diffusers' compile_repeated_blocks; the names of weights stay
         for block in (*transformer.transformer_blocks, *(adapter.blocks.values() if adapter else ())):
             block.compile()
-    if economy.vae_slicing:
+    if savings.vae_slicing:
         backbone.codec.vae.enable_slicing()
-    return FrozenWeights(backbone, economy.frozen, saved=stage != "2" and not has_lora(transformer))
+    return FrozenWeights(backbone, savings.frozen, saved=stage != "2" and not has_lora(transformer))

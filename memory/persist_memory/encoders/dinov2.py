@@ -71,7 +71,7 @@ class DinoV2(Encoder):
         return int(self._config.hidden_size)
 
     @property
-    def planned_channels(self) -> int:
+    def channels_by_name(self) -> int:
         """Width of the model, also of weights known by name that are not fetched yet."""
         weights = self.settings.weights
         known = None if Path(weights).is_dir() else WIDTHS.get(weights.removeprefix(PUBLISHER))

@@ -18,8 +18,8 @@ from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFi
 from persist_cli.api.observations import Observations
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
-from persist_memory.grid.pooling import Lattice, RunFeatures, Sampling, find_runs, max_pool, sum_pool
-from persist_memory.grid.storage import LIMIT, Column, SparseGrid, pack, unpack
+from persist_memory.grid.pooling import Lattice, PixelSampling, RunFeatures, find_runs, max_pool, sum_pool
+from persist_memory.grid.storage import LIMIT, SparseGrid, VerticalColumn, pack, unpack
 from persist_memory.grid.visibility import Views, nearest_in_each
 from persist_memory.stored_tensors import (
     check_mergeable,
@@ -63,7 +63,7 @@ class GridMemory(Memory):
     def __init__(self, settings: GridSettings, encoder: Encoder, reference: FrameOfReference) -> None:
         super().__init__(settings, encoder, reference)
         self.lattice = self.make_lattice()
-        self._sampling = Sampling(settings.stride, settings.max_depth)
+        self._sampling = PixelSampling(settings.stride, settings.max_depth)
         self._grid: SparseGrid | None = None
 
     @abstractmethod
@@ -83,12 +83,12 @@ class GridMemory(Memory):
         """The cells; made when first wanted, since an encoder may have to open a file to know its channels."""
         if self._grid is None:
             columns = {
-                "features": Column(self.encoder.channels, torch.float32, "max"),
-                "colors": Column(0, torch.int64, "min"),
+                "features": VerticalColumn(self.encoder.channels, torch.float32, "max"),
+                "colors": VerticalColumn(0, torch.int64, "min"),
             }
             if self.settings.pooling == "mean":
-                columns["features"] = Column(self.encoder.channels, torch.float32, "sum")
-                columns["counts"] = Column(0, torch.int64, "sum")
+                columns["features"] = VerticalColumn(self.encoder.channels, torch.float32, "sum")
+                columns["counts"] = VerticalColumn(0, torch.int64, "sum")
             self._grid = SparseGrid(columns)
         return self._grid
 
@@ -104,13 +104,13 @@ class GridMemory(Memory):
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """At most ``budget`` cells that reach into the view of a camera, those nearest to such a camera first."""
-        return self.read_together([cameras], budget)[0]
+        return self.read_batch([cameras], budget)[0]
 
-    def read_together(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
+    def read_batch(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
         """What ``read`` gives each of several askers; the grid is looked through once for all of them."""
         cameras = [each.to(self.grid.device) for each in cameras]
         if not same_size(cameras):
-            return super().read_together(cameras, budget)
+            return super().read_batch(cameras, budget)
         views, groups = distinct_cameras(cameras)
         found = nearest_in_each(self.grid, self.lattice, self.views(views), groups, budget)
         return [self._tokens(cells, each) for cells, each in zip(found, cameras, strict=True)]

@@ -51,7 +51,7 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Sampling:
+class PixelSampling:
     """Which pixels are taken.
 
     Args:
@@ -87,7 +87,7 @@ class PixelRuns:
 
 
 def pixel_cells(
-    observations: Observations, lattice: Lattice, sampling: Sampling
+    observations: Observations, lattice: Lattice, sampling: PixelSampling
 ) -> Int64[Tensor, "frame height width"]:
     """The cell of every strided pixel in one number, ``NOWHERE`` without valid depth or beyond the grid.
 
@@ -128,7 +128,7 @@ def packed_colors(observations: Observations, frame: Tensor, row: Tensor, column
     return depth << 24 | red << 16 | green << 8 | blue
 
 
-def find_runs(observations: Observations, lattice: Lattice, sampling: Sampling, feature_columns: int) -> PixelRuns:
+def find_runs(observations: Observations, lattice: Lattice, sampling: PixelSampling, feature_columns: int) -> PixelRuns:
     """The runs of some frames; none when no pixel has valid depth."""
     cells = pixel_cells(observations, lattice, sampling)
     _, height, width = cells.shape
@@ -172,7 +172,7 @@ class RunFeatures:
         features: Float[Tensor, "frame rows columns channel"],
         runs: PixelRuns,
         observations: Observations,
-        sampling: Sampling,
+        sampling: PixelSampling,
     ) -> None:
         _, rows, columns, self.channels = features.shape
         self._table = features.reshape(-1, self.channels)
@@ -218,7 +218,7 @@ def sum_pool(runs: PixelRuns, features: RunFeatures) -> tuple[Float[Tensor, "cel
 
 
 def _source(
-    pixel: Tensor, observations: Observations, sampling: Sampling, cells: int, vertical: bool = False
+    pixel: Tensor, observations: Observations, sampling: PixelSampling, cells: int, vertical: bool = False
 ) -> Float[Tensor, "*shape"]:
     """Where a strided pixel's centre lies among the centres of a feature map's rows or columns, float64."""
     extent = observations.depth.shape[1 if vertical else 2]

@@ -60,7 +60,7 @@ def unpack(keys: Int64[Tensor, "*shape"]) -> Int64[Tensor, "*shape 3"]:
 
 
 @dataclass(frozen=True)
-class Column:
+class VerticalColumn:
     """One value of every cell.
 
     Args:
@@ -86,7 +86,7 @@ class SparseGrid:
         columns: the values by name.
     """
 
-    def __init__(self, columns: Mapping[str, Column]) -> None:
+    def __init__(self, columns: Mapping[str, VerticalColumn]) -> None:
         self.columns = dict(columns)
         self.keys: Tensor
         self._rows: Tensor

@@ -93,16 +93,16 @@ class Snapshots(Memory):
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """At most ``budget`` tokens of at most ``count`` snapshots, the one that shows most of the view first."""
-        return self.read_together([cameras], budget)[0]
+        return self.read_batch([cameras], budget)[0]
 
-    def read_together(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
+    def read_batch(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
         """What ``read`` gives each of several askers; what the album shows is found once for all of them."""
         album = self.album
         if not len(album):
             return [MemoryTokens.empty(self.encoder.channels) for _ in cameras]
         cameras = [each.to(album.content.device) for each in cameras]
         if not same_size(cameras):
-            return super().read_together(cameras, budget)
+            return super().read_batch(cameras, budget)
         views, groups = distinct_cameras(cameras)
         size = torch.tensor([[views.height, views.width]], device=album.content.device).expand(len(views), 2)
         covered = covered_view(album, views.world_from_camera.double(), views.intrinsics.double(), size)

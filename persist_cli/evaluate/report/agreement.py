@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from persist_cli.evaluate.report.result_file import Clip, Column, Evaluation, Measured
+from persist_cli.evaluate.report.result_file import Clip, ColumnRecord, Evaluation, Measured
 
 MOST = 3  # differences of one sort that are spelled out
 
@@ -88,7 +88,7 @@ def _metrics(one: Measured, two: Measured) -> Iterator[str]:
                 yield from _unequal(f"weights {weight} of {metric.title}", *digests)
 
 
-def _columns(one: Mapping[str, Column], two: Mapping[str, Column]) -> Iterator[str]:
+def _columns(one: Mapping[str, ColumnRecord], two: Mapping[str, ColumnRecord]) -> Iterator[str]:
     for name, column in one.items():
         if name in two:
             for key in ("metric", "frames", "better", "definition"):

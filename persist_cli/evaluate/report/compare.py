@@ -13,7 +13,7 @@ from persist_cli.errors import DataError
 from persist_cli.evaluate.report.agreement import differing_notes, measured_differently
 from persist_cli.evaluate.report.result_file import (
     Cell,
-    Column,
+    ColumnRecord,
     Difference,
     Evaluation,
     difference_texts,
@@ -61,7 +61,7 @@ class Comparison:
 
     a: str
     b: str
-    columns: dict[str, Column]
+    columns: dict[str, ColumnRecord]
     tables: list[ComparedTable]
     notes: list[str]
 
@@ -130,7 +130,7 @@ def comparison_text(comparison: Comparison) -> str:
     return "\n\n".join(["# Two runs compared", *tables, "\n".join(remarks)]) + "\n"
 
 
-def _compared_tables(one: Evaluation, two: Evaluation, columns: dict[str, Column]) -> Iterator[ComparedTable]:
+def _compared_tables(one: Evaluation, two: Evaluation, columns: dict[str, ColumnRecord]) -> Iterator[ComparedTable]:
     for table, other in zip(one.tables, two.tables, strict=True):
         rows = {
             name: {key: compared(row.columns.get(key), other.rows[name].columns.get(key)) for key in columns}

@@ -30,13 +30,13 @@ def _defined(value: Any) -> Any:
 Figure = Annotated[float | None, BeforeValidator(_defined)]
 
 
-class Part(BaseModel):
+class ResultModel(BaseModel):
     """A part of the results; keys that are not known here are kept out, so that later minor additions still read."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class Protocol(Part):
+class Protocol(ResultModel):
     """Which clips were asked of the model, and how."""
 
     name: str
@@ -45,14 +45,14 @@ class Protocol(Part):
     frames: int
 
 
-class DataSet(Part):
+class DataSet(ResultModel):
     """A data set with the hash of each trajectory that was used."""
 
     path: str
     trajectories: dict[str, str]
 
 
-class Clip(Part):
+class Clip(ResultModel):
     """One measured clip; ``data`` is the number of its data set, ``seen_before`` a share for each frame."""
 
     data: int
@@ -66,7 +66,7 @@ class Clip(Part):
     turned_degrees: Figure = None
 
 
-class MetricFacts(Part):
+class MetricFacts(ResultModel):
     """What a metric is, with the hash of each weight it used."""
 
     title: str
@@ -75,7 +75,7 @@ class MetricFacts(Part):
     weights: dict[str, str] = {}
 
 
-class Measured(Part):
+class Measured(ResultModel):
     """Everything that two runs must share to be comparable."""
 
     protocol: Protocol
@@ -85,7 +85,7 @@ class Measured(Part):
     metrics: dict[str, MetricFacts]
 
 
-class Column(Part):
+class ColumnRecord(ResultModel):
     """A column of the table: a metric over all frames, the last one, the returns, or the views that are new."""
 
     metric: str
@@ -95,7 +95,7 @@ class Column(Part):
     frames: str = "all"
 
 
-class Difference(Part):
+class Difference(ResultModel):
     """Paired difference to another row with its 95 % interval."""
 
     mean: Figure
@@ -108,7 +108,7 @@ class Difference(Part):
         return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
 
 
-class Cell(Part):
+class Cell(ResultModel):
     """A figure with its spread, or why there is none."""
 
     na: str | None = None
@@ -122,7 +122,7 @@ class Cell(Part):
     differences: dict[str, Difference | None] = {}
 
 
-class Bin(Part):
+class Bin(ResultModel):
     """Frames whose view was seen before to a share from ``low`` to ``high``."""
 
     low: float
@@ -131,14 +131,14 @@ class Bin(Part):
     count: int
 
 
-class Curve(Part):
+class Curve(ResultModel):
     """A metric frame by frame, the last value at the clip's last frame, and by the seen-before share of the view."""
 
     per_frame: list[Figure] = []
     by_seen_before: list[Bin] = []
 
 
-class Row(Part):
+class Row(ResultModel):
     """A row of the table."""
 
     kind: Kind
@@ -149,7 +149,7 @@ class Row(Part):
     curves: dict[str, Curve] = {}
 
 
-class Table(Part):
+class Table(ResultModel):
     """A table over some of the clips."""
 
     name: str
@@ -157,14 +157,14 @@ class Table(Part):
     rows: dict[str, Row]
 
 
-class KnownScenes(Part):
+class KnownScenes(ResultModel):
     """How many scenes a checkpoint is known to have been trained on, and whether these are all."""
 
     known: int
     complete: bool
 
 
-class CheckpointFacts(Part):
+class CheckpointFacts(ResultModel):
     """A checkpoint by what is in it."""
 
     name: str
@@ -175,7 +175,7 @@ class CheckpointFacts(Part):
     adapters: dict[str, str] = {}
 
 
-class Sampling(Part):
+class SamplingRecord(ResultModel):
     """How clips were drawn from the models."""
 
     steps: int | None = None
@@ -187,15 +187,15 @@ class Sampling(Part):
     batch: int | None = None
 
 
-class Evaluation(Part):
+class Evaluation(ResultModel):
     """All results of one ``persist eval``."""
 
     measured: Measured
-    sampling: Sampling
+    sampling: SamplingRecord
     environment: dict[str, Any] = {}
     command: list[str] = []
     checkpoints: list[CheckpointFacts] = []
-    columns: dict[str, Column]
+    columns: dict[str, ColumnRecord]
     tables: list[Table]
     first_row: str | None = None
 
@@ -296,7 +296,7 @@ def difference_texts(difference: Difference, digits: int) -> tuple[str, str]:
     return number(mean, digits, signed=True) + mark, interval_text(difference.low, difference.high, digits, signed=True)
 
 
-def heading(column: Column) -> str:
+def heading(column: ColumnRecord) -> str:
     """The column's title with the arrow of what is better."""
     return f"{column.title} {ARROWS.get(column.better or '', '')}".strip()
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from persist_cli.evaluate.report.result_file import (
     MARK,
     Cell,
-    Column,
+    ColumnRecord,
     Evaluation,
     Row,
     Table,
@@ -141,7 +141,7 @@ def _view_table(results: Evaluation, table: Table, notes: list[str]) -> TableVie
     return TableView(table.name, len(table.clips), columns, rows, {number: notes[number - 1] for number in used})
 
 
-def _column_views(key: str, column: Column, rows: Sequence[Row], notes: list[str]) -> list[CellView]:
+def _column_views(key: str, column: ColumnRecord, rows: Sequence[Row], notes: list[str]) -> list[CellView]:
     """The column's cells; reasons of what is missing are added to ``notes``."""
     cells = [row.columns.get(key, Cell(na="not measured for this row")) for row in rows]
     digits = digits_of(cell.mean for cell in cells)
@@ -155,7 +155,7 @@ def _column_views(key: str, column: Column, rows: Sequence[Row], notes: list[str
     ]
 
 
-def _cell_view(cell: Cell, column: Column, digits: int, notes: list[str], best: bool) -> CellView:
+def _cell_view(cell: Cell, column: ColumnRecord, digits: int, notes: list[str], best: bool) -> CellView:
     if cell.na is not None:
         if cell.na not in notes:
             notes.append(cell.na)

@@ -96,10 +96,10 @@ def remark_lines(results: Evaluation) -> list[str]:
     ]
 
 
-Part = tuple[str, list[RowView], list[ColumnView], Callable[[CellView], str]]
+TextTable = tuple[str, list[RowView], list[ColumnView], Callable[[CellView], str]]
 
 
-def _parts(results: Evaluation) -> Iterator[Part]:
+def _parts(results: Evaluation) -> Iterator[TextTable]:
     """Figures, then differences, of each table."""
     several = len(results.tables) > 1
     for view in (table.view for table in compact_tables(results)):

@@ -10,11 +10,18 @@ from persist_cli.checkpoints.checkpoint import PLAIN, Checkpoint
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.protocols import Protocol
-from persist_cli.evaluate.rows.controls import Codec, Copy, Nearest, Truth, Warp
-from persist_cli.evaluate.rows.interventions import Emptied, Faithful, NoisyPoses, Oracle, Recall, Shuffled
-from persist_cli.evaluate.rows.model import ModelRow, Remembering
+from persist_cli.evaluate.rows.controls import CodecReconstruction, Copy, Nearest, Truth, Warp
+from persist_cli.evaluate.rows.interventions import (
+    Emptied,
+    MemoryIntervention,
+    NoisyPoses,
+    Oracle,
+    Shuffled,
+    Unmodified,
+)
+from persist_cli.evaluate.rows.model import ModelRow, RowMemory
 from persist_cli.evaluate.rows.row import Row
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 
 FORGETFUL = "none"  # the memory that never reads a token, which no disturbance can reach
 
@@ -22,7 +29,7 @@ CONTROLS: dict[str, Callable[[str, Checkpoint, Protocol], Row]] = {
     "copy": lambda name, base, protocol: Copy(name, base),
     "nearest": lambda name, base, protocol: Nearest(name, base, protocol.writes),
     "warp": lambda name, base, protocol: Warp(name, base, protocol.writes),
-    "codec": lambda name, base, protocol: Codec(name, base),
+    "codec": lambda name, base, protocol: CodecReconstruction(name, base),
     "truth": lambda name, base, protocol: Truth(name, base),
 }
 
@@ -34,16 +41,16 @@ TITLES = {
     "truth": "ground truth",
 }
 
-RECALLS = ("shuffled", "emptied", "oracle", "noisy")
+INTERVENTIONS = ("shuffled", "emptied", "oracle", "noisy")
 
 
 @dataclass(frozen=True)
-class RowChoice:
+class RowConfig:
     """Which rows.
 
     Args:
         memories: names of adapters, or ``stage1``.
-        controls: names of ``CONTROLS`` and ``RECALLS``.
+        controls: names of ``CONTROLS`` and ``INTERVENTIONS``.
         sampling: how clips are drawn.
         noise: centimetres and degrees of the control ``noisy``.
         depthless: fingerprints of the bases that give no depth.
@@ -56,11 +63,11 @@ class RowChoice:
     depthless: frozenset[str] = frozenset()
 
 
-def check_choice(choice: RowChoice) -> None:
+def check_choice(choice: RowConfig) -> None:
     """Raise ``PersistError`` for an unknown control, and when no memory is named."""
     if not choice.memories:
         raise PersistError("name at least one memory, as in --memories none,voxel")
-    known = [*CONTROLS, *RECALLS]
+    known = [*CONTROLS, *INTERVENTIONS]
     for name in choice.controls:
         if name not in known:
             raise PersistError(f"unknown control {name!r}; {hint(name, known)}")
@@ -69,7 +76,7 @@ def check_choice(choice: RowChoice) -> None:
 
 
 def make_rows(
-    checkpoints: Sequence[Checkpoint], choice: RowChoice, protocol: Protocol, cases: Sequence[Case]
+    checkpoints: Sequence[Checkpoint], choice: RowConfig, protocol: Protocol, cases: Sequence[Case]
 ) -> list[Row]:
     """A row for each memory and checkpoint that has it, these with a disturbed memory, then the controls.
 
@@ -79,7 +86,7 @@ def make_rows(
     """
     plain = [row for memory in choice.memories for row in model_rows(checkpoints, memory, choice, protocol)]
     disturbed = [
-        disturbed_row(row, recall)
+        with_intervention(row, recall)
         for row in plain
         if row.adapter not in (None, FORGETFUL)
         for recall in recalls(choice, cases)
@@ -98,7 +105,7 @@ def make_rows(
     return [*plain, *disturbed, *controls]
 
 
-def model_rows(checkpoints: Sequence[Checkpoint], memory: str, choice: RowChoice, protocol: Protocol) -> list[ModelRow]:
+def model_rows(checkpoints: Sequence[Checkpoint], memory: str, choice: RowConfig, protocol: Protocol) -> list[ModelRow]:
     """A row for each checkpoint that has the memory."""
     owners = [each for each in checkpoints if memory == PLAIN or memory in each.adapters]
     if memory == PLAIN:
@@ -109,11 +116,11 @@ def model_rows(checkpoints: Sequence[Checkpoint], memory: str, choice: RowChoice
     rows = []
     for owner, label in zip(owners, labels(owners), strict=True):
         adapter = None if memory == PLAIN else memory
-        maker = MemoryMaker.of(owner.memory_choice(memory)) if adapter else None
+        maker = MemoryFactory.of(owner.memory_config(memory)) if adapter else None
         name = memory if len(owners) == 1 else f"{memory} ({label})"
-        remembering = Remembering(maker, Faithful(), protocol.writes)
+        row_memory = RowMemory(maker, Unmodified(), protocol.writes)
         gives_depth = owner.fingerprint not in choice.depthless
-        rows.append(ModelRow(name, owner, adapter, choice.sampling, remembering, gives_depth))
+        rows.append(ModelRow(name, owner, adapter, choice.sampling, row_memory, gives_depth))
     return rows
 
 
@@ -123,19 +130,19 @@ def labels(checkpoints: Sequence[Checkpoint]) -> list[str]:
     return [each.name if names.count(each.name) == 1 else str(each.folder) for each in checkpoints]
 
 
-def disturbed_row(row: ModelRow, recall: Recall) -> ModelRow:
+def with_intervention(row: ModelRow, recall: MemoryIntervention) -> ModelRow:
     """The same row with another memory."""
-    remembering = Remembering(row.remembering.maker, recall, row.remembering.writes)
+    row_memory = RowMemory(row.row_memory.maker, recall, row.row_memory.writes)
     name = f"{row.name}, {recall.name}"
-    return ModelRow(name, row.checkpoint, row.adapter, row.sampling, remembering, row.gives_depth)
+    return ModelRow(name, row.checkpoint, row.adapter, row.sampling, row_memory, row.gives_depth)
 
 
-def recalls(choice: RowChoice, cases: Sequence[Case]) -> list[Recall]:
+def recalls(choice: RowConfig, cases: Sequence[Case]) -> list[MemoryIntervention]:
     """The memory controls asked for, in a fixed order."""
-    made: dict[str, Callable[[], Recall]] = {
+    made: dict[str, Callable[[], MemoryIntervention]] = {
         "shuffled": lambda: Shuffled(cases),
         "emptied": Emptied,
         "oracle": Oracle,
         "noisy": lambda: NoisyPoses(*choice.noise),
     }
-    return [made[name]() for name in RECALLS if name in choice.controls]
+    return [made[name]() for name in INTERVENTIONS if name in choice.controls]

@@ -19,7 +19,7 @@ from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.coverage import held_frames
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.rows.warp import Surface, warp
-from persist_cli.rollout.world_model import Question, batch_of
+from persist_cli.rollout.world_model import ClipRequest, batch_of
 
 Shower = Callable[[Cameras, Tensor], tuple[Tensor, Tensor]]
 
@@ -49,7 +49,7 @@ class Truth(Row):
         )
 
 
-class Codec(Row):
+class CodecReconstruction(Row):
     """Ground truth after the codec."""
 
     definition = "true frames encoded and decoded, clip after clip as the model predicts them: the codec's ceiling"
@@ -143,8 +143,8 @@ def pose_distances(cameras: Cameras, asked: Cameras) -> Float[Tensor, " frame"]:
     return metres + torch.deg2rad(degrees)
 
 
-def part_of(truth: Observations, first: int, length: int) -> Question:
+def part_of(truth: Observations, first: int, length: int) -> ClipRequest:
     """The frames ``first`` to ``first + length`` as a batch's sample, the last repeated to fill it."""
     numbers = [min(number, len(truth) - 1) for number in range(first, first + length + 1)]
     part = truth[numbers]
-    return Question(part, part.cameras, (None,) * length, None, 0)
+    return ClipRequest(part, part.cameras, (None,) * length, None, 0)

@@ -17,7 +17,7 @@ from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case, CaseFrames, read_case
 
 
-class Recall(ABC):
+class MemoryIntervention(ABC):
     """What is written into a row's memory; ``writes`` says whether the model's own output may follow."""
 
     name: ClassVar[str]
@@ -37,7 +37,7 @@ class Recall(ABC):
         return seen
 
 
-class Faithful(Recall):
+class Unmodified(MemoryIntervention):
     """The memory that the protocol says."""
 
     name = ""
@@ -49,7 +49,7 @@ class Faithful(Recall):
         return clip.context
 
 
-class Emptied(Recall):
+class Emptied(MemoryIntervention):
     """No memory at all."""
 
     name = "emptied"
@@ -60,7 +60,7 @@ class Emptied(Recall):
         return None
 
 
-class Oracle(Recall):
+class Oracle(MemoryIntervention):
     """A memory that has seen the future."""
 
     name = "oracle"
@@ -72,7 +72,7 @@ class Oracle(Recall):
         return Observations.concatenate(parts)
 
 
-class Shuffled(Recall):
+class Shuffled(MemoryIntervention):
     """The wrong memory.
 
     Args:
@@ -94,7 +94,7 @@ class Shuffled(Recall):
 
 
 @dataclass(frozen=True)
-class NoisyPoses(Recall):
+class NoisyPoses(MemoryIntervention):
     """A memory whose poses are wrong.
 
     Args:

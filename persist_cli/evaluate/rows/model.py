@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone, Sampling
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
 from persist_cli.checkpoints.checkpoint import Checkpoint, load_adapter
 from persist_cli.evaluate.cases import CaseFrames
-from persist_cli.evaluate.rows.interventions import Faithful, Recall
+from persist_cli.evaluate.rows.interventions import MemoryIntervention, Unmodified
 from persist_cli.evaluate.rows.row import Row
-from persist_cli.memorize.factory import MemoryMaker
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.rollout.world_model import WorldModel, imagine_together
 
 
 @dataclass(frozen=True)
-class Remembering:
+class RowMemory:
     """What a model row remembers with.
 
     Args:
@@ -31,8 +31,8 @@ class Remembering:
         writes: whether the protocol writes the model's own output.
     """
 
-    maker: MemoryMaker | None
-    recall: Recall
+    maker: MemoryFactory | None
+    recall: MemoryIntervention
     writes: bool
 
 
@@ -44,7 +44,7 @@ class ModelRow(Row):
         checkpoint: that has the adapter.
         adapter: its name; ``None`` is plain stage 1.
         sampling: how clips are drawn.
-        remembering: with which memory.
+        row_memory: with which memory.
         gives_depth: whether the model does.
     """
 
@@ -56,22 +56,22 @@ class ModelRow(Row):
         checkpoint: Checkpoint,
         adapter: str | None,
         sampling: Sampling,
-        remembering: Remembering,
+        row_memory: RowMemory,
         gives_depth: bool = True,
     ) -> None:
         super().__init__(name, checkpoint)
-        self.checkpoint, self.adapter, self.sampling, self.remembering = checkpoint, adapter, sampling, remembering
+        self.checkpoint, self.adapter, self.sampling, self.row_memory = checkpoint, adapter, sampling, row_memory
         self.gives_depth = gives_depth
-        self.kind = "model" if isinstance(remembering.recall, Faithful) else "memory control"
+        self.kind = "model" if isinstance(row_memory.recall, Unmodified) else "memory control"
 
     @property
     def definition(self) -> str:
         """Checkpoint, adapter and what the memory holds."""
         if self.adapter is None:
             return f"{self.checkpoint.name} without an adapter (stage 1)"
-        return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.remembering.recall.definition}"
+        return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.row_memory.recall.definition}"
 
-    def prepare(self, backbone: Backbone, placement: Placement) -> None:
+    def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
         """Load the adapter."""
         load_adapter(backbone, self.checkpoint, self.adapter)
         super().prepare(backbone, placement)
@@ -89,19 +89,19 @@ class ModelRow(Row):
 
     def start(self, backbone: Backbone, clip: CaseFrames, seed: int) -> WorldModel:
         """A world model at the clip's first frame."""
-        recall = self.remembering.recall
+        recall = self.row_memory.recall
         disturb = partial(recall.disturb, draws=torch.Generator().manual_seed(seed))
-        writes = self.remembering.writes and recall.writes
+        writes = self.row_memory.writes and recall.writes
         model = WorldModel(backbone, self.memory(clip, disturb), self.sampling, seed, writes, disturb)
         model.reset(clip.observations[:1], clip.info)
         return model
 
     def memory(self, clip: CaseFrames, disturb: Callable[[Observations], Observations]) -> Memory | None:
         """The clip's memory before it begins."""
-        if self.remembering.maker is None:
+        if self.row_memory.maker is None:
             return None
-        memory = self.remembering.maker.empty(clip.info)
-        context = self.remembering.recall.context(clip)
+        memory = self.row_memory.maker.empty(clip.info)
+        context = self.row_memory.recall.context(clip)
         if context is not None:
             memory.write(disturb(context))
         return memory

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.inference import Placement
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.checkpoints.checkpoint import Checkpoint
 from persist_cli.evaluate.cases import CaseFrames
 
@@ -38,9 +38,9 @@ class Row(ABC):
     def definition(self) -> str:
         """What the row shows, in a few words."""
 
-    def prepare(self, backbone: Backbone, placement: Placement) -> None:
+    def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
         """Make the backbone ready for this row, placed like this."""
-        backbone.place(placement)
+        backbone.prepare_inference(placement)
 
     @abstractmethod
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:

@@ -69,7 +69,7 @@ class Scene:
         assert world.memory is not None
         return len(world.memory.read(world.clip_path(world.cameras_after(self.actions)), budget))
 
-    def world(self, steps: int, remembering: bool) -> WorldModel:
+    def world(self, steps: int, row_memory: bool) -> WorldModel:
         """A world model that stands at the clip's first frame."""
         memory = self.memory.copy() if remembering else None
         model = WorldModel(self.bench.backbone, memory, Sampling(steps))

@@ -68,7 +68,7 @@ def make_batch(bench: Bench, batch: int, tokens: int) -> Clips:
     """Clips whose latents are known, and random ones, with so many tokens of a memory."""
     backbone, (frames, height, width) = bench.backbone, bench.size
     codec = backbone.codec
-    times = (frames - 1) // codec.temporal + 1 + (not backbone.frames_alone)  # behind it that of the first image alone
+    times = (frames - 1) // codec.temporal + 1 + (not backbone.framewise)  # behind it that of the first image alone
     shape = (batch, times, 2 * codec.channels, height // codec.spatial, width // codec.spatial)
     features = torch.randn(batch, tokens, bench.model.channels)
     memory = MemoryTokens(features, 2 * torch.randn(batch, tokens, 3).double(), torch.ones(batch, tokens).bool())
@@ -80,7 +80,7 @@ def plain_batch(bench: Bench, clips: Clips) -> tuple[Tensor, Tensor, Tensor]:
     """Latents, image latents and camera latents of the clips, for the plain loop."""
     backbone, kept = bench.backbone, clips.latents
     assert kept is not None
-    latents, first = (kept, kept[:, :1]) if backbone.frames_alone else (kept[:, :-1], kept[:, -1:])
+    latents, first = (kept, kept[:, :1]) if backbone.framewise else (kept[:, :-1], kept[:, -1:])
     image, camera = backbone.image_condition(first), backbone.camera_latents(clips)
     return latents, image.to(bench.precision), camera.to(bench.precision)
 
