@@ -1,4 +1,4 @@
-"""Clips of trajectories for training: sample number n is the same whoever asks, whenever."""
+"""Clips of trajectories for training: sample n depends on the seed and on n only, whichever process asks for it."""
 
 from __future__ import annotations
 
@@ -18,52 +18,16 @@ from persist_cli.errors import DataError, RecipeError
 
 
 @dataclass(frozen=True)
-class ClipFrames:
-    """Which frames a sample is made of, nothing of them read yet.
-
-    Args:
-        file: the trajectory.
-        frames: numbers of the clip's frames.
-        context: numbers of the context's frames; none when no context is asked for.
-        seed: for everything random about the sample.
-    """
-
-    file: TrajectoryFile
-    frames: range
-    context: tuple[int, ...]
-    seed: int
-
-
-@dataclass(frozen=True)
-class ClipSample:
-    """One clip with what came before it.
-
-    Args:
-        observations: the clip's frames; no images where none were asked for, the cameras always.
-        interactions: what the agent did to the world in each step of the clip.
-        context: earlier frames of the same trajectory, the clip's first one included; ``None`` when not asked for.
-        info: of the trajectory.
-        seed: for everything random about the sample.
-    """
-
-    observations: Observations
-    interactions: Interactions
-    context: Observations | None
-    info: TrajectoryInfo
-    seed: int
-
-
-@dataclass(frozen=True)
 class ClipPlan:
-    """Which clips to draw.
+    """Settings of the clips that a ``ClipDataset`` draws.
 
     Args:
-        frames: frames a clip.
+        frames: number of frames of a clip.
         strides: one is drawn for each clip, among those that fit the trajectory; a negative one plays it backwards.
-        context_frames: most earlier frames to give along; 0 gives none.
-        seed: of the draws.
-        image_size: height and width that the frames must have.
-        clips_per_trajectory: how many fixed clips each trajectory offers; 0 draws from all there are.
+        context_frames: largest number of earlier frames that come with a clip; 0 for no context.
+        seed: seed of the draws.
+        image_size: height and width in pixels that the frames must have.
+        clips_per_trajectory: number of fixed clips that each trajectory offers; 0 draws from all possible clips.
     """
 
     frames: int
@@ -74,12 +38,51 @@ class ClipPlan:
     clips_per_trajectory: int = 0
 
 
-class ClipDataset(Dataset[ClipSample]):
-    """Endless clips of some data sets; item n depends on the seed and n only.
+@dataclass(frozen=True)
+class ClipFrames:
+    """Frame numbers of one sample, drawn before anything of it is read.
 
     Args:
-        folders: of the data sets, in this order.
-        plan: which clips.
+        file: the trajectory.
+        frames: numbers of the clip's frames.
+        context: numbers of the context's frames; empty when the plan has no context.
+        seed: seed of everything random about the sample.
+    """
+
+    file: TrajectoryFile
+    frames: range
+    context: tuple[int, ...]
+    seed: int
+
+
+@dataclass(frozen=True)
+class ClipSample:
+    """One clip with the frames that came before it.
+
+    Args:
+        observations: the clip's frames; the images may have been left unread, the cameras are always there.
+        interactions: what the agent did to the world in each step of the clip.
+        context: earlier frames of the same trajectory and the clip's first one; ``None`` when left unread.
+        info: what holds for every frame of the trajectory.
+        seed: seed of everything random about the sample.
+    """
+
+    observations: Observations
+    interactions: Interactions
+    context: Observations | None
+    info: TrajectoryInfo
+    seed: int
+
+
+class ClipDataset(Dataset[ClipSample]):
+    """Endless clips of some data sets; sample n depends on the seed and on n only.
+
+    Args:
+        folders: folders of the data sets; their order matters for which clip is sample n.
+        plan: settings of the clips.
+
+    Raises:
+        DataError: when no trajectory is long enough, or images are not of the plan's size.
     """
 
     def __init__(self, folders: Sequence[Path], plan: ClipPlan) -> None:
@@ -99,7 +102,7 @@ class ClipDataset(Dataset[ClipSample]):
         return self.read(self.choose(number))
 
     def choose(self, number: int) -> ClipFrames:
-        """The frames of sample ``number``."""
+        """The frame numbers of sample ``number``, without reading images."""
         random = np.random.default_rng((self.plan.seed, number))
         place = int(random.integers(len(self.files)))
         file = self.files[place]
@@ -112,27 +115,27 @@ class ClipDataset(Dataset[ClipSample]):
         return ClipFrames(file, frames, context, int(random.integers(2**31)))
 
     def read(self, choice: ClipFrames, images: bool = True, context: bool = True) -> ClipSample:
-        """The sample of this choice.
+        """The sample with these frame numbers.
 
         Args:
-            choice: which frames.
+            choice: frame numbers, as ``choose`` gives them.
             images: false leaves the clip's images unread and gives its cameras only.
             context: false leaves the context unread.
         """
         file, frames = choice.file, choice.frames
         actions = file.actions()[frames[0] : frames[-1]]  # none backwards: what was done to the world is not undone
-        done = strided_interactions(actions, abs(frames.step), file.info.vocabulary)
-        wanted = choice.context if context else ()
+        interactions = strided_interactions(actions, abs(frames.step), file.info.vocabulary)
+        context_frames = choice.context if context else ()
         return ClipSample(
-            observations=file.read(list(frames)).observations if images else unseen(file, frames),
-            interactions=done or (None,) * (len(frames) - 1),
-            context=file.read(wanted).observations if wanted else None,
+            observations=file.read(list(frames)).observations if images else cameras_only(file, frames),
+            interactions=interactions or (None,) * (len(frames) - 1),
+            context=file.read(context_frames).observations if context_frames else None,
             info=file.info,
             seed=choice.seed,
         )
 
     def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:
-        """Frames of a random clip and of its context."""
+        """Frame numbers of a random clip and of its context."""
         steps = self.plan.frames - 1
         stride = int(random.choice([stride for stride in self.plan.strides if steps * abs(stride) < len(file)]))
         start = int(random.integers(len(file) - steps * abs(stride)))
@@ -146,13 +149,46 @@ class ClipDataset(Dataset[ClipSample]):
         return [*sorted(int(frame) for frame in earlier), start]
 
 
-def check_sharing(batch: int, accumulation: int, processes: int) -> None:
-    """Raise ``RecipeError`` when processes cannot have equal parts of a batch in so many micro-batches.
+class DistributedBatches(BatchSampler):
+    """Sample numbers of the micro-batches of one process; together the processes read every number once.
+
+    Args:
+        first_step: optimizer step to begin with.
+        last_step: optimizer step to stop before.
+        batch: samples of an optimizer step, over all processes and micro-batches.
+        accumulation: number of micro-batches of an optimizer step.
+        process: number of this process.
+        processes: number of processes.
+
+    Raises:
+        RecipeError: when the batch cannot be divided among them.
+    """
+
+    def __init__(
+        self, first_step: int, last_step: int, batch: int, accumulation: int, process: int, processes: int
+    ) -> None:
+        check_batch_division(batch, accumulation, processes)
+        self.first_step, self.last_step, self.batch = first_step, last_step, batch
+        self.accumulation, self.process, self.processes = accumulation, process, processes
+
+    def __len__(self) -> int:
+        return (self.last_step - self.first_step) * self.accumulation
+
+    def __iter__(self) -> Iterator[list[int]]:
+        size = self.batch // (self.accumulation * self.processes)
+        for step in range(self.first_step, self.last_step):
+            for micro_batch in range(self.accumulation):
+                first = step * self.batch + (micro_batch * self.processes + self.process) * size
+                yield list(range(first, first + size))
+
+
+def check_batch_division(batch: int, accumulation: int, processes: int) -> None:
+    """Raise ``RecipeError`` unless every process gets micro-batches of one size.
 
     Args:
         batch: samples of an optimizer step.
-        accumulation: micro-batches of it.
-        processes: that share each.
+        accumulation: number of micro-batches of an optimizer step.
+        processes: number of processes that share each micro-batch.
     """
     if batch % (accumulation * processes) == 0:
         return
@@ -168,55 +204,6 @@ def check_sharing(batch: int, accumulation: int, processes: int) -> None:
     )
 
 
-class SharedBatches(BatchSampler):
-    """This process's micro-batches of sample numbers, from any step on; together the processes see all numbers.
-
-    Args:
-        first_step: optimizer step to begin with.
-        last_step: optimizer step to stop before.
-        batch: samples a step, over all processes and micro-batches.
-        accumulation: micro-batches a step.
-        process: number of this process.
-        processes: how many there are.
-    """
-
-    def __init__(
-        self, first_step: int, last_step: int, batch: int, accumulation: int, process: int, processes: int
-    ) -> None:
-        check_sharing(batch, accumulation, processes)
-        self.first_step, self.last_step, self.batch = first_step, last_step, batch
-        self.accumulation, self.process, self.processes = accumulation, process, processes
-
-    def __len__(self) -> int:
-        return (self.last_step - self.first_step) * self.accumulation
-
-    def __iter__(self) -> Iterator[list[int]]:
-        micro = self.batch // (self.accumulation * self.processes)
-        for step in range(self.first_step, self.last_step):
-            for part in range(self.accumulation):
-                first = step * self.batch + (part * self.processes + self.process) * micro
-                yield list(range(first, first + micro))
-
-
-def strided_interactions(actions: Sequence[str | None], stride: int, vocabulary: ActionVocabulary) -> Interactions:
-    """For each step of ``stride`` frames the first interaction that happened in it, if one did."""
-    done = interactions_of(actions, vocabulary)
-    steps = (done[first : first + stride] for first in range(0, len(done), stride))
-    return tuple(next((name for name in step if name is not None), None) for step in steps)
-
-
-def unseen(file: TrajectoryFile, frames: Sequence[int]) -> Observations:
-    """The cameras of some frames, without their images: rgb and depth have no frames."""
-    height, width = file.info.height, file.info.width
-    images = torch.zeros(0, height, width, 3, dtype=torch.uint8), torch.zeros(0, height, width)
-    return Observations(*images, file.cameras(frames))
-
-
-def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:
-    """What of the actions changes the world rather than the camera."""
-    return tuple(name if name is not None and vocabulary[name].interaction else None for name in actions)
-
-
 def check_size(info: TrajectoryInfo, image_size: tuple[int, int], where: str) -> None:
     """Raise ``DataError`` when images are not of the size that a model takes."""
     if (info.height, info.width) != image_size:
@@ -226,3 +213,22 @@ def check_size(info: TrajectoryInfo, image_size: tuple[int, int], where: str) ->
             f"or import them with --size {height}x{width}, or take a model of theirs (finetune: "
             f"backbone.settings.height={info.height} backbone.settings.width={info.width})"
         )
+
+
+def interactions_of(actions: Sequence[str | None], vocabulary: ActionVocabulary) -> Interactions:
+    """The name of each action that changes the world, ``None`` for those that only move the camera."""
+    return tuple(name if name is not None and vocabulary[name].interaction else None for name in actions)
+
+
+def strided_interactions(actions: Sequence[str | None], stride: int, vocabulary: ActionVocabulary) -> Interactions:
+    """For each step of ``stride`` frames the first interaction in it, ``None`` for a step without one."""
+    interactions = interactions_of(actions, vocabulary)
+    steps = (interactions[first : first + stride] for first in range(0, len(interactions), stride))
+    return tuple(next((name for name in step if name is not None), None) for step in steps)
+
+
+def cameras_only(file: TrajectoryFile, frames: Sequence[int]) -> Observations:
+    """Observations with the cameras of some frames, and with rgb and depth of no frames."""
+    height, width = file.info.height, file.info.width
+    rgb, depth = torch.zeros(0, height, width, 3, dtype=torch.uint8), torch.zeros(0, height, width)
+    return Observations(rgb, depth, file.cameras(frames))

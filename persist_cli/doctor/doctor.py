@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from persist_cli.data.clips import check_sharing
+from persist_cli.data.clips import check_batch_division
 from persist_cli.doctor.changes import OFFLOADED, SHARDED, STAGE2, Strategy, changes_of, smallest
 from persist_cli.doctor.dry_run import dry_run
 from persist_cli.doctor.machine import Machine, gib
@@ -118,7 +118,7 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
         raise PersistError("--fsdp shares a model out over several GPUs; give --gpus N too")
     planned = build_meta_model(name, overrides)
     training = planned.recipe.training
-    check_sharing(training.batch, training.accumulation, machine.devices)
+    check_batch_division(training.batch, training.accumulation, machine.devices)
     samples = training.samples_at_once(machine.devices)
     if samples > MOST_SAMPLES:
         raise PersistError(f"{samples} samples at once on a device: no plan is made of more than {MOST_SAMPLES}")

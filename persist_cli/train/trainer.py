@@ -17,7 +17,7 @@ from accelerate import Accelerator
 from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.api.backbone import Backbone, Clips
-from persist_cli.data.clips import ClipDataset, ClipPlan, SharedBatches
+from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.memorize.factory import MemoryFactory, collate, recall_all
@@ -131,7 +131,7 @@ class Trainer:
     def loader(self) -> Iterator[Clips]:
         """Batches of this process from the state's step to the last."""
         settings = self.recipe.training
-        batches = SharedBatches(
+        batches = DistributedBatches(
             self.state.step, settings.steps, settings.batch, settings.accumulation,
             self.accelerator.process_index, self.accelerator.num_processes,
         )  # fmt: skip

@@ -7,7 +7,7 @@ import shutil
 import pytest
 import torch
 
-from persist_cli.data.clips import ClipDataset, ClipPlan, SharedBatches
+from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.errors import DataError, RecipeError
 from tests.support.walking import SIZE
 
@@ -77,7 +77,7 @@ def test_the_few_clips_are_the_same_with_and_without_context(walks):
 
 @pytest.mark.parametrize(("processes", "accumulation"), [(1, 1), (2, 1), (1, 4), (2, 2)])
 def test_processes_and_micro_batches_share_the_same_samples_of_each_step(processes, accumulation):
-    parts = [list(SharedBatches(3, 5, 8, accumulation, each, processes)) for each in range(processes)]
+    parts = [list(DistributedBatches(3, 5, 8, accumulation, each, processes)) for each in range(processes)]
     for step in (0, 1):
         of_step = slice(step * accumulation, (step + 1) * accumulation)
         numbers = sorted(number for part in parts for batch in part[of_step] for number in batch)
@@ -87,9 +87,9 @@ def test_processes_and_micro_batches_share_the_same_samples_of_each_step(process
 def test_a_run_that_changes_its_number_of_processes_reads_every_clip_once_and_in_order():
     read = []
     for first, processes in ((0, 2), (2, 1), (4, 4)):  # two steps by so many
-        parts = [SharedBatches(first, first + 2, 8, 2, each, processes) for each in range(processes)]
+        parts = [DistributedBatches(first, first + 2, 8, 2, each, processes) for each in range(processes)]
         read += [number for micro in zip(*parts, strict=True) for batch in micro for number in batch]
-    assert read == [number for batch in SharedBatches(0, 6, 8, 1, 0, 1) for number in batch]
+    assert read == [number for batch in DistributedBatches(0, 6, 8, 1, 0, 1) for number in batch]
 
 
 def test_what_cannot_be_drawn_is_one_line(walks):
@@ -98,4 +98,4 @@ def test_what_cannot_be_drawn_is_one_line(walks):
     with pytest.raises(DataError, match="images are 32x32, the model takes 64x64"):
         ClipDataset([walks], plan(image_size=(64, 64)))
     with pytest.raises(RecipeError, match=r"cannot be shared by 3 processes .* give training.batch=6 training.acc"):
-        SharedBatches(0, 1, 8, 1, 0, 3)
+        DistributedBatches(0, 1, 8, 1, 0, 3)
