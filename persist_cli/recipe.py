@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import yaml
 from pydantic import BeforeValidator, Field
@@ -17,91 +18,92 @@ from persist_cli.api.stages import Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
 
+EXTENDS: Final = "extends"
+
+# the key that chooses a variant: settings of one variant mean nothing to another
+CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "adapter": "form"}
+SETTINGS_OF: Final = {"backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings"}
+
+CHANGEABLE: Final = "a run may be resumed with another value"
+
+Value = TypeVar("Value")
+Changeable = Annotated[Value, CHANGEABLE]
+
 Count = Annotated[int, Field(ge=0)]
-
 Positive = Annotated[int, Field(ge=1)]
-
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
 Precision = Annotated[  # YAML reads the word no as false
-    Literal["no", "bf16"], BeforeValidator(lambda given: "no" if given is False else given)
+    Literal["no", "bf16"], BeforeValidator(lambda value: "no" if value is False else value)
 ]
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How long and how.
+    """How long a stage is trained and how.
 
     Args:
         steps: optimizer steps.
         batch: samples an optimizer step, over all processes and accumulated micro-batches.
         accumulation: micro-batches that a step is split into.
-        learning_rate: of AdamW, after the warm-up.
-        warmup: steps of linear warm-up.
+        learning_rate: the optimizer's, after the warm-up.
+        warmup: steps over which the learning rate rises linearly.
         cooldown: steps at the end over which the learning rate falls linearly to zero.
-        weight_decay: of AdamW.
-        clip: largest gradient norm.
-        ema: decay of the averaged weights that are kept; 0 keeps the last ones.
+        weight_decay: the optimizer's.
+        clip: largest norm of all gradients together.
+        ema: decay of the moving average of the weights, which is what is saved; 0 saves the last weights.
         precision: ``no`` or ``bf16``.
-        seed: of weights, samples and noise.
+        seed: of everything random: fresh weights, the choice of clips, noise.
         checkpoint_every: steps between checkpoints.
         checkpoint_minutes: most minutes between checkpoints.
         workers: processes that read data.
-        threads: of torch on the CPU; 0 leaves torch's choice.
+        threads: CPU threads of torch; 0 leaves the number to torch.
         tracker: ``none`` or ``tensorboard``.
         optimizer: ``adamw``, or ``adamw-8bit`` of the package bitsandbytes, whose moments take a quarter of the bytes.
-        gradient_checkpointing: keep the hidden states between blocks alone and compute the rest again in the backward
-            pass: far fewer bytes for about a third more time.
-        compile: the blocks by ``torch.compile``; the first steps take minutes.
+        gradient_checkpointing: keep only the hidden states between blocks and compute the rest again in the backward
+            pass; this takes far fewer bytes and about a third more time.
+        compile: compile the blocks with ``torch.compile``; the first steps then take minutes.
         ema_device: where the averaged weights are: beside the ``model``, or in the memory of the ``cpu``.
-        frozen_precision: ``bf16`` holds what a stage does not train in half the bytes; what is saved stays exact.
+        frozen_precision: ``bf16`` holds the weights that a stage does not train in half the bytes; what is saved stays
+            exact.
         vae_slicing: encode clips one by one.
     """
 
-    steps: Positive = 1000
+    steps: Changeable[Positive] = 1000
     batch: Positive = 16
-    accumulation: Positive = 1
+    accumulation: Changeable[Positive] = 1
     learning_rate: PositiveNumber = 1e-4
     warmup: Count = 50
-    cooldown: Count = 0
+    cooldown: Changeable[Count] = 0
     weight_decay: Amount = 1e-4
     clip: PositiveNumber = 1.0
     ema: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
     precision: Precision = "bf16"
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # what numpy takes
-    checkpoint_every: Positive = 500
-    checkpoint_minutes: Amount = 5.0
-    workers: Count = 1
-    threads: Count = 0
-    tracker: Literal["none", "tensorboard"] = "none"
+    checkpoint_every: Changeable[Positive] = 500
+    checkpoint_minutes: Changeable[Amount] = 5.0
+    workers: Changeable[Count] = 1
+    threads: Changeable[Count] = 0
+    tracker: Changeable[Literal["none", "tensorboard"]] = "none"
     optimizer: Literal["adamw", "adamw-8bit"] = "adamw"
-    gradient_checkpointing: bool = False
-    compile: bool = False
-    ema_device: Literal["model", "cpu"] = "model"
+    gradient_checkpointing: Changeable[bool] = False
+    compile: Changeable[bool] = False
+    ema_device: Changeable[Literal["model", "cpu"]] = "model"
     frozen_precision: Precision = "no"
-    vae_slicing: bool = False
+    vae_slicing: Changeable[bool] = False
 
     def samples_at_once(self, processes: int) -> int:
-        """Samples of a micro-batch on each of so many processes, the most where they cannot have equal parts."""
+        """The most samples of a micro-batch that one of so many processes computes at once."""
         return math.ceil(self.batch / (self.accumulation * processes))
-
-
-EXTENDS = "extends"
-
-KINDS = {"backbone": "name", "memory": "name", "adapter": "form"}  # settings of one mean nothing to another
-
-SETTINGS_OF = {"backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings"}
 
 
 @dataclass(frozen=True)
 class BackboneConfig:
-    """Which video model.
+    """The choice of the video model.
 
     Args:
-        name: of the plugin.
-        settings: for the plugin; on top of the base checkpoint's where there is one.
+        name: of the backbone plugin.
+        settings: of the plugin, on top of those of the base checkpoint where there is one.
     """
 
     name: str = "cogvideox"
@@ -110,13 +112,13 @@ class BackboneConfig:
 
 @dataclass(frozen=True)
 class MemoryConfig:
-    """Which memory and what it is made of.
+    """The choice of the memory and of the encoder that gives its features.
 
     Args:
         name: of the memory plugin.
-        settings: for it.
+        settings: of the memory plugin.
         encoder: name of the encoder plugin.
-        encoder_settings: for it.
+        encoder_settings: of the encoder plugin.
     """
 
     name: str = "voxel"
@@ -125,8 +127,8 @@ class MemoryConfig:
     encoder_settings: dict[str, Any] = field(default_factory=dict)
 
 
-def _several(value: Any) -> Any:
-    """A list of paths, also of one that stands alone."""
+def _as_list(value: Any) -> Any:
+    """Make a list of a single path; pydantic checks all other values."""
     if isinstance(value, str):
         return [value] if value else []
     return value
@@ -134,18 +136,18 @@ def _several(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class DataSettings:
-    """Which clips.
+    """The choice of the clips to train on.
 
     Args:
-        path: data set folders, or one; ``--data`` sets them.
-        strides: every n-th frame; one of these is drawn for each clip. A negative one plays the clip backwards, with
-            what was seen on the way there as its context.
-        context_frames: most earlier frames that a clip's memory is made of (stage 2).
+        path: one data set folder or several; ``--data`` sets them.
+        strides: one is drawn for each clip, which then has every n-th frame of its trajectory. With a negative stride
+            the clip plays backwards and its context is what was seen on the way there.
+        context_frames: the most earlier frames that a clip's memory is made of (stage 2).
         clips_per_trajectory: how many fixed clips, with fixed contexts, each trajectory offers, so that clips come
-            again and can be cached; 0 draws from all that there are.
+            again and can be cached; 0 draws from all possible clips.
     """
 
-    path: Annotated[tuple[str, ...], BeforeValidator(_several)] = ()
+    path: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
     strides: tuple[int, ...] = (1, 2, 3)
     context_frames: Count = 48
     clips_per_trajectory: Count = 0
@@ -160,11 +162,11 @@ class Recipe:
         description: one line for ``persist recipes``.
         base: run or checkpoint to start from.
         backbone: the video model.
-        memory: stage 2 only.
+        memory: the memory that the adapter reads, stage 2 only.
         adapter: settings of the memory adapter, stage 2 only.
-        lora: trains a change of low rank of the base instead of all its weights, stage 1 only.
-        data: clips.
-        training: steps, batch, optimizer.
+        lora: train a change of low rank instead of all weights of the base, stage 1 only.
+        data: the clips.
+        training: steps, batch, optimizer and what else decides how long and how it is trained.
     """
 
     stage: Stage
@@ -178,27 +180,34 @@ class Recipe:
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
 
+def changeable_on_resume() -> set[str]:
+    """Dotted keys of the settings that may differ when a run is resumed."""
+    hints = typing.get_type_hints(TrainingSettings, include_extras=True)
+    return {f"training.{name}" for name, kind in hints.items() if CHANGEABLE in getattr(kind, "__metadata__", ())}
+
+
 def recipe_names() -> list[str]:
-    """Names of the recipes that come with persist."""
+    """The names of the recipes that come with persist, sorted."""
     files = resources.files("persist_recipes").iterdir()
     return sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml"))
 
 
 def read_recipe(name: str) -> dict[str, Any]:
-    """Plain values of a recipe by name, or of a YAML file, with those of the recipe that it ``extends``.
+    """Plain values of a recipe by its name, or of a YAML file, merged into those of the recipe that it ``extends``.
 
-    It need only say what is different, key by key inside mappings too. A ``backbone``, ``memory``, ``adapter`` or
-    encoder that it names begins without the settings of the one before.
+    ``extends: tiny-stage1`` with ``training: {steps: 7}`` is the recipe ``tiny-stage1`` with 7 steps: a recipe only has
+    to say what is different, inside mappings too. Where it names another backbone, memory, adapter form or encoder,
+    the settings of the one before are left out.
 
     Raises:
-        RecipeError: when one of them is unknown or no YAML mapping, and when they extend each other.
+        RecipeError: when a recipe is unknown or not a YAML mapping, or when recipes extend each other.
     """
     return _read_extended(name, ())
 
 
-def _read_extended(name: str, readers: tuple[str, ...]) -> dict[str, Any]:
-    if name in readers:
-        raise RecipeError(f"{name}: extends itself ({' -> '.join([*readers, name])})")
+def _read_extended(name: str, extended_by: tuple[str, ...]) -> dict[str, Any]:
+    if name in extended_by:
+        raise RecipeError(f"{name}: extends itself ({' -> '.join([*extended_by, name])})")
     values = parse_yaml_mapping(_recipe_text(name), name)
     extended = values.pop(EXTENDS, None)
     if extended is None:
@@ -207,16 +216,17 @@ def _read_extended(name: str, readers: tuple[str, ...]) -> dict[str, Any]:
         raise RecipeError(f"{name}: {EXTENDS} is the name of a recipe or a YAML file, not {extended!r}")
     if _is_file(name) and _is_file(extended):
         extended = str(Path(name).parent / extended)
-    merged = _read_extended(extended, (*readers, name))
-    return merged | {key: _merged(key, merged.get(key), value) for key, value in values.items()}
+    base = _read_extended(extended, (*extended_by, name))
+    return base | {key: _merge(key, base.get(key), value) for key, value in values.items()}
 
 
-def _merged(key: str, before: Any, value: Any) -> Any:
-    """The value, with what it does not say taken from the one before where both are mappings."""
-    if not isinstance(before, dict) or not isinstance(value, dict) or KINDS.get(key) in value:
+def _merge(key: str, base: Any, value: Any) -> Any:
+    """Merge a value into that of the extended recipe, key by key where both are mappings of the same variant."""
+    if not isinstance(base, dict) or not isinstance(value, dict) or CHOSEN_BY.get(key) in value:
         return value
-    kept = {name: each for name, each in before.items() if name != "encoder_settings" or "encoder" not in value}
-    return kept | {name: _merged(name, kept.get(name), each) for name, each in value.items()}
+    if "encoder" in value:
+        base = {name: setting for name, setting in base.items() if name != "encoder_settings"}
+    return base | {name: _merge(name, base.get(name), setting) for name, setting in value.items()}
 
 
 def _recipe_text(name: str) -> str:
@@ -234,10 +244,14 @@ def _is_file(name: str) -> bool:
 
 
 def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
-    """A YAML mapping.
+    """The values of a YAML mapping.
+
+    Args:
+        text: YAML.
+        where: the recipe's name or file, with which error messages begin.
 
     Raises:
-        RecipeError: one line with the place where it stops being YAML.
+        RecipeError: one line that says where the text stops being YAML, or that it is no mapping.
     """
     try:
         values = yaml.safe_load(text)
@@ -249,25 +263,33 @@ def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
 
 
 def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """The mapping with ``a.b=value`` changes, values read as YAML.
+    """Return a changed copy of the mapping.
 
-    Another backbone, memory or encoder begins without the settings that the mapping has for the one before.
+    ``training.steps=200`` sets the key ``steps`` in the mapping ``training``. Where another backbone, memory or encoder
+    is named, the settings that the mapping has for the one before are left out.
+
+    Args:
+        values: plain values, as YAML gives them.
+        overrides: KEY=VALUE texts with dotted keys and values in YAML.
+
+    Raises:
+        RecipeError: when a text is not of that form.
     """
     changed: dict[str, Any] = _copy(values)
-    read = [_read_override(override) for override in overrides]
-    for key, value in read:
-        choice, _, kind = key.partition(".")
-        there = changed.get(choice)
-        if key in SETTINGS_OF and isinstance(there, dict) and there.get(kind, value) != value:
-            there.pop(SETTINGS_OF[key], None)
-    for key, value in read:
+    settings = [_read_override(override) for override in overrides]
+    for key, value in settings:
+        owner, _, choice = key.partition(".")
+        mapping = changed.get(owner)
+        if key in SETTINGS_OF and isinstance(mapping, dict) and mapping.get(choice, value) != value:
+            mapping.pop(SETTINGS_OF[key], None)
+    for key, value in settings:
         *parents, last = key.split(".")
-        place = changed
+        mapping = changed
         for parent in parents:
-            if not isinstance(place.get(parent), dict):
-                place[parent] = {}
-            place = place[parent]
-        place[last] = value
+            if not isinstance(mapping.get(parent), dict):
+                mapping[parent] = {}
+            mapping = mapping[parent]
+        mapping[last] = value
     return changed
 
 
@@ -282,19 +304,27 @@ def _read_override(override: str) -> tuple[str, Any]:
 
 
 def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
-    """A recipe of plain values, every problem reported at once."""
+    """The recipe that plain values stand for, with the defaults of what they leave out.
+
+    Args:
+        values: plain values, as YAML gives them.
+        where: the recipe's name or file, with which error messages begin.
+
+    Raises:
+        RecipeError: one line with all unknown keys and wrong values, else with all settings that contradict each other.
+    """
     values = dict(values)
     if isinstance(values.get("stage"), int):
         values["stage"] = str(values["stage"])
     recipe = parse_settings(Recipe, values, where)
-    problems = list(_inconsistencies(recipe))
+    problems = _contradictions(recipe)
     if problems:
         raise RecipeError(f"{where}: " + "; ".join(problems))
     return recipe
 
 
-def _inconsistencies(recipe: Recipe) -> list[str]:
-    """What is well-formed but makes no sense."""
+def _contradictions(recipe: Recipe) -> list[str]:
+    """Describe each group of settings that are valid alone but not together."""
     training = recipe.training
     problems = []
     if training.cooldown > training.steps:
@@ -318,20 +348,20 @@ def _inconsistencies(recipe: Recipe) -> list[str]:
 
 
 def to_plain(recipe: Recipe) -> dict[str, Any]:
-    """The resolved recipe as plain values, fit for YAML and JSON."""
+    """The resolved recipe as plain values for YAML and JSON."""
     plain: dict[str, Any] = _copy(dataclasses.asdict(recipe))
     return plain
 
 
 def to_yaml(recipe: Recipe) -> str:
-    """The resolved recipe as YAML, saved beside every output."""
+    """The resolved recipe as YAML, as it is saved beside every output."""
     return yaml.safe_dump(to_plain(recipe), sort_keys=False)
 
 
 def _copy(value: Any) -> Any:
-    """A deep copy in YAML's own types."""
+    """Copy a value deeply into the types of YAML: tuples become lists."""
     if isinstance(value, Mapping):
-        return {key: _copy(part) for key, part in value.items()}
+        return {key: _copy(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_copy(part) for part in value]
+        return [_copy(item) for item in value]
     return value

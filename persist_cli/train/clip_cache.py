@@ -14,7 +14,7 @@ import json
 import shutil
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,19 +25,19 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from persist_cli import __version__
-from persist_cli.api.backbone import Backbone
+from persist_cli.api.backbone import Backbone, Clip, ClipLatents, Clips
 from persist_cli.api.observations import Observations
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import ClipDataset, ClipFrames, ClipSample
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import ASIDE, file_sha256, read_tensors, write_tensors
-from persist_cli.memorize.factory import MemoryFactory, collate, recall
+from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.sources import Source
 from persist_cli.plugins import find_plugin
 from persist_cli.recipe import MemoryConfig, Recipe
 from persist_cli.viewing.console import say
 
-FORMAT = 1  # of the entries; another number makes every older one unknown
+FORMAT = 2  # of the entries; another number makes every older one unknown
 
 SCANS = 64  # how often at most the folder is measured while it fills up
 
@@ -258,14 +258,17 @@ class ClipCache:
         """Whether it takes latents of whole trajectories."""
         return self.keys.whole
 
-    def latents(self, choice: ClipFrames) -> Tensor | None:
+    def latents(self, choice: ClipFrames) -> ClipLatents | None:
         """Latents of the clip, ``None`` where there are none."""
-        found = self.cache.get(self.keys.of_clip(choice).latents)
-        return None if found is None else self.cut(found["latents"], choice)
+        tensors = self.cache.get(self.keys.of_clip(choice).latents)
+        if tensors is None:
+            return None
+        return self.cut(tensors["video"], choice) if self.whole else ClipLatents(**tensors)
 
-    def cut(self, latents: Tensor, choice: ClipFrames) -> Tensor:
-        """The clip's latents of those that are stored."""
-        return latents[list(choice.frames)] if self.whole else latents
+    def cut(self, video: Tensor, choice: ClipFrames) -> ClipLatents:
+        """The clip's latents out of those of its whole trajectory, every frame of which was encoded alone."""
+        frames = video[list(choice.frames)]
+        return ClipLatents(frames, frames[:1])
 
     def tokens(self, choice: ClipFrames) -> MemoryTokens | None:
         """Memory tokens of the clip, ``None`` where there are none."""
@@ -273,9 +276,10 @@ class ClipCache:
         found = None if key is None else self.cache.get(key)
         return None if found is None else MemoryTokens(**found)
 
-    def put_latents(self, choice: ClipFrames, latents: Tensor) -> None:
+    def put_latents(self, choice: ClipFrames, latents: ClipLatents) -> None:
         """Store the clip's latents, or those of its whole trajectory, while there is room."""
-        self.cache.put(self.keys.of_clip(choice).latents, {"latents": latents})
+        tensors = {"video": latents.video} | ({} if self.whole else {"image": latents.image})
+        self.cache.put(self.keys.of_clip(choice).latents, tensors)
 
     def put_tokens(self, choice: ClipFrames, tokens: MemoryTokens) -> None:
         """Store the clip's memory tokens while there is room."""
@@ -287,19 +291,15 @@ class ClipCache:
 
 @dataclass(frozen=True)
 class CachedSample:
-    """A clip with what a cache has of it.
+    """A training clip, with the latents and tokens that a cache has of it.
 
     Args:
-        clip: without the images and the context that nothing has to be made of.
-        choice: which frames it is made of.
-        latents: what ``Backbone.encode`` gives of this clip alone, without a batch axis, where the cache has it.
-        tokens: what a memory of the context says to the clip's cameras, where the cache has it.
+        sample: the clip, without the images and the context that nothing has to be made of any more.
+        frames: which frames of which trajectory it is made of.
     """
 
-    clip: ClipSample
-    choice: ClipFrames
-    latents: Tensor | None = None
-    tokens: MemoryTokens | None = None
+    sample: ClipSample
+    frames: ClipFrames
 
 
 class CachedClips(Dataset[CachedSample]):
@@ -314,79 +314,65 @@ class CachedClips(Dataset[CachedSample]):
         self.clips, self.cache = clips, cache
 
     def __getitem__(self, number: int) -> CachedSample:
-        choice = self.clips.choose(number)
+        frames = self.clips.choose(number)
         if self.cache is None:
-            return CachedSample(self.clips.read(choice), choice)
-        latents, tokens = self.cache.latents(choice), self.cache.tokens(choice)
-        clip = self.clips.read(choice, images=latents is None, context=tokens is None)
-        return CachedSample(clip, choice, latents, tokens)
+            return CachedSample(self.clips.read(frames), frames)
+        latents, tokens = self.cache.latents(frames), self.cache.tokens(frames)
+        sample = self.clips.read(frames, images=latents is None, context=tokens is None)
+        return CachedSample(replace(sample, clip=replace(sample.clip, latents=latents, tokens=tokens)), frames)
 
 
 class ClipEncoder:
-    """Makes batches of latents and memory tokens; those that the cache lacks are made of each clip alone, and stored.
+    """Completes clips by latents and memory tokens; those that the cache lacks are made of each clip alone, and stored.
 
     Args:
         backbone: encodes, on its device.
-        maker: of memories, ``None`` without one.
+        factory: of memories, ``None`` without one.
         accelerator: gives the precision of training.
         cache: ``None`` stores nothing.
     """
 
     def __init__(
-        self, backbone: Backbone, maker: MemoryFactory | None, accelerator: Accelerator, cache: ClipCache | None
+        self, backbone: Backbone, factory: MemoryFactory | None, accelerator: Accelerator, cache: ClipCache | None
     ) -> None:
-        self.backbone, self.maker, self.accelerator, self.cache = backbone, maker, accelerator, cache
-        self.asked, self.found = 0, 0
-
-    def all_latents(self, samples: Sequence[CachedSample]) -> Tensor:
-        """Latents of all the clips as a batch."""
-        self.asked += len(samples)
-        self.found += sum(sample.latents is not None for sample in samples)
-        return torch.stack([self.latents(sample) for sample in samples])
-
-    def all_tokens(self, samples: Sequence[CachedSample]) -> MemoryTokens | None:
-        """Memory tokens of all the clips as a batch; ``None`` without a memory."""
-        maker = self.maker
-        return None if maker is None else MemoryTokens.stack([self.tokens(sample, maker) for sample in samples])
-
-    def without_images(self, samples: Sequence[CachedSample]) -> list[ClipSample]:
-        """The clips without the images, which latents stand for."""
-        return [_without_images(sample.clip) for sample in samples]
+        self.backbone, self.factory, self.accelerator, self.cache = backbone, factory, accelerator, cache
+        self.clips, self.cached = 0, 0  # how many there were, and how many of them came with latents
 
     def figures(self) -> dict[str, float]:
         """How many of this process's clips came with latents since the start, as a share."""
-        return {"latents_found": round(self.found / self.asked, 4)} if self.asked else {}
+        return {"latents_found": round(self.cached / self.clips, 4)} if self.clips else {}
 
-    def latents(self, sample: CachedSample) -> Tensor:
-        """The clip's latents, found or made."""
-        if sample.latents is not None:
-            return sample.latents
-        cache, choice = self.cache, sample.choice
-        if cache is None or cache.cache.full:  # a whole trajectory would be encoded again for each of its clips
-            return self.encode(sample.clip)
-        if cache.whole:
-            pieces = Source(choice.file, range(len(choice.file)), str(choice.file.path)).pieces()
-            latents = torch.cat([self.encode(replace(sample.clip, observations=piece)) for piece in pieces])
-        else:
-            latents = self.encode(sample.clip)
-        cache.put_latents(choice, latents)
-        return cache.cut(latents, choice)
+    def with_latents(self, cached: CachedSample) -> CachedSample:
+        """The clip with its latents, which stand for its images."""
+        sample = cached.sample
+        self.clips, self.cached = self.clips + 1, self.cached + (sample.clip.latents is not None)
+        latents = sample.clip.latents or self._new_latents(sample.clip, cached.frames)
+        seen = sample.clip.observations
+        cameras = Observations(seen.rgb[:0], seen.depth[:0], seen.cameras)
+        return replace(cached, sample=replace(sample, clip=replace(sample.clip, observations=cameras, latents=latents)))
 
-    def encode(self, clip: ClipSample) -> Tensor:
+    def with_tokens(self, cached: CachedSample) -> Clip:
+        """The clip with what a memory of its context says to its cameras, if there is a memory."""
+        if self.factory is None or cached.sample.clip.tokens is not None:
+            return cached.sample.clip
+        clip = with_memory(cached.sample, self.factory, self.backbone.token_budget)
+        if self.cache is not None and clip.tokens is not None:
+            self.cache.put_tokens(cached.frames, clip.tokens)
+        return clip
+
+    def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
+        if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip
+            return self._encode(clip)
+        if not self.cache.whole:
+            latents = self._encode(clip)
+            self.cache.put_latents(frames, latents)
+            return latents
+        pieces = Source(frames.file, range(len(frames.file)), str(frames.file.path)).pieces()
+        video = torch.cat([self._encode(replace(clip, observations=piece)).video for piece in pieces])
+        self.cache.put_latents(frames, ClipLatents(video, video[:1]))
+        return self.cache.cut(video, frames)
+
+    def _encode(self, clip: Clip) -> ClipLatents:
         """Latents of these frames, on the CPU."""
         with torch.no_grad(), self.accelerator.autocast():
-            return self.backbone.encode(collate([clip]))[0].cpu()
-
-    def tokens(self, sample: CachedSample, maker: MemoryFactory) -> MemoryTokens:
-        """What a memory of the clip's context says, found or made."""
-        if sample.tokens is not None:
-            return sample.tokens
-        tokens = recall(sample.clip, maker, self.backbone.token_budget)
-        if self.cache is not None:
-            self.cache.put_tokens(sample.choice, tokens)
-        return tokens
-
-
-def _without_images(clip: ClipSample) -> ClipSample:
-    seen = clip.observations
-    return replace(clip, observations=Observations(seen.rgb[:0], seen.depth[:0], seen.cameras), context=None)
+            return self.backbone.encode(Clips.stack([clip]))[0].to("cpu")

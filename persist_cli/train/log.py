@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -17,40 +17,56 @@ import torch
 from persist_cli.io.files import write_json, written_aside
 from persist_cli.viewing.console import print_table
 
+PARTS: Final = ("data", "encode", "memory", "forward", "backward", "optimizer")  # of a step, as they follow each other
+
+REST: Final = "other"  # the time of a step that none of its parts takes
+
 
 class StepLog:
-    """``log.jsonl`` of a run, one line for each optimizer step.
+    """The file ``log.jsonl`` of a run, with a line for each optimizer step.
 
     Args:
-        path: of the file.
-        step: the step to go on from; later lines, of a run that was stopped after its last checkpoint, are dropped.
+        path: the file; it is made when missing.
+        step: the step to go on from. Later lines, which a run wrote after its last checkpoint, are dropped.
     """
 
     def __init__(self, path: Path, step: int) -> None:
         self.path = path
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-        self.rows: list[dict[str, float]] = [row for row in map(_parse, lines) if row and row["step"] <= step]
+        self.rows: list[dict[str, float]] = [row for row in map(_parse_row, lines) if row and row["step"] <= step]
         path.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
-        """Append a step's values."""
+        """Append the logged values of a step."""
         row = {"step": float(step)} | dict(values)
         self.rows.append(row)
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
     def draw(self, path: Path) -> None:
-        """The loss curve as PNG."""
+        """Draw the loss as PNG: each step in grey and the running mean over a twentieth of the run, on a log scale."""
+        from matplotlib.figure import Figure
 
-        if self.rows:
-            draw_curve([row["step"] for row in self.rows], [row["loss"] for row in self.rows], path)
+        if not self.rows:
+            return
+        steps, losses = [row["step"] for row in self.rows], [row["loss"] for row in self.rows]
+        figure = Figure(figsize=(7, 4), layout="constrained")
+        axes = figure.subplots()
+        axes.plot(steps, losses, color="0.8", linewidth=0.8, label="step")
+        window = max(1, len(losses) // 20)
+        mean = np.convolve(losses, np.ones(window) / window, mode="valid")
+        axes.plot(steps[window - 1 :], mean, color="tab:blue", label=f"mean of {window}")
+        axes.set(xlabel="optimizer step", ylabel="loss", yscale="log")
+        axes.legend()
+        with written_aside(path) as aside:
+            figure.savefig(aside, format="png", dpi=120)
 
 
 class SpeedLog:
-    """``speed.jsonl`` of a run: a line for each checkpoint with samples a second since the one before.
+    """The file ``speed.jsonl`` of a run, with a line for each checkpoint: samples a second since the one before.
 
     Args:
-        path: of the file; lines are appended.
+        path: the file; lines are appended.
         step: the step to go on from.
         batch: samples a step, over all processes.
     """
@@ -61,7 +77,7 @@ class SpeedLog:
         self.samples, self.seconds = 0, 0.0
 
     def add(self, step: int, figures: Mapping[str, float]) -> None:
-        """Append the speed up to a step, of everything that it took, and other figures."""
+        """Append the speed since the last line, all work included, and other figures."""
         now = time.monotonic()
         samples, seconds = (step - self.step) * self.batch, now - self.since
         self.samples, self.seconds = self.samples + samples, self.seconds + seconds
@@ -71,32 +87,18 @@ class SpeedLog:
             file.write(json.dumps(row | dict(figures)) + "\n")
 
     def rate(self) -> float:
-        """Samples a second of all lines that this process wrote."""
+        """Samples a second over all lines that this process wrote."""
         return self.samples / self.seconds if self.seconds else 0.0
-
-
-def _parse(line: str) -> dict[str, float] | None:
-    """A row, or nothing for the half line of a killed run."""
-    try:
-        row: dict[str, float] = json.loads(line)
-    except ValueError:
-        return None
-    return row
-
-
-PARTS = ("data", "encode", "memory", "forward", "backward", "optimizer")
-
-REST = "other"
 
 
 @dataclass
 class StepTimes:
-    """Seconds of each part of a run's steps, all work of the device waited for at its end.
+    """Measures the seconds of each part of a run's steps; at the end of a part the device has done all of its work.
 
     The first step, in which kernels are chosen and blocks compiled, is left out as soon as there is another.
 
     Args:
-        device: that works.
+        device: the device that computes.
         batch: samples a step, over all processes.
     """
 
@@ -107,7 +109,7 @@ class StepTimes:
 
     @contextlib.contextmanager
     def step(self) -> Iterator[None]:
-        """The block is a step; what its parts do not take is the rest."""
+        """Measure the block as one step."""
         since, self.current = self._now(), dict.fromkeys(PARTS, 0.0)
         yield
         self.current[REST] = self._now() - since - sum(self.current.values())
@@ -116,14 +118,14 @@ class StepTimes:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """The block's seconds are those of this part of the step; outside of steps they do not count."""
+        """Add the block's seconds to this part of the step; outside of steps they do not count."""
         since = self._now()
         yield
         if self.current is not None:
             self.current[name] += self._now() - since
 
     def figures(self) -> dict[str, Any]:
-        """Seconds a step and share of each part, and samples a second, JSON values; nothing without a whole step."""
+        """Mean seconds and share of each part and samples a second as JSON values, empty before the first step ends."""
         steps = self.steps[1:] or self.steps
         if not steps:
             return {}
@@ -139,8 +141,8 @@ class StepTimes:
         if not figures:
             return
         write_json(path, figures)
-        shown = [(name, each["seconds"], each["share"]) for name, each in figures["parts"].items()]
-        rows = [(name, f"{1000 * seconds:.1f}", f"{100 * share:.1f}") for name, seconds, share in shown]
+        parts = figures["parts"].items()
+        rows = [(name, f"{1000 * part['seconds']:.1f}", f"{100 * part['share']:.1f}") for name, part in parts]
         whole = ("step", f"{1000 * figures['seconds_per_step']:.1f}", "100.0")
         print_table(f"mean of {figures['steps']} steps on {self.device}", ("", "ms", "%"), [*rows, whole])
 
@@ -151,21 +153,14 @@ class StepTimes:
 
 
 def timed(times: StepTimes | None, name: str) -> AbstractContextManager[None]:
-    """A part of a step's times, or nothing at all where none are taken."""
+    """Measure the block as a part of a step where times are taken."""
     return contextlib.nullcontext() if times is None else times.part(name)
 
 
-def draw_curve(steps: Sequence[float], losses: Sequence[float], path: Path) -> None:
-    """The loss of every step in grey and its running mean over a twentieth of the run, on a log scale."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
-    axes.plot(steps, losses, color="0.8", linewidth=0.8, label="step")
-    window = max(1, len(losses) // 20)
-    mean = np.convolve(losses, np.ones(window) / window, mode="valid")
-    axes.plot(list(steps)[window - 1 :], mean, color="tab:blue", label=f"mean of {window}")
-    axes.set(xlabel="optimizer step", ylabel="loss", yscale="log")
-    axes.legend()
-    with written_aside(path) as aside:
-        figure.savefig(aside, format="png", dpi=120)
+def _parse_row(line: str) -> dict[str, float] | None:
+    """The values of a line, ``None`` for the half line that a killed run leaves."""
+    try:
+        row: dict[str, float] = json.loads(line)
+    except ValueError:
+        return None
+    return row

@@ -1,4 +1,4 @@
-"""What makes a training step cheaper, of a recipe's settings: for the backbone, the optimizer and the average."""
+"""The optimizer of a training, the moving average of its weights, and the memory savings of its backbone."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ COMPILERS = ("c++", "g++", "clang++")  # what torch.compile looks for on a CPU
 
 
 def requested_savings(settings: TrainingSettings, device: torch.device) -> MemorySavings:
-    """What the settings ask of the backbone.
+    """The memory savings that the settings ask of the backbone.
 
     Raises:
-        PersistError: when blocks shall be compiled on a CPU and there is no compiler.
+        PersistError: when blocks are to be compiled on a CPU and there is no compiler.
     """
     compilers = (os.environ["CXX"],) if os.environ.get("CXX") else COMPILERS
     if settings.compile and device.type == "cpu" and not any(map(shutil.which, compilers)):
@@ -37,10 +37,10 @@ def requested_savings(settings: TrainingSettings, device: torch.device) -> Memor
 
 
 def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> torch.optim.Optimizer:
-    """AdamW, its moments in 32 bits, or in 8.
+    """AdamW with moments of 32 bits, or of 8 bits for ``adamw-8bit``.
 
     Raises:
-        PersistError: when 8 bits are asked for and bitsandbytes is not installed.
+        PersistError: when bitsandbytes, which has the one of 8 bits, is not installed.
     """
     rate, decay = settings.learning_rate, settings.weight_decay
     if settings.optimizer == "adamw":
@@ -56,7 +56,7 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSetting
 
 
 def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> EMAModel:
-    """The moving average of the parameters, beside them or where the settings want it."""
+    """The moving average of the parameters, on their device or on the CPU as the settings say."""
     average = EMAModel(parameters, decay=settings.ema, use_ema_warmup=True)
     if settings.ema_device == "cpu":
         average.to("cpu")
@@ -64,7 +64,7 @@ def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings)
 
 
 def update_average(average: EMAModel, parameters: Iterable[nn.Parameter]) -> None:
-    """Take a step of the average, which may be on another device than the parameters."""
+    """Move the average towards the parameters, which may be on another device."""
     device = average.shadow_params[0].device
-    # requires_grad tells the average what is trained; what is not it copies
-    average.step([each if each.device == device else each.detach().to(device).requires_grad_() for each in parameters])
+    # EMAModel averages tensors with requires_grad and copies the others
+    average.step([p if p.device == device else p.detach().to(device).requires_grad_() for p in parameters])

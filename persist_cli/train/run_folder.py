@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
+from typing import Final
 
 from safetensors import SafetensorError
 
@@ -15,19 +15,20 @@ from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
 from persist_cli.recipe import to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
-from persist_cli.train.state import model_folder, save_state
+from persist_cli.train.state import save_state
 from persist_cli.train.trainer import Trainer
 
-CODEC_BATCHES = 4  # batches that the scale of the codec's latents is measured on
+CODEC_BATCHES: Final = 4  # for measuring the scale of the codec's latents at the end of its stage
 
 
 class RunFolder:
-    """What a run leaves, written by the main process; where the training is sharded, by all of them.
+    """Writes the files of a run: the main process alone, or all processes where the training is sharded.
 
     Args:
-        path: of the folder, made when missing.
-        trainer: in the state of the folder's newest checkpoint, where there is one.
-        base: what the run was started from; what it came from is asked now, while its runs are there.
+        path: the folder; it is made when missing.
+        trainer: the run's trainer, in the state of the folder's newest checkpoint where there is one.
+        base: the checkpoint that the run starts from. Its scenes and the recipes of its stages are read now, because
+            the runs behind it may be removed later.
     """
 
     def __init__(self, path: Path, trainer: Trainer, base: Checkpoint | None) -> None:
@@ -46,7 +47,7 @@ class RunFolder:
         self.speed = SpeedLog(path / "speed.jsonl", self.saved, trainer.recipe.training.batch)
 
     def save(self) -> None:
-        """Leave a checkpoint of this step, unless it is there.
+        """Write a checkpoint of the current step, unless it is written already.
 
         Raises:
             PersistError: when it cannot be written.
@@ -56,7 +57,7 @@ class RunFolder:
             return
         try:
             self._save()
-        except (OSError, SafetensorError) as error:  # the latter of what a backbone writes by itself
+        except (OSError, SafetensorError) as error:  # a backbone may write with safetensors itself
             raise PersistError(f"{self.path}: a checkpoint cannot be written there ({error})") from error
         self.trainer.accelerator.wait_for_everyone()
         self.saved = step
@@ -66,12 +67,11 @@ class RunFolder:
         main = self.trainer.accelerator.is_main_process
         if main:
             self.speed.add(state.step, encoder.figures() if encoder else {})
-        save_state(self.path, state, partial(self.save_model, home=model_folder(self.path, state.step)))
+        save_state(self.path, state, self._save_model)
         if main:
             self.log.draw(self.path / "loss.png")
 
-    def save_model(self, folder: Path, home: Path) -> None:
-        """Write the model into a folder that will stand at ``home``."""
+    def _save_model(self, folder: Path, home: Path) -> None:
         with self.trainer.model_to_save() as backbone:
             if self.trainer.accelerator.is_main_process:
                 self._write_model(backbone, folder, home)
@@ -80,8 +80,8 @@ class RunFolder:
         trainer, recipe = self.trainer, self.trainer.recipe
         folder.mkdir()
         size = recipe.training.batch
-        samples = ([trainer.clips[number * size + row] for row in range(size)] for number in range(CODEC_BATCHES))
-        backbone.finish_stage(recipe.stage, (trainer.to_batch(each) for each in samples))
+        batches = ([trainer.clips[number * size + row] for row in range(size)] for number in range(CODEC_BATCHES))
+        backbone.finish_stage(recipe.stage, (trainer.to_batch(samples) for samples in batches))
         if recipe.memory is not None and self.base is not None:
             save_adapter(backbone, self.base, recipe.memory, folder, home, self.scenes)
         elif recipe.lora is not None:

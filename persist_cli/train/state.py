@@ -1,6 +1,7 @@
-"""Tensors of which every process holds a part: one safetensors file a process, read by any number of them.
+"""The training state of a run and its checkpoints, written by one process or in parts by many.
 
-The files are those of ``torch.distributed.checkpoint``'s Hugging Face storage: each says where its parts stand.
+Where the training is sharded each process writes its parts of all tensors into a file of its own, as
+``torch.distributed.checkpoint`` does for Hugging Face. Any number of processes can read these files.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from accelerate import PartialState
@@ -25,10 +26,150 @@ from torch.distributed.checkpoint.metadata import TensorStorageMetadata
 from torch.distributed.checkpoint.state_dict_loader import load
 from torch.distributed.checkpoint.state_dict_saver import save
 
-from persist_cli.checkpoints.checkpoint import STEP, step_folders
 from persist_cli.errors import CheckpointError
+from persist_cli.io.checkpoint_folder import STEP, step_folders
 from persist_cli.io.files import folder_aside, read_json, read_tensors, write_json, write_tensors
 from persist_cli.train.distributed import is_sharded
+
+STATE_FILE: Final = "training.safetensors"  # of a training that is not sharded
+
+SHARDS_FOLDER: Final = "training"  # with a file of each process
+
+NOTES_FILE: Final = "training.json"  # what of the state is no tensor
+
+
+@dataclass
+class TrainingState:
+    """Everything that changes while a run goes on.
+
+    Args:
+        parameters: the trained parameters by name.
+        moments: the optimizer's state of each parameter.
+        average: the exponential moving average of the parameters, ``None`` when none is kept.
+        step: optimizer steps done; the position in the data follows from it.
+    """
+
+    parameters: dict[str, nn.Parameter]
+    moments: MutableMapping[nn.Parameter, dict[str, Any]]
+    average: EMAModel | None
+    step: int = 0
+
+    @property
+    def sharded(self) -> bool:
+        """Whether each process holds only a part of the parameters."""
+        return any(map(is_sharded, self.parameters.values()))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors of the state, the random state of torch included, by the names that files give them."""
+        tensors: dict[str, Tensor] = {"random/torch": torch.get_rng_state()}
+        for name, parameter in self.parameters.items():
+            tensors[f"parameter/{name}"] = parameter
+            for key, value in self.moments[parameter].items():
+                tensors[f"optimizer/{key}/{name}"] = torch.as_tensor(value)  # a step count may be a plain number
+        return tensors | {f"average/{name}": average for name, average in self.averages().items()}
+
+    def averages(self) -> dict[str, Tensor]:
+        """The averaged parameters by name, empty when none are kept."""
+        return {} if self.average is None else dict(zip(self.parameters, self.average.shadow_params, strict=True))
+
+    @contextlib.contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Within the block the parameters have their averaged values, where these are kept."""
+        if self.average is None:
+            yield
+            return
+        parameters = [*self.parameters.values()]
+        self.average.store(parameters)
+        self.average.copy_to(parameters)
+        try:
+            yield
+        finally:
+            self.average.restore(parameters)
+
+    def write(self, folder: Path, main: bool) -> dict[str, Any]:
+        """Write the tensors into a checkpoint's folder; all processes must call it.
+
+        Args:
+            folder: an existing folder.
+            main: whether this is the main process, which alone writes what is not sharded.
+
+        Returns:
+            The JSON values that ``read`` expects in the folder's ``training.json``.
+        """
+        notes = {"step": self.step, "ema_steps": self.average.optimization_step if self.average else 0}
+        tensors = self.tensors()  # with DeepSpeed, processes gather them together
+        if self.sharded:
+            write_shards(folder / SHARDS_FOLDER, tensors)
+            return notes | {"files": len(list((folder / SHARDS_FOLDER).iterdir()))}
+        if main:
+            write_tensors(folder / STATE_FILE, _in_memory_of_their_own(tensors))
+        return notes
+
+    def read(self, folder: Path) -> None:
+        """Restore the state that was written into a checkpoint's folder, by any number of processes.
+
+        Raises:
+            CheckpointError: when a file is missing or damaged, or a tensor is missing or of another shape.
+        """
+        notes: dict[str, Any] = read_json(folder / NOTES_FILE)
+        shards = folder / SHARDS_FOLDER if "files" in notes else folder
+        if "files" in notes and len(list(shards.glob("*.safetensors"))) != notes["files"]:
+            raise CheckpointError(f"{shards}: of its {notes['files']} files some are missing; go back to a whole copy")
+        if "files" in notes or self.sharded:
+            self._restore(read_shards(shards, self._empty_like), shards)
+        else:
+            self._restore(read_tensors(folder / STATE_FILE)[0], folder / STATE_FILE)
+        self.step = int(notes["step"])
+        if self.average is not None:
+            self.average.optimization_step = int(notes["ema_steps"])
+
+    def _empty_like(self, name: str, shape: torch.Size, dtype: torch.dtype) -> Tensor:
+        """A tensor to read one of the state into, sharded like the parameter that it belongs to."""
+        parameter = self.parameters.get(name.split("/")[-1])
+        if parameter is None or parameter.shape != shape:
+            return torch.empty(shape, dtype=dtype)
+        return torch.empty_like(parameter, dtype=dtype, requires_grad=False)
+
+    def _restore(self, tensors: dict[str, Tensor], path: Path) -> None:
+        averages, moments = self.averages(), _moments_by_parameter(tensors)
+        with torch.no_grad():
+            for name, parameter in self.parameters.items():
+                parameter.copy_(_take(tensors, f"parameter/{name}", parameter, path))
+                if name in averages:
+                    averages[name].copy_(_take(tensors, f"average/{name}", parameter, path))
+                self.moments[parameter] = {
+                    key: _step_count(value) if key == "step" else value.to(parameter.device)
+                    for key, value in moments.get(name, {}).items()
+                }
+        torch.set_rng_state(tensors["random/torch"])
+
+
+def save_state(run: Path, state: TrainingState, save_model: Callable[[Path, Path], None]) -> None:
+    """Write a checkpoint aside, rename it to ``step-…`` and remove the older ones; all processes must call it.
+
+    Args:
+        run: the run's folder.
+        state: the state of the training.
+        save_model: called with a folder to make, and the place where that folder will be in the end; its main process
+            writes the model there that other commands load.
+    """
+    main = PartialState().is_main_process
+    checkpoint = run / f"{STEP}{state.step:08d}"
+    with _shared_folder_aside(checkpoint) as aside:
+        notes = state.write(aside, main)
+        save_model(aside / "model", checkpoint / "model")
+        if main:
+            write_json(aside / NOTES_FILE, notes)
+    if main:
+        for older in step_folders(run)[:-1]:
+            shutil.rmtree(older)
+
+
+def load_state(run: Path, state: TrainingState) -> None:
+    """Restore the newest checkpoint of a run, if there is one."""
+    folders = step_folders(run)
+    if folders:
+        state.read(folders[-1])
 
 
 def write_shards(folder: Path, tensors: Mapping[str, Tensor]) -> None:
@@ -43,26 +184,25 @@ def write_shards(folder: Path, tensors: Mapping[str, Tensor]) -> None:
         raise OSError(_causes(error)) from error
 
 
-def read_shards(folder: Path, like: Callable[[str, torch.Size, torch.dtype], Tensor]) -> dict[str, Tensor]:
+def read_shards(folder: Path, empty: Callable[[str, torch.Size, torch.dtype], Tensor]) -> dict[str, Tensor]:
     """Read the parts that this process needs of every tensor.
 
     Args:
-        folder: with files of ``write_shards``, or a single file of whole tensors.
-        like: a tensor to read into for each name, shape and type; a sharded one takes its part.
+        folder: a folder with the files of ``write_shards``, or with a single file of whole tensors.
+        empty: makes a tensor to read into, of a name, shape and type; a sharded one takes its part.
 
     Raises:
         CheckpointError: one line when a file is not whole.
     """
     try:
         reader = HuggingFaceStorageReader(str(folder))
-        stored = reader.read_metadata().state_dict_metadata
         tensors = {
-            name: like(name, each.size, each.properties.dtype)
-            for name, each in stored.items()
-            if isinstance(each, TensorStorageMetadata)
+            name: empty(name, metadata.size, metadata.properties.dtype)
+            for name, metadata in reader.read_metadata().state_dict_metadata.items()
+            if isinstance(metadata, TensorStorageMetadata)
         }
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that no process waits for another is what is meant here
+            warnings.simplefilter("ignore", UserWarning)  # no_dist is meant: each process reads without the others
             load(tensors, storage_reader=HuggingFaceStorageReader(str(folder)), no_dist=True)
     except CheckpointException as error:
         raise CheckpointError(f"{folder}: its parts cannot be read ({_causes(error)})") from error
@@ -72,146 +212,9 @@ def read_shards(folder: Path, like: Callable[[str, torch.Size, torch.dtype], Ten
 
 
 def _causes(error: CheckpointException) -> str:
-    """What went wrong on which process, in one line."""
+    """One line that says what went wrong on which process."""
     causes = {process: str(cause).splitlines() for process, (cause, _) in error.failures.items()}
     return "; ".join(f"process {process}: {lines[0] if lines else '?'}" for process, lines in sorted(causes.items()))
-
-
-WHOLE = "training.safetensors"
-
-SHARDS = "training"  # the folder of the processes' files
-
-
-@dataclass
-class TrainingState:
-    """Everything that changes while a run goes on.
-
-    Args:
-        parameters: the trained ones by name.
-        moments: the optimizer's state of each.
-        average: exponential moving average of them, if one is kept.
-        step: optimizer steps done; the position in the data follows from it.
-    """
-
-    parameters: dict[str, nn.Parameter]
-    moments: MutableMapping[nn.Parameter, dict[str, Any]]
-    average: EMAModel | None
-    step: int = 0
-
-    def tensors(self) -> dict[str, Tensor]:
-        """All of it by name."""
-        found: dict[str, Tensor] = {"random/torch": torch.get_rng_state()}
-        for name, parameter in self.parameters.items():
-            found[f"parameter/{name}"] = parameter
-            for key, value in self.moments[parameter].items():
-                found[f"optimizer/{key}/{name}"] = torch.as_tensor(value)  # bitsandbytes counts steps by plain numbers
-        return found | {f"average/{name}": each for name, each in self.averages().items()}
-
-    @property
-    def sharded(self) -> bool:
-        """Whether each process holds a part of it."""
-        return any(map(is_sharded, self.parameters.values()))
-
-    def averages(self) -> dict[str, Tensor]:
-        """The averaged parameters by name, none where none are kept."""
-        return {} if self.average is None else dict(zip(self.parameters, self.average.shadow_params, strict=True))
-
-    @contextlib.contextmanager
-    def averaged(self) -> Iterator[None]:
-        """Within the block the parameters are their averages, where they are kept."""
-        if self.average is None:
-            yield
-            return
-        parameters = [*self.parameters.values()]
-        self.average.store(parameters)
-        self.average.copy_to(parameters)
-        try:
-            yield
-        finally:
-            self.average.restore(parameters)
-
-    def write(self, folder: Path, main: bool) -> dict[str, Any]:
-        """Write all of it into a checkpoint's folder, this process its part; gives what else is to be kept."""
-        notes = {"step": self.step, "ema_steps": self.average.optimization_step if self.average else 0}
-        if self.sharded:
-            write_shards(folder / SHARDS, self.tensors())
-            return notes | {"files": len(list((folder / SHARDS).iterdir()))}
-        tensors = self.tensors()  # which processes may have to gather together
-        if main:
-            write_tensors(folder / WHOLE, _apart(tensors))
-        return notes
-
-    def read(self, folder: Path) -> None:
-        """Take what was written into a checkpoint's folder.
-
-        Raises:
-            CheckpointError: when a file is missing or not whole, or a tensor is missing or of another shape.
-        """
-        notes: dict[str, Any] = read_json(folder / "training.json")
-        shards = folder / SHARDS if "files" in notes else folder
-        if "files" in notes and len(list(shards.glob("*.safetensors"))) != notes["files"]:
-            raise CheckpointError(f"{shards}: of its {notes['files']} files some are missing; go back to a whole copy")
-        if "files" in notes or self.sharded:
-            self.restore(read_shards(shards, self.place), shards)
-        else:
-            self.restore(read_tensors(folder / WHOLE)[0], folder / WHOLE)
-        self.step = int(notes["step"])
-        if self.average is not None:
-            self.average.optimization_step = int(notes["ema_steps"])
-
-    def place(self, name: str, shape: torch.Size, dtype: torch.dtype) -> Tensor:
-        """A tensor to read a part of the state into: sharded like the parameter that it belongs to."""
-        parameter = self.parameters.get(name.split("/")[-1])
-        if parameter is None or parameter.shape != shape:
-            return torch.empty(shape, dtype=dtype)
-        return torch.empty_like(parameter, dtype=dtype, requires_grad=False)
-
-    def restore(self, tensors: dict[str, Tensor], path: Path) -> None:
-        """Take what ``tensors`` gave.
-
-        Raises:
-            CheckpointError: when a tensor is missing or of another shape.
-        """
-        averages = self.averages()
-        with torch.no_grad():
-            for name, parameter in self.parameters.items():
-                parameter.copy_(_take(tensors, f"parameter/{name}", parameter, path))
-                if name in averages:
-                    averages[name].copy_(_take(tensors, f"average/{name}", parameter, path))
-                moments = {
-                    key.split("/")[1]: value for key, value in tensors.items()
-                    if key.startswith("optimizer/") and key.endswith(f"/{name}") and key.count("/") == 2
-                }  # fmt: skip
-                self.moments[parameter] = {
-                    key: _counted(value) if key == "step" else value.to(parameter.device)
-                    for key, value in moments.items()
-                }
-        torch.set_rng_state(tensors["random/torch"])
-
-
-def model_folder(run: Path, step: int) -> Path:
-    """Where the model of a run's checkpoint is, which others load."""
-    return run / f"{STEP}{step:08d}" / "model"
-
-
-def save_state(run: Path, state: TrainingState, save_model: Callable[[Path], None]) -> None:
-    """Write a checkpoint aside, rename it to ``step-…`` and remove the older ones; all processes must call it.
-
-    Args:
-        run: the run's folder.
-        state: of the training.
-        save_model: makes a folder with the model that others load, on the main process.
-    """
-    main = PartialState().is_main_process
-    model = model_folder(run, state.step)
-    with _shared_folder_aside(model.parent) as aside:
-        notes = state.write(aside, main)
-        save_model(aside / model.name)
-        if main:
-            write_json(aside / "training.json", notes)
-    if main:
-        for older in step_folders(run)[:-1]:
-            shutil.rmtree(older)
 
 
 @contextlib.contextmanager
@@ -224,31 +227,33 @@ def _shared_folder_aside(path: Path) -> Iterator[Path]:
         yield Path(name[0])
 
 
-def load_state(run: Path, state: TrainingState) -> None:
-    """Restore the newest checkpoint of a run, if there is one."""
-    folders = step_folders(run)
-    if folders:
-        state.read(folders[-1])
+def _in_memory_of_their_own(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Copy the tensors that share memory, which safetensors does not write.
 
-
-def _counted(steps: Tensor) -> Tensor | int:
-    """Steps as the optimizer that they were saved of counts them."""
-    return steps.clone() if steps.is_floating_point() else int(steps)
-
-
-def _apart(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors, each in memory of its own, as safetensors wants them.
-
-    DeepSpeed's are pieces of one; bitsandbytes' share the tables that their bytes stand for.
+    DeepSpeed's parameters are pieces of one tensor; those of bitsandbytes share the tables that their bytes stand for.
     """
     seen: set[int] = set()
-    found: dict[str, Tensor] = {}
+    separate: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         storage = tensor.untyped_storage()
         shared = storage.data_ptr() in seen or storage.nbytes() != tensor.nbytes
         seen.add(storage.data_ptr())
-        found[name] = tensor.detach().clone() if shared else tensor
-    return found
+        separate[name] = tensor.detach().clone() if shared else tensor
+    return separate
+
+
+def _moments_by_parameter(tensors: dict[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    moments: dict[str, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        if name.startswith("optimizer/"):
+            _, key, parameter = name.split("/")
+            moments.setdefault(parameter, {})[key] = tensor
+    return moments
+
+
+def _step_count(steps: Tensor) -> Tensor | int:
+    """The count as the optimizer keeps it that it was saved from: a float tensor of torch's, else a plain number."""
+    return steps.clone() if steps.is_floating_point() else int(steps)
 
 
 def _take(tensors: dict[str, Tensor], name: str, like: Tensor, path: Path) -> Tensor:

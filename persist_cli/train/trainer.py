@@ -20,7 +20,7 @@ from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
-from persist_cli.memorize.factory import MemoryFactory, collate, recall_all
+from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import Recipe, TrainingSettings
 from persist_cli.train.clip_cache import Cache, CachedClips, CacheKeys, CacheSettings, ClipCache, ClipEncoder
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
@@ -31,19 +31,19 @@ from persist_cli.viewing.console import add_task, progress
 
 
 @dataclass
-class Stop:
-    """Whether a signal asked the run to stop at the end of its step."""
+class StopSignal:
+    """Within the block, SIGINT and SIGTERM are noted here, so that a run can stop at the end of its step."""
 
     signal: int | None = None
-    before: dict[int, Any] = field(default_factory=dict)
+    previous_handlers: dict[int, Any] = field(default_factory=dict)
 
-    def __enter__(self) -> Stop:
+    def __enter__(self) -> StopSignal:
         for number in (signal.SIGINT, signal.SIGTERM):
-            self.before[number] = signal.signal(number, self._note)
+            self.previous_handlers[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self.before.items():
+        for number, handler in self.previous_handlers.items():
             signal.signal(number, handler)
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
@@ -51,14 +51,14 @@ class Stop:
 
 
 class Trainer:
-    """One stage of training a backbone.
+    """Trains one stage of a backbone.
 
     Args:
-        recipe: the run.
-        backbone: with the adapter to train in use, in stage 2.
-        maker: of the memories that the adapter reads, in stage 2.
-        accelerator: one process or many.
-        cache: of latents and tokens, for clips that come again.
+        recipe: the run's recipe.
+        backbone: the backbone; in stage 2 it uses the adapter to train.
+        factory: makes the memories that the adapter reads, in stage 2.
+        accelerator: accelerate for this process, which may be one of many.
+        cache: where latents and memory tokens of clips that come again are kept; ``None`` keeps none.
 
     Raises:
         PersistError: when there are no clips, or a cache would never be read.
@@ -68,12 +68,12 @@ class Trainer:
         self,
         recipe: Recipe,
         backbone: Backbone,
-        maker: MemoryFactory | None,
+        factory: MemoryFactory | None,
         accelerator: Accelerator,
         cache: CacheSettings | None = None,
     ) -> None:
         self.recipe, self.backbone, self.accelerator = recipe, backbone, accelerator
-        self.maker = maker
+        self.factory = factory
         self.times: StepTimes | None = None
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
@@ -90,43 +90,44 @@ class Trainer:
             parameters = self.sharding.parameters()
         average = make_average(parameters.values(), settings) if settings.ema else None
         moments: Any = optimizer.state
-        if uses_zero(accelerator):
+        self.zero = uses_zero(accelerator)
+        if self.zero:
             moments = ZeroState(self.optimizer.optimizer, [*parameters.values()])
         self.state = TrainingState(parameters, moments, average)
 
     def all_clips(self) -> ClipDataset:
-        """The recipe's clips."""
+        """All clips of the recipe's data sets."""
         recipe, backbone = self.recipe, self.backbone
         plan = ClipPlan(
             frames=backbone.frames_per_clip,
             strides=recipe.data.strides,
-            context_frames=recipe.data.context_frames if self.maker else 0,
+            context_frames=recipe.data.context_frames if self.factory else 0,
             seed=recipe.training.seed,
             image_size=backbone.image_size,
             clips_per_trajectory=recipe.data.clips_per_trajectory,
         )
-        return ClipDataset([data_folder(each) for each in recipe.data.path], plan)
+        return ClipDataset([data_folder(path) for path in recipe.data.path], plan)
 
     def clip_encoder(self, settings: CacheSettings | None) -> ClipEncoder | None:
-        """What encodes clips that come again, with a cache where there is one; ``None`` when none comes again."""
+        """The encoder of clips that come again, with a cache where there is one; ``None`` when no clip comes again."""
         recipe, backbone = self.recipe, self.backbone
-        again = recipe.data.clips_per_trajectory > 0
-        if settings is None and not again:
+        repeats = recipe.data.clips_per_trajectory > 0
+        if settings is None and not repeats:
             return None
         encodes = backbone.encodes(recipe.stage)
         if settings is None:
-            return ClipEncoder(backbone, self.maker, self.accelerator, None) if encodes else None
+            return ClipEncoder(backbone, self.factory, self.accelerator, None) if encodes else None
         if not encodes:
             raise RecipeError(
                 f"--cache: in stage {recipe.stage} backbone {backbone.name!r} keeps nothing of a clip; leave it out"
             )
-        if not again and (recipe.stage == "2" or not backbone.framewise):
+        if not repeats and (recipe.stage == "2" or not backbone.framewise):
             raise RecipeError(
                 "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
                 "data.clips_per_trajectory=32, or leave --cache out"
             )
-        keys = CacheKeys.of(recipe, backbone, self.maker, self.accelerator.device.type)
-        return ClipEncoder(backbone, self.maker, self.accelerator, ClipCache(Cache(settings), keys))
+        keys = CacheKeys.of(recipe, backbone, self.factory, self.accelerator.device.type)
+        return ClipEncoder(backbone, self.factory, self.accelerator, ClipCache(Cache(settings), keys))
 
     def loader(self) -> Iterator[Clips]:
         """Batches of this process from the state's step to the last."""
@@ -151,27 +152,16 @@ class Trainer:
             yield self.to_batch(samples)
 
     def to_batch(self, samples: list[Any]) -> Clips:
-        """Samples of ``clips`` as a batch with memory tokens, on the training device."""
-        device = self.accelerator.device
-        if self.encoder is not None:
-            with timed(self.times, "encode"):
-                latents = self.encoder.all_latents(samples)
+        """Samples of ``clips`` as a batch with memory tokens, and latents where clips come again."""
+        if self.encoder is None:
             with timed(self.times, "memory"):
-                tokens = self.encoder.all_tokens(samples)
-            clips = collate(self.encoder.without_images(samples), tokens, latents)
+                clips = [with_memory(sample, self.factory, self.backbone.token_budget) for sample in samples]
         else:
+            with timed(self.times, "encode"):
+                encoded = [self.encoder.with_latents(sample) for sample in samples]
             with timed(self.times, "memory"):
-                tokens = recall_all(samples, self.maker, self.backbone.token_budget)
-            clips = collate(samples, tokens)
-        return Clips(
-            rgb=clips.rgb.to(device),
-            depth=clips.depth.to(device),
-            cameras=clips.cameras,
-            interactions=clips.interactions,
-            tokens=clips.tokens,
-            seeds=clips.seeds,
-            latents=None if clips.latents is None else clips.latents.to(device),
-        )
+                clips = [self.encoder.with_tokens(sample) for sample in encoded]
+        return Clips.stack(clips).to(self.accelerator.device)
 
     def encoded(self, clips: Clips) -> Clips:
         """The clips with their latents, which the model would make by itself, so that they are timed apart."""
@@ -181,81 +171,95 @@ class Trainer:
             return dataclasses.replace(clips, latents=self.backbone.encode(clips))
 
     def steps(self) -> Iterator[dict[str, float]]:
-        """Train; after each optimizer step its logged values."""
-        settings = self.recipe.training
+        """Train to the last step; yields the logged values of each optimizer step."""
         batches = self.loader()
-        while self.state.step < settings.steps:
+        while self.state.step < self.recipe.training.steps:
             with nullcontext() if self.times is None else self.times.step():
-                for group in self.optimizer.param_groups:
-                    group["lr"] = learning_rate(settings, self.state.step)
-                values = self.accumulate(batches)
-                with timed(self.times, "optimizer"):
-                    self.optimize()
+                values = self.step(batches)
             self.state.step += 1
             yield values
 
-    def optimize(self) -> None:
-        """Change the parameters by their gradients, and their average by them."""
-        self.accelerator.clip_grad_norm_(self.state.parameters.values(), self.recipe.training.clip)
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        if self.state.average is not None:
-            update_average(self.state.average, self.state.parameters.values())
+    def step(self, batches: Iterator[Clips]) -> dict[str, float]:
+        """Take an optimizer step; returns its losses, which are means over micro-batches and processes.
 
-    def accumulate(self, batches: Iterator[Clips]) -> dict[str, float]:
-        """Gradients of one optimizer step; the mean of its logged values over micro-batches and processes."""
-        parts = self.recipe.training.accumulation
+        Raises:
+            PersistError: when the loss is not finite; the parameters are then unchanged.
+        """
+        settings, accelerator = self.recipe.training, self.accelerator
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(settings, self.state.step)
         totals: dict[str, torch.Tensor] = {}
-        for part in range(parts):
+        for number in range(1, settings.accumulation + 1):
             clips = self.encoded(next(batches))
-            with self.unsynced(last=part == parts - 1):
-                with timed(self.times, "forward"), self.accelerator.autocast():  # left out by accelerate if it shards
+            with self.synchronized(last=number == settings.accumulation):
+                with timed(self.times, "forward"), accelerator.autocast():  # accelerate leaves it out when it shards
                     losses = self.model(clips, self.recipe.stage)
-                with timed(self.times, "backward"):
-                    self.accelerator.backward(losses["loss"] / (1 if uses_zero(self.accelerator) else parts))
-            for name, value in losses.items():
-                totals[name] = totals.get(name, torch.zeros_like(value)) + value.detach() / parts
-        values = {name: float(self.accelerator.reduce(value, "mean")) for name, value in totals.items()}
-        if not math.isfinite(values["loss"]):
+                with timed(self.times, "backward"):  # DeepSpeed divides the loss itself
+                    accelerator.backward(losses["loss"] / (1 if self.zero else settings.accumulation))
+            for name, loss in losses.items():
+                totals[name] = totals.get(name, 0) + loss.detach() / settings.accumulation
+        means = {name: float(accelerator.reduce(total, "mean")) for name, total in totals.items()}
+        if not math.isfinite(means["loss"]):
             raise PersistError(
-                f"the loss is {values['loss']} at step {self.state.step}; lower training.learning_rate or train with "
+                f"the loss is {means['loss']} at step {self.state.step}; lower training.learning_rate or train with "
                 "training.precision=no"
             )
-        return values
+        with timed(self.times, "optimizer"):
+            accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+            if self.state.average is not None:
+                update_average(self.state.average, self.state.parameters.values())
+        return means
 
-    def unsynced(self, last: bool) -> AbstractContextManager[None]:
-        """Gradients stay with their process until the last micro-batch, but sharded ones: whole, they might not fit."""
-        if uses_zero(self.accelerator):
-            self.accelerator.gradient_state._set_sync_gradients(last)  # DeepSpeed steps when they are synced
-        if last or self.sharding is not None or uses_zero(self.accelerator):
+    def synchronized(self, last: bool) -> AbstractContextManager[None]:
+        """Within the block of the last micro-batch, processes add up their gradients.
+
+        Before that each keeps its own, which FSDP2 cannot: unsharded gradients might not fit.
+        """
+        if self.zero:
+            self.accelerator.gradient_state._set_sync_gradients(last)  # DeepSpeed then takes a step after the last
+        if last or self.zero or self.sharding is not None:
             return nullcontext()
-        waiting: AbstractContextManager[None] = self.accelerator.no_sync(self.model)
-        return waiting
+        unsynchronized: AbstractContextManager[None] = self.accelerator.no_sync(self.model)
+        return unsynchronized
 
     @contextmanager
     def model_to_save(self) -> Iterator[Backbone]:
-        """The backbone, whole, with averaged weights where they are kept; all processes must enter."""
+        """Within the block the main process has the whole backbone, with averaged weights where these are kept.
+
+        All processes must enter.
+        """
         main = self.accelerator.is_main_process
         if self.sharding is not None:
-            with self.sharding.gathered(self.state.averages(), main) as whole:
-                yield whole
+            with self.sharding.gathered(self.state.averages(), main) as backbone:
+                yield backbone
         elif not main:
             yield self.backbone
         else:
             parameters = self.state.parameters.values()
-            with unflattened(parameters) if uses_zero(self.accelerator) else nullcontext(), self.state.averaged():
+            with unflattened(parameters) if self.zero else nullcontext(), self.state.averaged():
                 yield self.backbone
 
     def agreed(self, due: bool, signal: int | None) -> tuple[bool, int | None]:
-        """What one process finds due, or what signal it got, as all of them see it: they save and stop together."""
+        """Whether a checkpoint is due for any process, and the signal that any got: they save and stop together."""
         if self.accelerator.num_processes == 1:
             return due, signal
-        found = torch.tensor([[int(due), signal or 0]], device=self.accelerator.device)
-        all_due, all_signal = self.accelerator.gather(found).amax(0).tolist()
-        return bool(all_due), all_signal or None
+        flags = torch.tensor([[int(due), signal or 0]], device=self.accelerator.device)
+        any_due, any_signal = self.accelerator.gather(flags).amax(0).tolist()
+        return bool(any_due), any_signal or None
 
-    def train(self, log: StepLog, save: Callable[[], None], stop: Stop) -> int | None:
-        """Run to the last step or to a signal, saving now and then; returns the signal that a process got."""
+    def train(self, log: StepLog, save: Callable[[], None], stop: StopSignal) -> int | None:
+        """Train to the last step or to a signal.
+
+        Args:
+            log: gets the values of each step.
+            save: writes a checkpoint; called as often as the recipe says.
+            stop: the signal that asked this process to stop, once there is one.
+
+        Returns:
+            The signal that ended the training, ``None`` when none did.
+        """
         settings = self.recipe.training
         saved = time.monotonic()
         with progress() as bar:
@@ -278,7 +282,7 @@ class Trainer:
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
-    """The rate of a step: a linear warm-up, then a constant, at the end a linear cool-down to zero."""
+    """The learning rate of a step: it rises linearly, stays, and at the end falls linearly to zero."""
     rising = (step + 1) / max(1, settings.warmup)
     falling = (settings.steps - step) / (settings.cooldown + 1)
     return settings.learning_rate * min(1.0, rising, falling)
