@@ -5,22 +5,15 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from persist_cli.data.store import SUFFIX
+from persist_cli.api.observations import Trajectory
+from persist_cli.data.store import SUFFIX, Store, TrajectoryFile
 from persist_cli.errors import DataError
 from persist_cli.io.bundled import bundled_folder
 
-if TYPE_CHECKING:
-    from persist_cli.api.observations import Trajectory
-    from persist_cli.data.store import Store, TrajectoryFile
-
-
 FRAMES = re.compile(r"^(?P<first>\d+)(?:-(?P<end>\d+))?$")
-
-SAMPLE = "sample"
-
-FORM = "write DATA, DATA#trajectory or DATA#trajectory:frames, as in runs/houses#0:0-48"
+SAMPLE = "sample"  # names the data set that comes with the package
+ADVICE = "write DATA, DATA#trajectory or DATA#trajectory:frames, as in runs/houses#0:0-48"
 
 
 @dataclass(frozen=True)
@@ -28,10 +21,10 @@ class Reference:
     """A data set, one trajectory of it, or some frames of one.
 
     Args:
-        folder: of the data set.
+        folder: folder of the data set.
         trajectory: a name, or a number in the order of names; ``None`` for all.
-        frames: ``None`` for all.
-        text: as the user wrote it.
+        frames: frame numbers; ``None`` for all.
+        text: the reference as the user wrote it.
     """
 
     folder: Path
@@ -39,33 +32,23 @@ class Reference:
     frames: slice | None = None
     text: str = ""
 
-    def store(self) -> Store:
-        """The data set.
-
-        Raises:
-            DataError: when the folder is missing or empty.
-        """
-        from persist_cli.data.store import Store
-
-        return Store(self.folder)
-
     def trajectories(self) -> list[TrajectoryFile]:
-        """Every trajectory meant, in the order of names.
+        """The trajectories that are referred to, in the order of names.
 
         Raises:
-            DataError: when one is not there.
+            DataError: when the folder is missing or empty, or the trajectory is not in it.
         """
-        store = self.store()
+        store = Store(self.folder)
         if self.trajectory is None:
             return list(store)
         by_number = self.trajectory.isdecimal() and self.trajectory not in store.names
         return [store[int(self.trajectory) if by_number else self.trajectory]]
 
     def single(self) -> TrajectoryFile:
-        """The one trajectory meant; the only one of a data set need not be named.
+        """The one trajectory that is referred to; the only one of a data set need not be named.
 
         Raises:
-            DataError: when several are meant.
+            DataError: when there are several.
         """
         files = self.trajectories()
         if len(files) > 1:
@@ -76,10 +59,10 @@ class Reference:
 
     @property
     def frame(self) -> int:
-        """The one frame meant; 0 when none is named.
+        """Number of the one frame that is referred to; 0 when none is named.
 
         Raises:
-            DataError: when a range of frames is meant.
+            DataError: when a range of frames is named.
         """
         if self.frames is None:
             return 0
@@ -91,19 +74,19 @@ class Reference:
         return first
 
     def read(self) -> list[Trajectory]:
-        """The frames of every trajectory meant, in memory."""
+        """The frames of every trajectory that is referred to, in memory."""
         return [file.read(self.frames or slice(None)) for file in self.trajectories()]
 
 
 def parse_reference(text: str) -> Reference:
-    """What ``text`` means; nothing is opened yet.
+    """The reference of a text form; nothing is opened yet.
 
     Args:
         text: DATA is a folder, or ``sample``; the trajectory is a name or a number (a name that is a number wins);
             frames are ``12``, or ``0-48`` where frame 48 is not included.
 
     Raises:
-        DataError: when it is not of this form, or means the packaged sample and there is none.
+        DataError: when it is not of this form, or names the packaged sample and there is none.
     """
     folder, sharp, rest = text.rpartition("#")
     if not sharp:
@@ -112,15 +95,15 @@ def parse_reference(text: str) -> Reference:
     if not colon:
         trajectory, frames = rest, ""
     if not folder or (sharp and not trajectory) or (colon and not frames):
-        raise DataError(f"cannot read {text!r}; {FORM}")
-    return Reference(data_folder(folder), trajectory or None, _frames(frames, text) if frames else None, text)
+        raise DataError(f"cannot read {text!r}; {ADVICE}")
+    return Reference(data_folder(folder), trajectory or None, _parse_frames(frames, text) if frames else None, text)
 
 
 def data_folder(text: str) -> Path:
     """The folder of a data set; ``sample`` is the one that comes with the package unless such a folder is here.
 
     Raises:
-        DataError: when the packaged sample is meant and this installation has none.
+        DataError: when the packaged sample is named and this installation has none.
     """
     folder = Path(text)
     if text == SAMPLE and not folder.is_dir():
@@ -128,19 +111,8 @@ def data_folder(text: str) -> Path:
     return folder
 
 
-def _frames(frames: str, text: str) -> slice:
-    match = FRAMES.match(frames)
-    if match is None:
-        raise DataError(f"cannot read the frames {frames!r} of {text!r}; write 12, or 0-48 (48 not included)")
-    first = int(match["first"])
-    end = int(match["end"]) if match["end"] else first + 1
-    if end <= first:
-        raise DataError(f"the frames {frames!r} of {text!r} are none; the end is not included")
-    return slice(first, end)
-
-
 def sample_data() -> Path:
-    """The folder of the sample data set: held-out houses, there and back.
+    """The folder of the sample data set: held-out houses, walked through there and back.
 
     Raises:
         DataError: when this installation has none.
@@ -149,3 +121,14 @@ def sample_data() -> Path:
     if not any(folder.glob(f"*{SUFFIX}")):
         raise DataError(f"no sample data in {folder}: it comes with the package; give the folder of a data set")
     return folder
+
+
+def _parse_frames(frames: str, text: str) -> slice:
+    match = FRAMES.match(frames)
+    if match is None:
+        raise DataError(f"cannot read the frames {frames!r} of {text!r}; write 12, or 0-48 (48 not included)")
+    first = int(match["first"])
+    end = int(match["end"]) if match["end"] else first + 1
+    if end <= first:
+        raise DataError(f"the frames {frames!r} of {text!r} are none; the end is not included")
+    return slice(first, end)

@@ -6,7 +6,7 @@ import bisect
 import contextlib
 import difflib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,19 +21,16 @@ from torch import Tensor
 from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses
 from persist_cli.api.observations import Frame, Observations, Trajectory, TrajectoryInfo
-from persist_cli.data import store as header
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
 from persist_cli.errors import DataError
 from persist_cli.io.files import ASIDE, written_aside
 
+SUFFIX = ".parquet"
 FORMAT = "persist-trajectory"
-
 VERSION = 1
-
-KEY = b"persist"
-
+METADATA_KEY = b"persist"
+FRAMES_PER_GROUP = 8  # a clip of a few frames reads little more than itself
 IMAGE = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])  # the form of Hugging Face datasets
-
 COLUMNS = pa.schema(
     [
         pa.field("rgb", IMAGE),
@@ -45,121 +42,47 @@ COLUMNS = pa.schema(
 )
 
 
-def schema(info: TrajectoryInfo) -> pa.Schema:
-    """The columns with ``info`` as metadata, which Hugging Face ``datasets`` shows as images."""
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "scene": info.scene,
-        "intrinsics": np.asarray(info.intrinsics, dtype=np.float64).tolist(),
-        "height": info.height,
-        "width": info.width,
-        "world_up": list(info.world_up),
-        "vocabulary": info.vocabulary.to_json(),
-        "source": info.source,
-    }
-    return COLUMNS.with_metadata({KEY: json.dumps(header), b"huggingface": json.dumps(_features())})
-
-
-def read_info(metadata: dict[bytes, bytes] | None, path: Path) -> TrajectoryInfo:
-    """What ``schema`` put into the metadata of the file ``path``.
-
-    Raises:
-        DataError: when the file is of something else, of a newer version, or its header is damaged.
-    """
-    text = (metadata or {}).get(KEY)
-    if text is None:
-        raise DataError(f"{path}: a Parquet file, but no trajectory of persist (it has no 'persist' metadata)")
-    try:
-        header = json.loads(text)
-        if header["format"] != FORMAT or header["version"] > VERSION:
-            raise DataError(
-                f"{path}: written as {header['format']} version {header['version']}; "
-                f"this persist reads {FORMAT} up to version {VERSION}"
-            )
-        info = _info(header)
-        check_info(info, str(path))
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path}: its header is damaged ({type(error).__name__}: {error})") from error
-    return info
-
-
-def check_info(info: TrajectoryInfo, where: str) -> None:
-    """Raise ``DataError`` naming ``where`` unless size, intrinsics and up axis can be used."""
-    if info.height < 1 or info.width < 1:
-        raise DataError(f"{where}: an image size of {info.height}×{info.width} is none")
-    intrinsics = np.asarray(info.intrinsics, dtype=np.float64)
-    if intrinsics.shape != (3, 3):
-        raise DataError(f"{where}: the intrinsics have shape {list(intrinsics.shape)}, not [3, 3]")
-    check_intrinsics(torch.from_numpy(intrinsics), where)
-    up = np.asarray(info.world_up, dtype=np.float64)
-    if up.shape != (3,) or not abs(float(np.linalg.norm(up)) - 1) < 1e-3:
-        raise DataError(f"{where}: world_up {list(info.world_up)} is not a unit vector of three numbers")
-
-
-def _info(header: dict[str, Any]) -> TrajectoryInfo:
-    x, y, z = (float(value) for value in header["world_up"])
-    return TrajectoryInfo(
-        scene=str(header["scene"]),
-        intrinsics=np.asarray(header["intrinsics"], dtype=np.float64),
-        height=int(header["height"]),
-        width=int(header["width"]),
-        world_up=(x, y, z),
-        vocabulary=ActionVocabulary.from_json(header["vocabulary"]),
-        source=dict(header["source"]),
-    )
-
-
-def _features() -> dict[str, Any]:
-    double = {"dtype": "float64", "_type": "Value"}
-    features = {
-        "rgb": {"_type": "Image"},
-        "depth": {"_type": "Image"},
-        "world_from_camera": {"feature": double, "length": 16, "_type": "Sequence"},
-        "action": {"dtype": "string", "_type": "Value"},
-        "timestamp": double,
-    }
-    return {"info": {"features": features}}
-
-
-SUFFIX = ".parquet"
-
-FRAMES_PER_GROUP = 8  # a clip of a few frames reads little more than itself
-
-
-def write_trajectory(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) -> int:
-    """Write a trajectory, whole or not at all, holding a few frames in memory at a time.
+class Store:
+    """A data set: the trajectories of one folder, in the order of their names.
 
     Args:
-        path: a ``.parquet`` file.
-        info: what holds for every frame.
-        frames: in order; depth that is NaN, negative, infinite or beyond 65.535 m is stored as missing.
-
-    Returns:
-        The number of frames.
+        folder: files that a killed writer left aside in it are ignored.
 
     Raises:
-        DataError: naming the frame whose shape or pose is wrong, for bad intrinsics, and when there is no frame.
+        DataError: when the folder is missing or holds no trajectory.
     """
-    header.check_info(info, str(path))
-    poses: list[Tensor] = []
-    group: list[dict[str, Any]] = []
-    schema = header.schema(info)
-    with written_aside(path) as aside:
-        with pq.ParquetWriter(aside, schema, compression="none", use_dictionary=False, write_page_checksum=True) as out:
-            for number, frame in enumerate(frames):
-                _check_frame(frame, info, f"{path}: frame {number}")
-                poses.append(torch.from_numpy(np.asarray(frame.world_from_camera, dtype=np.float64)))
-                group.append(_row(frame))
-                if len(group) == FRAMES_PER_GROUP:
-                    out.write_table(pa.Table.from_pylist(group, schema))
-                    group = []
-            if group:
-                out.write_table(pa.Table.from_pylist(group, schema))
-        if not poses:
-            raise DataError(f"{path}: a trajectory without frames")
-        check_poses(torch.stack(poses), str(path))
-    return len(poses)
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder)
+        if not self.folder.is_dir():
+            raise DataError(f"{self.folder}: no such data set folder")
+        paths = _trajectory_paths(self.folder)
+        if not paths:
+            subfolders = (path for path in self.folder.iterdir() if path.is_dir())
+            data_sets = sorted(str(subfolder) for subfolder in subfolders if _trajectory_paths(subfolder))
+            advice = f"name {' and '.join(data_sets)}" if data_sets else "`persist collect` or `import` writes some"
+            raise DataError(f"{self.folder}: no trajectory in it (*{SUFFIX}); {advice}")
+        self._files = {file.name: file for file in map(TrajectoryFile, paths)}
+        self.names = list(self._files)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[TrajectoryFile]:
+        return iter(self._files.values())
+
+    def __getitem__(self, key: int | str) -> TrajectoryFile:
+        if isinstance(key, str):
+            if key not in self._files:
+                close = difflib.get_close_matches(key, self.names, n=1)
+                hint = f"did you mean {close[0]!r}?" if close else f"the first is {self.names[0]!r}"
+                raise DataError(f"{self.folder}: no trajectory {key!r}; {hint}")
+            return self._files[key]
+        if not -len(self) <= key < len(self):
+            raise DataError(
+                f"{self.folder}: has {len(self)} trajectories (0-{len(self) - 1}), there is no number {key}"
+            )
+        return self._files[self.names[key]]
 
 
 class TrajectoryFile:
@@ -186,12 +109,12 @@ class TrajectoryFile:
 
     @cached_property
     def info(self) -> TrajectoryInfo:
-        """What holds for every frame.
+        """Camera, up axis, actions and provenance, which hold for every frame.
 
         Raises:
             DataError: when the file is missing, truncated, or holds no trajectory of persist.
         """
-        return header.read_info(self._metadata.metadata, self.path)
+        return read_info(self._metadata.metadata, self.path)
 
     def read(self, frames: slice | Sequence[int] = slice(None)) -> Trajectory:
         """Some frames as tensors; only the row groups that hold them are read.
@@ -203,17 +126,13 @@ class TrajectoryFile:
             DataError: naming the file, when frames lie outside it or something in it is damaged.
         """
         info = self.info
-        wanted = self.numbers(frames)
-        rows = self._rows(wanted)
-        rgb = [self._image(row["rgb"], decode_rgb, number) for number, row in zip(wanted, rows, strict=True)]
-        depth = [self._image(row["depth"], decode_depth, number) for number, row in zip(wanted, rows, strict=True)]
+        numbers = self.frame_numbers(frames)
+        rows = self._rows(numbers)
+        rgb = [self._image(row["rgb"], decode_rgb, number) for number, row in zip(numbers, rows, strict=True)]
+        depth = [self._image(row["depth"], decode_depth, number) for number, row in zip(numbers, rows, strict=True)]
         poses = torch.tensor([row["world_from_camera"] for row in rows], dtype=torch.float64).reshape(-1, 4, 4)
-        cameras = self._cameras(poses)
-        images, metres = (
-            torch.stack([torch.from_numpy(each) for each in part]) for part in (rgb, depth)
-        )  # torch's memory
-        observations = Observations(images, metres, cameras)
-        return Trajectory(self.name, observations, tuple(row["action"] for row in rows), info, wanted[0])
+        observations = Observations(_stacked(rgb), _stacked(depth), self._cameras(poses))
+        return Trajectory(self.name, observations, tuple(row["action"] for row in rows), info, numbers[0])
 
     def poses(self) -> Float[Tensor, "frame 4 4"]:
         """World from camera of every frame, float64, without reading an image."""
@@ -222,7 +141,7 @@ class TrajectoryFile:
 
     def cameras(self, frames: Sequence[int]) -> Cameras:
         """The cameras of some frames, without reading an image."""
-        return self._cameras(self.poses()[self.numbers(frames)])
+        return self._cameras(self.poses()[self.frame_numbers(frames)])
 
     def actions(self) -> tuple[str | None, ...]:
         """The action of every frame, without reading an image."""
@@ -232,16 +151,31 @@ class TrajectoryFile:
         """Seconds of every frame, float64, without reading an image."""
         return torch.tensor(self._column("timestamp"), dtype=torch.float64)
 
-    def _cameras(self, poses: Float[Tensor, "frame 4 4"]) -> Cameras:
-        intrinsics = torch.from_numpy(self.info.intrinsics).expand(len(poses), 3, 3).clone()
-        return Cameras(poses, intrinsics, self.info.height, self.info.width)
+    def frame_numbers(self, frames: slice | Sequence[int]) -> list[int]:
+        """The numbers of the frames in a slice or sequence.
+
+        Raises:
+            DataError: when there are none, or frames lie outside the trajectory.
+        """
+        length = self.length
+        if isinstance(frames, slice):
+            numbers = list(range(*frames.indices(length)))
+            outside = [end for end in (frames.start, frames.stop) if end is not None and abs(end) > length]
+        else:
+            numbers = [int(number) for number in frames]
+            outside = [number for number in numbers if not 0 <= number < length]
+        if outside:
+            raise DataError(f"{self.path}: has {length} frames (0-{length - 1}), there is no frame {outside[0]}")
+        if not numbers:
+            raise DataError(f"{self.path}: no frames asked for ({frames})")
+        return numbers
 
     @cached_property
     def _metadata(self) -> Any:
-        with _readable(self.path):
+        with _parquet_errors(self.path):
             metadata = pq.read_metadata(self.path)
-        missing = set(header.COLUMNS.names) - set(metadata.schema.to_arrow_schema().names)
-        if header.KEY in (metadata.metadata or {}) and missing:
+        missing = set(COLUMNS.names) - set(metadata.schema.to_arrow_schema().names)
+        if METADATA_KEY in (metadata.metadata or {}) and missing:
             raise DataError(f"{self.path}: its columns {', '.join(sorted(missing))} are missing")
         return metadata
 
@@ -251,49 +185,36 @@ class TrajectoryFile:
         sizes = [self._metadata.row_group(group).num_rows for group in range(self._metadata.num_row_groups)]
         return [sum(sizes[:group]) for group in range(len(sizes))]
 
-    def numbers(self, frames: slice | Sequence[int]) -> list[int]:
-        """The frame numbers that a slice or sequence asks for.
+    def _cameras(self, poses: Float[Tensor, "frame 4 4"]) -> Cameras:
+        intrinsics = torch.from_numpy(self.info.intrinsics).expand(len(poses), 3, 3).clone()
+        return Cameras(poses, intrinsics, self.info.height, self.info.width)
 
-        Raises:
-            DataError: when there are none, or frames lie outside the trajectory.
-        """
-        length = self.length
-        if isinstance(frames, slice):
-            wanted = list(range(*frames.indices(length)))
-            outside = [end for end in (frames.start, frames.stop) if end is not None and abs(end) > length]
-        else:
-            wanted = [int(number) for number in frames]
-            outside = [number for number in wanted if not 0 <= number < length]
-        if outside:
-            raise DataError(f"{self.path}: has {length} frames (0-{length - 1}), there is no frame {outside[0]}")
-        if not wanted:
-            raise DataError(f"{self.path}: no frames asked for ({frames})")
-        return wanted
-
-    def _rows(self, wanted: list[int]) -> list[dict[str, Any]]:
+    def _rows(self, numbers: list[int]) -> list[dict[str, Any]]:
         starts = self._group_starts
-        group_of = {number: bisect.bisect_right(starts, number) - 1 for number in wanted}
+        group_of = {number: bisect.bisect_right(starts, number) - 1 for number in numbers}
         groups = sorted(set(group_of.values()))
         columns = ["rgb.bytes", "depth.bytes", "world_from_camera", "action"]
-        with _readable(self.path), self._open() as file:
+        with _parquet_errors(self.path), self._open() as file:
             table = file.read_row_groups(groups, columns=columns, use_threads=False)
         first_row: dict[int, int] = {}  # of each row group in the table
         for group in groups:
             first_row[group] = sum(self._metadata.row_group(earlier).num_rows for earlier in first_row)
-        rows = [first_row[group_of[number]] + number - starts[group_of[number]] for number in wanted]
+        rows = [first_row[group_of[number]] + number - starts[group_of[number]] for number in numbers]
         return list(table.take(rows).to_pylist())
 
     def _column(self, name: str) -> list[Any]:
-        self.info  # noqa: B018  a foreign file is told before a missing column
-        with _readable(self.path), self._open() as file:
+        self.info  # noqa: B018  a foreign file is reported as one, not as one with a missing column
+        with _parquet_errors(self.path), self._open() as file:
             return list(file.read(columns=[name], use_threads=False)[name].to_pylist())
 
     def _open(self) -> Any:
         return pq.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True)
 
-    def _image(self, cell: dict[str, bytes], decode: Any, number: int) -> np.ndarray[Any, Any]:
+    def _image(
+        self, cell: dict[str, bytes], decode: Callable[[bytes], np.ndarray[Any, Any]], number: int
+    ) -> np.ndarray[Any, Any]:
         try:
-            image: np.ndarray[Any, Any] = decode(cell["bytes"])
+            image = decode(cell["bytes"])
         except (OSError, SyntaxError, ValueError, TypeError) as error:
             raise DataError(f"{self.path}: an image of frame {number} is damaged ({error})") from error
         if image.shape[:2] != (self.info.height, self.info.width):
@@ -304,56 +225,131 @@ class TrajectoryFile:
         return image
 
 
-class Store:
-    """A data set: the trajectories of one folder, in the order of their names.
+def write_trajectory(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) -> int:
+    """Write a trajectory, whole or not at all, holding a few frames in memory at a time.
 
     Args:
-        folder: what a killed writer left aside in it is ignored.
+        path: a ``.parquet`` file.
+        info: camera, up axis, actions and provenance, which hold for every frame.
+        frames: in order; depth that is NaN, negative, infinite or beyond 65.535 m is stored as missing.
+
+    Returns:
+        The number of frames.
 
     Raises:
-        DataError: when the folder is missing or holds no trajectory.
+        DataError: naming the frame whose shape or pose is wrong, for bad intrinsics, and when there is no frame.
     """
+    check_info(info, str(path))
+    poses: list[Tensor] = []
+    rows: list[dict[str, Any]] = []
+    form = schema(info)
+    with written_aside(path) as aside:
+        with pq.ParquetWriter(aside, form, compression="none", use_dictionary=False, write_page_checksum=True) as out:
+            for number, frame in enumerate(frames):
+                _check_frame(frame, info, f"{path}: frame {number}")
+                poses.append(torch.from_numpy(np.asarray(frame.world_from_camera, dtype=np.float64)))
+                rows.append(_row(frame))
+                if len(rows) == FRAMES_PER_GROUP:
+                    out.write_table(pa.Table.from_pylist(rows, form))
+                    rows = []
+            if rows:
+                out.write_table(pa.Table.from_pylist(rows, form))
+        if not poses:
+            raise DataError(f"{path}: a trajectory without frames")
+        check_poses(torch.stack(poses), str(path))
+    return len(poses)
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = Path(folder)
-        if not self.folder.is_dir():
-            raise DataError(f"{self.folder}: no such data set folder")
-        found = _trajectories(self.folder)
-        if not found:
-            data_sets = sorted(str(each) for each in self.folder.iterdir() if each.is_dir() and _trajectories(each))
-            mend = f"name {' and '.join(data_sets)}" if data_sets else "`persist collect` or `import` writes some"
-            raise DataError(f"{self.folder}: no trajectory in it (*{SUFFIX}); {mend}")
-        self._files = {file.name: file for file in map(TrajectoryFile, found)}
-        self.names = list(self._files)
 
-    def __len__(self) -> int:
-        return len(self.names)
+def schema(info: TrajectoryInfo) -> pa.Schema:
+    """The columns with ``info`` as metadata, in a form that Hugging Face ``datasets`` shows as images."""
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "scene": info.scene,
+        "intrinsics": np.asarray(info.intrinsics, dtype=np.float64).tolist(),
+        "height": info.height,
+        "width": info.width,
+        "world_up": list(info.world_up),
+        "vocabulary": info.vocabulary.to_json(),
+        "source": info.source,
+    }
+    return COLUMNS.with_metadata({METADATA_KEY: json.dumps(header), b"huggingface": json.dumps(_hugging_face_info())})
 
-    def __iter__(self) -> Iterator[TrajectoryFile]:
-        return iter(self._files.values())
 
-    def __getitem__(self, key: int | str) -> TrajectoryFile:
-        if isinstance(key, str):
-            if key not in self._files:
-                close = difflib.get_close_matches(key, self.names, n=1)
-                hint = f"did you mean {close[0]!r}?" if close else f"the first is {self.names[0]!r}"
-                raise DataError(f"{self.folder}: no trajectory {key!r}; {hint}")
-            return self._files[key]
-        if not -len(self) <= key < len(self):
+def read_info(metadata: dict[bytes, bytes] | None, path: Path) -> TrajectoryInfo:
+    """The ``info`` that ``schema`` put into the metadata of the file ``path``.
+
+    Raises:
+        DataError: when the file is of something else, of a newer version, or its header is damaged.
+    """
+    text = (metadata or {}).get(METADATA_KEY)
+    if text is None:
+        raise DataError(f"{path}: a Parquet file, but no trajectory of persist (it has no 'persist' metadata)")
+    try:
+        header = json.loads(text)
+        if header["format"] != FORMAT or header["version"] > VERSION:
             raise DataError(
-                f"{self.folder}: has {len(self)} trajectories (0-{len(self) - 1}), there is no number {key}"
+                f"{path}: written as {header['format']} version {header['version']}; "
+                f"this persist reads {FORMAT} up to version {VERSION}"
             )
-        return self._files[self.names[key]]
+        info = _parse_header(header)
+        check_info(info, str(path))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: its header is damaged ({type(error).__name__}: {error})") from error
+    return info
 
 
-def _trajectories(folder: Path) -> list[Path]:
+def check_info(info: TrajectoryInfo, where: str) -> None:
+    """Raise ``DataError`` naming ``where`` unless size, intrinsics and up axis can be used."""
+    if info.height < 1 or info.width < 1:
+        raise DataError(f"{where}: an image size of {info.height}×{info.width} is none")
+    intrinsics = np.asarray(info.intrinsics, dtype=np.float64)
+    if intrinsics.shape != (3, 3):
+        raise DataError(f"{where}: the intrinsics have shape {list(intrinsics.shape)}, not [3, 3]")
+    check_intrinsics(torch.from_numpy(intrinsics), where)
+    up = np.asarray(info.world_up, dtype=np.float64)
+    if up.shape != (3,) or not abs(float(np.linalg.norm(up)) - 1) < 1e-3:
+        raise DataError(f"{where}: world_up {list(info.world_up)} is not a unit vector of three numbers")
+
+
+def _parse_header(header: dict[str, Any]) -> TrajectoryInfo:
+    x, y, z = (float(value) for value in header["world_up"])
+    return TrajectoryInfo(
+        scene=str(header["scene"]),
+        intrinsics=np.asarray(header["intrinsics"], dtype=np.float64),
+        height=int(header["height"]),
+        width=int(header["width"]),
+        world_up=(x, y, z),
+        vocabulary=ActionVocabulary.from_json(header["vocabulary"]),
+        source=dict(header["source"]),
+    )
+
+
+def _hugging_face_info() -> dict[str, Any]:
+    double = {"dtype": "float64", "_type": "Value"}
+    features = {
+        "rgb": {"_type": "Image"},
+        "depth": {"_type": "Image"},
+        "world_from_camera": {"feature": double, "length": 16, "_type": "Sequence"},
+        "action": {"dtype": "string", "_type": "Value"},
+        "timestamp": double,
+    }
+    return {"info": {"features": features}}
+
+
+def _trajectory_paths(folder: Path) -> list[Path]:
     """The folder's files in the order of their names, without those that a writer left aside."""
     return sorted(path for path in folder.glob(f"*{SUFFIX}") if not path.name.startswith(ASIDE))
 
 
+def _stacked(images: list[np.ndarray[Any, Any]]) -> Tensor:
+    """One tensor of all images, in memory that torch allocated."""
+    return torch.stack([torch.from_numpy(image) for image in images])
+
+
 @contextlib.contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Turns whatever a missing or damaged file raises into one line."""
+def _parquet_errors(path: Path) -> Iterator[None]:
+    """Turn whatever a missing or damaged file raises into one line."""
     try:
         yield
     except FileNotFoundError as error:

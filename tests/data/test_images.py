@@ -1,4 +1,4 @@
-"""Crop and resize keep every world point on its own pixel."""
+"""Cropping and resizing keep every world point on its own pixel."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def test_a_picture_of_pixel_positions_still_shows_them(size: tuple[int, int]) ->
     crop = crop_resize((48, 64), size)
     image = np.stack([3 * u, 3 * v, np.zeros_like(u)], -1).astype(np.uint8)
     rows, columns = np.mgrid[: size[0], : size[1]] + 0.5
-    shown = crop.rgb(image)[..., :2] / 3
+    resized = crop.rgb(image)[..., :2] / 3
     mapped = np.stack([columns * crop.window[1] / size[1] + crop.left, rows * crop.window[0] / size[0] + crop.top], -1)
-    assert np.abs(shown - mapped)[2:-2, 2:-2].max() < 0.7  # rounding to whole levels, the nearest pixel
+    assert np.abs(resized - mapped)[2:-2, 2:-2].max() < 0.7  # rounding to whole levels, the nearest pixel
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -42,7 +42,7 @@ def test_depth_is_never_mixed_across_an_edge(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_the_window_is_central_and_of_the_target_s_aspect(size: tuple[int, int]) -> None:
+def test_the_window_is_central_and_has_the_aspect_of_the_target(size: tuple[int, int]) -> None:
     crop = crop_resize((48, 64), size)
     assert crop.window[0] == 48 or crop.window[1] == 64
     assert abs(crop.window[0] * size[1] - crop.window[1] * size[0]) <= max(size)
@@ -50,7 +50,7 @@ def test_the_window_is_central_and_of_the_target_s_aspect(size: tuple[int, int])
     assert abs(2 * crop.left + crop.window[1] - 64) <= 1
 
 
-def test_the_same_size_changes_nothing() -> None:
+def test_resizing_to_the_same_size_changes_nothing() -> None:
     crop = crop_resize((48, 64), (48, 64))
     image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     assert np.array_equal(crop.rgb(image), image)
@@ -58,7 +58,7 @@ def test_the_same_size_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "64", "64x", "x64", "0x64", "64x-1", "64x64x3"])
-def test_what_is_no_size_is_told(text: str) -> None:
+def test_a_text_that_is_no_size_is_refused(text: str) -> None:
     with pytest.raises(DataError, match="cannot read the size"):
         parse_size(text)
 

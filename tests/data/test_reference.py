@@ -29,7 +29,7 @@ def test_a_reference_is_read(text: str, folder: str, trajectory: str | None, fra
 
 
 @pytest.mark.parametrize("text", ["", "#0", "runs#", "runs#:0-4", "runs#0:", "runs#0:x", "runs#0:4-4", "runs#0:-3"])
-def test_what_is_no_reference_is_told_in_one_line(text: str) -> None:
+def test_a_text_that_is_no_reference_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(DataError, match=re.escape(repr(text))) as error:
         parse_reference(text)
     assert "\n" not in str(error.value)
@@ -49,14 +49,14 @@ def test_a_reference_opens_what_it_names(folder: Path) -> None:
     assert parse_reference(f"{folder}#7").single().name == "7"  # a name before a number
 
 
-def test_one_frame_is_a_start_and_a_range_is_not(folder: Path) -> None:
+def test_a_start_is_one_frame_and_not_a_range(folder: Path) -> None:
     assert parse_reference(f"{folder}#a:2").frame == 2
     assert parse_reference(f"{folder}#a").frame == 0
     with pytest.raises(DataError, match="names 2 frames where one is wanted"):
         parse_reference(f"{folder}#a:1-3").frame  # noqa: B018
 
 
-def test_several_trajectories_are_not_a_single_one(folder: Path) -> None:
+def test_a_single_trajectory_must_be_named_when_there_are_several(folder: Path) -> None:
     with pytest.raises(DataError, match="holds 3 trajectories; name one"):
         parse_reference(str(folder)).single()
 
@@ -66,6 +66,6 @@ def test_the_frames_of_a_reference_are_read(folder: Path) -> None:
     assert (trajectory.first, len(trajectory)) == (1, 2)
 
 
-def test_frames_beyond_the_end_are_named(folder: Path) -> None:
+def test_frames_beyond_the_end_are_refused(folder: Path) -> None:
     with pytest.raises(DataError, match=r"a\.parquet: has 4 frames \(0-3\), there is no frame"):
         parse_reference(f"{folder}#a:1-9").read()

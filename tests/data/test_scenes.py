@@ -1,4 +1,4 @@
-"""tests.data.test_scenes."""
+"""Names of training scenes come back from JSON, and numbered ones take little room in it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from persist_cli.data.scenes import TrainingScenes, shortened
+from persist_cli.data.scenes import TrainingScenes, name_ranges
 
 HOUSES = [f"miniworld/house-{number}" for number in range(2400)]
 
@@ -23,13 +23,13 @@ def test_scenes_come_back_from_json(names, complete):
 
 def test_numbered_scenes_take_a_line_for_each_number_of_digits():
     ends = [[0, 9], [10, 99], [100, 999], [1000, 2399]]
-    assert shortened(HOUSES) == [[f"miniworld/house-{number}" for number in each] for each in ends]
+    assert name_ranges(HOUSES) == [[f"miniworld/house-{number}" for number in pair] for pair in ends]
 
 
-def test_what_is_known_of_two_models_is_all_only_when_both_are():
-    one, two, unknown = TrainingScenes(frozenset("a")), TrainingScenes(frozenset("b")), TrainingScenes(complete=False)
-    assert one | two == TrainingScenes(frozenset("ab"))
-    assert one | unknown == TrainingScenes(frozenset("a"), complete=False)
+def test_the_scenes_of_two_models_are_complete_only_when_both_are():
+    a, b, unknown = TrainingScenes(frozenset("a")), TrainingScenes(frozenset("b")), TrainingScenes(complete=False)
+    assert a | b == TrainingScenes(frozenset("ab"))
+    assert a | unknown == TrainingScenes(frozenset("a"), complete=False)
 
 
 @pytest.mark.parametrize(
@@ -37,6 +37,6 @@ def test_what_is_known_of_two_models_is_all_only_when_both_are():
     [None, [], {}, {"complete": 1, "names": []}, {"complete": True, "names": [3]},
      {"complete": True, "names": [["a1"]]}, {"complete": True, "names": [["a1", "b2"]]}],
 )  # fmt: skip
-def test_what_is_no_list_of_scenes_is_refused(value):
+def test_json_that_is_no_list_of_scenes_is_refused(value):
     with pytest.raises(ValueError, match="scene"):
         TrainingScenes.from_json(value)

@@ -1,4 +1,4 @@
-"""The store gives back what was written, and says in one line what it cannot read."""
+"""The store gives back what was written, and reports in one line what it cannot read."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def test_a_trajectory_comes_back_as_it_was(path: Path) -> None:
     assert trajectory.name == "one"
 
 
-def test_the_header_comes_back_as_it_was(path: Path) -> None:
+def test_the_info_of_a_trajectory_comes_back_as_it_was(path: Path) -> None:
     info = TrajectoryFile(path).info
     assert np.array_equal(info.intrinsics, INTRINSICS)
     assert replace(info, intrinsics=INTRINSICS) == INFO
 
 
 @pytest.mark.parametrize("frames", [slice(3, 5), slice(5, 17), slice(-3, None), [0, 19], [17, 2, 2, 9]])
-def test_any_choice_of_frames_equals_that_choice_of_all(path: Path, frames: slice | list[int]) -> None:
+def test_reading_some_frames_equals_choosing_them_from_all(path: Path, frames: slice | list[int]) -> None:
     part, whole = TrajectoryFile(path).read(frames), TrajectoryFile(path).read()
     assert torch.equal(part.observations.rgb, whole.observations.rgb[frames])
     assert torch.equal(part.observations.cameras.centers, whole.observations.cameras.centers[frames])
@@ -60,7 +60,7 @@ def test_poses_actions_and_times_need_no_image(path: Path) -> None:
     assert file.timestamps().tolist() == [number / 10 for number in range(20)]
 
 
-def test_depth_that_is_no_distance_is_missing(tmp_path: Path) -> None:
+def test_depth_that_is_no_distance_is_stored_as_missing(tmp_path: Path) -> None:
     frame = make_frames(1)[0]
     frame.depth[0, :7] = [np.nan, -1, np.inf, -np.inf, 65.54, 65.53, 0]
     write_trajectory(tmp_path / "one.parquet", INFO, [frame])
@@ -91,7 +91,7 @@ def test_a_store_lists_its_trajectories_by_name_and_number(tmp_path: Path) -> No
     assert store[1] is store["b"]
 
 
-def test_a_folder_of_data_sets_is_none_and_they_are_named(tmp_path: Path) -> None:
+def test_a_folder_of_data_sets_is_refused_and_the_data_sets_are_named(tmp_path: Path) -> None:
     (tmp_path / "cache").mkdir()
     for name in ("train/a", "test/b"):
         write_trajectory(tmp_path / f"{name}.parquet", INFO, make_frames(2))
@@ -99,7 +99,7 @@ def test_a_folder_of_data_sets_is_none_and_they_are_named(tmp_path: Path) -> Non
         Store(tmp_path)
 
 
-def test_cameras_are_those_of_the_frames_that_are_read(path: Path) -> None:
+def test_cameras_without_images_equal_those_of_the_frames_that_are_read(path: Path) -> None:
     file = TrajectoryFile(path)
     frames, cameras = [7, 3, 3], file.read([7, 3, 3]).observations.cameras
     assert torch.equal(file.cameras(frames).world_from_camera, cameras.world_from_camera)
@@ -107,7 +107,7 @@ def test_cameras_are_those_of_the_frames_that_are_read(path: Path) -> None:
 
 
 @pytest.mark.parametrize("frames", [slice(0, 21), [20], [-1], [], slice(4, 4)])
-def test_frames_outside_a_trajectory_are_named(path: Path, frames: slice | list[int]) -> None:
+def test_frames_outside_a_trajectory_are_refused(path: Path, frames: slice | list[int]) -> None:
     with pytest.raises(DataError, match=r"one\.parquet: (has 20 frames|no frames asked for)"):
         TrajectoryFile(path).read(frames)
 
@@ -125,7 +125,9 @@ def test_frames_outside_a_trajectory_are_named(path: Path, frames: slice | list[
         ({"world_from_camera": np.diag([1.0, 1, -1, 1])}, "the pose of frame 3 is not rigid"),
     ],
 )
-def test_a_wrong_frame_is_named_and_leaves_nothing(tmp_path: Path, change: dict[str, np.ndarray], cause: str) -> None:
+def test_a_wrong_frame_is_named_and_nothing_is_written(
+    tmp_path: Path, change: dict[str, np.ndarray], cause: str
+) -> None:
     frames = make_frames(5)
     frames[3] = replace(frames[3], **change)
     with pytest.raises(DataError, match=cause):
@@ -154,13 +156,13 @@ def test_a_trajectory_without_frames_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_truncated_file_is_told_from_a_whole_one(path: Path) -> None:
+def test_a_truncated_file_is_refused(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match=r"one\.parquet: not a whole Parquet file"):
         TrajectoryFile(path).read()
 
 
-def test_damage_inside_a_file_is_noticed(path: Path) -> None:
+def test_damage_inside_a_file_is_reported(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
@@ -168,7 +170,7 @@ def test_damage_inside_a_file_is_noticed(path: Path) -> None:
         TrajectoryFile(path).read()
 
 
-def test_a_foreign_parquet_file_is_no_trajectory(tmp_path: Path) -> None:
+def test_a_foreign_parquet_file_is_refused(tmp_path: Path) -> None:
     pq.write_table(pa.table({"x": [1, 2]}), tmp_path / "foreign.parquet")
     with pytest.raises(DataError, match=r"foreign\.parquet: a Parquet file, but no trajectory of persist"):
         Store(tmp_path)["foreign"].read()
@@ -184,14 +186,14 @@ def test_a_newer_version_is_refused(path: Path) -> None:
         TrajectoryFile(path).read()
 
 
-def test_a_vanished_file_is_named(path: Path) -> None:
+def test_a_file_that_vanished_is_reported(path: Path) -> None:
     file = TrajectoryFile(path)
     path.unlink()
     with pytest.raises(DataError, match=r"one\.parquet: no such file"):
         file.read()
 
 
-def test_a_missing_or_empty_folder_is_named(tmp_path: Path) -> None:
+def test_a_missing_or_empty_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nowhere: no such data set folder"):
         Store(tmp_path / "nowhere")
     (tmp_path / f"{ASIDE}abc-one.parquet").touch()

@@ -1,1 +1,1 @@
-"""What ``persist inspect`` runs."""
+"""The checks that ``persist inspect`` runs on a data set."""

@@ -12,7 +12,14 @@ from typing import Any
 import typer
 
 from persist_cli.api.actions import Action, ActionVocabulary
-from persist_cli.data.check.convention import MOST_TRIED, OK, SUSPICIOUS, Check, check_convention, hypotheses
+from persist_cli.data.check.convention import (
+    MOST_TRIED,
+    OK,
+    SUSPICIOUS,
+    ConventionCheck,
+    check_convention,
+    hypotheses,
+)
 from persist_cli.data.check.reprojection import choose_pairs
 from persist_cli.data.reference import Reference, parse_reference
 from persist_cli.data.store import TrajectoryFile
@@ -24,9 +31,12 @@ class TrajectoryFigures:
     """Figures of one trajectory, or of some of its frames.
 
     Args:
+        name: name of the trajectory.
+        scene: name of its scene.
+        frames: number of frames.
         size: image height and width in pixels.
         field_of_view: degrees from the left to the right border.
-        metres: along the path.
+        metres: length of the path.
         turned: degrees, all turns added.
         seconds: from the first to the last frame; 0 where frames have no times.
         actions: how often each is taken.
@@ -42,16 +52,33 @@ class TrajectoryFigures:
     seconds: float
     actions: dict[str, int]
 
-    def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-        return asdict(self)
+
+def run_inspect(data: str, pairs: int, json: bool) -> None:
+    """Print figures and the convention check of ``data``; exit code 1 when it looks wrong.
+
+    Args:
+        data: a reference; see ``parse_reference``.
+        pairs: largest number of frame pairs to reproject.
+        json: print JSON instead of tables.
+    """
+    reference = parse_reference(data)
+    files = reference.trajectories()
+    figures, check = _inspect(files, reference, pairs)
+    if json:
+        print_json({"data": data, "trajectories": [asdict(one) for one in figures], "check": asdict(check)})
+    else:
+        print_table(data, ("holds", ""), figures_table(figures, files[0].info.vocabulary))
+        print_table(f"convention check, {check.pairs} frame pairs", ("reprojected", ""), check_table(check))
+        say(verdict_line(check))
+    if check.verdict == SUSPICIOUS:
+        raise typer.Exit(1)
 
 
 def trajectory_figures(file: TrajectoryFile, frames: slice | None = None) -> TrajectoryFigures:
     """Figures read from poses, times and actions alone; no image is decoded."""
-    kept = file.numbers(frames or slice(None))
-    info, poses, times = file.info, file.poses()[kept], file.timestamps()[kept]
-    taken = file.actions()
+    numbers = file.frame_numbers(frames or slice(None))
+    info, poses, times = file.info, file.poses()[numbers], file.timestamps()[numbers]
+    names = file.actions()
     steps = (poses[1:, :3, 3] - poses[:-1, :3, 3]).norm(dim=-1)
     between = poses[:-1, :3, :3].transpose(1, 2) @ poses[1:, :3, :3]
     cosines = ((between.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1)
@@ -66,32 +93,79 @@ def trajectory_figures(file: TrajectoryFile, frames: slice | None = None) -> Tra
         metres=float(steps.sum()),
         turned=math.degrees(float(cosines.acos().sum())),
         seconds=float(times[-1] - times[0]),
-        actions=dict(Counter(action for number in kept if (action := taken[number]) is not None)),
+        actions=dict(Counter(action for number in numbers if (action := names[number]) is not None)),
     )
 
 
-def figures_table(found: Sequence[TrajectoryFigures], vocabulary: ActionVocabulary) -> list[tuple[str, str]]:
+def figures_table(figures: Sequence[TrajectoryFigures], vocabulary: ActionVocabulary) -> list[tuple[str, str]]:
     """Rows of name and value that sum up all trajectories.
 
     Args:
+        figures: figures of each trajectory.
         vocabulary: gives the actions their units.
     """
-    frames = [one.frames for one in found]
     actions: Counter[str] = Counter()
-    for one in found:
+    for one in figures:
         actions.update(one.actions)
     units = {action.name: _unit(action) for action in vocabulary.actions}
     return [
-        ("trajectories", str(len(found))),
-        ("scenes", str(len({one.scene for one in found}))),
-        ("frames", _total(frames, str)),
-        ("image size", _distinct([f"{one.size[0]}×{one.size[1]}" for one in found])),
-        ("field of view", _distinct([f"{one.field_of_view:.1f}°" for one in found])),
-        ("metres travelled", _total([one.metres for one in found], "{:.2f}".format)),
-        ("degrees turned", _total([one.turned for one in found], "{:.0f}".format)),
-        ("seconds", _total([one.seconds for one in found], "{:.1f}".format)),
+        ("trajectories", str(len(figures))),
+        ("scenes", str(len({one.scene for one in figures}))),
+        ("frames", _total([one.frames for one in figures], str)),
+        ("image size", _distinct([f"{one.size[0]}×{one.size[1]}" for one in figures])),
+        ("field of view", _distinct([f"{one.field_of_view:.1f}°" for one in figures])),
+        ("metres travelled", _total([one.metres for one in figures], "{:.2f}".format)),
+        ("degrees turned", _total([one.turned for one in figures], "{:.0f}".format)),
+        ("seconds", _total([one.seconds for one in figures], "{:.1f}".format)),
         *[(f"action {name}{units.get(name, '')}", str(count)) for name, count in actions.most_common()],
     ]
+
+
+def check_table(check: ConventionCheck) -> list[tuple[str, str]]:
+    """Rows of name and value; a single row when no pair of frames overlaps."""
+    rows: list[tuple[str, str]] = [("pairs that see the same place", str(check.overlapping))]
+    if check.median_metres is None:
+        return rows
+    return [
+        *rows,
+        ("depth error, median", f"{check.median_metres:.4f} m"),
+        ("depth error, 95 % of what is not occluded", _metres(check.p95_metres)),
+        ("depth error over depth, median", _percent(check.median_relative)),
+        ("occluded", _percent(check.occluded)),
+        ("there and back, median", f"{check.median_pixels:.2f} pixels"),
+        ("colour error, reprojected", f"{check.color_warped:.1f} of 255"),
+        ("colour error, same pixel", f"{check.color_unwarped:.1f} of 255"),
+    ]
+
+
+def verdict_line(check: ConventionCheck) -> str:
+    """One line with the verdict, the cause when it is not ok, and the faults that the data cannot show."""
+    if check.verdict != OK:
+        return f"{check.verdict}: {check.cause}"
+    if check.undecided:
+        return f"{OK}, but this motion would not show: {', '.join(check.undecided)}"
+    return f"{OK}: cameras, depth and poses agree"
+
+
+def _inspect(
+    files: list[TrajectoryFile], reference: Reference, pairs: int
+) -> tuple[list[TrajectoryFigures], ConventionCheck]:
+    """Figures of every trajectory and the convention check, with a progress bar."""
+    with progress() as bar:
+        task = add_task(bar, "trajectories", len(files), "trajectories")
+        figures = []
+        for file in files:
+            figures.append(trajectory_figures(file, reference.frames))
+            bar.advance(task)
+        chosen = choose_pairs(files, reference.frames, pairs)
+        task = add_task(bar, "frame pairs", len(chosen), "pairs")
+        frames = []
+        for pair in chosen:
+            frames.append(pair.read())
+            bar.advance(task)
+        tries = len(hypotheses(frames[0].cameras)) * min(len(frames), MOST_TRIED) if frames else 0
+        task = add_task(bar, "reprojections", len(frames) + tries, "reprojections")
+        return figures, check_convention(frames, partial(bar.advance, task))
 
 
 def _unit(action: Action) -> str:
@@ -112,71 +186,6 @@ def _distinct(values: Sequence[str], most: int = 3) -> str:
     """The different values, the most frequent first."""
     counted = [value for value, _ in Counter(values).most_common()]
     return ", ".join(counted[:most]) + (f" and {len(counted) - most} more" if len(counted) > most else "")
-
-
-def run_inspect(data: str, pairs: int, json: bool) -> None:
-    """Print figures and the convention check of ``data``; exit code 1 when it looks wrong.
-
-    Args:
-        data: a reference; see ``parse_reference``.
-        pairs: frame pairs to reproject.
-    """
-    reference = parse_reference(data)
-    files = reference.trajectories()
-    found, check = _look(files, reference, pairs)
-    if json:
-        print_json({"data": data, "trajectories": [one.to_json() for one in found], "check": check.to_json()})
-    else:
-        print_table(data, ("holds", ""), figures_table(found, files[0].info.vocabulary))
-        print_table(f"convention check, {check.pairs} frame pairs", ("reprojected", ""), check_table(check))
-        say(verdict_line(check))
-    if check.verdict == SUSPICIOUS:
-        raise typer.Exit(1)
-
-
-def check_table(check: Check) -> list[tuple[str, str]]:
-    """Rows of name and value."""
-    rows: list[tuple[str, str]] = [("pairs that see the same place", str(check.overlapping))]
-    if check.median_metres is None:
-        return rows
-    return [
-        *rows,
-        ("depth error, median", f"{check.median_metres:.4f} m"),
-        ("depth error, 95 % of what is not occluded", _metres(check.p95_metres)),
-        ("depth error over depth, median", _percent(check.median_relative)),
-        ("occluded", _percent(check.occluded)),
-        ("there and back, median", f"{check.median_pixels:.2f} pixels"),
-        ("colour error, reprojected", f"{check.color_warped:.1f} of 255"),
-        ("colour error, same pixel", f"{check.color_unwarped:.1f} of 255"),
-    ]
-
-
-def verdict_line(check: Check) -> str:
-    """One line: the verdict, the cause when it is not ok, what the data cannot tell."""
-    if check.verdict != OK:
-        return f"{check.verdict}: {check.cause}"
-    if check.undecided:
-        return f"{OK}, but this motion would not show: {', '.join(check.undecided)}"
-    return f"{OK}: cameras, depth and poses agree"
-
-
-def _look(files: list[TrajectoryFile], reference: Reference, pairs: int) -> tuple[list[TrajectoryFigures], Check]:
-    """Read everything, with a progress bar."""
-    with progress() as bar:
-        task = add_task(bar, "trajectories", len(files), "trajectories")
-        found = []
-        for file in files:
-            found.append(trajectory_figures(file, reference.frames))
-            bar.advance(task)
-        chosen = choose_pairs(files, reference.frames, pairs)
-        task = add_task(bar, "frame pairs", len(chosen), "pairs")
-        frames = []
-        for pair in chosen:
-            frames.append(pair.read())
-            bar.advance(task)
-        tries = len(hypotheses(frames[0].cameras)) * min(len(frames), MOST_TRIED) if frames else 0
-        task = add_task(bar, "reprojections", len(frames) + tries, "reprojections")
-        return found, check_convention(frames, partial(bar.advance, task))
 
 
 def _metres(value: float | None) -> str:

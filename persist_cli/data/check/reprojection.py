@@ -1,4 +1,4 @@
-"""Pairs of frames that see the same surfaces, and how far one lands from the other when it is reprojected."""
+"""Pairs of frames that see the same surfaces, and how far points land from there when they are reprojected."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from persist_cli.api.geometry import in_view, project, transform
 from persist_cli.api.observations import Observations
 from persist_cli.data.store import TrajectoryFile
 
-T = TypeVar("T")
-
+# which frames make a pair
 GAPS = (64, 32, 16, 8, 4, 2, 1)  # frames between the two, the widest first
-
 MOST_TURN = 20.0  # degrees; more leaves too little in both views
-
 MOST_WALK = 0.3  # of the median depth; more hides too much ...
-
 MOST_METRES = 0.75  # ... and no more than this, should the depth be in wrong units
-
 LEAST_TURN = 0.5  # degrees
-
 LEAST_WALK = 0.005  # metres
+
+# which points are compared
+NEAR = 1e-3  # metres in front of the camera
+MOST_POINTS = 1200  # of a pair; more change no figure by a tenth
+SAME_SURFACE = 1.2  # ratio of neighbouring depths above which an edge lies between them
+OCCLUDED = 0.05  # a point this part of its depth behind what the second frame sees may be hidden by it
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -41,84 +43,21 @@ class FramePair:
     second: int
 
     def read(self) -> Observations:
-        """The two frames."""
+        """The observations of the two frames."""
         return self.file.read([self.first, self.second]).observations
 
 
-def choose_pairs(files: Sequence[TrajectoryFile], frames: slice | None, count: int) -> list[FramePair]:
-    """At most ``count`` pairs spread evenly over the trajectories, none without motion.
-
-    Args:
-        files: at least one.
-        frames: of each trajectory; ``None`` for all.
-        count: pairs wanted.
-    """
-    chosen = spread(files, count)
-    share = math.ceil(count / len(chosen))
-    return spread([pair for file in chosen for pair in _pairs_of(file, frames, share)], count)
-
-
-def spread(items: Sequence[T], count: int) -> list[T]:
-    """At most ``count`` of the items, evenly from first to last."""
-    keep = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
-    return [items[index] for index in keep]
-
-
-def _pairs_of(file: TrajectoryFile, frames: slice | None, count: int) -> list[FramePair]:
-    first, end, _ = (frames or slice(None)).indices(len(file))
-    poses = file.poses()[:end]
-    walk = min(MOST_WALK * _median_depth(file, (first + end) // 2), MOST_METRES)
-    starts = spread(range(first, end - 1), max(16, 4 * count))
-    found = [(start, _partner(poses, start, walk)) for start in starts]
-    return spread([FramePair(file, start, partner) for start, partner in found if partner is not None], count)
-
-
-def _partner(poses: Float[Tensor, "frame 4 4"], start: int, most_walk: float) -> int | None:
-    """The farthest frame that turned and walked little enough, else the next, if it moved at all.
-
-    The turn between two frames is the same with inverted poses and with other camera axes, so it can choose
-    before the conventions are known.
-    """
-    partners = [start + gap for gap in GAPS if start + gap < len(poses)]
-    motions = {partner: _motion(poses[start], poses[partner]) for partner in partners}
-    fit = [partner for partner, (turn, walk) in motions.items() if turn <= MOST_TURN and walk <= most_walk]
-    partner = (fit or partners[-1:])[0]
-    turn, walk = motions[partner]
-    return partner if turn >= LEAST_TURN or walk >= LEAST_WALK else None
-
-
-def _motion(one: Float[Tensor, "4 4"], other: Float[Tensor, "4 4"]) -> tuple[float, float]:
-    """Degrees and metres between two poses."""
-    cosine = (torch.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2
-    return math.degrees(math.acos(float(cosine.clamp(-1, 1)))), float((other[:3, 3] - one[:3, 3]).norm())
-
-
-def _median_depth(file: TrajectoryFile, frame: int) -> float:
-    depth = file.read([frame]).observations.depth
-    valid = depth[depth > 0]
-    return float(valid.median()) if len(valid) else math.inf
-
-
-NEAR = 1e-3  # metres in front of the camera
-
-MOST_POINTS = 1200  # of a pair; more change no figure by a tenth
-
-SAME_SURFACE = 1.2  # ratio of neighbouring depths above which an edge lies between them
-
-OCCLUDED = 0.05  # a point this part of its depth behind what frame j sees may be hidden by it
-
-
 @dataclass(frozen=True)
-class Disagreement:
-    """Errors of the points of frame i that frame j sees too.
+class ReprojectionErrors:
+    """Errors of the points of a first frame that a second frame sees too.
 
     Args:
-        seen: part of the points of frame i that fall on a surface of frame j.
-        depth: metres, predicted less seen; positive when the point lies behind what frame j sees.
-        relative: the same over the seen depth.
-        pixels: distance from where a point started after going to frame j and, with its depth there, back.
-        warped: mean absolute colour difference of the point's two pixels, levels of 255.
-        unwarped: the same of the same pixel of both frames.
+        seen: part of the first frame's points that fall on a surface of the second, 0 to 1.
+        depth: predicted minus seen depth in metres; positive when the point lies behind what the second frame sees.
+        relative: the depth error over the seen depth.
+        pixels: distance from where a point started after going to the second frame and, with its depth there, back.
+        warped: mean absolute colour difference between a point's pixels in both frames, levels of 255.
+        unwarped: mean absolute colour difference between equal pixels of both frames, levels of 255.
     """
 
     seen: float
@@ -130,12 +69,31 @@ class Disagreement:
 
     @property
     def occluded(self) -> Tensor:
-        """Which points may well be hidden behind something in frame j."""
+        """Boolean ``[point]``: whether something in the second frame may well hide the point."""
         return self.relative > OCCLUDED
 
 
-def reproject(pair: Observations) -> Disagreement:
-    """How the second of two frames disagrees with the first.
+def choose_pairs(files: Sequence[TrajectoryFile], frames: slice | None, count: int) -> list[FramePair]:
+    """At most ``count`` pairs spread evenly over the trajectories, none without motion.
+
+    Args:
+        files: at least one trajectory.
+        frames: the frames of each trajectory to choose from; ``None`` for all.
+        count: largest number of pairs.
+    """
+    chosen = evenly_spaced(files, count)
+    share = math.ceil(count / len(chosen))
+    return evenly_spaced([pair for file in chosen for pair in _pairs_of(file, frames, share)], count)
+
+
+def evenly_spaced(items: Sequence[T], count: int) -> list[T]:
+    """At most ``count`` of the items, evenly from first to last."""
+    indices = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[index] for index in indices]
+
+
+def reproject(pair: Observations) -> ReprojectionErrors:
+    """Errors of an even grid of points of the first of two frames, seen from the second.
 
     Depth is interpolated as 1/z, which is linear in the pixels of a plane, and not across edges.
     """
@@ -144,16 +102,18 @@ def reproject(pair: Observations) -> Disagreement:
     depth = pair.depth[0, rows, columns].double()
     points = unproject_pixels(start, depth, pair.cameras[0])
     visible, pixels, predicted = in_view(points, pair.cameras[1], near=NEAR)
-    depth, valid = _seen_depth(pair.depth[1], pixels, visible), depth > 0
-    seen = valid & (depth > 0)
-    returned, _ = project(unproject_pixels(pixels[seen], depth[seen], pair.cameras[1]), pair.cameras[0])
+    depth_there, surface = sample_depth(pair.depth[1], pixels)
+    valid = depth > 0
+    seen = valid & visible & surface & (depth_there > 0)
+    depth_there = depth_there[seen]
+    returned, _ = project(unproject_pixels(pixels[seen], depth_there, pair.cameras[1]), pair.cameras[0])
     warped = sample_color(pair.rgb[1], pixels[seen])
     color = pair.rgb[0, rows, columns].double()[seen]
-    error = predicted[seen] - depth[seen]
-    return Disagreement(
+    error = predicted[seen] - depth_there
+    return ReprojectionErrors(
         seen=float(seen.sum() / valid.sum().clamp_min(1)),
         depth=error,
-        relative=error / depth[seen],
+        relative=error / depth_there,
         pixels=(returned - start[seen]).norm(dim=-1),
         warped=(warped - color).abs().mean(-1),
         unwarped=(pair.rgb[1, rows, columns].double()[seen] - color).abs().mean(-1),
@@ -161,18 +121,18 @@ def reproject(pair: Observations) -> Disagreement:
 
 
 def sample_depth(depth: Float[Tensor, "height width"], pixels: Float[Tensor, "point 2"]) -> tuple[Tensor, Tensor]:
-    """Depth at pixels (u, v) and whether the four pixels around lie on one surface."""
-    around, weights = _around(depth, pixels)
-    low, high = around.amin(-1), around.amax(-1)
+    """Depth ``[point]`` at pixels (u, v), and whether the four pixels around each lie on one surface."""
+    neighbours, weights = _neighbours(depth, pixels)
+    low, high = neighbours.amin(-1), neighbours.amax(-1)
     surface = (low > 0) & (high < SAME_SURFACE * low)
-    inverse = (weights / around.clamp_min(1e-6)).sum(-1)
+    inverse = (weights / neighbours.clamp_min(1e-6)).sum(-1)
     return 1 / inverse, surface
 
 
 def sample_color(rgb: Tensor, pixels: Float[Tensor, "point 2"]) -> Float[Tensor, "point 3"]:
     """Interpolated colour of a uint8 ``[height, width, 3]`` image at pixels (u, v), levels of 255."""
-    around, weights = _around(rgb, pixels)
-    return (weights[..., None] * around).sum(1)
+    neighbours, weights = _neighbours(rgb, pixels)
+    return (weights[..., None] * neighbours).sum(1)
 
 
 def unproject_pixels(pixels: Float[Tensor, "point 2"], depth: Float[Tensor, " point"], camera: Cameras) -> Tensor:
@@ -180,6 +140,41 @@ def unproject_pixels(pixels: Float[Tensor, "point 2"], depth: Float[Tensor, " po
     homogeneous = torch.cat([pixels.double(), torch.ones_like(pixels[:, :1], dtype=torch.float64)], dim=-1)
     rays = homogeneous @ torch.linalg.inv(camera.intrinsics.double()).T
     return transform(camera.world_from_camera.double(), rays * depth[:, None])
+
+
+def _pairs_of(file: TrajectoryFile, frames: slice | None, count: int) -> list[FramePair]:
+    first, end, _ = (frames or slice(None)).indices(len(file))
+    poses = file.poses()[:end]
+    most_walk = min(MOST_WALK * _median_depth(file, (first + end) // 2), MOST_METRES)
+    starts = evenly_spaced(range(first, end - 1), max(16, 4 * count))
+    partners = [(start, _partner(poses, start, most_walk)) for start in starts]
+    return evenly_spaced([FramePair(file, start, partner) for start, partner in partners if partner is not None], count)
+
+
+def _partner(poses: Float[Tensor, "frame 4 4"], start: int, most_walk: float) -> int | None:
+    """The farthest frame that turned and walked little enough, else the next, if it moved at all.
+
+    Inverted poses and poses with other camera axes have equal turns between two frames, so partners can be chosen
+    before the conventions are known.
+    """
+    partners = [start + gap for gap in GAPS if start + gap < len(poses)]
+    motions = {partner: _motion(poses[start], poses[partner]) for partner in partners}
+    near = [partner for partner, (turn, walk) in motions.items() if turn <= MOST_TURN and walk <= most_walk]
+    partner = (near or partners[-1:])[0]
+    turn, walk = motions[partner]
+    return partner if turn >= LEAST_TURN or walk >= LEAST_WALK else None
+
+
+def _motion(start: Float[Tensor, "4 4"], end: Float[Tensor, "4 4"]) -> tuple[float, float]:
+    """Degrees and metres between two poses."""
+    cosine = (torch.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
+    return math.degrees(math.acos(float(cosine.clamp(-1, 1)))), float((end[:3, 3] - start[:3, 3]).norm())
+
+
+def _median_depth(file: TrajectoryFile, frame: int) -> float:
+    depth = file.read([frame]).observations.depth
+    valid = depth[depth > 0]
+    return float(valid.median()) if len(valid) else math.inf
 
 
 def _grid(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -191,13 +186,7 @@ def _grid(height: int, width: int) -> tuple[Tensor, Tensor]:
     return rows.flatten(), columns.flatten()
 
 
-def _seen_depth(depth: Tensor, pixels: Tensor, visible: Tensor) -> Tensor:
-    """Depth at the visible pixels, 0 where there is none or an edge."""
-    values, surface = sample_depth(depth, pixels)
-    return torch.where(visible & surface, values, 0.0)
-
-
-def _around(image: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def _neighbours(image: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Values ``[point, 4, ...]`` of the four pixels around (u, v), those at the border repeated, and their weights."""
     height, width = image.shape[:2]
     corner = (pixels - 0.5).nan_to_num(0.0, 0.0, 0.0)

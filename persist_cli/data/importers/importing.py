@@ -21,7 +21,7 @@ from persist_cli.viewing.console import add_task, print_json, print_table, progr
 
 @dataclass(frozen=True)
 class ImportPlan:
-    """What happens to every trajectory on its way in.
+    """Changes made to every trajectory while it is imported.
 
     Args:
         size: height and width in pixels, ``None`` to keep them.
@@ -32,22 +32,22 @@ class ImportPlan:
     every: int = 1
 
     def info(self, info: TrajectoryInfo) -> TrajectoryInfo:
-        """What holds for every frame after the change."""
-        if self.every > 1:  # an action leads to the next frame only
+        """The info of the imported trajectory."""
+        if self.every > 1:  # the foreign actions lead to frames that are left out
             info = replace(info, vocabulary=free_motion(), source={**info.source, "every": self.every})
         return self._crop(info).info(info) if self.size else info
 
     def frames(self, trajectory: ForeignTrajectory) -> Iterator[Frame]:
-        """The kept frames at their new size; the last one leads nowhere."""
+        """The frames that are kept, at their new size; the last one has no action."""
         crop = self._crop(trajectory.info) if self.size else None
         last = self.length(trajectory) - 1
         for number, frame in enumerate(islice(trajectory.frames, 0, None, self.every)):
             action = None if number == last else FREE if self.every > 1 else frame.action
-            kept = replace(frame, action=action)
-            yield crop.frame(kept) if crop else kept
+            frame = replace(frame, action=action)
+            yield crop.frame(frame) if crop else frame
 
     def length(self, trajectory: ForeignTrajectory) -> int:
-        """How many frames are kept."""
+        """Number of frames that are kept."""
         return -(-trajectory.length // self.every)
 
     def _crop(self, info: TrajectoryInfo) -> CropResize:
@@ -55,18 +55,24 @@ class ImportPlan:
 
 
 def run_import(format: str, source: Path, out: Path, size: str | None, every: int, json: bool) -> None:
-    """Import every trajectory of ``source`` that is not yet in ``out``.
+    """Import every trajectory of ``source`` that is not yet in ``out``, and print what there is.
 
     Args:
-        format: an importer's name.
+        format: name of an importer.
+        source: folder or file of that format.
+        out: data set folder.
         size: ``HEIGHTxWIDTH`` in pixels, after a central crop to that aspect.
         every: keep every n-th frame.
+        json: print JSON instead of a table.
+
+    Raises:
+        PersistError: for an unknown format, a source that cannot be read, or a trajectory of other settings in ``out``.
     """
     plan = ImportPlan(parse_size(size) if size else None, every)
     importer = make_importer(format)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")
-    rows = [_import(trajectory, plan, out) for trajectory in importer.trajectories(source)]
+    rows = [import_trajectory(trajectory, plan, out) for trajectory in importer.trajectories(source)]
     if json:
         print_json({"out": str(out), "trajectories": rows})
         return
@@ -76,12 +82,12 @@ def run_import(format: str, source: Path, out: Path, size: str | None, every: in
     say(f"next: persist inspect {out}")
 
 
-def _import(trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
-    """Write one trajectory unless it is there; what became of it."""
+def import_trajectory(trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
+    """Write one trajectory unless it is there; name, frames, size and state are returned for the table."""
     path = out / f"{trajectory.name}{SUFFIX}"
     info = plan.info(trajectory.info)
     state = "already there"
-    if not _is_there(path, info, plan.length(trajectory)):
+    if not _is_imported(path, info, plan.length(trajectory)):
         _write(path, info, trajectory, plan)
         state = "written"
     return {
@@ -93,12 +99,12 @@ def _import(trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[
     }
 
 
-def _is_there(path: Path, info: TrajectoryInfo, length: int) -> bool:
+def _is_imported(path: Path, info: TrajectoryInfo, length: int) -> bool:
     """Whether an earlier run wrote this very trajectory; another one of that name is an error."""
     if not path.exists():
         return False
-    there = TrajectoryFile(path)
-    if there.length != length or schema(there.info).metadata != schema(info).metadata:
+    file = TrajectoryFile(path)
+    if file.length != length or schema(file.info).metadata != schema(info).metadata:
         raise DataError(f"{path}: holds another trajectory or one of other settings; remove it or take another --out")
     return True
 
@@ -109,9 +115,9 @@ def _write(path: Path, info: TrajectoryInfo, trajectory: ForeignTrajectory, plan
     with progress() as bar:
         task = add_task(bar, trajectory.name, plan.length(trajectory), "frames")
 
-        def counted() -> Iterator[Frame]:
+        def frames_with_progress() -> Iterator[Frame]:
             for frame in plan.frames(trajectory):
                 yield frame
                 bar.advance(task)
 
-        write_trajectory(path, info, counted())
+        write_trajectory(path, info, frames_with_progress())

@@ -20,19 +20,14 @@ from persist_cli.api.actions import FREE, free_motion
 from persist_cli.api.cameras import check_intrinsics, check_poses
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
-from persist_cli.data.importers.files import read_color, read_depth, read_matrix
+from persist_cli.data.importers.readers import read_color, read_depth, read_matrix
 from persist_cli.errors import DataError
 
 INTRINSICS = "camera-intrinsics.txt"
-
-FRAME = re.compile(r"^(?P<stem>frame-(?P<number>\d+))\.(?P<part>color\.jpg|color\.png|depth\.png|pose\.txt)$")
-
+FRAME = re.compile(r"^(?P<stem>frame-\d+)\.(?P<part>color\.jpg|color\.png|depth\.png|pose\.txt)$")
 SEQUENCE = re.compile(r"^seq-?\d+$")
-
-NO_DEPTH = (0, 65535)
-
+NO_DEPTH = (0, 65535)  # raw values of pixels without depth
 FRAMES_PER_SECOND = 30.0
-
 ROLL = 0.07  # radians, four degrees: how much a person holding a camera rolls it
 
 
@@ -41,7 +36,10 @@ class FrameFiles:
     """The three files of a frame.
 
     Args:
-        number: of the frame in the capture.
+        number: number of the frame in the capture.
+        color: path of the colour image.
+        depth: path of the depth image.
+        pose: path of the pose matrix.
     """
 
     number: int
@@ -51,10 +49,14 @@ class FrameFiles:
 
 
 class SevenScenes(Importer):
-    """One sequence, or a scene whose ``seq-*`` folders are its trajectories."""
+    """The importer of one sequence, or of a scene whose ``seq-*`` folders are its trajectories."""
 
     def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
-        """Every sequence of ``source``, named after its scene."""
+        """Read every sequence of ``source`` as a trajectory named after its scene.
+
+        Raises:
+            DataError: when there is none, or a frame lacks one of its files.
+        """
         source = source.resolve()
         if not source.is_dir():
             raise DataError(f"{source}: no such folder")
@@ -68,11 +70,12 @@ class SevenScenes(Importer):
 
 
 def estimate_up(poses: np.ndarray[Any, Any]) -> tuple[float, float, float]:
-    """Up in the world, which 7-Scenes does not say: nearly across all the cameras' horizontal (x) axes.
+    """The unit vector that points up in the world, estimated from the cameras because 7-Scenes does not store it.
 
-    A hand-held camera pitches a lot and rolls little. The mean of the cameras' -y axes is taken, and what of it
-    lies where the x axes spread by more than the usual roll is damped. On the kitchen of 7-Scenes this is 9° off
-    the normal of its horizontal surfaces, the plain mean 26°.
+    A hand-held camera pitches a lot and rolls little, so up is nearly perpendicular to all the cameras' x axes. The
+    mean of the cameras' -y axes is taken, and its parts along directions in which the x axes spread by more than the
+    usual roll are damped. On the kitchen of 7-Scenes this is 9° off the normal of its horizontal surfaces, the plain
+    mean 26°.
 
     Args:
         poses: world_from_camera ``[frame, 4, 4]``.
@@ -109,23 +112,23 @@ def _sequence(folder: Path) -> ForeignTrajectory:
 
 def _frame_files(folder: Path) -> list[FrameFiles]:
     """The files of every frame in order; a frame that lacks one of them is an error."""
-    found: dict[str, dict[str, Path]] = {}
+    paths_by_stem: dict[str, dict[str, Path]] = {}
     for path in sorted(folder.iterdir()):
         match = FRAME.match(path.name)
         if match:
-            found.setdefault(match["stem"], {})[match["part"].partition(".")[0]] = path
-    if not found:
+            paths_by_stem.setdefault(match["stem"], {})[match["part"].partition(".")[0]] = path
+    if not paths_by_stem:
         raise DataError(f"{folder}: no frame-NNNNNN.color.png or .jpg files in it")
-    for stem, parts in found.items():
+    for stem, paths in paths_by_stem.items():
         for part in ("color", "depth", "pose"):
-            if part not in parts:
-                there = ", ".join(path.name for path in parts.values())
-                raise DataError(f"{folder}: {stem} has no {part} file (only {there})")
-    return [FrameFiles(int(stem.partition("-")[2]), **parts) for stem, parts in sorted(found.items())]
+            if part not in paths:
+                present = ", ".join(path.name for path in paths.values())
+                raise DataError(f"{folder}: {stem} has no {part} file (only {present})")
+    return [FrameFiles(int(stem.removeprefix("frame-")), **paths) for stem, paths in sorted(paths_by_stem.items())]
 
 
 def _check_poses(poses: np.ndarray[Any, Any], files: list[FrameFiles]) -> None:
-    """Names the file of the first pose that is not rigid."""
+    """Raise ``DataError`` naming the file of the first pose that is not rigid."""
     for pose, frame in zip(poses, files, strict=True):
         try:
             check_poses(torch.from_numpy(pose)[None], str(frame.pose))

@@ -1,4 +1,4 @@
-"""Inspect passes good data and names what is wrong with data broken on purpose."""
+"""Inspect passes good data and names the fault of data broken on purpose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from persist_cli.errors import DataError
 from tests.support import faulty_data as faults
 from tests.support.rooms import Room, look, walk
 
-KITCHEN = Path(__file__).parents[3] / "shared/data/kitchen"
+KITCHEN = Path(__file__).parents[4] / "shared/data/kitchen"
 
 PAIRS = 4
 
@@ -80,7 +80,7 @@ def test_real_kinect_frames_are_ok(kitchen: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize(("change", "intrinsics", "cause"), FAULTS)
 @pytest.mark.parametrize("data", ["room", "kitchen"])
-def test_a_fault_is_found_and_named(
+def test_a_known_fault_is_named_as_the_cause(
     request: pytest.FixtureRequest, tmp_path: Path, data: str, change: faults.Change, intrinsics: float, cause: str
 ) -> None:
     bad = faults.rewrite(request.getfixturevalue(data), tmp_path / "bad.parquet", change, intrinsics)
@@ -90,7 +90,7 @@ def test_a_fault_is_found_and_named(
     assert "; or " not in check["cause"]
 
 
-def test_poses_of_other_images_are_suspicious_without_a_wrong_name(
+def test_poses_of_other_images_are_suspicious_without_a_known_cause(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     check, code = inspect(faults.rewrite(room, tmp_path / "bad.parquet", faults.shuffled), capsys)
@@ -98,13 +98,15 @@ def test_poses_of_other_images_are_suspicious_without_a_wrong_name(
     assert "no single known fault explains it" in check["cause"]
 
 
-def test_turning_on_the_spot_cannot_show_the_depth_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_turning_on_the_spot_leaves_the_depth_units_undecided(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     poses = np.stack([look((0, 1.4, 0), 10 * number) for number in range(12)])
     check, code = inspect(Room().write(tmp_path / "turn.parquet", poses), capsys)
     assert (check["verdict"], check["undecided"], code) == ("ok", ["depth units"], 0)
 
 
-def test_a_camera_that_stands_still_tells_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_that_stands_still_cannot_be_checked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     check, code = inspect(Room().write(tmp_path / "still.parquet", np.stack([walk()[0]] * 3)), capsys)
     assert (check["verdict"], check["pairs"], code) == ("cannot tell", 0, 0)
     assert "does not move" in check["cause"]
@@ -131,14 +133,14 @@ def test_a_moved_world_origin_changes_no_figure(room: Path, tmp_path: Path, caps
 
 
 def test_a_frame_agrees_with_itself(room: Path) -> None:
-    found = reproject(TrajectoryFile(room).read([3, 3]).observations)
-    assert float(found.depth.abs().max()) < 1e-6
-    assert float(found.pixels.max()) < 1e-6
-    assert float(found.warped.max()) < 1e-6
-    assert found.seen > 0.8  # all but the edges
+    errors = reproject(TrajectoryFile(room).read([3, 3]).observations)
+    assert float(errors.depth.abs().max()) < 1e-6
+    assert float(errors.pixels.max()) < 1e-6
+    assert float(errors.warped.max()) < 1e-6
+    assert errors.seen > 0.8  # all but the edges
 
 
-def test_the_figures_are_those_of_the_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_agree_with_a_path_of_known_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses = np.stack([look((0, 1.4, 0.25 * number), 0) for number in range(5)])
     Room(field_of_view=70).write(tmp_path / "line.parquet", poses)
     run_inspect(str(tmp_path), PAIRS, True)
@@ -150,20 +152,20 @@ def test_the_figures_are_those_of_the_path(tmp_path: Path, capsys: pytest.Captur
     assert figures["actions"] == {"free": 4}
 
 
-def test_the_table_says_what_there_is_and_the_verdict(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_tables_show_figures_and_verdict(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_inspect(f"{room.parent}#0:0-12", PAIRS, False)
     text = capsys.readouterr().out
     for word in ("trajectories", "48×64", "metres travelled", "action free", "depth error, median", "ok: cameras"):
         assert word in text
 
 
-def test_only_the_asked_frames_are_checked(room: Path) -> None:
+def test_only_the_frames_of_the_reference_are_checked(room: Path) -> None:
     pairs = choose_pairs(list(Store(room.parent)), slice(4, 10), 50)
     assert {pair.first for pair in pairs} == {4, 5, 6, 7, 8}
     assert all(4 <= pair.first < pair.second < 10 for pair in pairs)
 
 
-def test_what_cannot_be_read_ends_in_one_line(room: Path, tmp_path: Path) -> None:
+def test_data_that_cannot_be_read_is_reported_in_one_line(room: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such data set folder"):
         run_inspect(str(tmp_path / "nowhere"), PAIRS, False)
     with pytest.raises(DataError, match="there is no frame 99"):

@@ -1,4 +1,4 @@
-"""7-Scenes folders come in as trajectories; what is broken in them is named."""
+"""7-Scenes folders are imported as trajectories, and a broken file in them is named."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def sequence(tmp_path: Path) -> Path:
     return write_sequence(tmp_path / "kitchen")
 
 
-def test_a_sequence_comes_in_as_it_was(sequence: Path) -> None:
+def test_a_sequence_is_imported_as_it_was(sequence: Path) -> None:
     (trajectory,) = SevenScenes().trajectories(sequence)
     assert (trajectory.name, trajectory.info.scene, trajectory.length) == ("kitchen", "kitchen", 4)
     assert trajectory.info.intrinsics == pytest.approx(ROOM.intrinsics)
@@ -51,7 +51,7 @@ def test_a_sequence_comes_in_as_it_was(sequence: Path) -> None:
         assert frame.action == truth.action
 
 
-def test_0_and_65535_are_missing_depth(sequence: Path) -> None:
+def test_depth_of_0_and_65535_is_missing(sequence: Path) -> None:
     (trajectory,) = SevenScenes().trajectories(sequence)
     assert next(trajectory.frames).depth[0, :2].tolist() == [0, 0]
 
@@ -60,18 +60,18 @@ def test_the_sequences_of_a_scene_share_its_name(tmp_path: Path) -> None:
     for number in (2, 1):
         write_sequence(tmp_path / "chess" / f"seq-0{number}", 2, "jpg")
     shutil.move(tmp_path / "chess/seq-01/camera-intrinsics.txt", tmp_path / "chess")  # one for all
-    found = list(SevenScenes().trajectories(tmp_path / "chess"))
-    assert [trajectory.name for trajectory in found] == ["chess-seq-01", "chess-seq-02"]
-    assert {trajectory.info.scene for trajectory in found} == {"chess"}
+    trajectories = list(SevenScenes().trajectories(tmp_path / "chess"))
+    assert [trajectory.name for trajectory in trajectories] == ["chess-seq-01", "chess-seq-02"]
+    assert {trajectory.info.scene for trajectory in trajectories} == {"chess"}
     assert next(SevenScenes().trajectories(tmp_path / "chess/seq-02")).name == "chess-seq-02"
 
 
-def test_times_follow_the_frame_numbers(sequence: Path) -> None:
+def test_timestamps_follow_the_frame_numbers(sequence: Path) -> None:
     (trajectory,) = SevenScenes().trajectories(sequence)
     assert [frame.timestamp for frame in trajectory.frames] == pytest.approx([0, 0.1, 0.2, 0.3])
 
 
-def test_up_is_found_although_the_camera_looks_down() -> None:
+def test_up_is_estimated_although_the_camera_looks_down() -> None:
     poses = np.stack([look((0, 1.5, 0), yaw, -35) for yaw in range(0, 120, 10)])
     assert np.degrees(np.arccos(np.dot(estimate_up(poses), (0, 1, 0)))) < 3
     assert np.degrees(np.arccos(np.dot(-poses[:, :3, 1].mean(0), (0, 1, 0)))) > 20  # the plain mean
@@ -120,7 +120,9 @@ COLOR, DEPTH, POSE = (f"frame-000006.{part}" for part in ("color.png", "depth.pn
         (write(POSE, "lost tracking"), r"frame-000006\.pose\.txt: not a text file of numbers"),
     ],
 )
-def test_what_is_broken_is_named_and_nothing_half_is_left(sequence: Path, tmp_path: Path, damage, cause: str) -> None:
+def test_a_broken_file_is_named_and_nothing_half_written_is_left(
+    sequence: Path, tmp_path: Path, damage, cause: str
+) -> None:
     damage(sequence)
     with pytest.raises(DataError, match=cause) as error:
         run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
@@ -128,7 +130,7 @@ def test_what_is_broken_is_named_and_nothing_half_is_left(sequence: Path, tmp_pa
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_a_folder_without_frames_is_named(tmp_path: Path) -> None:
+def test_a_folder_without_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither frame-"):
         run_import("7scenes", tmp_path, tmp_path / "out", None, 1, False)
     with pytest.raises(DataError, match="nowhere: no such file or folder"):
@@ -140,7 +142,7 @@ def test_an_unknown_format_gets_a_hint(tmp_path: Path) -> None:
         run_import("7scene", tmp_path, tmp_path / "out", None, 1, False)
 
 
-def test_import_writes_a_store_of_the_asked_size(sequence: Path, tmp_path: Path, capsys) -> None:
+def test_import_writes_a_store_of_the_size_given(sequence: Path, tmp_path: Path, capsys) -> None:
     run_import("7scenes", sequence, tmp_path / "out", "24x24", 2, True)
     report = json.loads(capsys.readouterr().out)
     assert report["trajectories"] == [
@@ -152,7 +154,7 @@ def test_import_writes_a_store_of_the_asked_size(sequence: Path, tmp_path: Path,
     assert torch.equal(trajectory.observations.cameras.intrinsics[0, :2, 2], torch.tensor([12.0, 12.0]).double())
 
 
-def test_a_second_import_finds_its_work_done(sequence: Path, tmp_path: Path, capsys) -> None:
+def test_a_second_import_leaves_finished_trajectories_alone(sequence: Path, tmp_path: Path, capsys) -> None:
     run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
     written = (tmp_path / "out/kitchen.parquet").stat().st_mtime_ns
     run_import("7scenes", sequence, tmp_path / "out", None, 1, False)

@@ -1,4 +1,4 @@
-"""Files of foreign formats read with one-line errors: colour images, depth images, matrices."""
+"""Readers of foreign files with one-line errors: colour images, depth images, matrices."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def read_depth(path: Path, units_per_metre: float, missing: tuple[int, ...] = (0
 
 
 def read_matrix(path: Path, rows: int, columns: int) -> np.ndarray[Any, Any]:
-    """The float64 matrix of a text file of that many numbers.
+    """The float64 ``[rows, columns]`` matrix of a text file of numbers.
 
     Raises:
-        DataError: when it is missing or holds anything else.
+        DataError: when it is missing, or holds another count of numbers or anything else.
     """
     try:
         numbers = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
