@@ -1,1 +1,1 @@
-"""The command line: signatures only; each command imports its work when it runs."""
+"""The command line ``persist``: its commands and their options."""

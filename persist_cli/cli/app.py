@@ -1,4 +1,4 @@
-"""The command line: signatures only; each command imports its work when it runs."""
+"""The command line ``persist``: signatures only, so that --help is fast; each command imports its work when it runs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import typer
 
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
-from persist_cli.cli.doctor import doctor
-from persist_cli.cli.listings import plugins, recipes
 from persist_cli.cli.options import (
     ActionsOption,
     Commands,
@@ -23,10 +21,9 @@ from persist_cli.cli.options import (
     SamplerOption,
     SaveMemoryOption,
     StepsOption,
-    names_in,
     show_version,
+    split_names,
 )
-from persist_cli.cli.weights import weights_app
 from persist_cli.errors import PersistError
 
 app = typer.Typer(
@@ -37,10 +34,12 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
+weights_app = typer.Typer(no_args_is_help=True, help="Weights of encoders and metrics: what there is, fetch, path.")
+app.add_typer(weights_app, name="weights")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; what the user can mend ends in one line and exit code 1."""
+    """Run the command line; an error that the user can mend is printed in one line and ends with exit code 1."""
     try:
         app(args=arguments)
     except PersistError as error:
@@ -284,18 +283,80 @@ def evaluate(
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
-        data=tuple(data), protocol=protocol, memories=names_in(memories), controls=names_in(controls),
-        metrics=names_in(metrics), frames=frames, clips=clips, seeds=seeds,
+        data=tuple(data), protocol=protocol, memories=split_names(memories), controls=split_names(controls),
+        metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=SamplingOverrides(steps, sampler, guidance), batch=batch, noise=pose_noise,
         placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 
 
-app.command(context_settings={"allow_interspersed_args": True})(doctor)
+@app.command(context_settings={"allow_interspersed_args": True})
+def doctor(
+    recipe: Annotated[str, typer.Argument(help="A recipe's name (`persist recipes`) or a YAML file.")],
+    overrides: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change.")] = None,
+    gpus: Annotated[int | None, typer.Option(min=1, help="Plan for so many GPUs; else for what is here.")] = None,
+    gpu_memory: Annotated[float | None, typer.Option(min=0.001, help="GiB of each: 80 for a card of 80 GB.")] = None,
+    fsdp: Annotated[bool, typer.Option("--fsdp", help="Plan with FSDP2 over the GPUs.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Say how much memory a training needs, whether it fits, and the smallest change that makes it fit.
 
-app.add_typer(weights_app, name="weights")
+    persist doctor cogvideox-5b-i2v-stage1 --gpus 8 --gpu-memory 80
+    """
+    from persist_cli.doctor.doctor import run_doctor
+    from persist_cli.doctor.machine import machine_of
 
-app.command()(plugins)
+    run_doctor(recipe, overrides or [], machine_of(gpus, gpu_memory), fsdp, json)
 
-app.command()(recipes)
+
+@app.command()
+def plugins(json: JsonOption = False) -> None:
+    """List every backbone, memory, encoder, simulator and importer; a broken one shows its cause."""
+    from persist_cli.viewing.listings import show_plugins
+
+    show_plugins(json)
+
+
+@app.command()
+def recipes(json: JsonOption = False) -> None:
+    """List the recipes that come with persist."""
+    from persist_cli.viewing.listings import show_recipes
+
+    show_recipes(json)
+
+
+@weights_app.command("list")
+def weights_list(json: JsonOption = False) -> None:
+    """List every weight with its use, licence, size and sources, and whether it is here."""
+    from persist_cli.weights.fetch import show_weights
+
+    show_weights(json)
+
+
+@weights_app.command("fetch")
+def weights_fetch(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Weights; `persist weights list` lists them.")],
+    source: Annotated[
+        Path | None, typer.Option("--from", help="Directory to look into first; else $PERSIST_WEIGHTS.")
+    ] = None,
+    offline: Annotated[bool, typer.Option("--offline", help="Never ask the network.")] = False,
+) -> None:
+    """Bring weights into the cache, verified and as safetensors: from a directory, the hub, or a pinned archive.
+
+    persist weights fetch lpips-alex i3d-kinetics-400
+    """
+    from persist_cli.weights.fetch import run_fetch
+
+    run_fetch(names, source, offline)
+
+
+@weights_app.command("path")
+def weights_path(name: Annotated[str, typer.Argument(help="A fetched weight.")]) -> None:
+    """Print the folder of a fetched weight, and nothing else.
+
+    ls $(persist weights path lpips-alex)
+    """
+    from persist_cli.weights.fetch import show_path
+
+    show_path(name)

@@ -1,4 +1,4 @@
-"""What several commands share: options, and how Ctrl-C ends them."""
+"""Options that several commands take, and the group of commands that ends Ctrl-C and a full disk in one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 from persist_cli import __version__
 from persist_cli.errors import INTERRUPTED, PersistError
 
-OF_THE_DISK: Final = {  # what a command cannot help
+DISK_ERRORS: Final = {  # of a disk that is full, closed or read-only, which is no fault of a command
     errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM,
     errno.EROFS,
 }  # fmt: skip
@@ -53,14 +53,14 @@ ActionsOption = Annotated[
 ]
 
 
-def names_in(text: str) -> tuple[str, ...]:
-    """The names of a list separated by commas."""
+def split_names(text: str) -> tuple[str, ...]:
+    """The names in a list separated by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def show_version(wanted: bool) -> None:
-    """Say the version and end, when wanted."""
-    if wanted:
+def show_version(show: bool) -> None:
+    """Print the version and end the command, when ``show`` is set."""
+    if show:
         typer.echo(f"persist {__version__}")
         raise typer.Exit
 
@@ -69,11 +69,11 @@ class Commands(TyperGroup):
     """Commands that Ctrl-C ends in one line, with exit code 130, and a disk that is full or closed with 1."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was asked for."""
+        """Run the command of the context."""
         try:
             return super().invoke(ctx)
         except OSError as error:
-            if error.errno not in OF_THE_DISK:
+            if error.errno not in DISK_ERRORS:
                 raise
             place, cause = error.filename or "a file cannot be written", error.strerror
             raise PersistError(f"{place}: {cause}; make room there, or choose another place") from error
