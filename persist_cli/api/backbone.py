@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.observations import Observations
 from persist_cli.api.stages import Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PersistError
@@ -25,8 +26,54 @@ Interactions = tuple[str | None, ...]  # one for each step between two frames of
 
 
 @dataclass(frozen=True)
+class ClipLatents:
+    """What a backbone's codec makes of clips.
+
+    Args:
+        video: latents of the whole clips.
+        image: latents of their first frames alone.
+    """
+
+    video: Float[Tensor, "*batch frame channel height width"]
+    image: Float[Tensor, "*batch 1 channel height width"]
+
+    def __getitem__(self, sample: int) -> ClipLatents:
+        return ClipLatents(self.video[sample], self.image[sample])
+
+    def to(self, device: torch.device | str) -> ClipLatents:
+        """The same latents on ``device``."""
+        return ClipLatents(self.video.to(device), self.image.to(device))
+
+    @staticmethod
+    def stack(samples: Sequence[ClipLatents]) -> ClipLatents:
+        """A batch of the latents of single clips."""
+        videos, images = [sample.video for sample in samples], [sample.image for sample in samples]
+        return ClipLatents(torch.stack(videos), torch.stack(images))
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One RGB-D clip with what conditions it.
+
+    Args:
+        observations: its frames with their cameras. To be predicted: the first frame alone, with the cameras of all.
+        interactions: what the agent did to the world between the frames.
+        seed: everything random about the clip is drawn from this.
+        tokens: what a memory says to the cameras, ``None`` without a memory.
+        latents: what ``Backbone.encode`` gave of this clip, if it was encoded before; the observations may then have no
+            images.
+    """
+
+    observations: Observations
+    interactions: Interactions
+    seed: int
+    tokens: MemoryTokens | None = None
+    latents: ClipLatents | None = None
+
+
+@dataclass(frozen=True)
 class Clips:
-    """A batch of RGB-D clips with what conditions them.
+    """A batch of RGB-D clips with what conditions them; see ``Clip``.
 
     Args:
         rgb: uint8.
@@ -35,8 +82,7 @@ class Clips:
         interactions: for each sample, what the agent did to the world between the frames.
         tokens: memory tokens of the batch, ``None`` without a memory.
         seeds: one for each sample; everything random about it is drawn from this.
-        latents: what ``Backbone.encode`` gave of these clips, if it was asked before; rgb and depth may then have no
-            frames.
+        latents: of the batch, where it was encoded before; rgb and depth may then have no frames.
     """
 
     rgb: UInt8[Tensor, "batch frame height width 3"]
@@ -45,7 +91,37 @@ class Clips:
     interactions: Sequence[Interactions]
     tokens: MemoryTokens | None
     seeds: Sequence[int]
-    latents: Tensor | None = None
+    latents: ClipLatents | None = None
+
+    @staticmethod
+    def stack(clips: Sequence[Clip]) -> Clips:
+        """A batch of clips of one size, of which all or none have tokens, and all or none latents."""
+        tokens = [clip.tokens for clip in clips if clip.tokens is not None]
+        latents = [clip.latents for clip in clips if clip.latents is not None]
+        return Clips(
+            rgb=torch.stack([clip.observations.rgb for clip in clips]),
+            depth=torch.stack([clip.observations.depth for clip in clips]),
+            cameras=Cameras.stack([clip.observations.cameras for clip in clips]),
+            interactions=[clip.interactions for clip in clips],
+            tokens=MemoryTokens.stack(tokens) if tokens else None,
+            seeds=[clip.seed for clip in clips],
+            latents=ClipLatents.stack(latents) if latents else None,
+        )
+
+    def first_frames(self) -> tuple[UInt8[Tensor, "batch 1 height width 3"], Float[Tensor, "batch 1 height width"]]:
+        """RGB and depth of the first frames."""
+        return self.rgb[:, :1], self.depth[:, :1]
+
+    def to(self, device: torch.device | str) -> Clips:
+        """The same clips on ``device``."""
+        return dataclasses.replace(
+            self,
+            rgb=self.rgb.to(device),
+            depth=self.depth.to(device),
+            cameras=self.cameras.to(device),
+            tokens=None if self.tokens is None else self.tokens.to(device),
+            latents=None if self.latents is None else self.latents.to(device),
+        )
 
 
 @dataclass(frozen=True)
@@ -168,15 +244,15 @@ class Backbone(nn.Module, ABC):
         """A fingerprint of what ``encode`` depends on besides the clips."""
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
-    def encode(self, clips: Clips) -> Tensor:
-        """What of the clips can be kept between steps, batch axis first; ``forward`` takes it as ``Clips.latents``."""
+    def encode(self, clips: Clips) -> ClipLatents:
+        """What of the clips can be kept between steps; ``forward`` takes it as ``Clips.latents``."""
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
     @property
     def framewise(self) -> bool:
-        """Whether ``encode`` gives one row a frame, each of its frame alone.
+        """Whether ``encode`` gives one latent frame a frame, each of its frame alone.
 
-        The latents of a whole trajectory then serve all clips of it.
+        The latents of a whole trajectory then serve all clips of it, and those of the first frame stand in the video's.
         """
         return False
 

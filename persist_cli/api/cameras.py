@@ -71,6 +71,15 @@ class Cameras:
         return replace(self, intrinsics=intrinsics, height=height, width=width)
 
     @staticmethod
+    def stack(paths: Sequence[Cameras]) -> Cameras:
+        """A batch of camera paths of one length and image size."""
+        return replace(
+            paths[0],
+            world_from_camera=torch.stack([path.world_from_camera for path in paths]),
+            intrinsics=torch.stack([path.intrinsics for path in paths]),
+        )
+
+    @staticmethod
     def concatenate(parts: Sequence[Cameras]) -> Cameras:
         """One camera path of several, all of one image size."""
         return replace(

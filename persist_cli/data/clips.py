@@ -11,7 +11,7 @@ import torch
 from torch.utils.data import BatchSampler, Dataset
 
 from persist_cli.api.actions import ActionVocabulary
-from persist_cli.api.backbone import Interactions
+from persist_cli.api.backbone import Clip, Interactions
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, RecipeError
@@ -60,18 +60,14 @@ class ClipSample:
     """One clip with the frames that came before it.
 
     Args:
-        observations: the clip's frames; the images may have been left unread, the cameras are always there.
-        interactions: what the agent did to the world in each step of the clip.
+        clip: its images may have been left unread, its cameras are always there.
         context: earlier frames of the same trajectory and the clip's first one; ``None`` when left unread.
         info: what holds for every frame of the trajectory.
-        seed: seed of everything random about the sample.
     """
 
-    observations: Observations
-    interactions: Interactions
+    clip: Clip
     context: Observations | None
     info: TrajectoryInfo
-    seed: int
 
 
 class ClipDataset(Dataset[ClipSample]):
@@ -126,12 +122,11 @@ class ClipDataset(Dataset[ClipSample]):
         actions = file.actions()[frames[0] : frames[-1]]  # none backwards: what was done to the world is not undone
         interactions = strided_interactions(actions, abs(frames.step), file.info.vocabulary)
         context_frames = choice.context if context else ()
+        observations = file.read(list(frames)).observations if images else cameras_only(file, frames)
         return ClipSample(
-            observations=file.read(list(frames)).observations if images else cameras_only(file, frames),
-            interactions=interactions or (None,) * (len(frames) - 1),
+            clip=Clip(observations, interactions or (None,) * (len(frames) - 1), choice.seed),
             context=file.read(context_frames).observations if context_frames else None,
             info=file.info,
-            seed=choice.seed,
         )
 
     def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import torch
 
-from persist_cli.api.backbone import Backbone, Clips
+from persist_cli.api.backbone import Backbone, ClipLatents, Clips
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.doctor.tracing import LiveBytes, imagined, kernels
@@ -47,13 +47,11 @@ class Encoding:
 
     Args:
         peak: most bytes at once.
-        shape: of the latents, ``None`` where nothing is kept of a clip.
-        dtype: of the latents.
+        latents: on the meta device, ``None`` where the stage encodes nothing before its step.
     """
 
     peak: int
-    shape: tuple[int, ...] | None = None
-    dtype: torch.dtype = torch.float32
+    latents: ClipLatents | None = None
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ class Twins:
         with self.imagined(self.shallow, recipe, kind) as (backbone, live), autocast(recipe), torch.no_grad():
             clips = imagined_clips(backbone, self.channels, kind.batch)
             latents = backbone.encode(clips)
-            return Encoding(live.peak, tuple(latents.shape), latents.dtype)
+            return Encoding(live.peak, latents.to("meta"))
 
     def activations(self, recipe: Recipe, kind: StepKind, encoding: Encoding) -> Activations:
         """What forward and backward pass take."""
@@ -104,8 +102,10 @@ class Twins:
         """Most bytes of a twin's forward and backward pass."""
         with self.imagined(twin, recipe, kind) as (backbone, live):
             clips = imagined_clips(backbone, self.channels, kind.batch)
-            if encoding.shape is not None:
-                clips = dataclasses.replace(clips, latents=torch.zeros(encoding.shape, dtype=encoding.dtype))
+            if encoding.latents is not None:
+                video = torch.zeros_like(encoding.latents.video, device="cpu")
+                image = video[:, :1] if backbone.framewise else torch.zeros_like(encoding.latents.image, device="cpu")
+                clips = dataclasses.replace(clips, latents=ClipLatents(video, image))
             with autocast(recipe):
                 loss = backbone(clips, recipe.stage)["loss"]
             forward, live.peak = live.peak, live.now

@@ -13,7 +13,7 @@ from diffusers.hooks import (
     TextKVCacheConfig,
 )
 
-from persist_backbones.extensions.caches import ClipCaches
+from persist_backbones.extensions.caches import ClipCaches, enable_cache
 from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.tokens import MemoryTokens
@@ -55,7 +55,7 @@ EVERY = pytest.mark.parametrize("name", BUSY)
 def test_a_cache_that_skips_nothing_changes_nothing(name):
     backbone = trained()
     plain = backbone.generate(CLIPS, SAMPLING)
-    backbone.transformer.enable_cache(IDLE[name]())
+    enable_cache(backbone.transformer, IDLE[name]())
     assert equal(backbone.generate(CLIPS, SAMPLING), plain)
 
 
@@ -63,21 +63,21 @@ def test_a_cache_that_skips_nothing_changes_nothing(name):
 def test_a_cache_changes_the_clip_and_keeps_nothing_for_the_next(name):
     backbone = trained()
     plain = backbone.generate(CLIPS, SAMPLING)
-    backbone.transformer.enable_cache(BUSY[name]())
+    enable_cache(backbone.transformer, BUSY[name]())
     cached = backbone.generate(CLIPS, SAMPLING)
     assert not equal(cached, plain)
     assert all(torch.isfinite(each.float()).all() for each in cached)
     assert equal(backbone.generate(CLIPS, SAMPLING), cached)
     batch = random_clips(2, random_tokens(2, 5))
     assert torch.isfinite(backbone.generate(batch, SAMPLING)[1]).all()  # of another size
-    backbone.transformer.disable_cache()
+    backbone.transformer.base.disable_cache()
     assert equal(backbone.generate(CLIPS, SAMPLING), plain)
 
 
 @EVERY
 def test_a_clip_that_is_broken_off_leaves_nothing_for_the_next(name):
     backbone, left = trained(), [None] * 7  # two predictions a step
-    backbone.transformer.enable_cache(BUSY[name]())
+    enable_cache(backbone.transformer, BUSY[name]())
     whole = backbone.generate(CLIPS, SAMPLING)
     breaking = backbone.transformer.register_forward_pre_hook(lambda *_: left.pop())
     with pytest.raises(IndexError):
@@ -89,7 +89,7 @@ def test_a_clip_that_is_broken_off_leaves_nothing_for_the_next(name):
 @EVERY
 def test_what_is_cached_without_memory_is_not_mixed_with_what_is_cached_with_it(name):
     backbone = trained()
-    backbone.transformer.enable_cache(BUSY[name]())
+    enable_cache(backbone.transformer, BUSY[name]())
     nothing = dataclasses.replace(CLIPS, tokens=MemoryTokens.stack([MemoryTokens.empty(CHANNELS)]))
     blind = backbone.generate(nothing, Sampling(STEPS))
     assert equal(backbone.generate(CLIPS, Sampling(STEPS, memory_guidance=0.0)), blind)
@@ -101,13 +101,13 @@ def test_blocks_that_are_skipped_add_their_memory_once(name, form):
     backbone = with_adapter(micro(transformer={**micro().settings.transformer, "num_layers": 4}), form=form)
     shaken(backbone)
     config = MagCacheConfig(threshold=9.0, retention_ratio=0.0, **RATIOS) if name == "MagCache" else BUSY[name]()
-    backbone.transformer.enable_cache(config)
+    enable_cache(backbone.transformer, config)
     noisy, at = torch.randn(1, 3, 8, 8, 8, generator=torch.Generator().manual_seed(0)), torch.tensor([500])
-    given = backbone.conditions(CLIPS, at, backbone.prepare_memory(CLIPS))
+    given = backbone.conditions(CLIPS, at, backbone.memory_condition(CLIPS))
     image, caches, ran = backbone.encode_first(CLIPS), ClipCaches(backbone.transformer), []
     backbone.transformer.base.transformer_blocks[2].attn1.register_forward_hook(lambda *_: ran.append(1))
-    with torch.no_grad(), caches.prediction("cond", at):
-        computed, cached = (backbone.predict(noisy, image, given) for _ in range(2))
+    with torch.no_grad(), caches.prediction("cond", given):
+        computed, cached = (backbone.predict(noisy, image, caches.around(given)) for _ in range(2))
     assert len(ran) == 1
     assert torch.allclose(cached, computed, atol=1e-4)
 
@@ -115,7 +115,7 @@ def test_blocks_that_are_skipped_add_their_memory_once(name, form):
 @EVERY
 def test_a_pipeline_caches_as_diffusers_users_enable_it(name):
     backbone = trained()
-    backbone.transformer.enable_cache(BUSY[name]())
+    enable_cache(backbone.transformer, BUSY[name]())
     rgb, _ = backbone.generate(CLIPS, SAMPLING)
     pipeline, config = WorldPipeline.of(trained()), BUSY[name]()
     pipeline.set_progress_bar_config(disable=True)
@@ -136,9 +136,9 @@ def test_a_cache_that_cannot_work_is_one_line():
     with pytest.raises(
         PersistError, match=r"^TextKVCacheConfig does not work with this transformer; known: FirstBlock"
     ):
-        backbone.transformer.enable_cache(TextKVCacheConfig())
+        enable_cache(backbone.transformer, TextKVCacheConfig())
     with pytest.raises(PersistError, match=r"give it is_guidance_distilled=True$"):
-        backbone.transformer.enable_cache(FasterCacheConfig())
+        enable_cache(backbone.transformer, FasterCacheConfig())
     backbone.transformer.base.enable_cache(TaylorSeerCacheConfig())  # whose own names for layers fit none
     with pytest.raises(PersistError, match=r"^TaylorSeerCacheConfig fits no layer; attention is"):
         backbone.generate(CLIPS, SAMPLING)

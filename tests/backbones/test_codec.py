@@ -10,7 +10,7 @@ import torch
 from diffusers import AutoencoderKLCogVideoX
 
 from persist_backbones.cogvideox.backbone import CogVideoX
-from persist_backbones.cogvideox.codec import batch_to_frames, fold_pixels, frames_to_batch, unfold_pixels
+from persist_backbones.cogvideox.codec import batch_to_frames, fold_pixels, frames_to_batch, to_uint8, unfold_pixels
 from persist_cli.api.backbone import Sampling
 from persist_cli.doctor.tracing import imagined
 from persist_cli.errors import CheckpointError
@@ -46,7 +46,9 @@ def test_a_frame_coded_alone_does_not_depend_on_the_others(still: CogVideoX) -> 
     for frame in (0, 4, 8):
         alone = still.codec.encode(clips.rgb[:, frame : frame + 1], clips.depth[:, frame : frame + 1])
         assert torch.allclose(alone[:, 0], whole[:, frame], atol=1e-5)
-    assert torch.equal(still.encode(clips), whole)
+    latents = still.encode(clips)
+    assert torch.equal(latents.video, whole)
+    assert torch.equal(latents.image, whole[:, :1])
 
 
 def test_the_fast_convolution_gives_what_diffusers_gives_for_videos_of_one_frame(still: CogVideoX) -> None:
@@ -87,7 +89,7 @@ def test_samples_that_are_too_many_at_once_for_diffusers_go_through_it_in_parts(
     whole = codec.encode(many.rgb, many.depth)
     codec.samples_at_once = lambda *_: 2  # type: ignore[method-assign]
     assert torch.allclose(codec.encode(many.rgb, many.depth), whole, atol=1e-5)
-    assert codec.decode(whole)[0].shape == many.rgb.shape
+    assert to_uint8(codec.decode_images(whole)[0]).shape == many.rgb.shape
     assert codec.encode(few.rgb, few.depth).shape == whole[:1].shape
 
 
@@ -100,8 +102,8 @@ def test_the_papers_clips_are_decoded_whatever_their_number() -> None:
     assert codec.samples_at_once(256, (512, 512)) == 1
     with imagined():
         codec.to_empty(device="cpu")
-        rgb, depth = codec.decode(torch.zeros(4, 3, 32, 64, 64))
-    assert (rgb.shape, depth.shape) == ((4, 9, 512, 512, 3), (4, 9, 512, 512))
+        colors, depth = codec.decode_images(torch.zeros(4, 3, 32, 64, 64))
+    assert (colors.shape, depth.shape) == ((4, 3, 9, 512, 512), (4, 9, 512, 512))
 
 
 def test_folding_loses_nothing() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_backbones.cogvideox.diffusion import loss_weights, predicted_target
+from persist_backbones.cogvideox.diffusion import loss_weights, prediction_target
 from persist_cli.api.backbone import Sampling
 from persist_cli.errors import CheckpointError, RecipeError
 from tests.support.micro_model import micro, random_clips, shaken
@@ -23,7 +23,7 @@ def test_an_error_counts_the_same_said_as_velocity_or_as_clean_latents(weighting
     for kind in ("v_prediction", "sample"):
         scheduler = micro(prediction=kind).scheduler
         signal = scheduler.alphas_cumprod[STEPS][:, None, None, None, None]
-        target = predicted_target(scheduler, latents, noise, STEPS)
+        target = prediction_target(scheduler, latents, noise, STEPS)
         noisy = scheduler.add_noise(latents, noise, STEPS)
         said = wrong if kind == "sample" else (signal.sqrt() * noisy - wrong) / (1 - signal).sqrt()
         weights = loss_weights(scheduler, STEPS, weighting, 5.0)

@@ -113,9 +113,10 @@ def test_the_codec_stage_measures_the_scale_of_its_latents():
 
 
 def test_the_printed_rays_are_another_model_input():
-    assert not torch.equal(
-        micro(rays="printed").camera_latents(random_clips(1)), micro().camera_latents(random_clips(1))
+    correct, printed = (
+        micro(rays=rays).conditions(random_clips(1), torch.tensor([0])).camera for rays in ("correct", "printed")
     )
+    assert not torch.equal(correct, printed)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from persist_backbones.extensions.offload import overlap, place
+from persist_backbones.extensions.offload import prepare_inference, tile_overlap
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.errors import PersistError
@@ -46,11 +46,11 @@ def test_whole_parts_that_rest_elsewhere_give_the_same_clip_again_and_after_anot
     backbone = trained()
     before = backbone.generate(CLIPS, SAMPLING)
     for _ in range(2):
-        backbone.offloaded = place(backbone, InferenceOptions(offload="model"), CPU)
+        backbone.offloaded = prepare_inference(backbone, backbone.offloaded, InferenceOptions(offload="model"), CPU)
         assert equal(backbone.generate(CLIPS, SAMPLING), before)
         assert equal(backbone.generate(CLIPS, SAMPLING), before)
     with_adapter(backbone, form="canvas")
-    backbone.offloaded = place(backbone, InferenceOptions(offload="model"), CPU)
+    backbone.offloaded = prepare_inference(backbone, backbone.offloaded, InferenceOptions(offload="model"), CPU)
     backbone.generate(CLIPS, SAMPLING)
     backbone.use_adapter("voxel")
     backbone.prepare_inference(InferenceOptions())
@@ -76,9 +76,9 @@ def test_an_offloaded_backbone_leaves_the_gpu_empty_between_clips(offload):
 @pytest.mark.parametrize("scale", [1, 4, 8])
 def test_tiles_overlap_by_whole_latent_pixels(scale):
     for tile in range(2, 120):
-        share = overlap(tile, scale)
+        share = tile_overlap(tile, scale)
         blend, step = int(tile * share), int(tile * scale * (1 - share))
         assert step == scale * (tile - blend)
         assert 0 < blend < tile
     with pytest.raises(PersistError, match=r"tiles of 1 latent pixels are too small to overlap; leave it out$"):
-        overlap(1, scale)
+        tile_overlap(1, scale)

@@ -7,6 +7,7 @@ import torch
 
 from persist_backbones.adapters.forms import FORMS
 from persist_backbones.adapters.projected import image_places
+from persist_cli.api.stages import MemorySavings
 from persist_cli.api.tokens import MemoryTokens
 from tests.support.micro_model import (
     CHANNELS,
@@ -73,10 +74,12 @@ def test_a_dropped_memory_is_no_memory(form):
 @every_variant
 def test_an_emptied_memory_is_no_memory(form):
     backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
-    memory = backbone.prepare_memory(dataclasses.replace(clips, tokens=tokens))
+    memory = backbone.memory_condition(dataclasses.replace(clips, tokens=tokens))
     some, none = predicted(backbone, clips, tokens), predicted(backbone, clips, None)
     assert torch.allclose(predicted_of(backbone, clips, memory.emptied()), none, atol=1e-5)
-    one = predicted_of(backbone, clips, memory.only(torch.tensor([True, False])))
+    one = predicted_of(
+        backbone, clips, dataclasses.replace(memory, memory=memory.memory.only(torch.tensor([True, False])))
+    )
     assert torch.allclose(one[0], some[0], atol=1e-5)
     assert torch.allclose(one[1], none[1], atol=1e-5)
     assert not torch.allclose(some, none, atol=1e-3)
@@ -89,7 +92,7 @@ def test_gradients_are_the_same_with_checkpointing(form):
     backbone(clips, "2")["loss"].backward()
     plain = {name: each.grad.clone() for name, each in parameters.items()}
     backbone.zero_grad()
-    backbone.transformer.base.enable_gradient_checkpointing()
+    backbone.apply_memory_savings("2", MemorySavings(gradient_checkpointing=True))
     backbone.train()
     backbone(clips, "2")["loss"].backward()
     assert all(torch.allclose(each.grad, plain[name], atol=1e-6) for name, each in parameters.items())
@@ -111,10 +114,10 @@ def test_training_in_bfloat16_follows_training_in_float32(form):
 @every_variant
 def test_an_adapter_kept_in_bfloat16_takes_the_same_tokens(form):
     backbone, clips, tokens = trained(form).to(torch.bfloat16), random_clips(), random_tokens(2, 40)
-    memory = backbone.adapter.prepare(tokens, clips.cameras)
+    memory = backbone.memory_condition(dataclasses.replace(clips, tokens=tokens))
     video, time = torch.zeros(2, 48, 64, dtype=torch.bfloat16), torch.zeros(2, 32, dtype=torch.bfloat16)
-    before = backbone.adapter.before_block(0, video, memory)
-    after = backbone.adapter.after_block(0, before, memory, torch.zeros(2, 48, 24), time)
+    before = memory.before(0, video)
+    after = memory.after(0, before, torch.zeros(2, 48, 24), time)
     assert after.dtype == torch.bfloat16
     assert after.isfinite().all()
     assert after.any()

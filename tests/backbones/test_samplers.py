@@ -12,10 +12,10 @@ from persist_backbones.cogvideox.config import PRESETS
 from persist_backbones.cogvideox.diffusion import (
     MULTISTEP,
     SAMPLERS,
-    denoise,
-    generators_of,
-    make_schedule,
+    SamplingSchedule,
+    make_scheduler,
     noise_like,
+    sample_generators,
 )
 from persist_cli.errors import PersistError
 
@@ -32,7 +32,7 @@ SHAPE = (3, 4, 2, 2)
 @functools.cache
 def alphas(config: str) -> Tensor:
     """Share of signal in the variance at each noise level of training."""
-    return make_schedule(json.loads(config), "ddim", 1).alphas_cumprod
+    return make_scheduler(json.loads(config), "ddim", 1).alphas_cumprod
 
 
 def levels(config: dict, timesteps: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,8 +62,23 @@ def expecting(spread: float, config: dict) -> Callable[[Tensor, Tensor], Tensor]
     return predict
 
 
+def denoise(
+    predict: Callable[[Tensor, Tensor], Tensor],
+    latents: Tensor,
+    config: dict,
+    sampler: str,
+    steps: int,
+    generators: list[torch.Generator],
+) -> Tensor:
+    """Latents after all steps of a schedule."""
+    schedule = SamplingSchedule(config, sampler, steps, generators)
+    for timestep in schedule.timesteps:
+        latents = schedule.step(predict(latents, timestep.expand(len(latents))), timestep, latents)
+    return latents
+
+
 def drawn(seeds: list[int]) -> tuple[Tensor, list[torch.Generator]]:
-    generators = generators_of(seeds)
+    generators = sample_generators(seeds)
     return noise_like(torch.zeros(len(seeds), *SHAPE), generators), generators
 
 
@@ -131,7 +146,7 @@ def test_a_sample_depends_on_its_seed_and_not_on_its_batch(sampler, steps):
 @pytest.mark.parametrize("sampler", MULTISTEP)
 @pytest.mark.parametrize("steps", [10, 50, 1000])
 def test_a_multistep_sampler_has_the_noise_levels_of_training(config, sampler, steps):
-    trained, schedule = make_schedule(config, "ddim", steps), make_schedule(config, sampler, steps)
+    trained, schedule = make_scheduler(config, "ddim", steps), make_scheduler(config, sampler, steps)
     signal = trained.alphas_cumprod
     assert torch.allclose(schedule.alphas_cumprod[:-1].double(), signal[:-1], rtol=1e-5, atol=0)
     assert schedule.alphas_cumprod[-1] == 2**-24
@@ -144,7 +159,7 @@ def test_a_multistep_sampler_has_the_noise_levels_of_training(config, sampler, s
 @pytest.mark.parametrize("sampler", MULTISTEP)
 def test_a_schedule_without_zero_terminal_snr_stays_so(sampler):
     config = SHIFTED | {"rescale_betas_zero_snr": False}
-    trained, schedule = make_schedule(config, "ddim", 10), make_schedule(config, sampler, 10)
+    trained, schedule = make_scheduler(config, "ddim", 10), make_scheduler(config, sampler, 10)
     assert torch.allclose(schedule.alphas_cumprod.double(), trained.alphas_cumprod, rtol=1e-5, atol=0)
 
 
@@ -171,7 +186,7 @@ def distance_from_flow(spread: float, config: dict, sampler: str, steps: int) ->
 
 def test_an_unknown_sampler_or_number_of_steps_is_one_line():
     with pytest.raises(PersistError, match=r"^unknown sampler 'euler'; known: ddim, dpm, unipc, dpm\+\+$"):
-        make_schedule(UNSHIFTED, "euler", 4)
+        make_scheduler(UNSHIFTED, "euler", 4)
     for steps in (0, 1001):
         with pytest.raises(PersistError, match=f"^{steps} denoising steps; it must be 1 to 1000$"):
-            make_schedule(UNSHIFTED, "unipc", steps)
+            make_scheduler(UNSHIFTED, "unipc", steps)

@@ -12,7 +12,7 @@ from diffusers import (
     CogVideoXTransformer3DModel,
 )
 
-from persist_backbones.cogvideox.diffusion import generators_of, noise_like
+from persist_backbones.cogvideox.diffusion import noise_like, sample_generators
 from persist_backbones.cogvideox.inputs import ClipShape
 from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.api.backbone import Sampling
@@ -62,7 +62,7 @@ def test_the_widened_twin_is_diffusers_own_to_the_bit(twins, name):
     torch.manual_seed(0)
     noisy, image = torch.randn(2, 2, model.shape.padded_frames, 8, 8, 12)
     image = image if "i2v" in name else torch.zeros_like(image)
-    given = dataclasses.replace(model.conditions(clips, torch.tensor([3, 700]), None), text=torch.randn(2, 10, 8))
+    given = dataclasses.replace(model.conditions(clips, torch.tensor([3, 700])), text=torch.randn(2, 10, 8))
     ours = model.predict(noisy, image, given)
     config = pipe.transformer.config
     rotary, offset = None, noisy.new_full((1,), 2.0) if config.ofs_embed_dim else None
@@ -79,7 +79,7 @@ def test_the_widened_twin_is_diffusers_own_to_the_bit(twins, name):
 def test_an_untrained_twin_generates_what_diffusers_own_pipeline_does(twins, name, size):
     model, pipe, clips = load_twin(twins[name], size), plain_pipeline(twins[name], name), random_clips(1, size=size)
     rgb, _ = model.generate(clips, Sampling(steps=4))
-    noise = noise_like(model.encode_first(clips), generators_of(clips.seeds))[:, :, :4]
+    noise = noise_like(model.encode_first(clips), sample_generators(clips.seeds))[:, :, :4]
     image = {"image": clips.rgb[:, 0].permute(0, 3, 1, 2) / 255} if "i2v" in name else {}
     frames, height, width = size
     video = pipe(
@@ -98,7 +98,7 @@ def test_our_own_pipeline_generates_what_the_backbone_does(twins, name):
     pipeline.set_progress_bar_config(disable=True)
     found = pipeline(
         clips.rgb[0, 0].numpy(), clips.depth[0, 0], clips.cameras, num_inference_steps=2, output_type="pt",
-        generator=generators_of(clips.seeds),
+        generator=sample_generators(clips.seeds),
     )  # fmt: skip
     rgb, depth = model.generate(clips, Sampling(2))
     assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)

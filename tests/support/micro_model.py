@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from persist_backbones.adapters.base import PreparedMemory
+from persist_backbones.adapters.base import MemoryCondition
 from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_cli.api.backbone import Clips
 from persist_cli.api.cameras import Cameras
@@ -88,11 +88,11 @@ def random_clips(
 
 def predicted(backbone: CogVideoX, clips: Clips, tokens: MemoryTokens | None) -> Tensor:
     """What the transformer says of the clips' latents at one noise level."""
-    return predicted_of(backbone, clips, backbone.prepare_memory(dataclasses.replace(clips, tokens=tokens)))
+    return predicted_of(backbone, clips, backbone.memory_condition(dataclasses.replace(clips, tokens=tokens)))
 
 
 @torch.no_grad()
-def predicted_of(backbone: CogVideoX, clips: Clips, memory: PreparedMemory | None) -> Tensor:
+def predicted_of(backbone: CogVideoX, clips: Clips, memory: MemoryCondition) -> Tensor:
     """The same of prepared tokens."""
     latents = backbone.codec.encode(clips.rgb, clips.depth)
     given = backbone.conditions(clips, torch.full((len(clips.seeds),), 500), memory)

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor, nn
 
-from persist_cli.api.backbone import Clips
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
@@ -132,6 +131,11 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> Prepared:
         """Embed the tokens of a batch for the clip that the cameras look at."""
 
+    def block_at(self, layer: int) -> nn.Module | None:
+        """The adapter's block that stands at transformer block ``layer``, if one does."""
+        name = str(layer)
+        return self.blocks[name] if name in self.blocks else None  # noqa: SIM401 (no dictionary)
+
     def dropped(self, memory: Prepared, generators: list[torch.Generator]) -> Prepared:
         """Hide the memory of some training samples, for guidance over memory."""
         if self.settings.dropout == 0:
@@ -139,26 +143,21 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         draws = torch.cat([torch.rand(1, generator=each) for each in generators])
         return memory.only((draws >= self.settings.dropout).to(memory.mask.device))
 
-    def before_block(
-        self, layer: int, video: Float[Tensor, "batch token channel"], memory: Prepared
+    def before(
+        self, block: nn.Module, video: Float[Tensor, "batch token channel"], memory: Prepared
     ) -> Float[Tensor, "batch token channel"]:
-        """The hidden states before transformer block ``layer``."""
-        return self.change_before(self.blocks[str(layer)], video, memory) if str(layer) in self.blocks else video
-
-    def after_block(
-        self, layer: int, video: Tensor, memory: Prepared, camera: Tensor, time: Tensor
-    ) -> Float[Tensor, "batch token channel"]:
-        """The hidden states after transformer block ``layer``."""
-        if str(layer) not in self.blocks:
-            return video
-        return self.change_after(self.blocks[str(layer)], video, memory, camera, time)
-
-    def change_before(self, block: nn.Module, video: Tensor, memory: Prepared) -> Tensor:
-        """What a block of the adapter makes of the hidden states before its transformer block; the same by default."""
+        """The hidden states that the transformer block is given, where a block of the adapter stands at it."""
         return video
 
-    def change_after(self, block: nn.Module, video: Tensor, memory: Prepared, camera: Tensor, time: Tensor) -> Tensor:
-        """What a block of the adapter makes of the hidden states after its transformer block; the same by default."""
+    def after(
+        self,
+        block: nn.Module,
+        video: Float[Tensor, "batch token channel"],
+        memory: Prepared,
+        camera: Float[Tensor, "batch token camera"],
+        time: Float[Tensor, "batch time"],
+    ) -> Float[Tensor, "batch token channel"]:
+        """The hidden states after the transformer block, where a block of the adapter stands at it."""
         return video
 
     def correct(
@@ -172,22 +171,48 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         return predicted
 
 
-def memory_of(adapter: Adapter[Prepared], name: str, clips: Clips, device: torch.device) -> Prepared:
-    """The clips' memory tokens embedded by an adapter.
+class MemoryCondition:
+    """What the transformer asks of memory around its blocks; this one is no memory at all and changes nothing."""
+
+    def before(self, layer: int, video: Tensor) -> Tensor:
+        """The hidden states that transformer block ``layer`` is given."""
+        return video
+
+    def after(self, layer: int, video: Tensor, camera: Tensor, time: Tensor) -> Tensor:
+        """The hidden states that come after transformer block ``layer``."""
+        return video
+
+    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
+        """The prediction after the memory has corrected it."""
+        return predicted
+
+
+@dataclass(frozen=True)
+class AdapterCondition(MemoryCondition, Generic[Prepared]):
+    """An adapter with the memory that it prepared for a batch.
 
     Args:
-        adapter: embeds them.
-        name: what it is called in errors.
-        clips: without tokens, their memory is empty.
-        device: of the model.
-
-    Raises:
-        CheckpointError: when the tokens are of another encoder than the adapter was trained with.
+        adapter: whose blocks stand at some of the transformer's blocks.
+        memory: of the batch.
     """
-    tokens = clips.tokens or MemoryTokens.stack([MemoryTokens.empty(adapter.channels)] * len(clips.seeds))
-    if tokens.features.shape[-1] != adapter.channels:
-        raise CheckpointError(
-            f"the memory gives features of {tokens.features.shape[-1]} channels, {name} was trained with "
-            f"{adapter.channels}; use the encoder it was trained with"
-        )
-    return adapter.prepare(tokens.to(device), clips.cameras.to(device))
+
+    adapter: Adapter[Prepared]
+    memory: Prepared
+
+    def before(self, layer: int, video: Tensor) -> Tensor:
+        """The hidden states that transformer block ``layer`` is given."""
+        block = self.adapter.block_at(layer)
+        return video if block is None else self.adapter.before(block, video, self.memory)
+
+    def after(self, layer: int, video: Tensor, camera: Tensor, time: Tensor) -> Tensor:
+        """The hidden states that come after transformer block ``layer``."""
+        block = self.adapter.block_at(layer)
+        return video if block is None else self.adapter.after(block, video, self.memory, camera, time)
+
+    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
+        """The prediction after the memory has corrected it."""
+        return self.adapter.correct(predicted, inputs, self.memory, time)
+
+    def emptied(self) -> AdapterCondition[Prepared]:
+        """The same adapter with an empty memory, for guidance."""
+        return dataclasses.replace(self, memory=self.memory.emptied())

@@ -181,7 +181,7 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         features = self.embed(tokens.features.to(self.patches.weight.dtype))
         return splat(features, splats, (batch, frames, views.height, views.width))
 
-    def change_before(self, block: nn.Module, video: Tensor, memory: PreparedCanvas) -> Tensor:
+    def before(self, block: nn.Module, video: Tensor, memory: PreparedCanvas) -> Tensor:
         """The video with the canvas added."""
         changed: Tensor = block(video, memory.tokens, memory.mask)
         return changed

@@ -49,7 +49,7 @@ class CrossAdapter(Adapter[PreparedMemory]):
         hidden = self.embed(torch.cat([tokens.features, code], dim=-1).to(self.embed.weight.dtype))
         return PreparedMemory(hidden * tokens.mask[..., None], tokens.mask)
 
-    def change_after(
+    def after(
         self, block: nn.Module, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
         """The video after the memory block."""

@@ -70,7 +70,7 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         hidden = self.embed(tokens.features.to(dtype))[:, None] + self.place(folded.to(dtype))
         return ProjectedMemory(hidden * mask[..., None], mask, self.query_places(cameras).to(dtype))
 
-    def change_after(
+    def after(
         self, block: nn.Module, video: Tensor, memory: ProjectedMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
         """The video after the memory block, which takes each latent frame by itself."""

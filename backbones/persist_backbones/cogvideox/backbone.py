@@ -1,33 +1,35 @@
-"""The backbone ``cogvideox``: CogVideoX that predicts RGB-D from cameras, interactions and memory."""
+"""The backbone ``cogvideox``: CogVideoX that predicts RGB-D from cameras, interactions and memory.
+
+Read from here: ``forward`` is the training loss, ``sample`` the sampling loop, ``predict`` one look of the transformer.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, PreparedMemory, memory_of
+from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCondition
 from persist_backbones.adapters.forms import load_adapter, make_adapter, save_adapter
 from persist_backbones.cogvideox.build import check_fit, starting_parts, video_shape, widen
-from persist_backbones.cogvideox.checkpoint import load_whole, save_change, save_whole
-from persist_backbones.cogvideox.codec import Codec
+from persist_backbones.cogvideox.checkpoint import load_world, merge_lora, save_parts, save_world
+from persist_backbones.cogvideox.codec import Codec, to_uint8
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import (
     SAMPLERS,
+    SamplingSchedule,
     check_sampling,
-    denoise,
     draw_timesteps,
-    generators_of,
     loss_weights,
-    make_denoiser,
     noise_like,
-    predicted_target,
-    squared_error,
+    prediction_target,
+    sample_generators,
 )
 from persist_backbones.cogvideox.inputs import (
     camera_latents,
@@ -37,19 +39,34 @@ from persist_backbones.cogvideox.inputs import (
     model_input,
     rotary_positions,
 )
-from persist_backbones.cogvideox.model import Conditions
+from persist_backbones.cogvideox.model import NO_MEMORY, Conditions
 from persist_backbones.cogvideox.parameter_groups import group_parameters, truncate_layers
-from persist_backbones.cogvideox.pretrained import DiffusersParts, origin_of
-from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
-from persist_backbones.extensions.lora import add_lora, train_lora
-from persist_backbones.extensions.savings import FrozenWeights, apply_memory_savings
-from persist_cli.api.backbone import Backbone, Clips, Sampling
-from persist_cli.api.inference import InferenceOptions
-from persist_cli.api.stages import Lora, MemorySavings, ParameterGroup, Stage
+from persist_backbones.cogvideox.pretrained import DiffusersParts, load_parts, origin_of
+from persist_backbones.cogvideox.prompt import ORIGINS, check_kept, starting_prompt
+from persist_cli.api.backbone import Backbone, ClipLatents, Clips, Sampling
+from persist_cli.api.stages import ParameterGroup, Stage
+from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
+from persist_cli.io.checkpoint_folder import lora_base
 
-if TYPE_CHECKING:
-    from persist_backbones.pipeline.pipeline import WorldPipeline
+
+@dataclass
+class SamplingStep:
+    """One denoising step that was made; ``on_step`` may change ``latents`` and ``guidance``, or stop.
+
+    Args:
+        number: from 0.
+        timestep: that it began at.
+        latents: that the next step begins with; of the last step the clean prediction.
+        guidance: weight of guidance over memory of the next step; 1 predicts once only.
+        stop: whether this was the last step.
+    """
+
+    number: int
+    timestep: Tensor
+    latents: Tensor
+    guidance: float
+    stop: bool = False
 
 
 class CogVideoX(Backbone):
@@ -69,8 +86,7 @@ class CogVideoX(Backbone):
         super().__init__(settings)
         self.adapters = nn.ModuleDict()
         self.adapter_name: str | None = None
-        self.offloaded: WorldPipeline | None = None
-        self.frozen = FrozenWeights(self, None)
+        self.current_timestep: Tensor | None = None  # of the prediction, while clips are sampled
         self.set_parts(starting_parts(settings))
         self.prompt = starting_prompt(settings, self.prompt)
 
@@ -84,9 +100,175 @@ class CogVideoX(Backbone):
         config = parts.transformer.config
         self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
 
+    def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
+        """The training loss: that of the codec, or that of denoising RGB and depth latents (stages 1 and 2)."""
+        generators, clips = sample_generators(clips.seeds), clips.to(self.device)
+        if stage == "codec":
+            window, kl_weight = self.settings.codec_window, self.settings.kl_weight
+            return self.codec.loss(clips.rgb, clips.depth, window, kl_weight, generators)
+
+        # encode
+        latents = clips.latents or self.encode(clips)
+        clean, image = self.shape.pad(latents.video), self.image_condition(latents.image)
+        # noise
+        timesteps = draw_timesteps(self.scheduler, generators).to(self.device)
+        noise = noise_like(clean, generators)
+        target = prediction_target(self.scheduler, clean, noise, timesteps)
+        noisy = self.scheduler.add_noise(clean, noise, timesteps)
+        # condition
+        conditions = self.conditions(clips, timesteps, self.memory_condition(clips, generators))
+        # predict
+        predicted = self.predict(noisy, image, conditions)
+        # weigh
+        weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
+        error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
+        color, depth = error.chunk(2, dim=2)
+        if not self.settings.depth:
+            return {"loss": color.mean(), "rgb": color.mean()}
+        return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+
+    @torch.no_grad()
+    def sample(
+        self,
+        first: Clips,
+        sampling: Sampling,
+        on_step: Callable[[SamplingStep], None] | None = None,
+        generators: list[torch.Generator] | None = None,
+        noise: Tensor | None = None,
+    ) -> Float[Tensor, "batch frame channel height width"]:
+        """Latents of clips, denoised from noise; with the frames that ``ClipShape.pad`` puts in front.
+
+        Args:
+            first: clips of which the first frame is known, as for ``generate``.
+            sampling: steps, sampler and guidance.
+            on_step: called after each step.
+            generators: of the noise, one a sample; by default those of the clips' seeds.
+            noise: to begin with; by default drawn from the generators.
+        """
+        self.check_sampling(sampling)
+        first = first.to(self.device)
+        generators = generators or sample_generators(first.seeds)
+        image = self.encode_first(first).expand(len(first.seeds), -1, -1, -1, -1)
+        latents = noise_like(image, generators) if noise is None else noise.to(image)
+        schedule = SamplingSchedule(self.scheduler.config, sampling.sampler, sampling.steps, generators)
+        unset = torch.zeros(len(first.seeds), dtype=torch.long)
+        conditions = self.conditions(first, unset, self.memory_condition(first))
+        guidance = sampling.memory_guidance
+        for number, timestep in enumerate(schedule.timesteps):
+            self.current_timestep = timestep
+            timesteps = timestep.expand(len(latents)).to(self.device)
+            given = dataclasses.replace(conditions, timestep=timesteps)
+            predicted = self.predict_guided(latents, image, given, guidance)
+            latents = schedule.step(predicted, timestep, latents)
+            if on_step is not None:
+                step = SamplingStep(number, timestep, latents, guidance)
+                on_step(step)
+                latents, guidance = step.latents, step.guidance
+                if step.stop:
+                    break
+        self.current_timestep = None
+        return latents
+
+    def predict_guided(self, noisy: Tensor, image: Tensor, given: Conditions, guidance: float) -> Tensor:
+        """The prediction with classifier-free guidance over memory, in the latents' precision."""
+        precision = self.prompt.dtype
+        low, image = noisy.to(precision), image.to(precision)
+        predicted = self.predict(low, image, given).to(noisy.dtype)
+        if guidance == 1.0 or not isinstance(given.memory, AdapterCondition):
+            return predicted
+        emptied = dataclasses.replace(given, memory=given.memory.emptied())
+        without = self.predict(low, image, emptied, branch="uncond").to(noisy.dtype)
+        return without + guidance * (predicted - without)
+
+    def predict(self, noisy: Tensor, image: Tensor, given: Conditions, branch: str = "cond") -> Tensor:
+        """What the transformer says of noisy latents: velocities or clean latents.
+
+        Args:
+            noisy: latents of RGB and depth.
+            image: those of the image condition.
+            given: everything else.
+            branch: which of a step's predictions this is, for what is kept from step to step.
+        """
+        latents = model_input(noisy, image, given.camera, self.settings.depth)
+        camera = camera_tokens(given.camera, self.shape.patch, self.shape.token_frames)
+        predicted: Tensor = self.transformer(latents, dataclasses.replace(given, camera=camera))
+        return predicted
+
+    def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
+        """Clips denoised from each sample's own noise; the first frame is the given one."""
+        colors, depth = self.decode(self.sample(first, sampling), first)
+        return to_uint8(colors), depth
+
+    @torch.no_grad()
+    def decode(
+        self, latents: Float[Tensor, "batch frame channel height width"], first: Clips
+    ) -> tuple[Float[Tensor, "batch 3 frame height width"], Float[Tensor, "batch frame height width"]]:
+        """Colours, [-1, 1] and beyond, and depth in metres of sampled latents, the first frame as it was given."""
+        colors, depth = self.codec.decode_images(self.shape.drop_padding(latents), self.settings.depth)
+        colors[:, :, 0] = first.rgb[:, 0].movedim(-1, 1).to(colors) / 127.5 - 1
+        depth[:, 0] = first.depth[:, 0]
+        return colors, depth
+
+    @torch.no_grad()
+    def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
+        """RGB and depth after encoding and decoding; no depth (0) from a model without."""
+        clips = clips.to(self.device)
+        colors, depth = self.codec.decode_images(self.codec.encode(clips.rgb, clips.depth), self.settings.depth)
+        return to_uint8(colors), depth
+
+    @torch.no_grad()
+    def encode(self, clips: Clips) -> ClipLatents:
+        """Latents of the clips, and of their first frames alone."""
+        clips = clips.to(self.device)
+        video = self.codec.encode(clips.rgb, clips.depth)
+        return ClipLatents(video, video[:, :1] if self.framewise else self.codec.encode(*clips.first_frames()))
+
+    def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
+        """The image condition of the clips' first frames, float32 whatever precision the model computes in."""
+        return self.image_condition(self.codec.encode(*clips.first_frames()).float())
+
+    def image_condition(self, first: Float[Tensor, "batch 1 channel height width"]) -> Tensor:
+        """Latents of the first frame alone as the model takes them, followed by zeros for all other latent frames."""
+        return self.shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
+
+    def memory_condition(self, clips: Clips, dropout: list[torch.Generator] | None = None) -> MemoryCondition:
+        """The adapter in use with the batch's tokens embedded; without an adapter no memory.
+
+        Args:
+            clips: without tokens, their memory is empty.
+            dropout: generators that draw which samples see no memory, in training.
+
+        Raises:
+            CheckpointError: when the tokens are of another encoder than the adapter was trained with.
+        """
+        adapter = self.adapter
+        if adapter is None:
+            return NO_MEMORY
+        tokens = clips.tokens or MemoryTokens.stack([MemoryTokens.empty(adapter.channels)] * len(clips.seeds))
+        if tokens.features.shape[-1] != adapter.channels:
+            raise CheckpointError(
+                f"the memory gives features of {tokens.features.shape[-1]} channels, adapter {self.adapter_name!r} was "
+                f"trained with {adapter.channels}; use the encoder it was trained with"
+            )
+        memory = adapter.prepare(tokens.to(self.device), clips.cameras)
+        return AdapterCondition(adapter, memory if dropout is None else adapter.dropped(memory, dropout))
+
+    def conditions(self, clips: Clips, timesteps: Tensor, memory: MemoryCondition = NO_MEMORY) -> Conditions:
+        """Prompt, interactions, cameras and memory of a batch."""
+        printed, steps = self.settings.rays == "printed", self.settings.frames - 1
+        rays = (self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
+        return Conditions(
+            text=self.prompt.expand(len(clips.seeds), -1, -1),
+            timestep=timesteps,
+            interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(self.device),
+            camera=camera_latents(clips.cameras, *rays),
+            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.device),
+            memory=memory,
+        )
+
     @property
     def device(self) -> torch.device:
-        """Where the conditions are, wherever weights rest that are not in use."""
+        """Where the conditions are and the model computes, wherever weights rest that are not in use."""
         return self.prompt.device
 
     @property
@@ -101,7 +283,7 @@ class CogVideoX(Backbone):
 
     @property
     def samplers(self) -> tuple[str, ...]:
-        """Those of diffusers that keep to the noise levels of training."""
+        """diffusers' samplers that keep to the noise levels of training."""
         return tuple(SAMPLERS)
 
     def check_sampling(self, sampling: Sampling) -> None:
@@ -111,14 +293,13 @@ class CogVideoX(Backbone):
 
     @property
     def gives_depth(self) -> bool:
-        """What the settings say."""
+        """Whether clips have depth after their first frame, by the settings."""
         return self.settings.depth
 
-    def prepare_inference(self, placement: InferenceOptions) -> None:
-        """Get ready to sample, as diffusers' pipelines do; weights that are offloaded rest on the CPU between clips."""
-        from persist_backbones.extensions.offload import place  # a pipeline is made around this class
-
-        self.offloaded = place(self, placement, placement.device())
+    @property
+    def framewise(self) -> bool:
+        """Whether the codec encodes every frame alone."""
+        return self.codec.framewise
 
     @property
     def adapter(self) -> Adapter[Any] | None:
@@ -127,7 +308,7 @@ class CogVideoX(Backbone):
 
     @property
     def token_budget(self) -> int:
-        """Tokens that the adapter in use asks for; none without one."""
+        """Tokens that the adapter in use wants for a clip; none without one."""
         return self.adapter.settings.token_budget if self.adapter else 0
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -139,127 +320,27 @@ class CogVideoX(Backbone):
         return truncate_layers(self.transformer.base.transformer_blocks, self.adapter, groups)
 
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
-        """The VAE's, the transformer's, or the adapter's, everything else frozen."""
+        """The VAE's, the transformer's, or the adapter's parameters by name, everything else frozen."""
         self.requires_grad_(False)
         modules: dict[Stage, nn.Module | None] = {"codec": self.codec, "1": self.transformer, "2": self.adapter}
         module = modules[stage]
         if module is None:
             raise CheckpointError("stage 2 trains a memory adapter; add one first")
         module.requires_grad_(True)
-        if stage == "1":
-            train_lora(self.transformer.base)
-        return {name: each for name, each in self.named_parameters() if each.requires_grad}
-
-    def apply_memory_savings(self, stage: Stage, savings: MemorySavings) -> None:
-        """As asked; exact values of frozen weights are kept where the stage saves them."""
-        self.frozen = apply_memory_savings(self, stage, savings)
-
-    def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
-        """The codec's loss, or that of denoising RGB and depth latents."""
-        generators = generators_of(clips.seeds)
-        if stage == "codec":
-            window, weight = self.settings.codec_window, self.settings.kl_weight
-            return self.codec.loss(clips.rgb, clips.depth, window, weight, generators)
-        kept = self.encode(clips) if clips.latents is None else clips.latents
-        latents, first = (kept, kept[:, :1]) if self.framewise else (kept[:, :-1], kept[:, -1:])
-        latents, image = self.shape.pad(latents), self.image_condition(first)
-        timesteps = draw_timesteps(self.scheduler, generators).to(latents.device)
-        noise = noise_like(latents, generators)
-        target = predicted_target(self.scheduler, latents, noise, timesteps)
-        noisy = self.scheduler.add_noise(latents, noise, timesteps)
-        memory = self.prepare_memory(clips)
-        if memory is not None and self.adapter is not None:
-            memory = self.adapter.dropped(memory, generators)
-        predicted = self.predict(noisy, image, self.conditions(clips, timesteps, memory))
-        weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
-        return squared_error(predicted, target, weights, self.settings.depth)
+        return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
 
     def encodes(self, stage: Stage) -> bool:
-        """In all stages but the codec's own."""
+        """Whether clips can be encoded before a step: in all stages but the codec's own."""
         return stage != "codec"
 
     def encoding(self) -> str:
-        """The codec's fingerprint."""
+        """A fingerprint of the codec."""
         return self.codec.fingerprint()
-
-    @property
-    def framewise(self) -> bool:
-        """The codec's."""
-        return self.codec.framewise
-
-    @torch.no_grad()
-    def encode(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
-        """Latents of the clips, behind them those of the first image alone where the first latent frame is not that."""
-        whole = self.codec.encode(clips.rgb, clips.depth)
-        if self.framewise:
-            return whole
-        return torch.cat([whole, self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1])], dim=1)
-
-    @torch.no_grad()
-    def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
-        """Clips denoised from each sample's own noise; the first frame is the given one."""
-        self.check_sampling(sampling)
-        generators = generators_of(first.seeds)
-        image = self.encode_first(first).expand(len(generators), -1, -1, -1, -1)
-        predict = make_denoiser(self, first, image, lambda: sampling.memory_guidance)
-        noise = noise_like(image, generators)
-        latents = denoise(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
-        self.transformer.reset_cache()
-        rgb, depth = self.codec.decode(self.shape.drop_padding(latents), self.settings.depth)
-        if self.offloaded is not None:
-            self.offloaded.maybe_free_model_hooks()
-        rgb[:, 0], depth[:, 0] = first.rgb[:, 0], first.depth[:, 0]
-        return rgb, depth
-
-    @torch.no_grad()
-    def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
-        """RGB and depth after encoding and decoding; no depth (0) from a model without."""
-        return self.codec.decode(self.codec.encode(clips.rgb, clips.depth), self.settings.depth)
-
-    def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
-        """The image condition of the clips' first frames, float32 whatever precision the model computes in."""
-        return self.image_condition(self.codec.encode(clips.rgb[:, :1], clips.depth[:, :1]).float())
-
-    def image_condition(self, first: Float[Tensor, "batch 1 channel height width"]) -> Tensor:
-        """Latents of the first frame alone as the model takes them, followed by zeros for all other latent frames."""
-        return self.shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
-
-    def prepare_memory(self, clips: Clips) -> PreparedMemory | None:
-        """The batch's tokens embedded by the adapter in use, ``None`` without adapter."""
-        if self.adapter is None:
-            return None
-        prepared: PreparedMemory = memory_of(self.adapter, f"adapter {self.adapter_name!r}", clips, self.device)
-        return prepared
-
-    def conditions(self, clips: Clips, timesteps: Tensor, memory: PreparedMemory | None) -> Conditions:
-        """Prompt, interactions, cameras and memory of a batch."""
-        steps = self.settings.frames - 1
-        return Conditions(
-            text=self.prompt.expand(len(clips.seeds), -1, -1),
-            timestep=timesteps,
-            interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(self.device),
-            camera=self.camera_latents(clips),
-            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.device),
-            memory=memory,
-        )
-
-    def camera_latents(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
-        """Plücker rays at the latents' size."""
-        cameras, printed = clips.cameras.to(self.device), self.settings.rays == "printed"
-        return camera_latents(cameras, self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
-
-    def predict(self, noisy: Tensor, image: Tensor, given: Conditions) -> Tensor:
-        """What the objective asks for."""
-        latents = model_input(noisy, image, given.camera, self.settings.depth)
-        seen = camera_tokens(given.camera, self.shape.patch, self.shape.token_frames)
-        given = dataclasses.replace(given, camera=seen)
-        predicted: Tensor = self.transformer(latents, given, self.adapter)
-        return predicted
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """After the codec's stage, measure the scale of its latents on these clips."""
         if stage == "codec":
-            self.codec.take_scale((each.rgb, each.depth) for each in clips)
+            self.codec.take_scale((batch.rgb.to(self.device), batch.depth.to(self.device)) for batch in clips)
 
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter and use it."""
@@ -279,23 +360,28 @@ class CogVideoX(Backbone):
 
     def save_base(self, folder: Path) -> None:
         """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
-        save_whole(self, folder)
+        save_parts(DiffusersParts(self.transformer.base, self.codec.vae, self.scheduler), folder)
+        save_world(self.transformer, self.prompt, folder)
 
     def load_base(self, folder: Path) -> None:
-        """Take diffusers' parts and ours from a folder that ``save_base`` or ``save_lora`` wrote."""
-        load_whole(self, folder)
+        """Take what ``save_base`` wrote, or what ``save_lora`` did merged into the weights that it changes."""
+        check_kept(self.settings, folder)
+        base = lora_base(folder)
+        if base is None:
+            self.set_parts(load_parts(folder))
+        elif isinstance(base, Path):
+            self.load_base(base)
+        else:
+            self.set_parts(starting_parts(dataclasses.replace(self.settings, **base)))
+        if self.prompt.is_meta:
+            return
+        if base is not None:
+            merge_lora(self.transformer.base, folder, check=not isinstance(base, Path))  # a base has a fingerprint
+        self.prompt = load_world(self.transformer, folder)
 
     def origin(self) -> dict[str, Any]:
         """The pretrained directory, wherever one stands."""
         return origin_of(self.settings.pretrained)
-
-    def add_lora(self, lora: Lora) -> None:
-        """PEFT's layers in the transformer; what of it is new trains whole."""
-        add_lora(self.transformer.base, lora)
-
-    def save_lora(self, folder: Path) -> None:
-        """Write LoRA as diffusers' pipelines load it, and ``world.safetensors`` with what is ours."""
-        save_change(self, folder)
 
     def save_adapter(self, folder: Path) -> None:
         """Write the adapter in use."""

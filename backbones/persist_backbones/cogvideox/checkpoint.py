@@ -1,67 +1,36 @@
-"""What of a CogVideoX world model stands in a checkpoint folder: all of it, or what LoRA changed."""
+"""A checkpoint folder's files: diffusers' parts, what is ours beside them, and LoRA merged into its base."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from diffusers import CogVideoXTransformer3DModel
 from diffusers.loaders.lora_base import LORA_ADAPTER_METADATA_KEY, LORA_WEIGHT_NAME_SAFE
 from torch import Tensor
 
-from persist_backbones.cogvideox.build import starting_parts
 from persist_backbones.cogvideox.model import WorldTransformer
-from persist_backbones.cogvideox.pretrained import (
-    load_parts,
-)
-from persist_backbones.cogvideox.prompt import check_kept
-from persist_backbones.extensions.lora import save_lora
+from persist_backbones.cogvideox.pretrained import DiffusersParts
 from persist_cli.errors import CheckpointError
-from persist_cli.io.checkpoint_folder import lora_base
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
 
-if TYPE_CHECKING:
-    from persist_backbones.cogvideox.backbone import CogVideoX
+PREFIX = "transformer."  # of the names in a pipeline's LoRA file
+DOWN, UP = ".lora_A.weight", ".lora_B.weight"
+SAMPLED = 256  # values of a tensor that its digest looks at
 
 
-def save_whole(backbone: CogVideoX, folder: Path) -> None:
-    """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
-    with backbone.frozen.restored():
-        backbone.transformer.base.save_pretrained(folder / "transformer")
-        backbone.codec.vae.save_pretrained(folder / "vae")
-        backbone.scheduler.save_pretrained(folder / "scheduler")
-        save_world(backbone.transformer, backbone.prompt, folder)
-
-
-def save_change(backbone: CogVideoX, folder: Path) -> None:
-    """Write LoRA as diffusers' pipelines load it, and ``world.safetensors`` with what is ours."""
-    save_lora(backbone.transformer.base, folder)
-    save_world(backbone.transformer, backbone.prompt, folder)
-
-
-def load_whole(backbone: CogVideoX, folder: Path) -> None:
-    """Take what ``save_whole`` wrote, or what ``save_change`` did merged into the weights that it changes."""
-    check_kept(backbone.settings, folder)
-    changed = lora_base(folder)
-    if changed is None:
-        backbone.set_parts(load_parts(folder))
-    elif isinstance(changed, Path):
-        load_whole(backbone, changed)
-    else:
-        backbone.set_parts(starting_parts(dataclasses.replace(backbone.settings, **changed)))
-    if backbone.prompt.is_meta:
-        return
-    if changed is not None:
-        merge_lora(backbone.transformer.base, folder, check=not isinstance(changed, Path))  # a base has a fingerprint
-    backbone.prompt = load_world(backbone.transformer, folder)
+def save_parts(parts: DiffusersParts, folder: Path) -> None:
+    """Write diffusers' parts, each loadable by diffusers alone."""
+    parts.transformer.save_pretrained(folder / "transformer")
+    parts.vae.save_pretrained(folder / "vae")
+    parts.scheduler.save_pretrained(folder / "scheduler")
 
 
 def save_world(transformer: WorldTransformer, prompt: Tensor, folder: Path) -> None:
-    """Write what is ours beside diffusers' parts: widening, interactions and the prompt's embedding."""
+    """Write ``world.safetensors``: widening, interactions and the prompt's embedding."""
     own = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
     write_tensors(folder / "world.safetensors", own | {"prompt": prompt})
 
@@ -76,13 +45,6 @@ def load_world(transformer: WorldTransformer, folder: Path) -> Tensor:
     own = {name for name in transformer.state_dict() if not name.startswith("base.")}
     load_exactly(transformer, tensors, own, path)
     return prompt.to(next(transformer.parameters()).dtype)
-
-
-PREFIX = "transformer."  # of the names in a pipeline's LoRA file
-
-DOWN, UP = ".lora_A.weight", ".lora_B.weight"
-
-SAMPLED = 256  # values of a tensor that its digest looks at
 
 
 @torch.no_grad()
@@ -103,7 +65,7 @@ def merge_lora(transformer: CogVideoXTransformer3DModel, folder: Path, check: bo
     if check and metadata.get("digest") != weights_digest(transformer):
         raise CheckpointError(f"{path}: was trained on other weights than those that it is to change")
     weights = dict(transformer.named_parameters())
-    for name in sorted(each for each in tensors if each.endswith(DOWN)):
+    for name in sorted(name for name in tensors if name.endswith(DOWN)):
         module = name.removeprefix(PREFIX).removesuffix(DOWN)
         down, up = tensors[name], tensors.get(name.removesuffix(DOWN) + UP)
         weight = weights.get(f"{module}.weight")

@@ -15,7 +15,6 @@ from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from persist_backbones.extensions.offload import computing_device
 from persist_cli.errors import CheckpointError
 
 HALF_RANGE = 2.0  # metres that map to 0
@@ -154,6 +153,13 @@ def unfold_pixels(
     return F.pixel_shuffle(videos.transpose(1, 2), patch).transpose(1, 2)
 
 
+def to_uint8(
+    colors: Float[Tensor, "batch 3 frame height width"],
+) -> UInt8[Tensor, "batch frame height width 3"]:
+    """RGB frames of colours in [-1, 1]; what is beyond is clipped."""
+    return ((colors.permute(0, 2, 3, 4, 1) + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
+
+
 class Codec(nn.Module):
     """The VAE with the conversions around it.
 
@@ -203,11 +209,6 @@ class Codec(nn.Module):
         """Whether the latents of a frame depend on that frame only."""
         return self.temporal == 1
 
-    @property
-    def device(self) -> torch.device:
-        """Where it computes, wherever its weights rest."""
-        return computing_device(self.vae)
-
     def fingerprint(self) -> str:
         """SHA-256 of the VAE's weights and configuration: what ``encode`` depends on besides the clips.
 
@@ -227,8 +228,7 @@ class Codec(nn.Module):
     def images(
         self, rgb: UInt8[Tensor, "batch frame height width 3"], depth: Float[Tensor, "batch frame height width"]
     ) -> Float[Tensor, "stacked 3 frame height width"]:
-        """RGB clips, then depth clips, on the batch axis, in [-1, 1], on the codec's device."""
-        rgb, depth = rgb.to(self.device), depth.to(self.device)
+        """RGB clips, then depth clips, on the batch axis, in [-1, 1]."""
         color = rgb.permute(0, 4, 1, 2, 3).float() / 127.5 - 1
         filled = fill_missing(depth.float().flatten(0, 1)).unflatten(0, depth.shape[:2])
         grey = encode_depth(filled)[:, None].expand(-1, 3, -1, -1, -1)
@@ -240,17 +240,10 @@ class Codec(nn.Module):
         color, grey = (mean * self.vae.config.scaling_factor).transpose(1, 2).chunk(2)
         return torch.cat([color, grey], dim=2)
 
-    def decode(
-        self, latents: Float[Tensor, "batch frame channel height width"], depth: bool = True
-    ) -> tuple[UInt8[Tensor, "batch frame height width 3"], Float[Tensor, "batch frame height width"]]:
-        """RGB and depth in metres of latents that ``encode`` gave; without ``depth`` none (0), and none is decoded."""
-        color, metres = self.decode_images(latents, depth)
-        return ((color.permute(0, 2, 3, 4, 1) + 1) * 127.5).round().clamp(0, 255).to(torch.uint8), metres
-
     def decode_images(
         self, latents: Float[Tensor, "batch frame channel height width"], depth: bool = True
     ) -> tuple[Float[Tensor, "batch 3 frame height width"], Float[Tensor, "batch frame height width"]]:
-        """Colours, [-1, 1] and beyond, and depth in metres, as ``decode``."""
+        """Colours, [-1, 1] and beyond, and depth in metres; without ``depth`` none (0), and none is decoded."""
         parts = latents.chunk(2, dim=2)[: 2 if depth else 1]
         stacked = torch.cat(parts).transpose(1, 2) / self.vae.config.scaling_factor
         color, *grey = self.images_of(stacked).float().chunk(len(parts))

@@ -7,22 +7,20 @@ embedding. Sums with exact zeros keep the widened model equal to the original to
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from diffusers import CogVideoXTransformer3DModel
-from diffusers.models.cache_utils import CacheMixin
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, PreparedMemory
-from persist_backbones.extensions.caches import check_cache, rest_is_cached, with_layers
-from persist_backbones.extensions.offload import bring
+from persist_backbones.adapters.base import MemoryCondition
 from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches, zero_init
 
 OFFSET = 2.0  # what CogVideoX 1.5 image-to-video was trained with as ``ofs``
+
+
+NO_MEMORY = MemoryCondition()
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class Conditions:
         interactions: rows of the interaction embedding, 0 for none.
         camera: camera embedding at each video token, for the queries of memory blocks.
         rotary: cosines and sines, for models with rotary positions.
-        memory: prepared tokens, with the adapter that made them.
+        memory: an adapter with the tokens that it prepared, or no memory.
     """
 
     text: Float[Tensor, "batch word channel"]
@@ -43,13 +41,11 @@ class Conditions:
     interactions: Int[Tensor, "batch step"]
     camera: Float[Tensor, "batch token camera"]
     rotary: tuple[Tensor, Tensor] | None = None
-    memory: PreparedMemory | None = None
+    memory: MemoryCondition = NO_MEMORY
 
 
-class WorldTransformer(nn.Module, CacheMixin):  # type: ignore[misc]
-    """Predicts of RGB and depth latents what the objective asks for (see ``objective``).
-
-    diffusers' caches work with it: ``enable_cache(FirstBlockCacheConfig(threshold=0.1))`` before sampling.
+class WorldTransformer(nn.Module):
+    """Predicts of RGB and depth latents what the objective asks for (see ``diffusion``).
 
     Args:
         base: diffusers' transformer.
@@ -81,53 +77,24 @@ class WorldTransformer(nn.Module, CacheMixin):  # type: ignore[misc]
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
         self.camera_channels = camera_channels
         self.in_channels, self.out_channels = in_channels, out_channels
-        self.timestep = 0  # of the present step, for caches
         zero_init(self.extra_in, self.extra_out, self.interactions)
 
-    @property
-    def is_cache_enabled(self) -> bool:
-        """Whether the base has a cache."""
-        return bool(self.base.is_cache_enabled)
-
-    def enable_cache(self, config: Any) -> None:
-        """Skip work that changes little between denoising steps, by one of diffusers' caches.
-
-        Where a cache asks for the timestep (``current_timestep_callback``) and none is given, it is that of sampling.
-
-        Raises:
-            PersistError: for a cache that does not work here.
-        """
-        check_cache(config)
-        if getattr(config, "current_timestep_callback", self) is None:
-            config.current_timestep_callback = lambda: self.timestep
-        self.base.enable_cache(with_layers(config))
-
-    def disable_cache(self) -> None:
-        """Compute everything again."""
-        self.base.disable_cache()
-
-    def reset_cache(self) -> None:
-        """Forget what was kept of the last steps."""
-        CacheMixin._reset_stateful_cache(self)
-
     def forward(
-        self,
-        latents: Float[Tensor, "batch frame channel height width"],
-        given: Conditions,
-        adapter: Adapter[Any] | None,
+        self, latents: Float[Tensor, "batch frame channel height width"], given: Conditions
     ) -> Float[Tensor, "batch frame out height width"]:
         """Predictions of RGB and depth latents, concatenated on channels."""
-        bring(self.base)
         time = self.embed_time(given, latents.dtype)
         text, video = self.embed_patches(latents, given.text.to(latents.dtype))
-        for layer in range(len(self.base.transformer_blocks)):
-            video, text = self.recomputed(self.run_layer, layer, video, text, time, given, adapter)
+        for layer, block in enumerate(self.base.transformer_blocks):
+            video = given.memory.before(layer, video)
+            video, text = block(
+                hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=given.rotary
+            )
+            video = given.memory.after(layer, video, given.camera, time)
         video = self.base.norm_out(self.base.norm_final(video), temb=time)
-        parts = (self.unpatchify(self.base.proj_out(video), latents), self.unpatchify(self.extra_out(video), latents))
-        predicted = torch.cat(parts, dim=2)
-        if adapter is None or given.memory is None:
-            return predicted
-        return adapter.correct(predicted, latents, given.memory, time)
+        outputs = (self.base.proj_out(video), self.extra_out(video))
+        predicted = torch.cat([self.unpatchify(tokens, latents) for tokens in outputs], dim=2)
+        return given.memory.correct(predicted, latents, time)
 
     def embed_time(self, given: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
         """The time embedding, for CogVideoX 1.5 image-to-video with ``ofs``, and the interactions of the clip added."""
@@ -153,27 +120,6 @@ class WorldTransformer(nn.Module, CacheMixin):  # type: ignore[misc]
             embedded: Tensor = self.extra_in(fold_patches(latents, config.patch_size, config.patch_size_t))
             return embedded
         return tokens_of(self.extra_in(latents.flatten(0, 1)).unflatten(0, latents.shape[:2]))
-
-    def recomputed(self, function: Callable[..., Any], *given: Any) -> Any:
-        """What the function gives, computed again in the backward pass when checkpointing is on."""
-        if torch.is_grad_enabled() and self.base.gradient_checkpointing:
-            return self.base._gradient_checkpointing_func(function, *given)
-        return function(*given)
-
-    def run_layer(
-        self, layer: int, video: Tensor, text: Tensor, time: Tensor, given: Conditions, adapter: Adapter[Any] | None
-    ) -> tuple[Tensor, Tensor]:
-        """One of diffusers' blocks, and what the adapter has before and after it."""
-        memory = None if adapter is None else given.memory
-        blocks = self.base.transformer_blocks
-        if adapter is not None and memory is not None and not (layer and rest_is_cached(blocks[0])):
-            video = adapter.before_block(layer, video, memory)
-        video, text = blocks[layer](
-            hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=given.rotary
-        )
-        if adapter is not None and memory is not None and (layer == len(blocks) - 1 or not rest_is_cached(blocks[0])):
-            video = adapter.after_block(layer, video, memory, given.camera, time)
-        return video, text
 
     def unpatchify(self, tokens: Tensor, like: Tensor) -> Tensor:
         """Tokens of patches back to frames of the latents' size."""

@@ -1,7 +1,7 @@
 """diffusers' caches over the denoising steps of a clip, with memory blocks between the cached blocks.
 
 diffusers hangs hooks on the blocks of its transformer (``enable_cache``). What these do not know of is ours: the
-memory's blocks between, the second output layer, and that a step may ask twice, with memory and without.
+memory's blocks between, the second output layer, and that a step may predict twice, with memory and without.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from diffusers.hooks import (
     FasterCacheConfig,
@@ -24,26 +24,30 @@ from diffusers.hooks.taylorseer_cache import _TAYLORSEER_CACHE_HOOK, TaylorSeerS
 from diffusers.models.cache_utils import CacheMixin
 from torch import Tensor, nn
 
+from persist_backbones.adapters.base import MemoryCondition
+from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_cli.errors import PersistError
-
-if TYPE_CHECKING:
-    from persist_backbones.cogvideox.model import WorldTransformer
-
 
 CACHES = (
     FirstBlockCacheConfig, TaylorSeerCacheConfig, MagCacheConfig, PyramidAttentionBroadcastConfig, FasterCacheConfig,
 )  # fmt: skip
-
 ATTENTION = r"transformer_blocks\.\d+\.attn1"
 
 
-def with_layers(config: Any) -> Any:
-    """A cache's configuration that names the layers: what TaylorSeer takes by default fits none of CogVideoX."""
-    if not isinstance(config, TaylorSeerCacheConfig) or config.use_lite_mode:
-        return config
-    if config.cache_identifiers or config.skip_predict_identifiers:
-        return config
-    return dataclasses.replace(config, cache_identifiers=[ATTENTION])
+def enable_cache(transformer: WorldTransformer, config: Any) -> None:
+    """Skip work that changes little between denoising steps, by one of diffusers' caches.
+
+    For example ``enable_cache(backbone.transformer, FirstBlockCacheConfig(threshold=0.1))``;
+    ``transformer.base.disable_cache()`` computes everything again. Where a cache wants the timestep
+    (``current_timestep_callback``) and none is given, it is that of sampling.
+
+    Raises:
+        PersistError: for a cache that does not work here.
+    """
+    check_cache(config)
+    if getattr(config, "current_timestep_callback", transformer) is None:
+        config.current_timestep_callback = lambda: getattr(transformer, "timestep", 0)
+    transformer.base.enable_cache(_with_layers(config))
 
 
 def check_cache(config: Any) -> None:
@@ -58,17 +62,13 @@ def check_cache(config: Any) -> None:
         )
 
 
-def rest_is_cached(block: nn.Module) -> bool:
-    """Whether a cache put into the output of the first block what the others and the memory between them would add."""
-    registry = getattr(block, "_diffusers_hook", None)
-    hooks = registry.hooks.values() if registry is not None else ()
-    return any(_skips(hook.state_manager.get_state()) for hook in hooks if hasattr(hook, "state_manager"))
-
-
-def _skips(state: Any) -> bool:
-    if isinstance(state, TaylorSeerState):
-        return bool(state.is_inactive and state.last_update_step != state.current_step)
-    return not getattr(state, "should_compute", True)
+def _with_layers(config: Any) -> Any:
+    """A cache's configuration that names the layers: what TaylorSeer takes by default fits none of CogVideoX."""
+    if not isinstance(config, TaylorSeerCacheConfig) or config.use_lite_mode:
+        return config
+    if config.cache_identifiers or config.skip_predict_identifiers:
+        return config
+    return dataclasses.replace(config, cache_identifiers=[ATTENTION])
 
 
 class ClipCaches:
@@ -83,7 +83,7 @@ class ClipCaches:
 
     def __init__(self, transformer: WorldTransformer) -> None:
         self.transformer = transformer
-        self.hooks = [hook for part in transformer.modules() for hook in hooks_of(part)]
+        self.hooks = [hook for module in transformer.modules() for hook in _hooks_of(module)]
         self.states: dict[tuple[Any, str], Any] = {}  # of caches that know no contexts
         config = transformer.base._cache_config
         if config is not None:
@@ -96,24 +96,34 @@ class ClipCaches:
     def _begin(self, config: Any) -> None:
         base, second = self.transformer.base, HookRegistry.check_if_exists_or_initialize(self.transformer.extra_out)
         second.remove_hook(_TAYLORSEER_CACHE_HOOK)
-        if any(_TAYLORSEER_CACHE_HOOK in registry.hooks for registry in registries_of(base.proj_out)):
+        if any(_TAYLORSEER_CACHE_HOOK in registry.hooks for registry in _registries_of(base.proj_out)):
             alike = {"use_lite_mode": False, "cache_identifiers": ["extra_out"], "skip_predict_identifiers": None}
             apply_taylorseer_cache(self.transformer, dataclasses.replace(config, **alike))
         self.transformer.__dict__.pop("_diffusers_hook", None)  # it remembers which parts had hooks
-        self.transformer.reset_cache()
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was kept of the last steps."""
+        CacheMixin._reset_stateful_cache(self.transformer)
+
+    def around(self, given: Conditions) -> Conditions:
+        """The conditions, their memory left out where a cache stands for the blocks between which it would be read."""
+        if not self.hooks:
+            return given
+        return dataclasses.replace(given, memory=SkippedMemory(given.memory, self.transformer.base.transformer_blocks))
 
     @contextlib.contextmanager
-    def prediction(self, name: str, timesteps: Tensor) -> Iterator[None]:
+    def prediction(self, name: str, given: Conditions) -> Iterator[None]:
         """Within it the transformer predicts under this name.
 
         Args:
             name: of one of the predictions that every step makes.
-            timesteps: of the step.
+            given: at the timestep of the step.
         """
         if not self.hooks:
             yield
             return
-        self.transformer.timestep = int(timesteps[0])
+        self.transformer.timestep = int(given.timestep[0])  # type: ignore[assignment]
         for hook in self.hooks:
             if hasattr(hook, "state"):
                 hook.state = self.states.setdefault((hook, name), type(hook.state)())
@@ -121,12 +131,54 @@ class ClipCaches:
             yield
 
 
-def hooks_of(module: nn.Module) -> list[Any]:
+def _hooks_of(module: nn.Module) -> list[Any]:
     """The hooks that diffusers hung on a module itself."""
-    return [hook for registry in registries_of(module) for hook in registry.hooks.values()]
+    return [hook for registry in _registries_of(module) for hook in registry.hooks.values()]
 
 
-def registries_of(module: nn.Module) -> list[Any]:
+def _registries_of(module: nn.Module) -> list[Any]:
     """The registry of a module's hooks, if it has one."""
     registry = getattr(module, "_diffusers_hook", None)
     return [] if registry is None else [registry]
+
+
+@dataclasses.dataclass(frozen=True)
+class SkippedMemory(MemoryCondition):
+    """A memory that is not read between blocks whose output a cache gives.
+
+    Args:
+        memory: that is read where blocks are computed.
+        blocks: of diffusers' transformer.
+    """
+
+    memory: MemoryCondition
+    blocks: nn.ModuleList
+
+    def before(self, layer: int, video: Tensor) -> Tensor:
+        """The hidden states that transformer block ``layer`` is given."""
+        if layer and _rest_is_cached(self.blocks[0]):
+            return video
+        return self.memory.before(layer, video)
+
+    def after(self, layer: int, video: Tensor, camera: Tensor, time: Tensor) -> Tensor:
+        """The hidden states that come after transformer block ``layer``."""
+        if layer < len(self.blocks) - 1 and _rest_is_cached(self.blocks[0]):
+            return video
+        return self.memory.after(layer, video, camera, time)
+
+    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
+        """The prediction after the memory has corrected it."""
+        return self.memory.correct(predicted, inputs, time)
+
+
+def _rest_is_cached(block: nn.Module) -> bool:
+    """Whether a cache put into the output of the first block what the others and the memory between them would add."""
+    registry = getattr(block, "_diffusers_hook", None)
+    hooks = registry.hooks.values() if registry is not None else ()
+    return any(_skips(hook.state_manager.get_state()) for hook in hooks if hasattr(hook, "state_manager"))
+
+
+def _skips(state: Any) -> bool:
+    if isinstance(state, TaylorSeerState):
+        return bool(state.is_inactive and state.last_update_step != state.current_step)
+    return not getattr(state, "should_compute", True)

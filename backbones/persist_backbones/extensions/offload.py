@@ -2,45 +2,129 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
-from diffusers import AutoencoderKLCogVideoX
+from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel, DiffusionPipeline
+from diffusers.models.modeling_utils import ModelMixin
 from torch import nn
 
+from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_backbones.cogvideox.codec import pixel_patch
-from persist_backbones.pipeline.pipeline import WorldPipeline
+from persist_backbones.cogvideox.model import WorldTransformer
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.errors import CheckpointError
 
-if TYPE_CHECKING:
-    from persist_backbones.cogvideox.backbone import CogVideoX
-
-
-def computing_device(module: nn.Module) -> torch.device:
-    """Where a module computes: the device of the first offload hook in it that names one, else of its weights."""
-    for part in module.modules():
-        device = getattr(_hook(part), "execution_device", None)
-        if device is not None:
-            return torch.device(device)
-    return next(module.parameters()).device
-
-
-def bring(module: nn.Module) -> None:
-    """Move a module that is offloaded as a whole to where it computes.
-
-    accelerate does so when ``forward`` runs; this is for modules whose parts are run one by one.
-    """
-    hook = _hook(module)
-    if hook is not None:
-        hook.pre_forward(module)
-
-
-def _hook(module: nn.Module) -> Any:
-    return getattr(module, "_hf_hook", None)
-
-
 OVERLAP = 1 / 6  # of a tile, diffusers' own
+
+
+class OffloadingPipeline(DiffusionPipeline):  # type: ignore[misc]
+    """diffusers' CPU offload for a world model: what stands between the transformer's blocks goes with them."""
+
+    model_cpu_offload_seq = "transformer->vae"
+
+    def enable_sequential_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
+        """As diffusers' own: every layer of every component is on the accelerator while it runs."""
+        self._exclude_from_cpu_offload: list[str] = []
+        super().enable_sequential_cpu_offload(gpu_id, device)
+
+    def enable_model_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
+        """As diffusers' own; what runs between the transformer's blocks stays on the accelerator."""
+        self._exclude_from_cpu_offload = ["world", "adapter"]
+        super().enable_model_cpu_offload(gpu_id, device)
+
+
+class OffloadedModule(ModelMixin):  # type: ignore[misc]
+    """Modules of ours, shared, with what diffusers' offload wants to know of a model.
+
+    Args:
+        modules: by name.
+    """
+
+    def __init__(self, modules: Mapping[str, nn.Module]) -> None:
+        super().__init__()
+        for name, module in modules.items():
+            self.add_module(name, module)
+
+
+class OffloadedParts(OffloadingPipeline):
+    """The parts of a backbone that is offloaded; it samples by itself.
+
+    Args:
+        transformer: diffusers' own.
+        vae: diffusers' own.
+        world: what makes the transformer a world model, with the prompt's embedding.
+        adapter: of memory, if one is in use.
+    """
+
+    _optional_components: ClassVar = ["adapter"]
+
+    def __init__(
+        self,
+        transformer: CogVideoXTransformer3DModel,
+        vae: AutoencoderKLCogVideoX,
+        world: OffloadedModule,
+        adapter: OffloadedModule | None,
+    ) -> None:
+        super().__init__()
+        self.register_modules(transformer=transformer, vae=vae, world=world, adapter=adapter)
+
+
+def bring_when_run(transformer: WorldTransformer) -> None:
+    """Let diffusers' transformer come to the accelerator whenever ours runs, whose blocks are run one by one.
+
+    accelerate brings an offloaded module only when its own ``forward`` runs.
+    """
+
+    def bring(module: nn.Module, _: Any) -> None:
+        hook = getattr(module.base, "_hf_hook", None)
+        if hook is not None:
+            hook.pre_forward(module.base)
+
+    transformer.register_forward_pre_hook(bring)
+
+
+def prepare_inference(
+    backbone: CogVideoX, offloaded: OffloadedParts | None, options: InferenceOptions, device: torch.device
+) -> OffloadedParts | None:
+    """Get a backbone ready to sample.
+
+    Args:
+        backbone: with the adapter to use, if any.
+        offloaded: what this gave for the backbone before, if it did.
+        options: precision, offload, slices and tiles.
+        device: where it computes.
+
+    Returns:
+        The parts that rest on the CPU between clips, if any do.
+    """
+    if offloaded is not None:
+        offloaded.remove_all_hooks()  # weights that were on no device come back to the CPU
+    vae, patch = backbone.codec.vae, pixel_patch(backbone.codec.vae)
+    vae.disable_slicing()
+    vae.disable_tiling()
+    if options.slicing:
+        vae.enable_slicing()
+    if options.tiling:
+        enable_tiling(vae, *(side // patch for side in backbone.image_size))
+    if options.dtype is not None:
+        backbone.to(getattr(torch, options.dtype))
+    backbone.eval()
+    if options.offload == "none":
+        backbone.to(device)
+        return None
+    widening = {name: module for name, module in backbone.transformer.named_children() if name != "base"}
+    world = OffloadedModule(widening)
+    world.register_buffer("prompt", backbone.prompt)
+    adapter = None if backbone.adapter is None else OffloadedModule({"adapter": backbone.adapter})
+    parts = OffloadedParts(backbone.transformer.base, vae, world, adapter)
+    if options.offload == "model":
+        parts.enable_model_cpu_offload(device=device)
+    else:
+        parts.enable_sequential_cpu_offload(device=device)
+    backbone.prompt = world.get_buffer("prompt")
+    return parts
 
 
 def enable_tiling(vae: AutoencoderKLCogVideoX, height: int, width: int) -> None:
@@ -58,11 +142,11 @@ def enable_tiling(vae: AutoencoderKLCogVideoX, height: int, width: int) -> None:
     """
     scale = 2 ** (len(vae.config.block_out_channels) - 1)
     tiles = [-(-side // (2 * scale)) for side in (height, width)]
-    shares = [overlap(tile, scale) for tile in tiles]
+    shares = [tile_overlap(tile, scale) for tile in tiles]
     vae.enable_tiling(tiles[0] * scale, tiles[1] * scale, *shares)
 
 
-def overlap(tile: int, scale: int) -> float:
+def tile_overlap(tile: int, scale: int) -> float:
     """The share of a tile of latent pixels that diffusers' arithmetic makes whole pixels, nearest to its own.
 
     Args:
@@ -74,38 +158,3 @@ def overlap(tile: int, scale: int) -> float:
         if int(tile * share) == pixels and int(tile * scale * (1 - share)) == scale * (tile - pixels):
             return share
     raise CheckpointError(f"vae-tiling: tiles of {tile} latent pixels are too small to overlap; leave it out")
-
-
-def place(backbone: CogVideoX, placement: InferenceOptions, device: torch.device) -> WorldPipeline | None:
-    """Place a backbone for sampling; what keeps its weights on the CPU, and lets go of them after each clip, if any.
-
-    The offloading is that of diffusers' pipelines, with accelerate's hooks.
-
-    Args:
-        backbone: with the adapter to use, if any; may be placed already.
-        placement: what is asked for.
-        device: where it computes.
-    """
-    if backbone.offloaded is not None:
-        backbone.offloaded.remove_all_hooks()  # weights that were on no device come back to the CPU
-    pipeline = WorldPipeline.of(backbone)
-    vae, patch = backbone.codec.vae, pixel_patch(backbone.codec.vae)
-    vae.disable_slicing()
-    vae.disable_tiling()
-    if placement.slicing:
-        vae.enable_slicing()
-    if placement.tiling:
-        enable_tiling(vae, *(side // patch for side in backbone.image_size))
-    if placement.dtype is not None:
-        backbone.to(getattr(torch, placement.dtype))
-    backbone.eval()
-    if placement.offload == "none":
-        backbone.to(device)
-        return None
-    pipeline.world.prompt = backbone.prompt
-    if placement.offload == "model":
-        pipeline.enable_model_cpu_offload(device=device)
-    else:
-        pipeline.enable_sequential_cpu_offload(device=device)
-    backbone.prompt = pipeline.world.prompt
-    return pipeline

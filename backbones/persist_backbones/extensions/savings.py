@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
+from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_backbones.extensions.lora import has_lora
 from persist_cli.api.stages import MemorySavings, Stage
-
-if TYPE_CHECKING:
-    from persist_backbones.cogvideox.backbone import CogVideoX
 
 
 class FrozenWeights:
@@ -48,13 +47,26 @@ class FrozenWeights:
 
 
 def apply_memory_savings(backbone: CogVideoX, stage: Stage, savings: MemorySavings) -> FrozenWeights:
-    """Make steps cheaper as asked; exact values of frozen weights are kept where the stage saves them."""
+    """Make training steps cheaper; exact values of frozen weights are kept where the stage saves them."""
     transformer, adapter = backbone.transformer.base, backbone.adapter
-    if savings.gradient_checkpointing:
-        transformer.enable_gradient_checkpointing()
-    if savings.compile:  # block by block, as diffusers' compile_repeated_blocks; the names of weights stay
-        for block in (*transformer.transformer_blocks, *(adapter.blocks.values() if adapter else ())):
+    blocks = [*transformer.transformer_blocks, *(adapter.blocks.values() if adapter else ())]
+    for block in blocks:
+        if savings.gradient_checkpointing:
+            recompute_in_backward(block)
+        if savings.compile:  # block by block, as diffusers' compile_repeated_blocks; the names of weights stay
             block.compile()
     if savings.vae_slicing:
         backbone.codec.vae.enable_slicing()
     return FrozenWeights(backbone, savings.frozen, saved=stage != "2" and not has_lora(transformer))
+
+
+def recompute_in_backward(block: nn.Module) -> None:
+    """Let a block keep only what it is given; what is inside is computed again in the backward pass."""
+    forward = block.forward
+
+    def recomputed(*inputs: Any, **named: Any) -> Any:
+        if not torch.is_grad_enabled():
+            return forward(*inputs, **named)
+        return checkpoint(forward, *inputs, use_reentrant=False, **named)
+
+    block.forward = recomputed

@@ -16,6 +16,7 @@ from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_backbones.cogvideox.build import widen
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.pretrained import DiffusersParts
+from persist_backbones.extensions.backbone import ExtendedCogVideoX
 from persist_cli.io.settings import parse_settings
 
 BASE = "base"  # diffusers' transformer inside ours, a component of its own
@@ -83,14 +84,14 @@ class MemoryAdapter(ModelMixin, ConfigMixin):  # type: ignore[misc]
         return made.train(adapter.training)  # type: ignore[no-any-return]
 
 
-def assemble(parts: DiffusersParts, world: WorldModules, memory: MemoryAdapter | None) -> CogVideoX:
+def assemble(parts: DiffusersParts, world: WorldModules, memory: MemoryAdapter | None) -> ExtendedCogVideoX:
     """The backbone made of these components, which it shares.
 
     Raises:
         CheckpointError: when they do not fit together.
     """
     with torch.device("meta"):
-        backbone = CogVideoX(world.backbone_settings())
+        backbone = ExtendedCogVideoX(world.backbone_settings())
     backbone.name = "cogvideox"
     backbone.set_parts(parts)
     for name, module in world.named_children():

@@ -7,8 +7,8 @@ from typing import get_args
 
 import torch
 
-from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.extensions.backbone import ExtendedCogVideoX
 from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.api.inference import Precision
 from persist_cli.errors import CheckpointError, hint
@@ -27,7 +27,7 @@ def load_pipeline(folder: Path, adapter: str | None, dtype: Precision | None) ->
     if card["backbone"] != NAME:
         raise CheckpointError(f"{found.base / CARD}: a checkpoint of backbone {card['backbone']!r}, not of {NAME!r}")
     with torch.device("meta"):  # weights come from the files
-        backbone = CogVideoX(parse_settings(CogVideoXSettings, card["settings"], str(found.base / CARD)))
+        backbone = ExtendedCogVideoX(parse_settings(CogVideoXSettings, card["settings"], str(found.base / CARD)))
     backbone.name = NAME
     backbone.load_base(found.base)
     chosen = adapter or default_adapter(found.folder, found.adapters, found.card.get("default_adapter"))

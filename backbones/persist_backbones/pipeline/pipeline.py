@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
-from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel, DiffusionPipeline
+from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
 from diffusers.utils import BaseOutput
 from diffusers.video_processor import VideoProcessor
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.cogvideox.backbone import CogVideoX
-from persist_backbones.cogvideox.diffusion import SAMPLERS, Denoiser, Step, denoising, make_denoiser, noise_like
+from persist_backbones.cogvideox.backbone import SamplingStep
+from persist_backbones.cogvideox.diffusion import SAMPLERS
 from persist_backbones.cogvideox.pretrained import DiffusersParts
+from persist_backbones.extensions.backbone import ExtendedCogVideoX
+from persist_backbones.extensions.offload import OffloadingPipeline
 from persist_backbones.pipeline.call_inputs import batch_of_images, make_clips
 from persist_backbones.pipeline.components import MemoryAdapter, WorldModules, assemble
 from persist_cli.api.backbone import Clips, Interactions, Sampling
@@ -43,7 +46,7 @@ class WorldPipelineOutput(BaseOutput):  # type: ignore[misc]
     depth: Float[Tensor, "batch frame height width"] | None
 
 
-class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
+class WorldPipeline(OffloadingPipeline):
     """From an image, its depth and a path of cameras to the RGB-D clip that is seen along it.
 
     What a pipeline of diffusers can do, this one can: ``to``, CPU offload, ``vae.enable_slicing()`` and
@@ -58,7 +61,6 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
         adapter: a memory adapter; ``None`` is plain stage 1.
     """
 
-    model_cpu_offload_seq = "transformer->vae"
     _optional_components: ClassVar = ["adapter"]
     _callback_tensor_inputs: ClassVar = ["latents"]
 
@@ -72,14 +74,13 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
     ) -> None:
         super().__init__()
         self.register_modules(transformer=transformer, vae=vae, scheduler=scheduler, world=world, adapter=adapter)
-        self._assembled: tuple[CogVideoX, tuple[Any, ...]] | None = None
+        self._assembled: tuple[ExtendedCogVideoX, tuple[Any, ...]] | None = None
         self._guidance_scale = 1.0
-        self._current_timestep: Tensor | None = None
         self._num_timesteps = 0
         self._interrupt = False
 
     @classmethod
-    def of(cls, backbone: CogVideoX) -> Self:
+    def of(cls, backbone: ExtendedCogVideoX) -> Self:
         """The pipeline of a backbone with the adapter in use, which shares its weights."""
         adapter = None if backbone.adapter is None else MemoryAdapter.of(backbone.adapter)
         parts = (backbone.transformer.base, backbone.codec.vae, backbone.scheduler)
@@ -88,7 +89,7 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
         return pipeline
 
     @property
-    def backbone(self) -> CogVideoX:
+    def backbone(self) -> ExtendedCogVideoX:
         """The backbone of the present components, for all that a ``Backbone`` can do."""
         parts = self._parts()
         if self._assembled is None or any(a is not b for a, b in zip(self._assembled[1], parts, strict=True)):
@@ -115,22 +116,12 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
     @property
     def current_timestep(self) -> Tensor | None:
         """The noise level of the present step, ``None`` between calls."""
-        return self._current_timestep
+        return self.backbone.current_timestep
 
     @property
     def interrupt(self) -> bool:
         """Whether the present call shall make no further step."""
         return self._interrupt
-
-    def enable_sequential_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
-        """As diffusers' own: every layer of every component is on the accelerator while it runs."""
-        self._exclude_from_cpu_offload: list[str] = []
-        super().enable_sequential_cpu_offload(gpu_id, device)
-
-    def enable_model_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
-        """As diffusers' own; what runs between the transformer's blocks stays on the accelerator."""
-        self._exclude_from_cpu_offload = ["world", "adapter"]
-        super().enable_model_cpu_offload(gpu_id, device)
 
     def save_pretrained(self, save_directory: str | Path, safe_serialization: bool = True, **options: Any) -> None:
         """As diffusers' own, safetensors only."""
@@ -189,15 +180,22 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
         self._check(sampling, output_type, callback_on_step_end_tensor_inputs)
         images = self._images(image)
         first = make_clips(images, depth, cameras, interactions, memory_tokens, backbone.frames_per_clip)
-        condition = backbone.encode_first(first)
         generators = generators_for(generator, len(images))
-        noise = noise_like(condition, generators) if latents is None else latents.to(condition)
-        predict = self._noting(make_denoiser(backbone, first, condition, lambda: self._guidance_scale))
-        steps = denoising(predict, noise, self.scheduler.config, sampling.sampler, sampling.steps, generators)
-        found = self._run(steps, sampling, callback_on_step_end, callback_on_step_end_tensor_inputs)
-        output = self._output(found, first, output_type)
+        self._guidance_scale, self._num_timesteps, self._interrupt = guidance_scale, num_inference_steps, False
+        with self.progress_bar(total=num_inference_steps) as bar:
+            on_step = partial(self._end_step, bar, callback_on_step_end, callback_on_step_end_tensor_inputs)
+            sampled = backbone.sample(first, sampling, on_step, generators, latents)
+        output = self._output(sampled, first, output_type)
         self.maybe_free_model_hooks()
         return output if return_dict else output.to_tuple()
+
+    def _end_step(self, bar: Any, callback: Callback | None, names: Sequence[str], step: SamplingStep) -> None:
+        """Let the callback see and change a step; stop when the call is interrupted."""
+        if callback is not None:
+            tensors = {name: step.latents for name in names}
+            step.latents = callback(self, step.number, step.timestep, tensors).pop("latents", step.latents)
+        step.guidance, step.stop = self._guidance_scale, self._interrupt
+        bar.update()
 
     def _images(self, given: Any) -> Tensor:
         """The images as one batch, of the model's size."""
@@ -225,40 +223,11 @@ class WorldPipeline(DiffusionPipeline):  # type: ignore[misc]
             known = ", ".join(self._callback_tensor_inputs)
             raise PersistError(f"callback_on_step_end_tensor_inputs has {', '.join(sorted(unknown))}; known: {known}")
 
-    def _noting(self, predict: Denoiser) -> Denoiser:
-        """The same denoiser, which notes the timestep first: caches ask for it."""
-
-        def noting(latents: Tensor, timesteps: Tensor) -> Tensor:
-            self._current_timestep = timesteps[0]
-            return predict(latents, timesteps)
-
-        return noting
-
-    def _run(
-        self, steps: Iterator[Step], sampling: Sampling, callback: Callback | None, tensors: Sequence[str]
-    ) -> Tensor:
-        """Latents after all steps, or after the one that was interrupted."""
-        self._guidance_scale, self._num_timesteps, self._interrupt = sampling.memory_guidance, sampling.steps, False
-        with self.progress_bar(total=self._num_timesteps) as bar:
-            for step in steps:
-                if callback is not None:
-                    given = {name: step.latents for name in tensors}
-                    step.latents = callback(self, step.number, step.timestep, given).pop("latents", step.latents)
-                bar.update()
-                if self._interrupt:
-                    break
-        self._current_timestep = None
-        return step.latents
-
     def _output(self, latents: Tensor, first: Clips, output_type: str) -> WorldPipelineOutput:
         if output_type == "latent":
             return WorldPipelineOutput(latents, None)
-        backbone = self.backbone
-        latents = backbone.shape.drop_padding(latents)
-        color, metres = backbone.codec.decode_images(latents, backbone.gives_depth)
-        color[:, :, 0] = first.rgb[:, 0].movedim(-1, 1).to(color) / 127.5 - 1
-        metres[:, 0] = first.depth[:, 0]
-        return WorldPipelineOutput(VideoProcessor().postprocess_video(color, output_type), metres)
+        colors, metres = self.backbone.decode(latents, first)
+        return WorldPipelineOutput(VideoProcessor().postprocess_video(colors, output_type), metres)
 
 
 def generators_for(given: torch.Generator | list[torch.Generator] | None, batch: int) -> list[torch.Generator]:

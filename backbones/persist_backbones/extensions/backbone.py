@@ -1,0 +1,101 @@
+"""The plugin ``cogvideox``: the model with everything optional around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from persist_backbones.cogvideox.backbone import CogVideoX, SamplingStep
+from persist_backbones.cogvideox.checkpoint import save_world
+from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.cogvideox.model import Conditions
+from persist_backbones.cogvideox.pretrained import DiffusersParts
+from persist_backbones.extensions.caches import ClipCaches
+from persist_backbones.extensions.lora import add_lora, save_lora, train_lora
+from persist_backbones.extensions.offload import OffloadedParts, bring_when_run, prepare_inference
+from persist_backbones.extensions.savings import FrozenWeights, apply_memory_savings
+from persist_cli.api.backbone import Clips, Sampling
+from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.stages import Lora, MemorySavings, Stage
+
+
+class ExtendedCogVideoX(CogVideoX):
+    """CogVideoX with LoRA, memory savings in training, and CPU offload and caches in sampling.
+
+    Args:
+        settings: preset or pretrained directory, and sizes.
+    """
+
+    def __init__(self, settings: CogVideoXSettings) -> None:
+        super().__init__(settings)
+        self.frozen = FrozenWeights(self, None)
+        self.offloaded: OffloadedParts | None = None
+        self.caches: ClipCaches | None = None  # while a clip is sampled
+
+    def set_parts(self, parts: DiffusersParts) -> None:
+        """Build the model around diffusers' parts, which may be offloaded."""
+        super().set_parts(parts)
+        bring_when_run(self.transformer)
+
+    def sample(
+        self,
+        first: Clips,
+        sampling: Sampling,
+        on_step: Callable[[SamplingStep], None] | None = None,
+        generators: list[torch.Generator] | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Latents of clips, denoised from noise with the caches that are enabled; see ``CogVideoX.sample``."""
+        self.check_sampling(sampling)
+        self.caches = ClipCaches(self.transformer)
+        try:
+            return super().sample(first, sampling, on_step, generators, noise)
+        finally:
+            self.caches.forget()
+            self.caches = None
+
+    def predict(self, noisy: Tensor, image: Tensor, given: Conditions, branch: str = "cond") -> Tensor:
+        """What the transformer says of noisy latents; a cache may stand for some of its blocks."""
+        if self.caches is None:
+            return super().predict(noisy, image, given, branch)
+        with self.caches.prediction(branch, given):
+            return super().predict(noisy, image, self.caches.around(given), branch)
+
+    def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
+        """Clips denoised from each sample's own noise; offloaded weights rest on the CPU again afterwards."""
+        clips = super().generate(first, sampling)
+        if self.offloaded is not None:
+            self.offloaded.maybe_free_model_hooks()
+        return clips
+
+    def prepare_inference(self, options: InferenceOptions) -> None:
+        """Get ready to sample; weights that are offloaded rest on the CPU between clips."""
+        self.offloaded = prepare_inference(self, self.offloaded, options, options.device())
+
+    def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
+        """The stage's parameters by name, in stage 1 with LoRA those of LoRA and of what is new."""
+        parameters = super().trained_parameters(stage)
+        if stage == "1":
+            train_lora(self.transformer.base)
+        return {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
+
+    def apply_memory_savings(self, stage: Stage, savings: MemorySavings) -> None:
+        """Make steps cheaper; exact values of frozen weights are kept where the stage saves them."""
+        self.frozen = apply_memory_savings(self, stage, savings)
+
+    def add_lora(self, lora: Lora) -> None:
+        """Put PEFT's layers into the transformer; what of it is new trains whole."""
+        add_lora(self.transformer.base, lora)
+
+    def save_base(self, folder: Path) -> None:
+        """Write diffusers' parts and ours, frozen weights in their exact values."""
+        with self.frozen.restored():
+            super().save_base(folder)
+
+    def save_lora(self, folder: Path) -> None:
+        """Write LoRA as diffusers' pipelines load it, and ``world.safetensors`` with what is ours."""
+        save_lora(self.transformer.base, folder)
+        save_world(self.transformer, self.prompt, folder)
