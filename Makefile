@@ -6,10 +6,10 @@ STAMP := $(VENV)/.installed
 .PHONY: demo demo-train table1 table1-reference test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.reproduce.reference_demo runs/demo
+	$(VENV)/bin/python -m persist_cli.reproduce.demo runs/demo
 
 demo-train: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.reproduce.training_demo runs/demo-train
+	$(VENV)/bin/python -m persist_cli.reproduce.demo --train runs/demo-train
 
 table1: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.table1 runs/table1

@@ -1,8 +1,8 @@
 """``make table1``: the reference model from nothing to its tables, by the commands that a user would type.
 
-``python -m persist_cli.table1 [OUT]`` runs them in order, each in a process of its own; with ``--reference`` it trains
-nothing and measures the model that comes with the package. Every command goes on where it was stopped, and what is done
-is neither trained nor predicted again, so this may be stopped and started at any time.
+``python -m persist_cli.reproduce.table1 [OUT]`` runs them in order, each in a process of its own; with ``--reference``
+it trains nothing and measures the model that comes with the package. Every command continues where it was stopped and
+repeats nothing that is done, so this may be stopped and started at any time.
 """
 
 from __future__ import annotations
@@ -19,35 +19,30 @@ from persist_cli.errors import INTERRUPTED
 from persist_cli.viewing.console import say
 
 MEMORIES = ("none", "voxel", "map2d", "snapshots")
-
-FORMS = ("cross", "projected")
-
+FORMS = ("cross", "projected")  # of the memory adapter, compared for voxel
 SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # chosen in a trial on eight held-out clips
-
 METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
-
 COLLECT = "collect miniworld --size 64x64"
-
-WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of all metrics that can be fetched
+WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of every metric that can be fetched
 
 
 def commands(out: Path) -> list[str]:
-    """All command lines in order; weights first, so that nothing is missing after days of training."""
+    """All command lines in order; weights come first, so that nothing is missing after days of training."""
     return [fetch_command(), *collect_commands(out), *train_commands(out), *evaluate_commands(out)]
 
 
 def reference_commands(out: Path) -> list[str]:
-    """Those that measure the model of the package: all tables but that of the forms, which it has one of."""
+    """The command lines that measure the packaged model: all tables but that of the forms, of which it has one."""
     return [fetch_command(), *collect_test_commands(out), *evaluate_commands(out, trained=False)]
 
 
 def fetch_command() -> str:
-    """Bring the weights of every metric."""
+    """The command line that brings the weights of every metric."""
     return f"weights fetch {' '.join(WEIGHTS)}"
 
 
 def collect_commands(out: Path) -> list[str]:
-    """2,400 training houses of 100 frames, and the held-out ones."""
+    """The command lines that collect 2,400 training houses of 100 frames, and the held-out ones."""
     home = shlex.quote(str(out))
     return [
         f"{COLLECT} --out {home}/houses/path --scenes 0:1600 --frames 100 --policy path",
@@ -57,7 +52,7 @@ def collect_commands(out: Path) -> list[str]:
 
 
 def collect_test_commands(out: Path) -> list[str]:
-    """100 held-out houses of 129 frames, on paths of three kinds."""
+    """The command lines that collect 100 held-out houses of 129 frames, on paths of three kinds."""
     home = shlex.quote(str(out))
     return [
         f"{COLLECT} --out {home}/test/path --scenes 0:50 --frames 129 --policy path --split test",
@@ -67,45 +62,45 @@ def collect_test_commands(out: Path) -> list[str]:
 
 
 def train_commands(out: Path) -> list[str]:
-    """Codec, stage 1, an adapter for each memory, the other forms for voxel, and the row without depth."""
+    """The command lines that train codec, stage 1 and adapters: for each memory, of other forms, and without depth."""
     home = shlex.quote(str(out))
-    run = f"--data {home}/houses/path --data {home}/houses/explore --resume"
-    kept = f"{run} --cache {home}/cache"
-    stage2 = f"{kept} base={home}/stage1"
+    data = f"--data {home}/houses/path --data {home}/houses/explore --resume"
+    cached = f"{data} --cache {home}/cache"
+    stage2 = f"{cached} base={home}/stage1"
     return [
-        f"finetune houses-64-codec {run} --out {home}/codec",
-        f"finetune houses-64-stage1 {kept} --out {home}/stage1 base={home}/codec",
+        f"finetune houses-64-codec {data} --out {home}/codec",
+        f"finetune houses-64-stage1 {cached} --out {home}/stage1 base={home}/codec",
         *(f"finetune houses-64-stage2-{memory} {stage2} --out {home}/{memory}" for memory in MEMORIES),
         *(f"finetune houses-64-stage2-voxel-{form} {stage2} --out {home}/voxel-{form}" for form in FORMS),
-        f"finetune houses-64-stage1-rgb {kept} --out {home}/stage1-rgb base={home}/stage1",
-        f"finetune houses-64-stage2-voxel-rgb {kept} --out {home}/voxel-rgb base={home}/stage1-rgb",
+        f"finetune houses-64-stage1-rgb {cached} --out {home}/stage1-rgb base={home}/stage1",
+        f"finetune houses-64-stage2-voxel-rgb {cached} --out {home}/voxel-rgb base={home}/stage1-rgb",
     ]
 
 
 def evaluate_commands(out: Path, trained: bool = True) -> list[str]:
-    """The tables: memories and controls on revisits, there and back, and long rollouts; forms.
+    """The command lines of the tables: memories and controls on revisits, returns and long rollouts; forms.
 
     Args:
-        out: the folder of everything.
-        trained: whether the runs there are measured, or the model that comes with the package.
+        out: folder of everything.
+        trained: measure the runs in ``out`` rather than the model that comes with the package.
     """
     home = shlex.quote(str(out))
 
-    def evaluation(name: str, memories: Sequence[str], given: str) -> str:
+    def table(name: str, checkpoints: Sequence[str], options: str) -> str:
+        outputs = f"--out {home}/eval-{name} --report {home}/report-{name}"
+        return " ".join(["eval", *checkpoints, options, SAMPLING, outputs])
+
+    def memory_table(name: str, memories: Sequence[str], options: str) -> str:
         runs = [f"{home}/{memory}" for memory in memories] if trained else []
-        return table(name, runs, f"--memories {','.join(memories)} {given}")
+        return table(name, runs, f"--memories {','.join(memories)} {options}")
 
-    def table(name: str, checkpoints: Sequence[str], given: str) -> str:
-        written = f"--out {home}/eval-{name} --report {home}/report-{name}"
-        return " ".join(["eval", *checkpoints, given, SAMPLING, written])
-
-    pair, back = MEMORIES[:2], f"--data {home}/there-and-back"
+    pair, returns = MEMORIES[:2], f"--data {home}/there-and-back"
     revisit = f"--data {home}/test/path --data {home}/test/explore --protocol revisit --frames 17 --clips 200"
     lines = [
-        evaluation("revisit", MEMORIES, f"{revisit} --controls copy,nearest,warp,codec"),
-        evaluation("disturbed", pair, f"{revisit} --controls shuffled,emptied,oracle,noisy --metrics {METRICS}"),
-        evaluation("return", MEMORIES, f"{back} --protocol return --clips 32 --controls warp"),
-        evaluation("long", pair, f"{back} --protocol long --clips 16 --metrics {METRICS}"),
+        memory_table("revisit", MEMORIES, f"{revisit} --controls copy,nearest,warp,codec"),
+        memory_table("disturbed", pair, f"{revisit} --controls shuffled,emptied,oracle,noisy --metrics {METRICS}"),
+        memory_table("return", MEMORIES, f"{returns} --protocol return --clips 32 --controls warp"),
+        memory_table("long", pair, f"{returns} --protocol long --clips 16 --metrics {METRICS}"),
     ]
     if trained:
         forms = [f"{home}/voxel{form}" for form in ("", *(f"-{form}" for form in FORMS), "-rgb")]
@@ -114,23 +109,23 @@ def evaluate_commands(out: Path, trained: bool = True) -> list[str]:
 
 
 def run_command(command: Sequence[str]) -> int:
-    """The exit code of a command; one that is interrupted with us is given the time to end."""
+    """Run a command and return its exit code; after Ctrl-C the command is given the time to end."""
     interrupts: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))  # a child begins without it
+    previous = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))  # a child does not inherit it
     try:
         code = subprocess.run(command, check=False).returncode
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
     return INTERRUPTED if interrupts else code
 
 
 def main() -> None:
-    """Run every command until one fails; its exit code is ours."""
+    """Run every command until one fails, and end with its exit code."""
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.table1")
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/table1"), help="folder of everything")
     parser.add_argument("--reference", action="store_true", help="measure the model of the package, train none")
-    asked = parser.parse_args()
-    for line in reference_commands(asked.out) if asked.reference else commands(asked.out):
+    options = parser.parse_args()
+    for line in reference_commands(options.out) if options.reference else commands(options.out):
         say(f"\n$ persist {line}")
         code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
         if code == INTERRUPTED:

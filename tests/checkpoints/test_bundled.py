@@ -142,13 +142,11 @@ def test_without_the_variable_both_are_sought_in_the_package(monkeypatch):
 
 def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monkeypatch, capsys):
     from persist_cli.reproduce import demo
-    from persist_cli.reproduce import reference_demo as shown
 
     monkeypatch.setattr(demo, "HALF", 11)
-    monkeypatch.setattr(shown, "HALF", 11)
-    monkeypatch.setattr(shown, "CLIPS", 1)
+    monkeypatch.setattr(demo, "CLIPS", 1)
     monkeypatch.setenv("PERSIST_CACHE", str(here / "cache"))
-    demo.run_demo(shown.DEMO, here / "demo")
+    demo.run_demo(demo.REFERENCE_DEMO, here / "demo")
     names = {path.name for path in (here / "demo").iterdir()}
     assert {"rollout.mp4", "rollout.gif", "sheet.png", "map.png", "metrics.json", "report"} <= names
     assert (here / "demo/report/report.html").is_file()

@@ -1,4 +1,4 @@
-"""The demos' frame: their commands are run as a user would type them, and nothing of the user's is touched."""
+"""The demos run commands as a user would type them, and touch no files of the user's."""
 
 from __future__ import annotations
 
@@ -12,40 +12,33 @@ from persist_cli.cli.app import app
 from persist_cli.data.store import Store
 from persist_cli.io.files import write_json
 from persist_cli.reproduce import demo
-from persist_cli.reproduce import reference_demo as reference
-from persist_cli.reproduce import training_demo as training
 from tests.support.faulty_data import inverted, rewrite
 
 
-def started(line: str) -> demo.Demo:
-    """A demo of a single command."""
-    return demo.Demo("title", "", lambda out: "", lambda out: [line], lambda out: "")
-
-
-def test_a_command_that_finds_fault_ends_the_demo(walks, tmp_path, capsys):
+def test_a_command_that_fails_ends_the_demo(walks, tmp_path, capsys):
     for file in Store(walks):
         rewrite(file.path, tmp_path / file.path.name, inverted)
     with pytest.raises(SystemExit) as ended:
-        demo.run_lines([f"inspect {shlex.quote(str(tmp_path))}", "recipes"])
+        demo.run_commands([f"inspect {shlex.quote(str(tmp_path))}", "recipes"])
     assert ended.value.code == 1
     assert "persist recipes" not in capsys.readouterr().out
 
 
-def test_an_interrupt_ends_the_demo_in_one_line(monkeypatch, capsys):
-    def stop() -> None:
+def test_an_interrupt_ends_the_demo_in_one_line(monkeypatch, tmp_path, capsys):
+    def stop(command: str, data: str) -> None:
         raise KeyboardInterrupt
 
     stopped = typer.Typer()
     stopped.command()(stop)
     monkeypatch.setattr(demo, "app", stopped)
-    monkeypatch.setattr("sys.argv", ["demo"])
+    monkeypatch.setattr("sys.argv", ["demo", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
-        demo.main(started(""))
+        demo.main()
     assert ended.value.code == 130
     assert capsys.readouterr().out.splitlines()[-1] == "stopped"
 
 
-def test_only_an_evaluation_of_ours_is_deleted(tmp_path):
+def test_only_an_evaluation_of_persist_is_deleted(tmp_path):
     (tmp_path / "eval").mkdir()
     (tmp_path / "eval/notes.txt").write_text("mine")
     demo.remove_evaluation(tmp_path / "eval")
@@ -56,15 +49,15 @@ def test_only_an_evaluation_of_ours_is_deleted(tmp_path):
 
 
 def test_make_demo_shows_the_reference_model_and_make_demo_train_trains_one():
-    targets = (Path(__file__).parents[1] / "Makefile").read_text().split("\n\n")
-    for target, module in (("demo", reference), ("demo-train", training)):
-        (recipe,) = (each for each in targets if each.startswith(f"{target}:"))
-        assert f"-m {module.__name__} " in recipe
+    targets = (Path(__file__).parents[2] / "Makefile").read_text().split("\n\n")
+    for target, arguments in (("demo", "runs/"), ("demo-train", "--train runs/")):
+        (rule,) = (text for text in targets if text.startswith(f"{target}:"))
+        assert f"-m {demo.__name__} {arguments}" in rule
 
 
-@pytest.mark.parametrize("shown", [reference.DEMO, training.DEMO])
-def test_every_command_is_one_that_persist_takes_whatever_the_folder_is_called(shown):
-    for line in shown.commands(Path("my demo")):
+@pytest.mark.parametrize("commands", [demo.reference_commands, demo.training_commands])
+def test_every_command_is_one_that_persist_takes_whatever_the_folder_is_called(commands):
+    for line in commands(Path("my demo")):
         name, *arguments = shlex.split(line)
         typer.main.get_command(app).commands[name].make_context(name, arguments)
         folders = [word for word in arguments if "demo" in word]

@@ -1,4 +1,4 @@
-"""The reference model's commands: each is one that persist takes, with recipes that it has."""
+"""The reference model is made and measured by commands and recipes that persist has."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_command_is_one_that_persist_takes(line: str) -> None:
     command.make_context(name, arguments)
 
 
-def test_weights_come_first_and_are_those_of_every_metric_but_one(tmp_path: Path, monkeypatch) -> None:
+def test_the_weights_of_every_metric_but_one_are_fetched_first(tmp_path: Path, monkeypatch) -> None:
     command, job, *names = shlex.split(LINES[0])
     assert (command, job) == ("weights", "fetch")
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
@@ -66,7 +66,7 @@ def test_a_folder_with_a_blank_in_its_name_is_one_folder() -> None:
     assert not [word for line in LINES for word in shlex.split(line) if word == "runs"]
 
 
-def test_an_interrupt_lets_the_command_end_and_is_no_traceback() -> None:
+def test_an_interrupt_lets_the_command_end_without_a_traceback() -> None:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     process = subprocess.Popen([sys.executable, "-c", WAITING], text=True, start_new_session=True, **pipes)
     assert process.stdout is not None
@@ -76,17 +76,17 @@ def test_an_interrupt_lets_the_command_end_and_is_no_traceback() -> None:
     assert process.returncode == INTERRUPTED
 
 
-def test_every_recipe_of_the_reference_model_is_trained_and_nothing_before_its_base() -> None:
+def test_every_recipe_of_the_reference_model_is_trained_after_its_base() -> None:
     lines = [shlex.split(line) for line in train_commands(OUT)]
     assert {words[1] for words in lines} == {name for name in recipe_names() if name.startswith("houses-64-")}
-    made: set[str] = set()
+    trained: set[str] = set()
     for words in lines:
         bases = {word.removeprefix("base=") for word in words if word.startswith("base=")}
-        assert bases <= made
-        made.add(words[words.index("--out") + 1])
+        assert bases <= trained
+        trained.add(words[words.index("--out") + 1])
 
 
-def test_models_are_trained_on_collected_training_houses_and_evaluated_on_held_out_ones() -> None:
+def test_models_are_trained_on_the_training_houses_and_evaluated_on_the_held_out_ones() -> None:
     def folders(line: str, option: str) -> set[str]:
         words = shlex.split(line)
         return {words[number + 1] for number, word in enumerate(words) if word == option}
@@ -97,7 +97,7 @@ def test_models_are_trained_on_collected_training_houses_and_evaluated_on_held_o
     assert {folder for line in evaluate_commands(OUT) for folder in folders(line, "--data")} == test
 
 
-def test_the_model_of_the_package_is_measured_as_a_trained_one_but_for_its_forms() -> None:
+def test_the_packaged_model_is_measured_as_a_trained_one_but_for_the_table_of_forms() -> None:
     trained = {word for line in evaluate_commands(OUT) for word in shlex.split(line) if word.startswith("--")}
     lines = [line for line in reference_commands(OUT) if line.startswith("eval")]
     assert {word for line in lines for word in shlex.split(line) if word.startswith("--")} == trained
