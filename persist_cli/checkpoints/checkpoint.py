@@ -1,8 +1,8 @@
-"""Checkpoints: one base and small memory adapters that load onto it by name.
+"""Checkpoints: one base, and small memory adapters that load onto it by name.
 
-A checkpoint folder holds ``persist.json``, the backbone's own files and ``adapters/NAME/``; that of a stage-2 run
-holds adapters only and says where its base is, that of a LoRA run what it changes and where that is. A run folder
-stands for its newest checkpoint.
+A checkpoint's folder holds the card ``persist.json``, the backbone's own files and ``adapters/NAME/``. That of a
+stage-2 run holds adapters only, and its card says where the base is. That of a LoRA run holds the change of low rank,
+and its card says what it changes. A run's folder stands for its newest checkpoint.
 """
 
 from __future__ import annotations
@@ -18,11 +18,7 @@ from persist_cli.checkpoints.sampling_defaults import read_sampling
 from persist_cli.data.scenes import TrainingScenes
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.bundled import bundled_folder
-from persist_cli.io.checkpoint_folder import CARD as CARD  # the tool has these from here
-from persist_cli.io.checkpoint_folder import PLAIN as PLAIN
-from persist_cli.io.checkpoint_folder import STEP as STEP
-from persist_cli.io.checkpoint_folder import VERSION, adapter_folder, default_adapter, open_checkpoint
-from persist_cli.io.checkpoint_folder import step_folders as step_folders
+from persist_cli.io.checkpoint_folder import CARD, STEP, VERSION, adapter_folder, default_adapter, open_checkpoint
 from persist_cli.io.files import file_sha256, read_json, write_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
@@ -33,19 +29,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint that was found, its weights not loaded yet.
+    """A checkpoint on disk; its weights are not loaded yet.
 
     Args:
-        folder: of ``persist.json``.
-        name: what tables call it, the run's or folder's name.
-        base_folder: where the backbone's own files are.
-        backbone: name of the plugin.
-        settings: for the plugin.
-        fingerprint: of the base's weights.
+        folder: the folder of ``persist.json``.
+        name: the name of the run or folder, which tables show.
+        base_folder: the folder of the backbone's own files.
+        backbone: the name of the backbone plugin.
+        settings: the plain settings of the backbone.
+        fingerprint: a hash of the base's weights.
         adapters: folders of the memory adapters by name.
-        default: which of several adapters is meant when none is named.
-        sampling: what is meant when nothing is asked for; ``None`` when the card says nothing.
-        training_scenes: of base and adapters; ``None`` for a card of a version that did not write them down.
+        default: the name of the adapter to use when a command names none.
+        sampling: how to sample when a command does not say; ``None`` when the card does not say either.
+        training_scenes: the scenes that base and adapters were trained on; ``None`` for cards of earlier versions.
     """
 
     folder: Path
@@ -60,16 +56,24 @@ class Checkpoint:
     training_scenes: TrainingScenes | None = None
 
     def memory_config(self, adapter: str) -> MemoryConfig:
-        """What the adapter's memory is made of."""
+        """The choice of the memory that the adapter reads."""
         path = self.adapter_folder(adapter) / "memory.json"
         return parse_settings(MemoryConfig, read_json(path), str(path))
 
     def adapter_folder(self, adapter: str) -> Path:
-        """The adapter's folder; a one-line error that names the others when there is none."""
+        """The adapter's folder.
+
+        Raises:
+            CheckpointError: when there is no such adapter, naming those that there are.
+        """
         return adapter_folder(self.folder, self.adapters, adapter)
 
     def default_adapter(self) -> str | None:
-        """The card's default or the only adapter, or none when there is none; an error when one must be chosen."""
+        """The card's default or only adapter, ``None`` when there is no adapter.
+
+        Raises:
+            CheckpointError: when there are several adapters and no default.
+        """
         return default_adapter(self.folder, self.adapters, self.default)
 
 
@@ -92,6 +96,18 @@ def find_checkpoint(path: Path) -> Checkpoint:
         sampling=read_sampling(dict(found.card), found.folder / CARD),
         training_scenes=_training_scenes(dict(found.card), found.folder / CARD),
     )
+
+
+def reference_checkpoint() -> Path:
+    """The folder of the reference model that comes with the package, a checkpoint with an adapter for each memory.
+
+    Raises:
+        CheckpointError: when this installation does not have it.
+    """
+    folder = bundled_folder("reference")
+    if not (folder / CARD).is_file():
+        raise CheckpointError(f"no reference model in {folder}: it comes with the package; give a CHECKPOINT")
+    return folder
 
 
 def load_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
@@ -140,7 +156,7 @@ def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None
 
 
 def save_base(backbone: Backbone, folder: Path, scenes: TrainingScenes | None = None) -> None:
-    """Write the backbone's own files and its card into an existing folder."""
+    """Write the backbone's own files and a card into an existing folder."""
     backbone.save_base(folder)
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(folder)}
     write_card(folder, card, scenes)
@@ -149,34 +165,34 @@ def save_base(backbone: Backbone, folder: Path, scenes: TrainingScenes | None = 
 def save_lora(
     backbone: Backbone, base: Checkpoint | None, folder: Path, home: Path, scenes: TrainingScenes | None = None
 ) -> None:
-    """Write what LoRA trained and a card that points to what it changes.
+    """Write what LoRA trained and a card that points to the base that it changes.
 
     Args:
-        backbone: with LoRA.
-        base: what it was trained on; ``None`` for the pretrained weights that the backbone's settings bring.
-        folder: to write into.
-        home: where the folder will stand in the end.
-        scenes: that base and LoRA were trained on, where they are known.
+        backbone: a backbone with LoRA.
+        base: the checkpoint that LoRA was trained on; ``None`` for the pretrained weights in the backbone's settings.
+        folder: the existing folder to write into.
+        home: the place where that folder will be in the end; the path to the base is relative to it.
+        scenes: the scenes that base and LoRA were trained on, where they are known.
     """
     backbone.save_lora(folder)
     changes: dict[str, Any] = {"settings": backbone.origin()}
     if base is not None:
-        changes = {"base": _way(base, home), "fingerprint": base.fingerprint}
+        changes = {"base": _path_to_base(base, home), "fingerprint": base.fingerprint}
     own = hashlib.sha256(f"{fingerprint(folder)} {changes.get('fingerprint')}".encode()).hexdigest()
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings()}
     write_card(folder, card | {"changes": changes, "fingerprint": own}, scenes)
 
 
 def write_card(folder: Path, card: dict[str, Any], scenes: TrainingScenes | None) -> None:
-    """Write ``persist.json``, which makes a folder a checkpoint."""
-    known = {} if scenes is None else {"training_scenes": scenes.to_json()}
-    write_json(folder / CARD, {"format": "persist-checkpoint", "version": VERSION} | card | known)
+    """Write ``persist.json``, the card that makes a folder a checkpoint."""
+    lineage = {} if scenes is None else {"training_scenes": scenes.to_json()}
+    write_json(folder / CARD, {"format": "persist-checkpoint", "version": VERSION} | card | lineage)
 
 
 def save_adapter(
     backbone: Backbone,
     base: Checkpoint,
-    choice: MemoryConfig,
+    memory: MemoryConfig,
     folder: Path,
     home: Path,
     scenes: TrainingScenes | None = None,
@@ -184,28 +200,28 @@ def save_adapter(
     """Write the adapter in use and a card that points to its base.
 
     Args:
-        backbone: with the adapter in use.
-        base: what the adapter was trained on.
-        choice: its memory.
-        folder: to write into.
-        home: where the folder will stand in the end; the way to the base is relative to it.
-        scenes: that base and adapter were trained on, where they are known.
+        backbone: a backbone that uses the adapter.
+        base: the checkpoint that the adapter was trained on.
+        memory: the choice of the memory that the adapter reads.
+        folder: the existing folder to write into.
+        home: the place where that folder will be in the end; the path to the base is relative to it.
+        scenes: the scenes that base and adapter were trained on, where they are known.
     """
-    adapter = folder / "adapters" / choice.name
+    adapter = folder / "adapters" / memory.name
     adapter.mkdir(parents=True)
     backbone.save_adapter(adapter)
-    write_json(adapter / "memory.json", dataclasses.asdict(choice))
-    write_card(folder, {"base": _way(base, home), "fingerprint": base.fingerprint}, scenes)
+    write_json(adapter / "memory.json", dataclasses.asdict(memory))
+    write_card(folder, {"base": _path_to_base(base, home), "fingerprint": base.fingerprint}, scenes)
 
 
 def base_files(folder: Path, pattern: str) -> list[Path]:
-    """Files under a checkpoint folder in order of their names, those of adapters left out."""
-    found = (path for path in folder.rglob(pattern) if path.is_file())
-    return sorted(path for path in found if path.relative_to(folder).parts[0] != "adapters")
+    """The files under a checkpoint's folder that match a pattern, without those of adapters, sorted by path."""
+    files = (path for path in folder.rglob(pattern) if path.is_file())
+    return sorted(path for path in files if path.relative_to(folder).parts[0] != "adapters")
 
 
 def fingerprint(folder: Path) -> str:
-    """SHA-256 over every weight file of a checkpoint's base, in order of their names."""
+    """SHA-256 over all weight files of a checkpoint's base, in order of their paths."""
     digest = hashlib.sha256()
     for path in base_files(folder, "*.safetensors"):
         digest.update(str(path.relative_to(folder)).encode())
@@ -213,8 +229,7 @@ def fingerprint(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def _way(base: Checkpoint, home: Path) -> str:
-    """The way from a checkpoint folder to what it stands on."""
+def _path_to_base(base: Checkpoint, home: Path) -> str:
     return os.path.relpath(_home(base.base_folder).resolve(), home.resolve())
 
 
@@ -230,15 +245,3 @@ def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:
         return TrainingScenes.from_json(card["training_scenes"])
     except ValueError as error:
         raise CheckpointError(f"{path}: its training scenes cannot be read ({error})") from error
-
-
-def reference_checkpoint() -> Path:
-    """The folder of the reference model, a checkpoint with an adapter for each memory.
-
-    Raises:
-        CheckpointError: when this installation has none.
-    """
-    folder = bundled_folder("reference")
-    if not (folder / CARD).is_file():
-        raise CheckpointError(f"no reference model in {folder}: it comes with the package; give a CHECKPOINT")
-    return folder

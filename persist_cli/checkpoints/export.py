@@ -8,15 +8,13 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 import yaml
 
 from persist_cli import __version__
 from persist_cli.checkpoints.checkpoint import (
-    CARD,
-    PLAIN,
     Checkpoint,
     base_files,
     empty_backbone,
@@ -28,7 +26,7 @@ from persist_cli.checkpoints.checkpoint import (
 from persist_cli.checkpoints.lineage import RECIPE, RECIPES, save_stage_recipes, stage_recipes, training_scenes
 from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
 from persist_cli.errors import CheckpointError, PersistError, hint
-from persist_cli.io.checkpoint_folder import lora_base
+from persist_cli.io.checkpoint_folder import CARD, PLAIN, lora_base
 from persist_cli.io.files import (
     check_folder,
     empty_folder_aside,
@@ -43,13 +41,17 @@ from persist_cli.io.files import (
 from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.viewing.console import print_json, print_table, say, watched
 
-PRECISIONS = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
+PRECISIONS: Final = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
 
-SUMS = "SHA256SUMS"
+SUMS: Final = "SHA256SUMS"
 
-PLACE = "_name_or_path"  # where diffusers once loaded a part from
+ADAPTERS: Final = "adapters"  # the folder of the adapters, and in the folder of recipes that of theirs
 
-OF_RUNS = {CARD, RECIPE, SUMS}  # at the top of a checkpoint folder; an export makes its own
+MADE_ANEW: Final = {CARD, RECIPE, SUMS}  # files at the top of a checkpoint's folder that an export does not copy
+
+LOADED_FROM: Final = "_name_or_path"  # the key under which diffusers notes where it once loaded a part from
+
+NAMED_RUN: Final = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9_-]*)=(?P<run>.+)")
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,29 @@ class ExportPlan:
     sampling: SamplingOverrides
 
 
+@dataclass(frozen=True)
+class AdapterSource:
+    """An adapter to export.
+
+    Args:
+        checkpoint: the checkpoint that has the adapter.
+        adapter: the name of the adapter there.
+    """
+
+    checkpoint: Checkpoint
+    adapter: str
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the adapter's files."""
+        return self.checkpoint.adapter_folder(self.adapter)
+
+
 def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
-    """Write the checkpoint folder, whole or not at all, and say what is in it.
+    """Write the checkpoint folder, whole or not at all, and print a table of its files.
 
     Raises:
-        PersistError: one line for whatever does not fit, and when ``out`` exists.
+        PersistError: when ``out`` exists or when checkpoint, runs and options do not fit together.
     """
     if plan.dtype not in PRECISIONS:
         raise PersistError(f"unknown dtype {plan.dtype!r}; {hint(plan.dtype, PRECISIONS)}")
@@ -75,53 +95,106 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         raise PersistError(f"{out}: exists already; choose another --out")
     check_folder(out)
     base = find_checkpoint(plan.checkpoint)
-    parts = adapter_parts(base, plan.runs)
-    default = default_of(base, parts, plan.default)
-    sampling = chosen_sampling(base, plan)
+    adapters = _find_adapters(base, plan.runs)
+    defaults = {
+        "dtype": plan.dtype,
+        "default_adapter": _default_adapter(base, adapters, plan.default),
+        "sampling": _default_sampling(base, plan.sampling),
+    }
     scenes = training_scenes(base)
-    for part in parts.values():
-        scenes |= training_scenes(part.checkpoint)
-    said = {"dtype": plan.dtype, "default_adapter": default, "sampling": sampling}
+    for adapter in adapters.values():
+        scenes |= training_scenes(adapter.checkpoint)
     with folder_aside(out) as folder:
-        card = write_checkpoint(folder, base, parts, PRECISIONS[plan.dtype])
-        write_card(folder, card | said | {"exported_by": __version__}, scenes)
-        files = write_sums(folder)
-    show(out, {"fingerprint": card["fingerprint"]} | said, files, json)
+        card = _write_checkpoint(folder, base, adapters, PRECISIONS[plan.dtype])
+        write_card(folder, card | defaults | {"exported_by": __version__}, scenes)
+        files = _write_sums(folder)
+    _print_files(out, {"fingerprint": card["fingerprint"]} | defaults, files, json)
 
 
-def default_of(base: Checkpoint, parts: dict[str, AdapterExport], asked: str | None) -> str | None:
-    """The adapter that is meant when none is named: the one asked for, the checkpoint's, or the only one."""
-    if asked is None:
-        return base.default if base.default in parts else next(iter(parts)) if len(parts) == 1 else None
-    if asked not in parts:
-        raise CheckpointError(f"no adapter {asked!r} to be the default; {hint(asked, parts, 'there are')}")
-    return asked
+def _find_adapters(base: Checkpoint, runs: Sequence[str]) -> dict[str, AdapterSource]:
+    """The adapters of the base and of the runs, by the names that they get in the export.
+
+    Args:
+        base: the checkpoint whose backbone is exported.
+        runs: texts ``RUN``, whose adapters keep their names, or ``NAME=RUN``.
+
+    Raises:
+        CheckpointError: when an adapter is of another base, or two get one name.
+    """
+    adapters = {name: AdapterSource(base, name) for name in base.adapters}
+    for text in runs:
+        for name, adapter in _adapters_of_run(text).items():
+            folder = adapter.checkpoint.folder
+            if adapter.checkpoint.fingerprint != base.fingerprint:
+                raise CheckpointError(f"{folder}: its adapter is of another base than {base.folder}")
+            if name in adapters:
+                raise CheckpointError(
+                    f"{folder}: adapter {name!r} is there already, from {adapters[name].checkpoint.folder}"
+                    f"; name this one, as in {name}-other={text.removeprefix(f'{name}=')}"
+                )
+            adapters[name] = adapter
+    return adapters
 
 
-def chosen_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, Any] | None:
-    """How the card says to sample: as asked for, else as the checkpoint's; ``None`` when neither says anything.
+def _adapters_of_run(text: str) -> dict[str, AdapterSource]:
+    match = None if Path(text).exists() else NAMED_RUN.fullmatch(text)
+    run = find_checkpoint(Path(match["run"] if match else text))
+    if not run.adapters:
+        raise CheckpointError(f"{run.folder}: has no memory adapter; name stage-2 runs after the CHECKPOINT")
+    if match is None:
+        return {name: AdapterSource(run, name) for name in run.adapters}
+    if len(run.adapters) > 1:
+        raise CheckpointError(f"{run.folder}: NAME=RUN names one adapter, there are {', '.join(run.adapters)}")
+    if match["name"] == PLAIN:
+        raise CheckpointError(f"{text}: {PLAIN!r} is the base without an adapter; choose another name")
+    return {match["name"]: AdapterSource(run, next(iter(run.adapters)))}
+
+
+def _default_adapter(base: Checkpoint, adapters: dict[str, AdapterSource], requested: str | None) -> str | None:
+    """The adapter to use when none is named: the requested one, else the checkpoint's default, else the only one."""
+    if requested is None:
+        return base.default if base.default in adapters else next(iter(adapters)) if len(adapters) == 1 else None
+    if requested not in adapters:
+        raise CheckpointError(f"no adapter {requested!r} to be the default; {hint(requested, adapters, 'there are')}")
+    return requested
+
+
+def _default_sampling(base: Checkpoint, requested: SamplingOverrides) -> dict[str, Any] | None:
+    """How to sample when a command does not say, ``None`` when neither options nor checkpoint say it.
 
     Raises:
         PersistError: when the backbone cannot sample so.
     """
-    if base.sampling is None and not plan.sampling.given():
+    if base.sampling is None and not requested.requested():
         return None
-    sampling = plan.sampling.over(base.sampling)
+    sampling = requested.over(base.sampling)
     empty_backbone(base).check_sampling(sampling)
     return asdict(sampling)
 
 
-def write_checkpoint(
-    folder: Path, base: Checkpoint, parts: dict[str, AdapterExport], dtype: torch.dtype
+def _write_checkpoint(
+    folder: Path, base: Checkpoint, adapters: dict[str, AdapterSource], dtype: torch.dtype
 ) -> dict[str, Any]:
-    """Write base, adapters and recipes into the folder, weights in this precision; returns what the card must say."""
-    with whole_base(base, folder) as home:
-        return _write_checkpoint(folder, home, base, parts, dtype)
+    """Write base, adapters and recipes into the folder; returns what the card must say of them."""
+    with _merged_base(base, folder) as home:
+        paths = [path.relative_to(home) for path in base_files(home, "*")]
+        jobs = [(home / path, folder / path) for path in paths if _is_copied(path)]
+        for name, adapter in adapters.items():
+            files = sorted(path for path in adapter.folder.glob("[!.]*") if path.is_file())
+            jobs += [(path, folder / ADAPTERS / name / path.name) for path in files]
+        for source, target in watched(jobs, "export", "file"):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                _convert(source, target, dtype) if source.suffix == ".safetensors" else _copy(source, target)
+            except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
+                raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
+    save_stage_recipes(folder, _recipes(base, adapters))
+    return {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(folder)}
 
 
 @contextlib.contextmanager
-def whole_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
-    """A folder with all of a base's own files; that of LoRA, merged, is made beside and removed again."""
+def _merged_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
+    """A folder with all of a base's own files; where LoRA has to be merged, it is made aside and removed again."""
     if lora_base(base.base_folder) is None:
         yield base.base_folder
         return
@@ -130,41 +203,23 @@ def whole_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
         yield folder
 
 
-def _write_checkpoint(
-    folder: Path, home: Path, base: Checkpoint, parts: dict[str, AdapterExport], dtype: torch.dtype
-) -> dict[str, Any]:
-    own = [path for path in base_files(home, "*") if belongs(path.relative_to(home))]
-    jobs = [(path, folder / path.relative_to(home)) for path in own]
-    for name, part in parts.items():
-        files = sorted(path for path in part.folder.glob("[!.]*") if path.is_file())
-        jobs += [(path, folder / "adapters" / name / path.name) for path in files]
-    for source, target in watched(jobs, "export", "file"):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            convert(source, target, dtype) if source.suffix == ".safetensors" else copy(source, target)
-        except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
-            raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
-    save_stage_recipes(folder, known_recipes(base, parts))
-    return {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(folder)}
-
-
-def belongs(path: Path) -> bool:
-    """Whether a file of a base is the backbone's, by its path in the folder: not one that every export makes anew."""
+def _is_copied(path: Path) -> bool:
+    """Whether a file of a base, by its path in the folder, is the backbone's and not one that an export makes anew."""
     hidden = any(part.startswith(".") for part in path.parts)
-    return str(path) not in OF_RUNS and path.parts[0] != RECIPES and not hidden
+    return str(path) not in MADE_ANEW and path.parts[0] != RECIPES and not hidden
 
 
-def copy(source: Path, target: Path) -> None:
+def _copy(source: Path, target: Path) -> None:
     """Copy a file; a configuration of diffusers without the folder that it was loaded from."""
     values = read_json(source) if source.suffix == ".json" else None
-    if not isinstance(values, dict) or PLACE not in values:
+    if not isinstance(values, dict) or LOADED_FROM not in values:
         shutil.copyfile(source, target)
         return
-    write_json(target, {key: value for key, value in values.items() if key != PLACE})
+    write_json(target, {key: value for key, value in values.items() if key != LOADED_FROM})
 
 
-def convert(source: Path, target: Path, dtype: torch.dtype) -> None:
-    """Write a weight file in another precision; whole numbers stay what they are.
+def _convert(source: Path, target: Path, dtype: torch.dtype) -> None:
+    """Write a weight file in another precision; integers stay integers.
 
     Raises:
         CheckpointError: when a value is too large for the precision, naming the tensor.
@@ -183,115 +238,53 @@ def convert(source: Path, target: Path, dtype: torch.dtype) -> None:
     write_tensors(target, tensors, metadata)
 
 
-def write_sums(folder: Path) -> dict[str, dict[str, Any]]:
-    """Write ``SHA256SUMS`` for ``sha256sum -c``; returns size and hash of every file by its path in the folder."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    table = {
-        path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
-        for path in files
-    }
-    write_text(folder / SUMS, "".join(f"{each['sha256']}  {name}\n" for name, each in table.items()))
-    return table
-
-
-def show(out: Path, card: dict[str, Any], files: dict[str, dict[str, Any]], json: bool) -> None:
-    """Print the files with their sizes."""
-    total = sum(each["bytes"] for each in files.values())
-    if json:
-        print_json({"folder": str(out), **card, "bytes": total, "files": files})
-        return
-    rows = [(name, f"{each['bytes']:,}") for name, each in files.items()]
-    print_table(str(out), ("file", "bytes"), [*rows, ("all", f"{total:,}")])
-    say(f"{total / 1e6:.1f} MB, weights in {card['dtype']}; check them with: cd {out} && sha256sum -c {SUMS}")
-
-
-ADAPTERS = "adapters"  # the folder of their recipes
-
-NAMED = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9_-]*)=(?P<run>.+)")
-
-
-@dataclass(frozen=True)
-class AdapterExport:
-    """One adapter of an export.
-
-    Args:
-        checkpoint: that has it.
-        adapter: what it is called there.
-    """
-
-    checkpoint: Checkpoint
-    adapter: str
-
-    @property
-    def folder(self) -> Path:
-        """Where its files are."""
-        return self.checkpoint.adapter_folder(self.adapter)
-
-
-def adapter_parts(base: Checkpoint, runs: Sequence[str]) -> dict[str, AdapterExport]:
-    """The base's own adapters and those of the runs, by the names that they get.
-
-    Args:
-        base: whose backbone is exported.
-        runs: ``RUN``, whose adapters keep their names, or ``NAME=RUN``.
-
-    Raises:
-        CheckpointError: for an adapter of another base, and for one name twice.
-    """
-    parts = {name: AdapterExport(base, name) for name in base.adapters}
-    for text in runs:
-        for name, part in _parts_of_run(text).items():
-            if part.checkpoint.fingerprint != base.fingerprint:
-                raise CheckpointError(f"{part.checkpoint.folder}: its adapter is of another base than {base.folder}")
-            if name in parts:
-                raise CheckpointError(
-                    f"{part.checkpoint.folder}: adapter {name!r} is there already, from {parts[name].checkpoint.folder}"
-                    f"; name this one, as in {name}-other={text.removeprefix(f'{name}=')}"
-                )
-            parts[name] = part
-    return parts
-
-
-def _parts_of_run(text: str) -> dict[str, AdapterExport]:
-    match = None if Path(text).exists() else NAMED.fullmatch(text)
-    found = find_checkpoint(Path(match["run"] if match else text))
-    if not found.adapters:
-        raise CheckpointError(f"{found.folder}: has no memory adapter; name stage-2 runs after the CHECKPOINT")
-    if match is None:
-        return {name: AdapterExport(found, name) for name in found.adapters}
-    if len(found.adapters) > 1:
-        raise CheckpointError(f"{found.folder}: NAME=RUN names one adapter, there are {', '.join(found.adapters)}")
-    if match["name"] == PLAIN:
-        raise CheckpointError(f"{text}: {PLAIN!r} is the base without an adapter; choose another name")
-    return {match["name"]: AdapterExport(found, next(iter(found.adapters)))}
-
-
-def known_recipes(base: Checkpoint, parts: dict[str, AdapterExport]) -> dict[str, str]:
+def _recipes(base: Checkpoint, adapters: dict[str, AdapterSource]) -> dict[str, str]:
     """Texts of the recipes behind an export by file name: those of the base's stages and ``adapters/NAME.yaml``.
 
-    Absolute paths are cut to their last part: they say nothing elsewhere.
+    Of absolute paths in them only the last part is kept, because they lead nowhere on another machine.
     """
     recipes = stage_recipes(base.base_folder)
-    for name, part in parts.items():
-        folder = part.checkpoint.folder
-        for path in (folder / RECIPES / ADAPTERS / f"{part.adapter}.yaml", folder / RECIPE):
+    for name, adapter in adapters.items():
+        folder = adapter.checkpoint.folder
+        for path in (folder / RECIPES / ADAPTERS / f"{adapter.adapter}.yaml", folder / RECIPE):
             if path.is_file():
                 recipes[f"{ADAPTERS}/{name}.yaml"] = path.read_text(encoding="utf-8")
                 break
-    return {name: _without_places(text, name) for name, text in recipes.items()}
+    return {name: _without_absolute_paths(text, name) for name, text in recipes.items()}
 
 
-def _without_places(text: str, where: str) -> str:
+def _without_absolute_paths(text: str, where: str) -> str:
     values = parse_yaml_mapping(text, where)
     data: dict[str, Any] = values.get("data") or {}
     settings: dict[str, Any] = (values.get("backbone") or {}).get("settings") or {}
-    places = ((values, "base"), (data, "path"), (settings, "pretrained"), (settings, "prompt_embedding"))
-    for owner, key in places:
-        owner |= {key: _without_place(owner[key])} if key in owner else {}
+    for owner, key in ((values, "base"), (data, "path"), (settings, "pretrained"), (settings, "prompt_embedding")):
+        if key in owner:
+            owner[key] = _last_part(owner[key])
     return yaml.safe_dump(values, sort_keys=False)
 
 
-def _without_place(value: Any) -> Any:
+def _last_part(value: Any) -> Any:
     if isinstance(value, list):
-        return [_without_place(each) for each in value]
+        return [_last_part(path) for path in value]
     return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+
+
+def _write_sums(folder: Path) -> dict[str, dict[str, Any]]:
+    """Write ``SHA256SUMS`` for ``sha256sum -c``; returns size and hash of every file by its path in the folder."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    files = {
+        path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+        for path in paths
+    }
+    write_text(folder / SUMS, "".join(f"{file['sha256']}  {name}\n" for name, file in files.items()))
+    return files
+
+
+def _print_files(out: Path, card: dict[str, Any], files: dict[str, dict[str, Any]], json: bool) -> None:
+    total = sum(file["bytes"] for file in files.values())
+    if json:
+        print_json({"folder": str(out), **card, "bytes": total, "files": files})
+        return
+    rows = [(name, f"{file['bytes']:,}") for name, file in files.items()]
+    print_table(str(out), ("file", "bytes"), [*rows, ("all", f"{total:,}")])
+    say(f"{total / 1e6:.1f} MB, weights in {card['dtype']}; check them with: cd {out} && sha256sum -c {SUMS}")

@@ -1,10 +1,10 @@
-"""What a model came from: the recipes of its stages and the scenes that it was trained on, base by base."""
+"""What a model came from: the recipes of its stages and the scenes that it was trained on, over all its bases."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from persist_cli.checkpoints.checkpoint import Checkpoint, find_checkpoint
 from persist_cli.data.reference import data_folder
@@ -15,41 +15,43 @@ from persist_cli.io.files import write_text
 from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.viewing.console import warn
 
-RECIPE = "recipe.yaml"  # of the last stage, in the checkpoint folder of a run
+RECIPE: Final = "recipe.yaml"  # of the last stage, in the checkpoint folder of a run
 
-RECIPES = "recipes"  # the folder of those of the stages before
+RECIPES: Final = "recipes"  # the folder with those of the stages before
 
 
 def stage_recipes(folder: Path) -> dict[str, str]:
-    """Texts of the recipes behind a base by file name, ``codec.yaml``, ``stage1.yaml``, ``stage1-2.yaml``, ….
+    """Texts of the recipes behind a base by file name: ``codec.yaml``, ``stage1.yaml``, ``stage1-2.yaml``, ….
 
     Args:
-        folder: of a base: a run's keeps the recipes of the stages before, an export's all of them.
+        folder: a base's checkpoint folder. That of a run holds its recipe and those of the stages before, that of an
+            export all of them.
     """
-    found = {path.name: path.read_text(encoding="utf-8") for path in sorted((folder / RECIPES).glob("*.yaml"))}
+    recipes = {path.name: path.read_text(encoding="utf-8") for path in sorted((folder / RECIPES).glob("*.yaml"))}
     path = folder / RECIPE
     if not path.is_file():
-        return found
+        return recipes
     text = path.read_text(encoding="utf-8")
     values = parse_yaml_mapping(text, str(path))
-    if not found and values.get("base"):  # a run of a version that did not keep them
-        before = _base_of(values)
-        found = stage_recipes(before.base_folder) if before else {}
-        if not before:
+    if not recipes and values.get("base"):  # a run of a version that did not keep them
+        base = _find_base(values)
+        recipes = stage_recipes(base.base_folder) if base else {}
+        if not base:
             warn(f"{path}: its base {values['base']} is not there any more, so the recipe of that is not kept")
-    return found | {_free_name("codec" if values.get("stage") == "codec" else "stage1", found): text}
+    return recipes | {_free_name("codec" if values.get("stage") == "codec" else "stage1", recipes): text}
 
 
 def save_stage_recipes(folder: Path, recipes: dict[str, str]) -> None:
-    """Keep recipes by their paths in the checkpoint folder's ``recipes``."""
+    """Write the texts of recipes into a checkpoint's folder, by their paths in its folder ``recipes``."""
     for name, text in recipes.items():
         write_text(folder / RECIPES / name, text)
 
 
 def training_scenes(checkpoint: Checkpoint) -> TrainingScenes:
-    """The scenes that base and adapters were trained on, as their cards say.
+    """The scenes that base and adapters were trained on, as the checkpoint's card says.
 
-    Where a card does not, they are those in the data sets that its recipe names, as far as these are still there.
+    Cards of earlier versions do not say so. Then they are the scenes in the data sets that the recipes of the
+    checkpoint and its bases name, as far as these are still there; else the result is marked as incomplete.
     """
     if checkpoint.training_scenes is not None:
         return checkpoint.training_scenes
@@ -60,21 +62,21 @@ def training_scenes(checkpoint: Checkpoint) -> TrainingScenes:
         return own | training_scenes(find_checkpoint(checkpoint.base_folder))
     if not values.get("base"):
         return own
-    before = _base_of(values)
-    return own | (training_scenes(before) if before else TrainingScenes(complete=False))
+    base = _find_base(values)
+    return own | (training_scenes(base) if base else TrainingScenes(complete=False))
 
 
-def _scenes_of_data(path: str | Sequence[str]) -> TrainingScenes:
-    scenes = TrainingScenes(complete=bool(path))
-    for each in [path] if isinstance(path, str) else path:
+def _scenes_of_data(paths: str | Sequence[str]) -> TrainingScenes:
+    scenes = TrainingScenes(complete=bool(paths))
+    for path in [paths] if isinstance(paths, str) else paths:
         try:
-            scenes |= TrainingScenes(frozenset(file.info.scene for file in Store(data_folder(each))))
+            scenes |= TrainingScenes(frozenset(file.info.scene for file in Store(data_folder(path))))
         except DataError:
             scenes |= TrainingScenes(complete=False)
     return scenes
 
 
-def _base_of(values: dict[str, Any]) -> Checkpoint | None:
+def _find_base(values: dict[str, Any]) -> Checkpoint | None:
     try:
         return find_checkpoint(Path(values["base"]))
     except PersistError:
