@@ -1,4 +1,4 @@
-"""Cases: the clips of an evaluation, found once, the same for every row."""
+"""The cases of an evaluation: which clips are predicted, the same for every row."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from persist_cli.io.files import file_sha256
 
 @dataclass(frozen=True)
 class Case:
-    """One clip to predict.
+    """One clip to predict, by its place in a data set.
 
     Args:
         data: folder of the data set.
-        trajectory: its name there.
-        scene: whose world it shows.
-        start: number of the clip's first frame, which is given.
-        frames: of the clip, the given one included.
+        trajectory: name of the trajectory in that folder.
+        scene: name of the scene that the trajectory shows.
+        start: number of the clip's first frame, which is given to the model.
+        frames: length of the clip, the given frame included.
         context: how many frames at the trajectory's beginning the memory is made of before the clip.
-        seen_before: for each frame the share of its view that the frames in memory have seen; ``None`` unknown.
-        first_visits: for each frame the number within the clip of the frame it returns to, -1 for none.
+        seen_before: for each frame the share of its view that the frames in memory have seen, ``None`` if unknown.
+        first_visits: for each frame the number of the clip's earlier frame that it returns to, -1 for none.
     """
 
     data: str
@@ -46,7 +46,7 @@ class Case:
 
     @property
     def file(self) -> TrajectoryFile:
-        """The trajectory it is cut from."""
+        """The trajectory that the clip is cut from."""
         return TrajectoryFile(Path(self.data) / f"{self.trajectory}{SUFFIX}")
 
     @staticmethod
@@ -61,11 +61,11 @@ class CaseFrames:
     """A case with its frames.
 
     Args:
-        case: which.
-        observations: of the clip, ground truth.
-        interactions: for each step of the clip.
-        context: what the memory is made of before the clip; ``None`` when it begins empty.
-        info: of the trajectory.
+        case: the place of the clip.
+        observations: the true frames of the clip.
+        interactions: what the agent did to the world in each step of the clip.
+        context: frames that the memory is made of before the clip; ``None`` when it begins empty.
+        info: description of the trajectory.
     """
 
     case: Case
@@ -76,12 +76,12 @@ class CaseFrames:
 
     @property
     def first_visits(self) -> Int64[Tensor, " frame"]:
-        """For each frame the frame it returns to, -1 for none."""
+        """For each frame the number of the earlier frame that it returns to, -1 for none."""
         return torch.tensor(self.case.first_visits, dtype=torch.int64)
 
 
 def read_case(case: Case) -> CaseFrames:
-    """The clip's frames and those of its memory."""
+    """Read the clip's frames and those of its memory from the data set."""
     file = case.file
     clip = file.read(slice(case.start, case.start + case.frames))
     return CaseFrames(
@@ -93,44 +93,33 @@ def read_case(case: Case) -> CaseFrames:
     )
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How much a camera moves.
-
-    Args:
-        path_metres: length of its way.
-        farthest_metres: from its first pose.
-        turned_degrees: sum of its turns.
-    """
-
-    path_metres: float
-    farthest_metres: float
-    turned_degrees: float
-
-    @staticmethod
-    def of(poses: Float[Tensor, "frame 4 4"]) -> Motion:
-        """The motion of a path."""
-        metres, degrees = pose_differences(poses[:-1], poses[1:])
-        away, _ = pose_differences(poses[:1].expand_as(poses), poses)
-        return Motion(float(metres.sum()), float(away.max()), float(degrees.sum()))
-
-
-def data_files(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Each data set with the SHA-256 of every trajectory that the cases use, JSON values."""
-    used: dict[str, dict[str, str]] = {}
+def hash_trajectories(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Each data set with the SHA-256 of every trajectory that the cases use, as JSON values."""
+    hashes_by_folder: dict[str, dict[str, str]] = {}
     for case in cases:
-        hashes = used.setdefault(case.data, {})
+        hashes = hashes_by_folder.setdefault(case.data, {})
         if case.trajectory not in hashes:
             hashes[case.trajectory] = file_sha256(case.file.path)
-    return [{"path": path, "trajectories": dict(sorted(hashes.items()))} for path, hashes in used.items()]
+    return [{"path": path, "trajectories": dict(sorted(hashes.items()))} for path, hashes in hashes_by_folder.items()]
 
 
 def cases_json(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """The cases for the results, with how far their paths go; data sets by number."""
+    """The cases and the motion of their cameras as JSON values; ``data`` is the number of the data set."""
     folders = list(dict.fromkeys(case.data for case in cases))
-    found = []
-    for case in cases:
-        poses = case.file.poses()[case.start : case.start + case.frames]
-        values = dataclasses.asdict(case) | {"data": folders.index(case.data)}
-        found.append(values | dataclasses.asdict(Motion.of(poses)))
-    return found
+    return [
+        dataclasses.asdict(case)
+        | {"data": folders.index(case.data)}
+        | path_motion(case.file.poses()[case.start : case.start + case.frames])
+        for case in cases
+    ]
+
+
+def path_motion(poses: Float[Tensor, "frame 4 4"]) -> dict[str, float]:
+    """The length of a camera path, its greatest distance from the first pose, and the sum of its turns."""
+    metres, degrees = pose_differences(poses[:-1], poses[1:])
+    distances, _ = pose_differences(poses[:1].expand_as(poses), poses)
+    return {
+        "path_metres": float(metres.sum()),
+        "farthest_metres": float(distances.max()),
+        "turned_degrees": float(degrees.sum()),
+    }

@@ -11,18 +11,18 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from persist_cli.evaluate.cases import Case
-from persist_cli.evaluate.protocols import Protocol, Selection
+from persist_cli.evaluate.protocols import FrameSelection, Protocol
 from persist_cli.metrics.metric import FrameMetric, Metric
 
-ENDS: tuple[Selection, ...] = ("all", "last", "return")
+ENDS: tuple[FrameSelection, ...] = ("all", "last", "return")
 
-PARTS: dict[str, tuple[Selection, ...]] = {  # what is shown over more than all frames, where the protocol has them
+SELECTIONS: dict[str, tuple[FrameSelection, ...]] = {  # of metrics shown over more than all frames
     "psnr": (*ENDS, "new"), "ssim": ENDS, "lpips-alex": ENDS, "lpips-vgg": ENDS, "dreamsim": ENDS,
 }  # fmt: skip
 
 FAMILIAR = 0.9  # share of a view seen before from which on nothing of it counts as new
 
-SUFFIXES: dict[Selection, tuple[str, str, str]] = {
+SUFFIXES: dict[FrameSelection, tuple[str, str, str]] = {
     "all": ("", "", "mean over the predicted frames"),
     "last": ("-last", " last", "at the last frame only"),
     "return": ("-return", " at return", "at the frames that return to an earlier pose only"),
@@ -35,12 +35,12 @@ class Column:
     """A metric over some frames of a clip.
 
     Args:
-        name: of the column.
-        metric: its name.
-        title: as the table heads it.
+        name: name of the column, as in ``psnr-last``.
+        metric: name of the metric.
+        title: heading of the column in the table.
         better: ``higher``, ``lower`` or, where neither is, ``None``.
-        definition: of the metric and the frames.
-        frames: which.
+        definition: sentence that says what is measured over which frames.
+        frames: frames of a clip that the column is the mean over.
     """
 
     name: str
@@ -48,15 +48,15 @@ class Column:
     title: str
     better: str | None
     definition: str
-    frames: Selection
+    frames: FrameSelection
 
 
 def make_columns(metrics: Mapping[str, Metric], protocol: Protocol) -> list[Column]:
-    """The columns of a protocol's table."""
+    """Make the columns of a protocol's table, metric by metric."""
     columns = []
     for name, metric in metrics.items():
         for selection in protocol.selections:
-            if selection not in PARTS.get(name, ("all",)):
+            if selection not in SELECTIONS.get(name, ("all",)):
                 continue
             suffix, title, words = SUFFIXES[selection]
             definition = metric.definition
@@ -67,12 +67,12 @@ def make_columns(metrics: Mapping[str, Metric], protocol: Protocol) -> list[Colu
 
 
 def column_json(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
-    """The columns by name, JSON values."""
+    """The columns by name as JSON values."""
     return {column.name: {key: value for key, value in asdict(column).items() if key != "name"} for column in columns}
 
 
-def chosen_frames(cases: Sequence[Case], frames: Selection) -> Bool[Tensor, "clip frame"]:
-    """Which frames of each clip a column is the mean over; never the given first one."""
+def chosen_frames(cases: Sequence[Case], frames: FrameSelection) -> Bool[Tensor, "clip frame"]:
+    """A mask of the frames of each clip that a column is the mean over; the given first one never is."""
     chosen = torch.ones(len(cases), cases[0].frames, dtype=torch.bool)
     if frames == "last":
         chosen[:, :-1] = False

@@ -1,4 +1,4 @@
-"""What of a view was seen before, by reprojecting a grid of its pixels into earlier frames."""
+"""How much of a view was seen before, measured by reprojecting a grid of its pixels into earlier frames."""
 
 from __future__ import annotations
 
@@ -14,25 +14,6 @@ from persist_cli.api.observations import Observations
 GRID = 16  # a view is probed at a grid of 16 × 16 of its pixels
 
 TOLERANCE = 0.05  # relative depth within which a probe is the same surface, plus as many metres
-
-
-def probe_points(seen: Observations, frame: int) -> Float[Tensor, "point 3"]:
-    """World points of a coarse grid of a frame's pixels that have depth."""
-    rows = torch.linspace(0, seen.rgb.shape[1] - 1, GRID).round().long()
-    columns = torch.linspace(0, seen.rgb.shape[2] - 1, GRID).round().long()
-    points = unproject(seen.depth[frame], seen.cameras[frame])[rows][:, columns]
-    return points[seen.depth[frame][rows][:, columns] > 0]
-
-
-def visible(points: Float[Tensor, "point 3"], seen: Observations) -> Bool[Tensor, "frame point"]:
-    """Which points each of the frames sees, in view and not hidden."""
-    count, height, width = seen.depth.shape
-    pixels, depth = project(points.expand(count, -1, -1), seen.cameras)
-    columns, rows = pixels.nan_to_num().floor().clamp(-1, 10_000).long().unbind(-1)
-    inside = (depth > 0) & (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    frames = torch.arange(count)[:, None].expand_as(rows)
-    surface = seen.depth[frames, rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
-    return inside & (surface > 0) & ((depth - surface).abs() < TOLERANCE * (1 + depth))
 
 
 def seen_share(seen: Observations, frame: int, held: Sequence[int]) -> float | None:
@@ -52,18 +33,37 @@ def recalled_share(seen: Observations, start: int, last: int) -> float:
     return float((earlier & ~visible(points, seen[start : start + 1])[0]).double().mean())
 
 
-def held_frames(start: int, context: int, frame: int, clip: int, writes: bool) -> list[int]:
+def probe_points(seen: Observations, frame: int) -> Float[Tensor, "point 3"]:
+    """World points of a coarse grid of a frame's pixels that have depth."""
+    rows = torch.linspace(0, seen.rgb.shape[1] - 1, GRID).round().long()
+    columns = torch.linspace(0, seen.rgb.shape[2] - 1, GRID).round().long()
+    points = unproject(seen.depth[frame], seen.cameras[frame])[rows][:, columns]
+    return points[seen.depth[frame][rows][:, columns] > 0]
+
+
+def visible(points: Float[Tensor, "point 3"], seen: Observations) -> Bool[Tensor, "frame point"]:
+    """For each frame and point whether the frame sees the point, in view and not hidden."""
+    count, height, width = seen.depth.shape
+    pixels, depth = project(points.expand(count, -1, -1), seen.cameras)
+    columns, rows = pixels.nan_to_num().floor().clamp(-1, 10_000).long().unbind(-1)
+    inside = (depth > 0) & (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    frames = torch.arange(count)[:, None].expand_as(rows)
+    surface = seen.depth[frames, rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
+    return inside & (surface > 0) & ((depth - surface).abs() < TOLERANCE * (1 + depth))
+
+
+def held_frames(start: int, context: int, frame: int, predicted_at_once: int, writes: bool) -> list[int]:
     """Numbers in the trajectory of the frames that the memory holds when a frame is predicted.
 
     Args:
         start: number of the clip's first frame.
         context: how many of the trajectory's first frames the memory was made of.
         frame: the frame's number within the clip.
-        clip: frames that the backbone predicts at once.
-        writes: whether what was predicted is written to the memory.
+        predicted_at_once: frames that the backbone predicts at once.
+        writes: whether predicted frames are written to the memory.
     """
     before = list(range(context))
     if not writes:
         return before
-    written = max(0, frame - 1) // clip * clip
+    written = max(0, frame - 1) // predicted_at_once * predicted_at_once
     return before + [number for number in range(start, start + written + 1) if number >= context]

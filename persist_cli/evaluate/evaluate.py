@@ -1,4 +1,4 @@
-"""What ``persist eval`` does from its options to its table, results and report."""
+"""``persist eval`` from its options to its table, results and report."""
 
 from __future__ import annotations
 
@@ -26,23 +26,28 @@ RESULTS = "metrics.json"
 
 
 def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | None, json: bool) -> None:
-    """Measure rows and leave ``metrics.json``, and a report where one is asked for; see ``persist eval --help``.
+    """Measure all rows and write ``metrics.json``, and a report where a folder is named; see ``persist eval --help``.
 
-    Without paths it is the reference model's; the data set ``sample`` is that of the package.
+    Args:
+        paths: runs or checkpoints; when empty, the reference model is evaluated.
+        plan: the options; ``sample`` among its data is the package's data set.
+        out: folder of the evaluation.
+        report: folder of the report, ``None`` for none.
+        json: whether the results are printed as JSON instead of tables.
     """
     for folder in (out, report):
         if folder is not None:
             check_folder(folder)
     processes = Processes()
     plan = replace(plan, data=tuple(data_folder(str(folder)) for folder in plan.data))
-    run, backbones = prepare(paths or [reference_checkpoint()], plan, out, processes)
-    measure_rows(run, backbones, processes)
+    run, loader = prepare(paths or [reference_checkpoint()], plan, out, processes)
+    measure_rows(run, loader, processes)
     if not processes.main:
         return
-    results = describe(run, processes.count)
+    results = results_json(run, processes.count)
     write_json(out / RESULTS, results)
     if report is not None:
-        write_report(results, make_pictures(run, domains(run), backbones), report)
+        write_report(results, make_pictures(run, clips_by_domain(run), loader), report)
     if json:
         print_json(results)
         return
@@ -51,30 +56,20 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
     say(f"written to {out / RESULTS}" + (f" and {report / 'report.html'}" if report else ""))
 
 
-def motion_line(clips: Sequence[dict[str, Any]]) -> str:
-    """How much the clips move and how much of what they look at was seen before: a frozen video scores well on some."""
-    way, away, turned = (
-        sum(clip[key] for clip in clips) / len(clips) for key in ("path_metres", "farthest_metres", "turned_degrees")
-    )
-    shares = [share for clip in clips for share in clip["seen_before"][1:] if share is not None]
-    seen = f"; {sum(shares) / len(shares):.0%} of what they look at was seen before" if shares else ""
-    return f"{len(clips)} clips, on average {way:.1f} m long, {away:.1f} m away, {turned:.0f}° of turns{seen}"
-
-
-def describe(run: Evaluation, processes: int) -> dict[str, Any]:
-    """The results with all that is needed to measure them again, JSON values."""
+def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
+    """The results and all that is needed to measure them again, as JSON values."""
     info = run.cases[0].file.info
-    protocol = {
-        "name": run.protocol.name,
-        "title": run.protocol.title,
-        "definition": run.protocol.definition,
-        "frames": run.cases[0].frames,
-    }
+    rows = [RowResults(run, number) for number in range(len(run.rows))]
     return {
         "format": "persist-evaluation",
         "version": 1,
         "measured": {
-            "protocol": protocol,
+            "protocol": {
+                "name": run.protocol.name,
+                "title": run.protocol.title,
+                "definition": run.protocol.definition,
+                "frames": run.cases[0].frames,
+            },
             "data": run.journal.data(),
             "image_size": [info.height, info.width],
             "clips": cases_json(run.cases),
@@ -90,26 +85,34 @@ def describe(run: Evaluation, processes: int) -> dict[str, Any]:
         | run.plan.placement.changes(),
         "environment": environment(processes),
         "command": command(),
-        "checkpoints": [checkpoint_json(each) | scenes_json(each) for each in run.checkpoints],
+        "checkpoints": [checkpoint_json(checkpoint) | scenes_json(checkpoint) for checkpoint in run.checkpoints],
         "columns": column_json(make_columns(run.metrics, run.protocol)),
-        "tables": tables(run),
+        "tables": [Table(run, name, clips).to_json(rows) for name, clips in clips_by_domain(run).items()],
         "first_row": run.rows[0].name,
     }
 
 
-def tables(run: Evaluation) -> list[dict[str, Any]]:
-    """One table of all clips, or one for each data set where the protocol says so."""
-    rows = [RowResults(run, number) for number in range(len(run.rows))]
-    return [Table(run, name, clips).to_json(rows) for name, clips in domains(run).items()]
-
-
-def domains(run: Evaluation) -> dict[str, list[int]]:
-    """Numbers of the clips of each table."""
+def clips_by_domain(run: Evaluation) -> dict[str, list[int]]:
+    """Numbers of the clips of each table: all clips in one, or a table for each data set where the protocol says so."""
     if not run.protocol.domains:
         return {"all": list(range(len(run.cases)))}
-    found: dict[str, list[int]] = {}
+    domains: dict[str, list[int]] = {}
     for number, case in enumerate(run.cases):
         source = case.file.info.source
         origin = source.get("simulator") or source.get("format") or "unknown origin"
-        found.setdefault(f"{case.data} ({origin})", []).append(number)
-    return found
+        domains.setdefault(f"{case.data} ({origin})", []).append(number)
+    return domains
+
+
+def motion_line(clips: Sequence[dict[str, Any]]) -> str:
+    """A line that says how far the clips move, because a frozen video scores well on clips that hardly do.
+
+    Args:
+        clips: ``measured.clips`` of the results.
+    """
+    metres, distance, degrees = (
+        sum(clip[key] for clip in clips) / len(clips) for key in ("path_metres", "farthest_metres", "turned_degrees")
+    )
+    shares = [share for clip in clips for share in clip["seen_before"][1:] if share is not None]
+    seen = f"; {sum(shares) / len(shares):.0%} of what they look at was seen before" if shares else ""
+    return f"{len(clips)} clips, on average {metres:.1f} m long, {distance:.1f} m away, {degrees:.0f}° of turns{seen}"

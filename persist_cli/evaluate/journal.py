@@ -1,4 +1,4 @@
-"""The processes of ``accelerate launch`` that share an evaluation; one without it."""
+"""The journal keeps every measured batch, so that a stopped evaluation goes on and several processes share one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from persist_cli.data.store import SUFFIX
 from persist_cli.errors import DataError, PersistError
-from persist_cli.evaluate.cases import Case, data_files
+from persist_cli.evaluate.cases import Case, hash_trajectories
 from persist_cli.io.files import (
     file_sha256,
     read_json,
@@ -25,49 +25,23 @@ from persist_cli.io.files import (
     write_tensors,
 )
 
-LONGEST = timedelta(days=7)  # a process may wait this long for the slowest
-
-
-class Processes:
-    """This process among those of the run."""
-
-    def __init__(self) -> None:
-        self.state = PartialState(cpu=not torch.cuda.is_available(), timeout=LONGEST)
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return int(self.state.num_processes)
-
-    @property
-    def main(self) -> bool:
-        """Whether this one finds the clips and writes the results."""
-        return bool(self.state.is_main_process)
-
-    def mine(self, number: int) -> bool:
-        """Whether a batch is this process's to measure; batches are the same for any number of processes."""
-        return number % self.count == int(self.state.process_index)
-
-    def wait(self) -> None:
-        """Until every process is here."""
-        self.state.wait_for_everyone()
-
-
 FOLDER = "parts"
 
 PLAN, CASES, DATA = "plan.json", "cases.json", "data.json"
 
-TRUTH = -1  # in the place of a row's number: the true videos
+TRUTH = -1  # stands for the true videos where a row's number is expected
+
+LONGEST_WAIT = timedelta(days=7)  # of a process for the slowest one
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One batch of one row at one seed.
+    """The smallest piece of work: one batch of one row at one sampling seed.
 
     Args:
-        row: its number, or ``TRUTH``.
-        seed: of the sampling noise.
-        batch: its number.
+        row: number of the row, or ``TRUTH``.
+        seed: seed of the sampling noise.
+        batch: number of the batch.
     """
 
     row: int
@@ -76,18 +50,18 @@ class Unit:
 
     @property
     def file(self) -> str:
-        """Where it is kept."""
+        """Name of the file that keeps its figures and features."""
         row = "truth" if self.row == TRUTH else f"row-{self.row:03d}"
         return f"{row}-seed-{self.seed:03d}-batch-{self.batch:05d}.safetensors"
 
 
 @dataclass(frozen=True)
-class Shown:
-    """One clip of a row that the report shows.
+class ExampleClip:
+    """A clip of one row whose video the report shows.
 
     Args:
-        row: its number.
-        clip: its number.
+        row: number of the row.
+        clip: number of the clip.
     """
 
     row: int
@@ -95,15 +69,15 @@ class Shown:
 
     @property
     def file(self) -> str:
-        """Where it is kept."""
+        """Name of the file that keeps its video."""
         return f"shown-{self.row:03d}-clip-{self.clip:05d}.safetensors"
 
 
 class Journal:
-    """The folder of an evaluation's parts.
+    """The files of an evaluation that is under way or finished.
 
     Args:
-        out: the evaluation's folder.
+        out: folder of the evaluation.
     """
 
     def __init__(self, out: Path) -> None:
@@ -116,11 +90,11 @@ class Journal:
 
     def check(self, plan: dict[str, Any]) -> None:
         """Raise ``PersistError`` when the folder holds another evaluation than this one."""
-        there = read_json(self.folder / PLAN) if self.begun else plan
-        if there != plan:
+        kept_plan = read_json(self.folder / PLAN) if self.begun else plan
+        if kept_plan != plan:
             raise PersistError(
-                f"{self.folder.parent}: holds another evaluation ({different(there, plan)}); choose another --out or "
-                "delete it"
+                f"{self.folder.parent}: holds another evaluation ({first_difference(kept_plan, plan)}); choose another "
+                "--out or delete it"
             )
         remove_leftovers(self.folder)
 
@@ -128,17 +102,17 @@ class Journal:
         """Keep what is measured, on which clips of which files."""
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / PLAN, plan)
-        write_json(self.folder / DATA, data_files(cases))
+        write_json(self.folder / DATA, hash_trajectories(cases))
         write_json(self.folder / CASES, [dataclasses.asdict(case) for case in cases])
 
     def cases(self) -> list[Case] | None:
-        """The cases, when they were found before."""
+        """The cases of the evaluation that was begun, ``None`` when none was."""
         if not ((self.folder / CASES).is_file() and (self.folder / DATA).is_file()):
             return None
-        return [Case.from_json(each) for each in read_json(self.folder / CASES)]
+        return [Case.from_json(values) for values in read_json(self.folder / CASES)]
 
     def data(self) -> list[dict[str, Any]]:
-        """The data sets with the hashes of the trajectories, as ``data_files`` gave them at the beginning."""
+        """The data sets with the hashes of their trajectories at the beginning, see ``hash_trajectories``."""
         return list(read_json(self.folder / DATA))
 
     def check_data(self) -> None:
@@ -152,26 +126,51 @@ class Journal:
                         "--out or delete that one"
                     )
 
-    def has(self, part: Unit | Shown) -> bool:
-        """Whether a batch was measured, or a clip predicted to be shown."""
+    def has(self, part: Unit | ExampleClip) -> bool:
+        """Whether a batch was measured, or a clip was predicted to be shown."""
         return (self.folder / part.file).is_file()
 
-    def write(self, part: Unit | Shown, tensors: dict[str, Tensor]) -> None:
+    def write(self, part: Unit | ExampleClip, tensors: dict[str, Tensor]) -> None:
         """Keep a batch's figures ``[clip, frame, metric]`` and features, or a clip's video, whole or not at all."""
         write_tensors(self.folder / part.file, tensors)
 
-    def read(self, part: Unit | Shown) -> dict[str, Tensor]:
-        """What ``write`` kept."""
+    def read(self, part: Unit | ExampleClip) -> dict[str, Tensor]:
+        """The tensors that ``write`` kept."""
         return read_tensors(self.folder / part.file)[0]
 
     def gather(self, row: int, seed: int, batches: int, name: str) -> Tensor:
-        """A tensor of every clip of a measured row at a seed."""
+        """A tensor of every clip of a measured row at a seed, its batches one after the other."""
         return torch.cat([self.read(Unit(row, seed, batch))[name] for batch in range(batches)])
 
 
-def different(one: Any, other: Any, where: str = "") -> str:
-    """The first thing that two plans differ in, with both values."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        key = next(key for key in sorted({*one, *other}) if one.get(key) != other.get(key))
-        return different(one.get(key), other.get(key), f"{where} {key}".strip())
-    return f"{where}: {one}, now {other}"
+class Processes:
+    """This process among those of ``accelerate launch`` that share an evaluation; without it there is one."""
+
+    def __init__(self) -> None:
+        self.state = PartialState(cpu=not torch.cuda.is_available(), timeout=LONGEST_WAIT)
+
+    @property
+    def count(self) -> int:
+        """Number of processes."""
+        return int(self.state.num_processes)
+
+    @property
+    def main(self) -> bool:
+        """Whether this process is the one that finds the clips and writes the results."""
+        return bool(self.state.is_main_process)
+
+    def owns(self, batch: int) -> bool:
+        """Whether this process measures a batch; batches are equal for any number of processes."""
+        return batch % self.count == int(self.state.process_index)
+
+    def wait(self) -> None:
+        """Wait until every process is here."""
+        self.state.wait_for_everyone()
+
+
+def first_difference(kept: Any, new: Any, where: str = "") -> str:
+    """The first key that two plans differ in, with both values."""
+    if isinstance(kept, dict) and isinstance(new, dict):
+        key = next(key for key in sorted({*kept, *new}) if kept.get(key) != new.get(key))
+        return first_difference(kept.get(key), new.get(key), f"{where} {key}".strip())
+    return f"{where}: {kept}, now {new}"

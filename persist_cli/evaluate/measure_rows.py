@@ -9,10 +9,10 @@ from rich.progress import Progress
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.evaluate.bases import Backbones
+from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.cases import CaseFrames, read_case
 from persist_cli.evaluate.journal import TRUTH, Processes, Unit
-from persist_cli.evaluate.measure import VIDEO
+from persist_cli.evaluate.metric_suite import VIDEO
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.rollout.world_model import clip_seed
@@ -21,10 +21,10 @@ from persist_cli.viewing.console import add_task, progress
 SHOWN = 3  # clips whose videos are kept of every row, for the contact sheets
 
 
-def measure_rows(run: Evaluation, backbones: Backbones, processes: Processes) -> None:
+def measure_rows(run: Evaluation, loader: BackboneLoader, processes: Processes) -> None:
     """Measure every batch that the journal does not have, this process its share."""
     todo = [
-        [unit for unit in run.units(number) if processes.mine(unit.batch) and not run.journal.has(unit)]
+        [unit for unit in run.units(number) if processes.owns(unit.batch) and not run.journal.has(unit)]
         for number in range(len(run.rows))
     ]
     with progress() as bar:
@@ -34,7 +34,7 @@ def measure_rows(run: Evaluation, backbones: Backbones, processes: Processes) ->
         for row, units in zip(run.rows, todo, strict=True):
             if not units:
                 continue
-            backbone = backbones.ready(row)
+            backbone = loader.load_for(row)
             bar.update(task, note=row.name)
             for unit in units:
                 measure_unit(run, row, backbone, unit)
@@ -44,13 +44,13 @@ def measure_rows(run: Evaluation, backbones: Backbones, processes: Processes) ->
 
 def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
     """Keep the features of the true videos, which sets of videos are compared with."""
-    measurer = run.measurers[True]  # features of colours, which every row has
-    units = [Unit(TRUTH, 0, batch) for batch in range(run.batches) if processes.mine(batch)]
-    todo = [unit for unit in units if measurer.by_set and not run.journal.has(unit)]
+    suite = run.suites[0]  # the features are of colours, which every row has
+    units = [Unit(TRUTH, 0, batch) for batch in range(run.batches) if processes.owns(batch)]
+    todo = [unit for unit in units if suite.set_metrics and not run.journal.has(unit)]
     if todo:
         task = add_task(bar, "true videos", sum(len(run.batch(unit.batch)) for unit in todo), "clip")
     for unit in todo:
-        run.journal.write(unit, measurer.true_features(run.batch(unit.batch)))
+        run.journal.write(unit, suite.true_features(run.batch(unit.batch)))
         bar.advance(task, len(run.batch(unit.batch)))
 
 
@@ -58,7 +58,7 @@ def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> N
     """Measure one batch and keep it, with the videos of the clips to be shown."""
     clips = [read_case(case) for case in run.batch(unit.batch)]
     rgb, depth = predict(row, backbone, clips, unit.seed, unit.batch * run.plan.batch)
-    kept = run.measurer(row).measure(rgb, depth, clips, f"row {row.name!r}")
+    kept = run.suites[unit.row].measure(rgb, depth, clips, f"row {row.name!r}")
     shown = max(0, SHOWN - unit.batch * run.plan.batch) if unit.seed == 0 else 0
     if shown:
         kept[VIDEO] = rgb[:shown].cpu()

@@ -20,26 +20,47 @@ from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.coverage import GRID, held_frames, recalled_share, seen_share
 from persist_cli.viewing.console import watched
 
-Selection = Literal["all", "last", "return", "new"]  # frames of a clip that a column is the mean over
+FrameSelection = Literal["all", "last", "return", "new"]  # frames of a clip that a column is the mean over
+
+LEAST_RECALLED = 0.3  # share of the last view seen earlier and not from the clip's first frame
+
+SAME_METRES, SAME_DEGREES = 0.02, 2.0  # two poses that differ by less are the same pose
+
+AWAY_METRES, AWAY_DEGREES = 0.5, 45.0  # a path must exceed one of them before it returns
+
+RETURN_FRAMES = 49  # of a clip that returns, when half of the trajectories come back that far
+
+LEAST_RETURN_FRAMES = 5
+
+LEAST_LONG_FRAMES = 112  # frames to predict, as in the paper
 
 
 @dataclass(frozen=True)
-class Selected:
-    """Which clips are asked for.
+class ClipSearch:
+    """Where a protocol looks for clips, and how long and how many they are.
 
     Args:
-        folders: of the data sets.
-        frames: of a clip, the given one included; 0 takes the protocol's own number.
-        most: most clips.
-        clip: frames that the backbone predicts at once.
+        folders: the data sets.
+        frames: length of a clip, the given frame included; 0 takes the protocol's own number.
+        limit: greatest number of clips.
+        predicted_at_once: frames that the backbone predicts at once.
         training_scenes: names of scenes that a model is known to have been trained on.
     """
 
     folders: Sequence[Path]
     frames: int
-    most: int
-    clip: int
+    limit: int
+    predicted_at_once: int
     training_scenes: frozenset[str] = frozenset()
+
+    @property
+    def where(self) -> str:
+        """The data sets for an error message."""
+        return ", ".join(map(str, self.folders))
+
+    def trajectories(self) -> list[TrajectoryFile]:
+        """Every trajectory of the data sets, in order."""
+        return [file for folder in self.folders for file in Store(folder)]
 
 
 class Protocol(ABC):
@@ -53,30 +74,32 @@ class Protocol(ABC):
     title: ClassVar[str]
     definition: ClassVar[str]
     writes: ClassVar[bool]
-    selections: ClassVar[tuple[Selection, ...]]
+    selections: ClassVar[tuple[FrameSelection, ...]]
     domains: ClassVar[bool] = False  # whether each data set gets a table of its own
     guards: ClassVar[tuple[str, ...]] = ()  # controls without which its figures could be misread
 
     @abstractmethod
-    def find(self, asked: Selected) -> list[Case]:
-        """The clips.
+    def find(self, search: ClipSearch) -> list[Case]:
+        """Find the clips.
 
         Raises:
             DataError: one line, when there is none.
         """
 
-    def case(self, file: TrajectoryFile, seen: Observations, where: tuple[int, int, int], asked: Selected) -> Case:
-        """A case without returns.
+    def make_case(
+        self, file: TrajectoryFile, seen: Observations, where: tuple[int, int, int], search: ClipSearch
+    ) -> Case:
+        """Make a case that returns to no earlier pose.
 
         Args:
             file: the trajectory.
-            seen: its frames, at least up to the clip's last.
-            where: number of the first frame, frames of the clip, frames of context.
-            asked: for the frames predicted at once.
+            seen: the frames of the trajectory, at least up to the clip's last.
+            where: number of the clip's first frame, frames of the clip, frames of context.
+            search: says how many frames are predicted at once.
         """
         start, frames, context = where
         shares = [
-            seen_share(seen, start + frame, held_frames(start, context, frame, asked.clip, self.writes))
+            seen_share(seen, start + frame, held_frames(start, context, frame, search.predicted_at_once, self.writes))
             for frame in range(frames)
         ]
         return Case(
@@ -91,30 +114,8 @@ class Protocol(ABC):
         )
 
 
-def trajectories(folders: Sequence[Path]) -> list[TrajectoryFile]:
-    """Every trajectory of the data sets, in order."""
-    return [file for folder in folders for file in Store(folder)]
-
-
-def names(folders: Sequence[Path]) -> str:
-    """The data sets for an error message."""
-    return ", ".join(map(str, folders))
-
-
-def require_depth(seen: Observations, file: TrajectoryFile, protocol: str) -> None:
-    """Raise ``DataError`` when no frame has depth."""
-    if not bool((seen.depth > 0).any()):
-        raise DataError(
-            f"{file.path}: no frame has depth, which the protocol {protocol!r} needs to know what was seen before; "
-            "evaluate it with --protocol return or long"
-        )
-
-
-LEAST_RECALLED = 0.3  # share of the last view seen earlier and not from the clip's first frame
-
-
 class Revisit(Protocol):
-    """The paper's Table 1: the memory holds every frame before the clip, as it really was."""
+    """The protocol of the paper's Table 1: the memory holds every true frame before the clip."""
 
     name = "revisit"
     title = "Places seen before"
@@ -125,49 +126,55 @@ class Revisit(Protocol):
     writes = False
     selections = ("all", "last", "new")
 
-    def find(self, asked: Selected) -> list[Case]:
-        """The clips with the most to recall, taking turns over trajectories, disjoint within each."""
-        frames = asked.frames or asked.clip + 1
-        files = watched(trajectories(asked.folders), "what returns", "trajectory")
-        ranked = [self.rank(file, frames) for file in files]
+    def find(self, search: ClipSearch) -> list[Case]:
+        """Find the clips with the most to recall, taking turns over trajectories, disjoint within each."""
+        frames = search.frames or search.predicted_at_once + 1
+        files = watched(search.trajectories(), "what returns", "trajectory")
+        ranked = [self.rank_starts(file, frames) for file in files]
         turns = range(max(map(len, ranked), default=0))
-        chosen = [(row[turn], number) for turn in turns for number, row in enumerate(ranked) if turn < len(row)]
+        chosen = [
+            (starts[turn], number) for turn in turns for number, starts in enumerate(ranked) if turn < len(starts)
+        ]
         if not chosen:
             raise DataError(
-                f"{names(asked.folders)}: no clip of {frames} frames returns to a place seen before; collect with "
+                f"{search.where}: no clip of {frames} frames returns to a place seen before; collect with "
                 "--policy there-and-back or longer trajectories"
             )
-        return self.cases(chosen[: asked.most], frames, asked)
+        return self.make_cases(chosen[: search.limit], frames, search)
 
-    def cases(self, chosen: list[tuple[int, int]], frames: int, asked: Selected) -> list[Case]:
-        """The cases of (start, number of the trajectory), each trajectory read once."""
-        files = trajectories(asked.folders)
-        found: dict[tuple[int, int], Case] = {}
-        for number in watched(list(dict.fromkeys(number for _, number in chosen)), "seen before", "trajectory"):
-            seen = files[number].read().observations
-            for start in (start for start, owner in chosen if owner == number):
-                found[start, number] = self.case(files[number], seen, (start, frames, start + 1), asked)
-        return [found[each] for each in chosen]
-
-    def rank(self, file: TrajectoryFile, frames: int) -> list[int]:
+    def rank_starts(self, file: TrajectoryFile, frames: int) -> list[int]:
         """Starts of disjoint clips of one trajectory that recall enough, the most first."""
         if len(file) < frames + 2:
             return []
         seen = file.read().observations
-        require_depth(seen, file, self.name)
+        if not bool((seen.depth > 0).any()):
+            raise DataError(
+                f"{file.path}: no frame has depth, which the protocol {self.name!r} needs to know what was seen "
+                "before; evaluate it with --protocol return or long"
+            )
         first = min(frames, len(file) - frames)  # short trajectories still have something before their clip
         starts = range(first, len(file) - frames + 1, max(1, (frames - 1) // 2))
         shares = {start: recalled_share(seen, start, start + frames - 1) for start in starts}
-        enough = sorted((start for start in starts if shares[start] >= LEAST_RECALLED), key=lambda each: -shares[each])
+        enough = [start for start in starts if shares[start] >= LEAST_RECALLED]
         disjoint: list[int] = []
-        for start in enough:
-            if all(abs(start - other) >= frames for other in disjoint):
+        for start in sorted(enough, key=lambda start: -shares[start]):
+            if all(abs(start - previous) >= frames for previous in disjoint):
                 disjoint.append(start)
         return disjoint
 
+    def make_cases(self, chosen: list[tuple[int, int]], frames: int, search: ClipSearch) -> list[Case]:
+        """Make the cases of (start, number of the trajectory), reading each trajectory once."""
+        files = search.trajectories()
+        cases: dict[tuple[int, int], Case] = {}
+        for number in watched(list(dict.fromkeys(number for _, number in chosen)), "seen before", "trajectory"):
+            seen = files[number].read().observations
+            for start in (start for start, owner in chosen if owner == number):
+                cases[start, number] = self.make_case(files[number], seen, (start, frames, start + 1), search)
+        return [cases[place] for place in chosen]
+
 
 class Unseen(Revisit):
-    """As ``revisit``, on data whose origin shows that it was not trained on."""
+    """The protocol ``revisit`` on data whose origin shows that the model was not trained on it."""
 
     name = "unseen"
     title = "Unseen houses and simulators"
@@ -177,31 +184,21 @@ class Unseen(Revisit):
     )
     domains = True
 
-    def find(self, asked: Selected) -> list[Case]:
-        """The most clips of each data set."""
-        for file in trajectories(asked.folders):
-            source = file.info.source
-            if source.get("split") == "train":
+    def find(self, search: ClipSearch) -> list[Case]:
+        """Find the clips of each data set, up to the limit in each."""
+        for file in search.trajectories():
+            if file.info.source.get("split") == "train":
                 raise DataError(f"{file.path}: its scene is of the training split; collect with --split test")
-            if file.info.scene in asked.training_scenes:
+            if file.info.scene in search.training_scenes:
                 raise DataError(f"{file.path}: the model was trained on its scene {file.info.scene!r}")
-        found: list[Case] = []
-        for folder in asked.folders:
-            found += super().find(dataclasses.replace(asked, folders=[folder]))
-        return found
-
-
-SAME_METRES, SAME_DEGREES = 0.02, 2.0  # within which two poses are the same
-
-AWAY_METRES, AWAY_DEGREES = 0.5, 45.0  # of which a path must exceed one before it returns
-
-FRAMES = 49  # of a clip, when half of the trajectories come back that far
-
-FEWEST = 5
+        cases: list[Case] = []
+        for folder in search.folders:
+            cases += super().find(dataclasses.replace(search, folders=[folder]))
+        return cases
 
 
 class ThereAndBack(Protocol):
-    """The paper's SRC: go somewhere, return by the reversed actions."""
+    """The protocol of the paper's SRC: go somewhere and return by the reversed actions."""
 
     name = "return"
     title = "There and back"
@@ -214,36 +211,74 @@ class ThereAndBack(Protocol):
     selections = ("all", "return")
     guards = ("copy", "truth")  # a frozen video has the best SRC, the truth not quite
 
-    def find(self, asked: Selected) -> list[Case]:
-        """One clip of each trajectory that turns round and comes back far enough, all of one length."""
-        poses = {file.path: file.poses() for file in trajectories(asked.folders)}
-        files = watched(trajectories(asked.folders), "turning points", "trajectory")
+    def find(self, search: ClipSearch) -> list[Case]:
+        """Find one clip in each trajectory that turns round and comes back far enough, all of one length."""
+        poses = {file.path: file.poses() for file in search.trajectories()}
+        files = watched(search.trajectories(), "turning points", "trajectory")
         turns = {file.path: turning_point(poses[file.path]) for file in files}
-        lengths = [length for _, length in turns.values() if length >= FEWEST]
-        frames = asked.frames or min(FRAMES, sorted(lengths)[len(lengths) // 2] if lengths else FRAMES)
+        lengths = sorted(length for _, length in turns.values() if length >= LEAST_RETURN_FRAMES)
+        frames = search.frames or min(RETURN_FRAMES, lengths[len(lengths) // 2] if lengths else RETURN_FRAMES)
         cases: list[Case] = []
-        for file in watched(trajectories(asked.folders), "seen before", "trajectory"):
+        for file in watched(search.trajectories(), "seen before", "trajectory"):
             twice, length = turns[file.path]
-            if length < max(frames, FEWEST) or len(cases) == asked.most:
+            if length < max(frames, LEAST_RETURN_FRAMES) or len(cases) == search.limit:
                 continue
             start = (twice - frames + 1) // 2
             if goes_away(poses[file.path][start : start + frames]):
-                cases.append(self.returning(file, start, frames, twice, asked))
+                cases.append(self.make_returning_case(file, start, frames, twice, search))
         if not cases:
             longest = max((length for _, length in turns.values()), default=0)
             raise DataError(
-                f"{names(asked.folders)}: no trajectory goes away and comes back by the same poses within {frames} "
+                f"{search.where}: no trajectory goes away and comes back by the same poses within {frames} "
                 f"frames (the longest there and back has {longest}); collect with --policy there-and-back"
             )
         return cases
 
-    def returning(self, file: TrajectoryFile, start: int, frames: int, twice: int, asked: Selected) -> Case:
-        """A case whose later frames return to its earlier ones."""
+    def make_returning_case(
+        self, file: TrajectoryFile, start: int, frames: int, twice: int, search: ClipSearch
+    ) -> Case:
+        """Make a case whose later frames return to its earlier ones; ``twice`` is that of ``turning_point``."""
         seen = file.read(slice(0, start + frames)).observations
-        case = self.case(file, seen, (start, frames, 0), asked)
+        case = self.make_case(file, seen, (start, frames, 0), search)
         partners = [twice - (start + number) - start for number in range(frames)]
         visits = [earlier if 0 <= earlier < number - 1 else -1 for number, earlier in enumerate(partners)]
         return dataclasses.replace(case, first_visits=tuple(visits))
+
+
+class Long(Protocol):
+    """The protocol of the paper's long video: many clips one after the other from a single given frame."""
+
+    name = "long"
+    title = "Long rollout"
+    definition = (
+        f"at least {LEAST_LONG_FRAMES} frames predicted clip after clip from one given frame along the true path; the "
+        "memory begins empty and is written with the given frame and the model's own output"
+    )
+    writes = True
+    selections = ("all", "last")
+
+    def find(self, search: ClipSearch) -> list[Case]:
+        """Find disjoint clips from the beginning of each trajectory on."""
+        frames = search.frames or LEAST_LONG_FRAMES + 1
+        if frames <= LEAST_LONG_FRAMES:
+            raise DataError(
+                f"the protocol 'long' predicts at least {LEAST_LONG_FRAMES} frames; --frames {frames} are too few"
+            )
+        files = search.trajectories()
+        places = [(file, start) for file in files for start in range(0, len(file) - frames + 1, frames)]
+        if not places:
+            longest = max(len(file) for file in files)
+            raise DataError(
+                f"{search.where}: no trajectory has {frames} frames, the longest has {longest}; "
+                f"collect with --frames {frames}"
+            )
+        return [
+            self.make_case(file, file.read(slice(0, start + frames)).observations, (start, frames, 0), search)
+            for file, start in watched(places[: search.limit], "seen before", "clip")
+        ]
+
+
+PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in (Revisit(), ThereAndBack(), Long(), Unseen())}
 
 
 def turning_point(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, int]:
@@ -256,59 +291,20 @@ def turning_point(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, int]:
         first, last = twice // 2, (twice + 1) // 2
         count = min(first + 1, len(poses) - last)
         same = same_poses(poses[first - count + 1 : first + 1].flip(0), poses[last : last + count])
-        alike = count if bool(same.all()) else int((~same).nonzero()[0])
-        length = 2 * alike - (1 if twice % 2 == 0 else 0)
+        mirrored = count if bool(same.all()) else int((~same).nonzero()[0])
+        length = 2 * mirrored - (1 if twice % 2 == 0 else 0)
         if length > best[1]:
             best = (twice, length)
     return best
 
 
 def same_poses(first: Float[Tensor, "pose 4 4"], second: Float[Tensor, "pose 4 4"]) -> Bool[Tensor, " pose"]:
-    """Which pairs of poses are the same."""
+    """For each pair of poses whether they are the same."""
     metres, degrees = pose_differences(first, second)
     return (metres < SAME_METRES) & (degrees < SAME_DEGREES)
 
 
 def goes_away(poses: Float[Tensor, "frame 4 4"]) -> bool:
-    """Whether a path leaves its first pose far enough to ask for a memory."""
+    """Tell whether a path leaves its first pose far enough to ask for a memory."""
     metres, degrees = pose_differences(poses, poses[:1].expand_as(poses))
     return bool(((metres > AWAY_METRES) | (degrees > AWAY_DEGREES)).any())
-
-
-LEAST = 112  # frames to predict, as in the paper
-
-
-class Long(Protocol):
-    """The paper's long video: many clips one after the other from a single given frame."""
-
-    name = "long"
-    title = "Long rollout"
-    definition = (
-        f"at least {LEAST} frames predicted clip after clip from one given frame along the true path; the memory "
-        "begins empty and is written with the given frame and the model's own output"
-    )
-    writes = True
-    selections = ("all", "last")
-
-    def find(self, asked: Selected) -> list[Case]:
-        """Clips from the beginning of each trajectory on, disjoint."""
-        frames = asked.frames or LEAST + 1
-        if frames <= LEAST:
-            raise DataError(f"the protocol 'long' predicts at least {LEAST} frames; --frames {frames} are too few")
-        files = trajectories(asked.folders)
-        places = [(file, start) for file in files for start in range(0, len(file) - frames + 1, frames)]
-        if not places:
-            longest = max(len(file) for file in files)
-            raise DataError(
-                f"{names(asked.folders)}: no trajectory has {frames} frames, the longest has {longest}; "
-                f"collect with --frames {frames}"
-            )
-        return [
-            self.case(file, file.read(slice(0, start + frames)).observations, (start, frames, 0), asked)
-            for file, start in watched(places[: asked.most], "seen before", "clip")
-        ]
-
-
-PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in (Revisit(), ThereAndBack(), Long(), Unseen())}
-
-__all__ = ["PROTOCOLS", "Protocol", "Selection"]

@@ -1,4 +1,4 @@
-"""What an evaluation was made of: versions, machine, checkpoints and weights."""
+"""Provenance of the results: versions, machine, checkpoints, recipes and weights behind an evaluation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PACKAGES = ("accelerate", "diffusers", "numpy", "safetensors", "scipy", "torch",
 
 
 def environment(processes: int) -> dict[str, Any]:
-    """Versions and machine, JSON values."""
+    """Versions of the packages and the machine as JSON values."""
     cuda = torch.cuda.is_available()
     return {
         "persist": __version__,
@@ -38,12 +38,12 @@ def environment(processes: int) -> dict[str, Any]:
 
 
 def command() -> list[str]:
-    """The command line as it was given."""
+    """The command line that this process was started with."""
     return ["persist", *sys.argv[1:]]
 
 
 def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A checkpoint with the hashes of its base, recipes and adapters, JSON values."""
+    """A checkpoint with the hashes of its base, recipes and adapters as JSON values."""
     adapters = {name: file_sha256(folder / "adapter.safetensors") for name, folder in checkpoint.adapters.items()}
     return {
         "name": checkpoint.name,
@@ -55,13 +55,16 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def scenes_json(checkpoint: Checkpoint) -> dict[str, Any]:
-    """How many scenes it is known to have been trained on, which may change with what lies about; JSON values."""
+    """How many scenes a checkpoint is known to have been trained on, as JSON values.
+
+    The number may change between runs: it depends on which earlier checkpoints and data sets can still be read.
+    """
     scenes = lineage.training_scenes(checkpoint)
     return {"training_scenes": {"known": len(scenes.names), "complete": scenes.complete}}
 
 
 def recipe_sha256(folder: Path) -> str | None:
-    """SHA-256 of the recipe that a run kept in its checkpoint, or over the names and texts of all those of an export.
+    """SHA-256 of the recipe in a run's checkpoint, or over the names and texts of all recipes of an exported model.
 
     ``None`` when there is none.
     """
@@ -76,19 +79,19 @@ def recipe_sha256(folder: Path) -> str | None:
 
 
 def training_scenes(checkpoints: Sequence[Checkpoint]) -> frozenset[str]:
-    """Names of the scenes that the checkpoints are known to have been trained on; a line says where some are not."""
-    found: frozenset[str] = frozenset()
-    for each in checkpoints:
-        scenes = lineage.training_scenes(each)
-        found |= scenes.names
+    """Names of the scenes that the checkpoints were trained on, with a warning where not all of them are known."""
+    names: frozenset[str] = frozenset()
+    for checkpoint in checkpoints:
+        scenes = lineage.training_scenes(checkpoint)
+        names |= scenes.names
         if not scenes.complete:
-            some = f" ({len(scenes.names)} are)" if scenes.names else ""
-            warn(f"{each.folder}: not all scenes that it was trained on are known{some}")
-    return found
+            count = f" ({len(scenes.names)} are)" if scenes.names else ""
+            warn(f"{checkpoint.folder}: not all scenes that it was trained on are known{count}")
+    return names
 
 
 def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:
-    """What every metric is, with the hashes of the weights it used, JSON values."""
+    """Every metric's definition with the hashes of the weights it used, as JSON values."""
     return {
         name: {
             "title": metric.title,
@@ -101,6 +104,6 @@ def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:
 
 
 def weight_hashes(names: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of the converted weights that are there."""
-    found = {name: cached_weight(name) for name in names}
-    return {name: str(read_json(folder / "weight.json")["sha256"]) for name, folder in found.items() if folder}
+    """SHA-256 of the converted weights that are in the cache, by name."""
+    folders = {name: cached_weight(name) for name in names}
+    return {name: str(read_json(folder / "weight.json")["sha256"]) for name, folder in folders.items() if folder}

@@ -17,7 +17,7 @@ SEED = 0
 
 Array = NDArray[np.float64]
 
-Distance = Callable[[NDArray[np.int64], int], float]  # of the clips of these numbers, at a seed
+Distance = Callable[[NDArray[np.int64], int], float]  # takes numbers of clips and a sampling seed
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class Figure:
     """One cell of the table.
 
     Args:
-        mean: over seeds, clips and frames.
-        std: standard deviation over sampling seeds of the mean over clips; ``None`` for fewer than two.
-        low: of the 95 % interval over clips.
-        high: likewise.
-        count: clips that have the figure.
-        per_clip: the figure of each clip over seeds; ``None`` where only a set of clips has one.
-        resampled: the mean of every bootstrap sample, for paired differences.
+        mean: mean over seeds, clips and frames.
+        std: standard deviation over sampling seeds of the mean over clips; ``None`` for fewer than two seeds.
+        low: lower end of the 95 % interval over clips.
+        high: upper end of that interval.
+        count: number of clips that have the figure.
+        per_clip: mean of each clip over seeds; ``None`` where only a set of clips has a figure.
+        resampled: mean of every bootstrap sample, for paired differences.
     """
 
     mean: float
@@ -43,16 +43,16 @@ class Figure:
     resampled: Array
 
     def to_json(self) -> dict[str, Any]:
-        """The figure as JSON values, undefined ones as ``None``."""
+        """The figure as JSON values, with ``None`` for numbers that are not defined."""
         return {
             "mean": number(self.mean), "std": number(self.std), "low": number(self.low), "high": number(self.high),
             "count": self.count,
-            "per_clip": None if self.per_clip is None else [number(each) for each in self.per_clip],
+            "per_clip": None if self.per_clip is None else [number(value) for value in self.per_clip],
         }  # fmt: skip
 
 
 def resamples(clips: int, count: int) -> NDArray[np.int64]:
-    """Clip numbers of every bootstrap sample, the same for every row, ``[resample, clip]``."""
+    """Draw the clip numbers ``[resample, clip]`` of every bootstrap sample, equal for every row."""
     return np.random.default_rng((SEED, clips)).integers(clips, size=(count, clips))
 
 
@@ -60,7 +60,7 @@ def mean_figure(values: Array) -> Figure:
     """The figure of a metric that every clip has.
 
     Args:
-        values: ``[seed, clip]``; NaN where a clip has none.
+        values: ``[seed, clip]``, NaN where a clip has no figure.
     """
     by_seed = mean(values, axis=1)
     per_clip = mean(values, axis=0)
@@ -84,9 +84,9 @@ def set_figure(distance: Distance, clips: int, seeds: int) -> Figure:
     resampled distances moved so that their mean is the distance itself.
 
     Args:
-        distance: of the clips of some numbers, at a seed.
-        clips: how many there are.
-        seeds: how many there are; bootstrap samples take turns over them.
+        distance: distance of the clips of some numbers from the true ones, at a seed.
+        clips: number of clips.
+        seeds: number of sampling seeds; bootstrap samples take turns over them.
     """
     by_seed = np.array([distance(np.arange(clips), seed) for seed in range(seeds)])
     draws = resamples(clips, SET_RESAMPLES)
@@ -97,17 +97,17 @@ def set_figure(distance: Distance, clips: int, seeds: int) -> Figure:
     return Figure(float(mean(by_seed)), std, low, high, clips, None, drawn)
 
 
-def difference(figure: Figure, first: Figure) -> dict[str, float | None] | None:
-    """Paired difference to the first row's figure with its 95 % interval, from the same bootstrap samples."""
-    if len(figure.resampled) != len(first.resampled):
+def difference(figure: Figure, reference: Figure) -> dict[str, float | None] | None:
+    """Paired difference to another row's figure with its 95 % interval, from the same bootstrap samples."""
+    if len(figure.resampled) != len(reference.resampled):
         return None
-    value = figure.mean - first.mean
-    low, high = interval(figure.resampled - first.resampled)
+    value = figure.mean - reference.mean
+    low, high = interval(figure.resampled - reference.resampled)
     return {"mean": number(value), "low": number(low), "high": number(high)}
 
 
 def interval(drawn: Array) -> tuple[float, float]:
-    """The 2.5 and 97.5 % quantiles of what is defined."""
+    """The 2.5 and 97.5 % quantiles of the finite values."""
     known = drawn[np.isfinite(drawn)]
     if not len(known):
         return float("nan"), float("nan")
@@ -116,7 +116,7 @@ def interval(drawn: Array) -> tuple[float, float]:
 
 
 def mean(values: Array, axis: int | None = None) -> Any:
-    """The mean of what is defined, NaN without a warning where nothing is."""
+    """The mean of the finite values; NaN, without a warning, where there is none."""
     known = np.isfinite(values)
     count = known.sum(axis=axis)
     total = np.where(known, values, 0.0).sum(axis=axis)
@@ -124,5 +124,5 @@ def mean(values: Array, axis: int | None = None) -> Any:
 
 
 def number(value: float | None) -> float | None:
-    """A JSON number, ``None`` for what is undefined."""
+    """The value as a JSON number, ``None`` where it is not finite."""
     return None if value is None or not np.isfinite(value) else float(value)

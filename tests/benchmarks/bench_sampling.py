@@ -29,12 +29,12 @@ from persist_cli.api.observations import Observations
 from persist_cli.checkpoints.checkpoint import find_checkpoint, reference_checkpoint, save_adapter, save_base
 from persist_cli.data.reference import sample_data
 from persist_cli.errors import CheckpointError
-from persist_cli.evaluate.bases import Backbones
+from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.cases import Case, CaseFrames, read_case
-from persist_cli.evaluate.measure import Measurer, choose_metrics, make_setup
-from persist_cli.evaluate.protocols import PROTOCOLS, Selected
+from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_setup
+from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
 from persist_cli.evaluate.provenance import checkpoint_json, environment, metric_json
-from persist_cli.evaluate.rows.build_rows import FORGETFUL, PLAIN, RowConfig, make_rows
+from persist_cli.evaluate.rows.build_rows import NO_MEMORY, PLAIN, RowConfig, build_model_rows
 from persist_cli.evaluate.rows.model import ModelRow
 from persist_cli.io.files import write_json, written_aside
 from persist_cli.memorize.factory import MemoryFactory
@@ -59,20 +59,20 @@ class Bench:
         row: whose clips are sampled in every way.
         samplings: the ways; times are told as ratios to the first.
         cases: the clips.
-        measurer: of their quality.
-        backbones: that make them.
+        suite: of their quality.
+        loader: of the backbones that make them.
     """
 
     rows: Sequence[ModelRow]
     row: ModelRow
     samplings: Sequence[Sampling]
     cases: Sequence[Case]
-    measurer: Measurer
-    backbones: Backbones
+    suite: MetricSuite
+    loader: BackboneLoader
 
     def start(self, row: ModelRow, number: int) -> tuple[WorldModel, CaseFrames]:
         """The row's world model at the beginning of a clip, its memory filled, and the clip."""
-        backbone, clip = self.backbones.ready(row), read_case(self.cases[number])
+        backbone, clip = self.loader.load_for(row), read_case(self.cases[number])
         return row.start(backbone, clip, clip_seed(0, number)), clip
 
 
@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         results = {"samplers": samplers, "memories": memories} | conditions(bench)
         write_json(options.out / "sampling.json", results)
-        draw(samplers, bench.measurer, options.out / "sampling.png")
+        draw(samplers, bench.suite, options.out / "sampling.png")
         say(f"written to {options.out / 'sampling.json'} and {options.out / 'sampling.png'}")
 
 
@@ -136,21 +136,20 @@ def fresh_model(folder: Path, settings: dict[str, Any]) -> list[Path]:
 
 def make_bench(options: argparse.Namespace) -> Bench:
     checkpoints = [find_checkpoint(path) for path in options.checkpoint]
-    backbones = Backbones()
-    backbone = backbones.of(checkpoints[0])
+    loader = BackboneLoader()
+    backbone = loader.load(checkpoints[0])
     samplers = options.samplers.split(",") if options.samplers else backbone.samplers
     counts = [int(steps) for steps in options.steps.split(",")]
     samplings = [Sampling(steps, sampler, options.guidance) for sampler in samplers for steps in counts]
-    cases = PROTOCOL.find(Selected(options.data, 0, options.clips, backbone.frames_per_clip - 1))
+    cases = PROTOCOL.find(ClipSearch(options.data, 0, options.clips, backbone.frames_per_clip - 1))
     adapters = sorted({name for each in checkpoints for name in each.adapters})
-    rows = make_rows(checkpoints, RowConfig([PLAIN, *adapters], (), samplings[0]), PROTOCOL, cases)
-    models = [row for row in rows if isinstance(row, ModelRow)]
+    models = build_model_rows(checkpoints, RowConfig([PLAIN, *adapters], (), samplings[0]), PROTOCOL)
     wanted = options.adapter or next((name for name in ("voxel", *adapters) if name in adapters), None)
     row = next((row for row in models if row.adapter == wanted), None)
     if row is None:
         raise CheckpointError(f"no checkpoint has a memory adapter {wanted!r}; there are: {', '.join(adapters)}")
-    measurer = Measurer.of(choose_metrics(FIGURES, METRICS), make_setup(cases))
-    return Bench(models, row, samplings, cases, measurer, backbones)
+    suite = MetricSuite(choose_metrics(FIGURES, METRICS), make_setup(cases))
+    return Bench(models, row, samplings, cases, suite, loader)
 
 
 def imagine(model: WorldModel, clip: CaseFrames) -> tuple[float, Observations]:
@@ -175,13 +174,13 @@ def compare_samplers(bench: Bench) -> list[dict[str, Any]]:
         for name, model.sampling in zip(names, bench.samplings, strict=True):
             took, seen = imagine(model, clip)
             seconds[name].append(took)
-            figures[name].append(bench.measurer.figures(seen.rgb, seen.depth, clip, name)[1:].mean(0).numpy())
+            figures[name].append(bench.suite.figures(seen.rgb, seen.depth, clip, name)[1:].mean(0).numpy())
     times = Times({name: np.array(values) for name, values in seconds.items()})
     return [
         {"sampler": each.sampler, "steps": each.steps, "memory_guidance": each.memory_guidance}
         | {"seconds": times.median(name)}
         | {"ratio": times.ratio(name, names[0])}
-        | dict(zip(bench.measurer.by_frame, np.mean(figures[name], axis=0).tolist(), strict=True))
+        | dict(zip(bench.suite.frame_metrics, np.mean(figures[name], axis=0).tolist(), strict=True))
         for name, each in zip(names, bench.samplings, strict=True)
     ]
 
@@ -199,7 +198,7 @@ def compare_memories(bench: Bench) -> list[dict[str, Any]]:
             reads[row.name].append(time.perf_counter() - start)
             clips[row.name].append(imagine(model, clip)[0])
     reading, whole = (Times({name: np.array(each) for name, each in part.items()}) for part in (reads, clips))
-    reference = next((row.name for row in bench.rows if row.adapter == FORGETFUL), bench.rows[0].name)
+    reference = next((row.name for row in bench.rows if row.adapter == NO_MEMORY), bench.rows[0].name)
     return [
         {"memory": row.name, "read": reading.median(row.name), "seconds": whole.median(row.name)}
         | {"ratio": whole.ratio(row.name, reference), "reference": reference}
@@ -209,7 +208,7 @@ def compare_memories(bench: Bench) -> list[dict[str, Any]]:
 
 def show(bench: Bench, samplers: Sequence[dict[str, Any]], memories: Sequence[dict[str, Any]]) -> None:
     """The two tables."""
-    for name, why in bench.measurer.obstacles.items():
+    for name, why in bench.suite.obstacles.items():
         say(f"{name}: n/a ({why})")
     first = bench.samplings[0]
     clips = f"clips of {bench.cases[0].frames - 1} frames: {len(bench.cases)}"
@@ -238,19 +237,19 @@ def conditions(bench: Bench) -> dict[str, Any]:
         "memory": bench.row.name,
         "clips": clips,
         "checkpoints": list(checkpoints.values()),
-        "metrics": metric_json(bench.measurer.by_frame),
+        "metrics": metric_json(bench.suite.frame_metrics),
         "threads": torch.get_num_threads(),
         "environment": environment(1),
     }
 
 
-def draw(samplers: Sequence[dict[str, Any]], measurer: Measurer, path: Path) -> None:
+def draw(samplers: Sequence[dict[str, Any]], suite: MetricSuite, path: Path) -> None:
     """A plot for each figure: a line a sampler over seconds a clip, its dots named by their steps."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6 * len(measurer.by_frame), 4), layout="constrained")
-    plots = figure.subplots(1, len(measurer.by_frame), squeeze=False)[0]
-    for axes, (name, metric) in zip(plots, measurer.by_frame.items(), strict=True):
+    figure = Figure(figsize=(6 * len(suite.frame_metrics), 4), layout="constrained")
+    plots = figure.subplots(1, len(suite.frame_metrics), squeeze=False)[0]
+    for axes, (name, metric) in zip(plots, suite.frame_metrics.items(), strict=True):
         for sampler in dict.fromkeys(each["sampler"] for each in samplers):
             dots = [each for each in samplers if each["sampler"] == sampler]
             axes.plot([each["seconds"] for each in dots], [each[name] for each in dots], "o-", label=sampler)

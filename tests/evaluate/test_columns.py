@@ -1,4 +1,4 @@
-"""Columns: over which frames a figure is the mean."""
+"""Columns of the table: the frames that a figure is the mean over."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.columns import chosen_frames, make_columns
-from persist_cli.evaluate.measure import choose_metrics
+from persist_cli.evaluate.metric_suite import choose_metrics
 from persist_cli.evaluate.protocols import PROTOCOLS
 from persist_cli.metrics import METRICS
 
@@ -16,16 +16,16 @@ def case(seen_before, first_visits=(-1, -1, -1, -1)):
 
 
 @pytest.mark.parametrize(("frames", "chosen"), [("all", [1, 2, 3]), ("last", [3]), ("return", [2]), ("new", [1, 2])])
-def test_a_column_is_over_its_frames_and_never_over_the_given_one(frames, chosen):
+def test_a_column_is_the_mean_over_its_frames_and_never_over_the_given_first_frame(frames, chosen):
     cases = [case((0.0, 0.1, 0.89, 0.9), (-1, -1, 0, -1))]
     assert chosen_frames(cases, frames)[0].nonzero()[:, 0].tolist() == chosen
 
 
-def test_views_of_which_nothing_is_known_are_not_new():
+def test_views_without_depth_do_not_count_as_new():
     assert not chosen_frames([case((None, None, None, None))], "new").any()
 
 
-def test_psnr_is_shown_where_the_view_is_new_too_and_only_where_the_protocol_tells():
+def test_psnr_has_a_column_for_new_views_only_where_the_protocol_selects_them():
     chosen = choose_metrics(("psnr", "ssim"), METRICS)
     names = [column.name for column in make_columns(chosen, PROTOCOLS["revisit"])]
     assert names == ["psnr", "psnr-last", "psnr-new", "ssim", "ssim-last"]
@@ -36,5 +36,5 @@ def test_psnr_is_shown_where_the_view_is_new_too_and_only_where_the_protocol_tel
     assert "psnr-new" not in [column.name for column in make_columns(chosen, PROTOCOLS["return"])]
 
 
-def test_scene_consistency_is_never_shown_without_its_guard():
+def test_choosing_scene_consistency_chooses_its_guard_too():
     assert list(choose_metrics(("src",), METRICS)) == ["src", "src-away"]

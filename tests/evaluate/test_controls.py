@@ -1,4 +1,4 @@
-"""tests.evaluate.test_controls."""
+"""Controls that need no training: copies, warps and the codec."""
 
 from __future__ import annotations
 
@@ -10,26 +10,21 @@ from persist_cli.api.observations import Observations
 from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
 from persist_cli.data.store import Store
 from persist_cli.evaluate.cases import read_case
-from persist_cli.evaluate.protocols import PROTOCOLS, Selected
+from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
 from persist_cli.evaluate.rows.controls import CodecReconstruction, Copy, Nearest, Warp
 from persist_cli.evaluate.rows.warp import Surface, warp
+from tests.support.predictions import seen
 from tests.support.rooms import Room, look
 
 
-def room(*poses: np.ndarray, size: int = 64) -> Observations:
-    view = Room(size, size)
-    frames = [view.see(pose) for pose in poses]
-    whole = torch.from_numpy
-    from persist_cli.api.cameras import Cameras
-
-    cameras = Cameras(whole(np.stack(poses)), whole(view.intrinsics).expand(len(poses), 3, 3), view.height, view.width)
-    rgb, depth = (np.stack([getattr(frame, name) for frame in frames]) for name in ("rgb", "depth"))
-    return Observations(whole(rgb), whole(depth), cameras)
+def room(*poses: np.ndarray) -> Observations:
+    """Views of the furnished room from these poses."""
+    return seen(np.stack(poses), Room(64, 64))
 
 
-def warped(seen: Observations, asked: Observations) -> tuple[torch.Tensor, torch.Tensor]:
-    """The view asked for, colours from the last frame that shows a surface."""
-    return warp(Surface.of(seen), asked.cameras, -torch.arange(len(seen)).double())
+def warped(earlier: Observations, view: Observations) -> tuple[torch.Tensor, torch.Tensor]:
+    """The view made of earlier frames, colours from the last frame that shows a surface."""
+    return warp(Surface.of(earlier), view.cameras, -torch.arange(len(earlier)).double())
 
 
 @pytest.fixture(scope="module")
@@ -39,20 +34,20 @@ def backbone(stage1):
 
 @pytest.fixture(scope="module")
 def revisits(walks):
-    return [read_case(case) for case in PROTOCOLS["revisit"].find(Selected([walks], 0, 8, 8))]
+    return [read_case(case) for case in PROTOCOLS["revisit"].find(ClipSearch([walks], 0, 8, 8))]
 
 
 def test_a_view_warped_into_itself_is_itself():
-    seen = room(look((0.0, 1.3, 0.2), 30.0))
-    rgb, depth = warped(seen, seen)
-    assert torch.equal(rgb, seen.rgb[0])
-    assert torch.allclose(depth, seen.depth[0])
+    view = room(look((0.0, 1.3, 0.2), 30.0))
+    rgb, depth = warped(view, view)
+    assert torch.equal(rgb, view.rgb[0])
+    assert torch.allclose(depth, view.depth[0])
 
 
 def test_a_warp_shows_the_new_view_better_than_the_old_frame_does():
     old, new = room(look((0.0, 1.3, 0.2), 30.0)), room(look((0.1, 1.3, 0.1), 22.0))
     rgb, depth = warped(old, new)
-    error, frozen = ((shown.float() - new.rgb[0].float()).abs().mean() for shown in (rgb, old.rgb[0]))
+    error, frozen = ((image.float() - new.rgb[0].float()).abs().mean() for image in (rgb, old.rgb[0]))
     assert error < 0.5 * frozen
     assert float((depth - new.depth[0]).abs().median()) < 0.02
 
@@ -67,8 +62,8 @@ def test_the_warp_shows_the_nearer_surface_whichever_frame_comes_last():
 
 
 def test_a_warp_of_nothing_in_view_is_black_without_depth():
-    seen, behind = room(look((0.0, 1.3, 0.0), 0.0, 0.0)), room(look((0.0, 1.3, 0.0), 180.0, 0.0))
-    rgb, depth = warped(seen, behind)
+    ahead, behind = room(look((0.0, 1.3, 0.0), 0.0, 0.0)), room(look((0.0, 1.3, 0.0), 180.0, 0.0))
+    rgb, depth = warped(ahead, behind)
     assert not rgb.any()
     assert not depth.any()
 
@@ -84,8 +79,8 @@ def test_the_nearest_frame_at_a_pose_seen_before_is_the_true_one(backbone, revis
         assert (rgb[0] == revisits[0].observations.rgb).all(-1).float().mean() > 0.9
 
 
-def test_controls_know_only_what_the_memory_holds_by_then(backbone, walks):
-    case = PROTOCOLS["return"].find(Selected([walks], 0, 1, 8))[0]
+def test_the_nearest_frame_is_taken_from_what_the_memory_holds_by_then(backbone, walks):
+    case = PROTOCOLS["return"].find(ClipSearch([walks], 0, 1, 8))[0]
     clip = read_case(case)
     row = Nearest("nearest", None, writes=True)
     assert row.held(clip, 8, 8).nonzero()[:, 0].tolist() == [0]
@@ -95,11 +90,11 @@ def test_controls_know_only_what_the_memory_holds_by_then(backbone, walks):
 
 
 def test_the_codec_gives_as_many_frames_as_the_clip_has(backbone, walks):
-    clip = read_case(PROTOCOLS["return"].find(Selected([walks], 0, 1, 8))[0])
+    clip = read_case(PROTOCOLS["return"].find(ClipSearch([walks], 0, 1, 8))[0])
     rgb, depth = CodecReconstruction("codec", None).videos(backbone, [clip], [0])
     assert rgb.shape[1] == depth.shape[1] == len(clip.observations) == 24
     assert torch.equal(rgb[0, 0], clip.observations.rgb[0])
 
 
-def test_walks_are_long_enough_for_these_tests(walks):
+def test_walks_have_the_24_frames_that_these_tests_count_on(walks):
     assert {len(file) for file in Store(walks)} == {24}

@@ -1,4 +1,4 @@
-"""tests.evaluate.test_evaluate."""
+"""``persist eval`` from its options to its results and report."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def results(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
-def figures(folder):
-    """Every figure of every row, without what tells of the machine and the moment."""
+def tables(folder):
+    """The tables of the results, without the environment and the command."""
     return results(folder)["tables"]
 
 
 def run(*arguments):
-    """A command in this process, as if it had been typed."""
+    """Run a command in this process, as if it had been typed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["persist", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
@@ -37,16 +37,15 @@ def run(*arguments):
 
 
 @pytest.fixture(scope="module")
-def whole(voxel, walks, tmp_path_factory):
-    """An evaluation without interruption."""
+def uninterrupted(voxel, walks, tmp_path_factory):
+    """The folder of an evaluation that was not interrupted."""
     out = tmp_path_factory.mktemp("eval") / "whole"
     run("eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out, "--report", out / "report")
     return out
 
 
-def test_eval_leaves_figures_intervals_and_differences(whole):
-    table = figures(whole)[0]
-    rows = table["rows"]
+def test_eval_leaves_figures_intervals_and_differences(uninterrupted):
+    rows = tables(uninterrupted)[0]["rows"]
     assert list(rows)[:4] == ["stage1", "voxel", "voxel, shuffled", "voxel, emptied"]
     assert {row["kind"] for row in rows.values()} == {"model", "memory control", "control"}
     psnr = rows["voxel"]["columns"]["psnr"]
@@ -54,41 +53,41 @@ def test_eval_leaves_figures_intervals_and_differences(whole):
     assert psnr["low"] <= psnr["mean"] <= psnr["high"]
     assert psnr["difference"]["mean"] == pytest.approx(psnr["mean"] - rows["stage1"]["columns"]["psnr"]["mean"])
     assert rows["stage1"]["columns"]["psnr"]["difference"] is None
-    for one, other in itertools.permutations(rows, 2):
-        there, back = (rows[a]["columns"]["psnr"]["differences"][b] for a, b in ((one, other), (other, one)))
-        assert there["mean"] == pytest.approx(-back["mean"])
-        assert (there["low"], there["high"]) == pytest.approx((-back["high"], -back["low"]))
+    for one, two in itertools.permutations(rows, 2):
+        gap, reverse = (rows[a]["columns"]["psnr"]["differences"][b] for a, b in ((one, two), (two, one)))
+        assert gap["mean"] == pytest.approx(-reverse["mean"])
+        assert (gap["low"], gap["high"]) == pytest.approx((-reverse["high"], -reverse["low"]))
     assert rows["codec reconstruction"]["columns"]["psnr"]["std"] is None
     assert len(rows["voxel"]["curves"]["psnr"]["per_frame"]) == 8
     assert rows["voxel"]["curves"]["psnr"]["by_seen_before"]
 
 
-def test_an_emptied_memory_is_not_the_memory(whole):
-    rows = figures(whole)[0]["rows"]
+def test_emptying_the_memory_changes_the_figures(uninterrupted):
+    rows = tables(uninterrupted)[0]["rows"]
     assert rows["voxel, emptied"]["columns"]["psnr"]["per_clip"] != rows["voxel"]["columns"]["psnr"]["per_clip"]
 
 
-def test_the_results_tell_all_that_is_needed_to_measure_again(whole, voxel):
-    found = results(whole)
-    assert found["command"][:2] == ["persist", "eval"]
-    assert found["sampling"] == {
+def test_the_results_hold_all_that_is_needed_to_measure_again(uninterrupted, voxel):
+    values = results(uninterrupted)
+    assert values["command"][:2] == ["persist", "eval"]
+    assert values["sampling"] == {
         "steps": 2, "sampler": "ddim", "memory_guidance": 1.0, "seeds": [0, 1], "batch": 1,
     }  # fmt: skip
-    assert len(found["measured"]["data"][0]["trajectories"]["walk-0"]) == 64
-    assert found["measured"]["metrics"]["psnr"]["definition"].startswith("dB")
-    assert found["checkpoints"][0]["name"] == voxel.name
-    assert len(found["checkpoints"][0]["recipe_sha256"]) == len(found["checkpoints"][0]["adapters"]["voxel"]) == 64
-    assert {"persist", "torch", "platform", "packages"} <= set(found["environment"])
+    assert len(values["measured"]["data"][0]["trajectories"]["walk-0"]) == 64
+    assert values["measured"]["metrics"]["psnr"]["definition"].startswith("dB")
+    assert values["checkpoints"][0]["name"] == voxel.name
+    assert len(values["checkpoints"][0]["recipe_sha256"]) == len(values["checkpoints"][0]["adapters"]["voxel"]) == 64
+    assert {"persist", "torch", "platform", "packages"} <= set(values["environment"])
 
 
-def test_eval_leaves_a_report_with_clips_of_every_row(whole):
-    report = whole / "report"
+def test_eval_leaves_a_report_with_clips_of_every_row(uninterrupted):
+    report = uninterrupted / "report"
     assert {"report.html", "table.md", "table.tex", "results.json"} <= {path.name for path in report.iterdir()}
     assert list((report / "clips").glob("*voxel*best*.mp4"))
     assert list((report / "sheets").glob("*rows-walk-0*.png"))
 
 
-def test_a_killed_eval_goes_on_to_the_same_figures(whole, voxel, walks, tmp_path):
+def test_a_killed_eval_goes_on_to_the_same_figures(uninterrupted, voxel, walks, tmp_path):
     out = tmp_path / "eval"
     command = [str(part) for part in [*PERSIST, "eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out]]
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -101,64 +100,64 @@ def test_a_killed_eval_goes_on_to_the_same_figures(whole, voxel, walks, tmp_path
     assert not (out / "metrics.json").exists()
     run("eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out)
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert figures(out) == figures(whole)
+    assert tables(out) == tables(uninterrupted)
 
 
-def test_two_processes_give_the_same_figures_as_one(whole, voxel, walks, tmp_path):
+def test_two_processes_give_the_same_figures_as_one(uninterrupted, voxel, walks, tmp_path):
     command = ["eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", tmp_path / "eval"]
     together(*map(str, command))
     assert results(tmp_path / "eval")["environment"]["processes"] == 2
-    assert figures(tmp_path / "eval") == figures(whole)
+    assert tables(tmp_path / "eval") == tables(uninterrupted)
 
 
-def test_figures_do_not_depend_on_the_batch(persist, whole, voxel, walks, tmp_path):
+def test_figures_do_not_depend_on_the_batch_size(persist, uninterrupted, voxel, walks, tmp_path):
     command = ["eval", voxel, "--data", walks, *QUICK, "--batch", 2, "--controls", "copy", "--out", tmp_path]
     assert persist(*command).code == 0
-    columns = [figures(folder)[0]["rows"]["voxel"]["columns"]["psnr"] for folder in (tmp_path, whole)]
+    columns = [tables(folder)[0]["rows"]["voxel"]["columns"]["psnr"] for folder in (tmp_path, uninterrupted)]
     assert columns[0]["per_clip"] == pytest.approx(columns[1]["per_clip"], abs=0.05)
 
 
-def test_another_evaluation_in_the_folder_is_refused(persist, whole, voxel, walks):
-    ended = persist("eval", voxel, "--data", walks, *QUICK, "--batch", 2, "--out", whole)
+def test_another_evaluation_in_the_folder_is_refused(persist, uninterrupted, voxel, walks):
+    ended = persist("eval", voxel, "--data", walks, *QUICK, "--batch", 2, "--out", uninterrupted)
     assert ended.code == 1
     assert "holds another evaluation (batch: 1, now 2); choose another --out" in ended.err
 
 
-def test_checkpoints_of_one_name_are_told_apart_by_their_folders(persist, voxel, stage1, walks, tmp_path):
+def test_rows_of_checkpoints_with_one_name_show_their_folders(persist, voxel, stage1, walks, tmp_path):
     shutil.copytree(stage1, tmp_path / "stage1")
     shutil.copytree(voxel, tmp_path / "voxel")
     options = ["--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1, "--controls", "codec"]
     ended = persist("eval", voxel, tmp_path / "voxel", voxel, "--data", walks, *options, "--out", tmp_path / "o")
     assert ended.code == 0, ended.err
-    rows = figures(tmp_path / "o")[0]["rows"]
+    rows = tables(tmp_path / "o")[0]["rows"]
     assert len(rows) == 3
     assert [name.startswith("voxel (/") for name in rows] == [True, True, False]
     one, two = (rows[name]["columns"]["psnr"]["per_clip"] for name in list(rows)[:2])
     assert one == two
 
 
-def test_a_metric_that_cannot_be_measured_says_why_and_the_others_are(persist, voxel, walks, tmp_path):
+def test_a_metric_that_cannot_be_measured_gives_its_reason_and_leaves_the_others(persist, voxel, walks, tmp_path):
     options = ["--memories", "stage1", "--metrics", "psnr,fvd,src", "--seeds", 1, "--steps", 2, "--controls", "copy"]
     ended = persist("eval", voxel, "--data", walks, *options, "--out", tmp_path)
     assert ended.code == 0, ended.err
-    columns = figures(tmp_path)[0]["rows"]["stage1"]["columns"]
+    columns = tables(tmp_path)[0]["rows"]["stage1"]["columns"]
     assert columns["psnr"]["mean"] > 0
     assert columns["fvd"] == {"na": "8 frames a clip, FVD needs 16"}
     assert "return" in columns["src"]["na"]
 
 
-def test_results_of_two_runs_are_compared_when_measured_alike(persist, whole, voxel, walks, tmp_path):
-    same = persist("eval", "--compare", whole / "metrics.json", whole / "metrics.json")
+def test_two_runs_are_compared_only_when_they_measured_the_same_clips(persist, uninterrupted, voxel, walks, tmp_path):
+    same = persist("eval", "--compare", uninterrupted / "metrics.json", uninterrupted / "metrics.json")
     assert same.code == 0, same.err
     options = ["--memories", "stage1", "--metrics", "psnr", "--steps", 2, "--seeds", 1, "--clips", 1]
     ended = persist("eval", voxel, "--data", walks, *options, "--controls", "copy", "--out", tmp_path)
     assert ended.code == 0, ended.err
-    other = persist("eval", "--compare", whole / "metrics.json", tmp_path / "metrics.json")
-    assert other.code == 1
-    assert "clip" in other.err
+    refused = persist("eval", "--compare", uninterrupted / "metrics.json", tmp_path / "metrics.json")
+    assert refused.code == 1
+    assert "clip" in refused.err
 
 
-def test_a_checkpoint_and_a_memory_that_do_not_fit_are_one_line(persist, voxel, stage1, walks, tmp_path):
+def test_an_encoder_that_does_not_fit_the_checkpoint_is_one_line(persist, voxel, stage1, walks, tmp_path):
     shutil.copytree(stage1, tmp_path / "runs" / "stage1")
     shutil.copytree(voxel, tmp_path / "runs" / "voxel")
     (card,) = (tmp_path / "runs" / "voxel").glob("step-*/model/adapters/voxel/memory.json")
@@ -185,19 +184,19 @@ def test_a_checkpoint_and_a_memory_that_do_not_fit_are_one_line(persist, voxel, 
         (["--protocol", "long"], "no trajectory has 113 frames"),
     ],
 )
-def test_what_cannot_be_evaluated_is_one_line_and_leaves_nothing(persist, voxel, walks, tmp_path, options, cause):
+def test_an_impossible_evaluation_is_one_line_and_leaves_no_folder(persist, voxel, walks, tmp_path, options, cause):
     ended = persist("eval", voxel, "--data", walks, "--memories", "voxel", *options, "--out", tmp_path / "o")
     assert (ended.code, cause in ended.err) == (1, True), ended.err
     assert not (tmp_path / "o").exists()
 
 
-def test_eval_wants_a_checkpoint_and_data_that_are_there(persist, voxel, walks, tmp_path):
+def test_eval_without_checkpoint_or_trajectories_names_what_is_missing(persist, voxel, walks, tmp_path):
     assert "give --data DATA" in persist("eval", voxel).err
     assert "give a CHECKPOINT" in persist("eval", "--data", walks).err
     assert "no trajectory" in persist("eval", voxel, "--data", tmp_path, "--memories", "voxel").err
 
 
-def test_data_without_depth_is_measured_where_depth_is_not_needed(persist, voxel, walks, tmp_path):
+def test_data_without_depth_is_measured_by_metrics_and_controls_that_need_none(persist, voxel, walks, tmp_path):
     data, command = without_depth(walks, tmp_path / "data"), ["--memories", "voxel", "--seeds", 1, "--steps", 1]
     common = ["--protocol", "return", *command, "--metrics", "psnr,absrel", "--out", tmp_path / "o"]
     refused = persist("eval", voxel, "--data", data, *common)
@@ -205,7 +204,7 @@ def test_data_without_depth_is_measured_where_depth_is_not_needed(persist, voxel
     assert not (tmp_path / "o").exists()
     ended = persist("eval", voxel, "--data", data, *common, "--controls", "copy")
     assert ended.code == 0, ended.err
-    rows = figures(tmp_path / "o")[0]["rows"]
+    rows = tables(tmp_path / "o")[0]["rows"]
     assert set(rows) == {"voxel", "copy of the first frame", "ground truth"}
     assert rows["voxel"]["columns"]["absrel"] == {"na": "the data has no depth"}
     assert rows["ground truth"]["columns"]["psnr-return"]["mean"] == 100.0

@@ -1,4 +1,4 @@
-"""tests.evaluate.test_interventions."""
+"""Memory interventions: what is written into a row's memory in place of the true frames."""
 
 from __future__ import annotations
 
@@ -11,43 +11,43 @@ from persist_cli.api.geometry import pose_differences
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import read_case
-from persist_cli.evaluate.protocols import PROTOCOLS, Selected
+from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
 from persist_cli.evaluate.rows.interventions import (
     Emptied,
     NoisyPoses,
     Oracle,
     Shuffled,
-    partner,
+    next_in_another_scene,
     small_motions,
 )
 
 
 @pytest.fixture(scope="module")
 def cases(walks):
-    return PROTOCOLS["revisit"].find(Selected([walks], 0, 8, 8))
+    return PROTOCOLS["revisit"].find(ClipSearch([walks], 0, 8, 8))
 
 
-def test_the_shuffled_memory_is_another_scenes_moved_to_where_the_clip_begins(cases):
-    clip, other = read_case(cases[0]), read_case(cases[1])
+def test_a_shuffled_memory_holds_another_scene_moved_to_where_the_clip_begins(cases):
+    clip, partner = read_case(cases[0]), read_case(cases[1])
     wrong = Shuffled(cases).context(clip)
-    assert torch.equal(wrong.rgb, other.context.rgb)
+    assert torch.equal(wrong.rgb, partner.context.rgb)
     here, moved = clip.observations.cameras.world_from_camera[0], wrong.cameras.world_from_camera[-1]
     assert torch.allclose(here, moved, atol=1e-9)
 
 
 def test_shuffling_needs_another_scene(cases):
-    alike = [replace(case, scene="one") for case in cases]
+    one_scene = [replace(case, scene="one") for case in cases]
     with pytest.raises(DataError, match=r"'shuffled' needs clips of two scenes.*leave it out of --controls"):
-        partner(alike, 0)
+        next_in_another_scene(one_scene, 0)
 
 
-def test_the_oracle_has_seen_the_clip_and_the_emptied_memory_nothing(cases):
+def test_the_oracle_holds_the_frames_of_the_clip_and_the_emptied_memory_none(cases):
     clip = read_case(cases[0])
     assert torch.equal(Oracle().context(clip).rgb[-9:], clip.observations.rgb)
     assert Emptied().context(clip) is None
 
 
-def test_noisy_poses_are_off_by_what_they_say(walks):
+def test_noisy_poses_have_errors_of_the_given_deviations(walks):
     seen = Store(walks)[0].read().observations
     many = seen[[0] * 4000]
     wrong = NoisyPoses(5.0, 2.0).disturb(many, torch.Generator().manual_seed(0))
@@ -57,7 +57,7 @@ def test_noisy_poses_are_off_by_what_they_say(walks):
     assert torch.equal(wrong.rgb, many.rgb)
 
 
-def test_no_noise_changes_nothing(walks):
+def test_noise_of_no_deviation_changes_no_pose(walks):
     seen = Store(walks)[0].read().observations
     same = NoisyPoses(0.0, 0.0).disturb(seen, torch.Generator().manual_seed(0))
     assert torch.equal(same.cameras.world_from_camera, seen.cameras.world_from_camera)

@@ -1,4 +1,4 @@
-"""What an evaluation checks before it measures, and what it takes from its folder: all bases, cards, data, clips."""
+"""The checks before an evaluation measures anything, and what it takes from a folder that holds one already."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ONE = ["--memories", "voxel", "--metrics", "psnr", "--controls", "copy", "--seed
 
 
 def write_model(folder, scale=0.1, sampling=None, **settings):
-    """A voxel adapter, whose card may say how it is sampled, on a base of its own."""
+    """A voxel adapter on a base of its own; its card may hold a sampling."""
     backbone = write_base(folder / "base", scale, **settings)
     model = write_adapter(backbone, folder / "base", folder / "voxel", "voxel")
     if sampling:
@@ -27,21 +27,21 @@ def columns(out):
 
 
 def refused(persist, *command):
-    """The error of a command that fails, its last line."""
+    """The last line of the error of a command that fails."""
     ended = persist(*command)
     assert ended.code == 1, ended.err
     assert ended.err.count("error: ") == 1
     return ended.err.strip().splitlines()[-1]
 
 
-def test_checkpoints_whose_cards_mean_different_samplings_want_a_word(persist, walks, tmp_path):
+def test_checkpoints_whose_cards_give_different_samplings_need_options_that_name_one(persist, walks, tmp_path):
     a = write_model(tmp_path / "a", 0.1, {"steps": 1, "sampler": "ddim"})
     b = write_model(tmp_path / "b", 0.2, {"steps": 2, "sampler": "unipc", "memory_guidance": 1.5})
     for pair in ((a, b), (b, a)):
-        told = refused(persist, "eval", *pair, "--data", walks, *ONE, "--out", tmp_path / "o")
-        assert "a/voxel means 1 steps of ddim with guidance 1" in told
-        assert "b/voxel means 2 steps of unipc with guidance 1.5" in told
-        assert told.endswith("; name --steps, --sampler and --guidance")
+        error = refused(persist, "eval", *pair, "--data", walks, *ONE, "--out", tmp_path / "o")
+        assert "a/voxel means 1 steps of ddim with guidance 1" in error
+        assert "b/voxel means 2 steps of unipc with guidance 1.5" in error
+        assert error.endswith("; name --steps, --sampler and --guidance")
     assert not (tmp_path / "o").exists()
     named = ["--steps", 1, "--sampler", "unipc", "--guidance", 1]
     assert persist("eval", a, b, "--data", walks, *ONE, *named, "--out", tmp_path / "o").code == 0
@@ -57,14 +57,14 @@ def test_checkpoints_whose_cards_mean_different_samplings_want_a_word(persist, w
         ({"frames": 17}, "b/voxel predicts clips of 17 frames and"),
     ],
 )
-def test_every_base_must_take_the_clips(persist, walks, tmp_path, settings, cause):
+def test_a_base_that_does_not_take_the_clips_is_refused(persist, walks, tmp_path, settings, cause):
     a, b = write_model(tmp_path / "a"), write_model(tmp_path / "b", 0.2, **settings)
-    told = refused(persist, "eval", a, b, "--data", walks, *ONE, "--steps", 1, "--out", tmp_path / "o")
-    assert cause in told
+    error = refused(persist, "eval", a, b, "--data", walks, *ONE, "--steps", 1, "--out", tmp_path / "o")
+    assert cause in error
     assert not (tmp_path / "o").exists()
 
 
-def test_only_rows_of_a_model_without_depth_lack_figures_of_depth(persist, walks, tmp_path):
+def test_only_rows_of_a_model_without_depth_lack_depth_metrics(persist, walks, tmp_path):
     a, b = write_model(tmp_path / "a"), write_model(tmp_path / "b", 0.2, depth=False)
     command = ["eval", a, b, "--data", walks, "--memories", "voxel", "--metrics", "psnr,absrel,drift"]
     options = ["--controls", "codec", "--seeds", 1, "--clips", 1, "--steps", 1]
@@ -78,21 +78,21 @@ def test_only_rows_of_a_model_without_depth_lack_figures_of_depth(persist, walks
     assert (tmp_path / "r/report.html").is_file()
 
 
-def test_data_that_changed_since_is_not_measured_on(persist, walks, tmp_path):
+def test_an_evaluation_does_not_go_on_with_trajectories_that_changed(persist, walks, tmp_path):
     voxel, data = write_model(tmp_path), shutil.copytree(walks, tmp_path / "data")
     command = ["eval", voxel, "--data", data, *ONE, "--steps", 1, "--out", tmp_path / "o"]
     assert persist(*command).code == 0
     measured = read_json(tmp_path / "o/metrics.json")["measured"]
     assert persist(*command).code == 0
     (name,) = measured["data"][0]["trajectories"]
-    other = next(path for path in data.iterdir() if path.stem != name)
-    shutil.copyfile(other, data / f"{name}.parquet")
+    another = next(path for path in data.iterdir() if path.stem != name)
+    shutil.copyfile(another, data / f"{name}.parquet")
     assert f"{name}.parquet: not what it was when the evaluation in" in refused(persist, *command)
     (data / f"{name}.parquet").unlink()
     assert "not what it was" in refused(persist, *command)
 
 
-def test_what_is_named_twice_is_measured_once(persist, walks, tmp_path):
+def test_memories_and_data_named_twice_are_measured_once(persist, walks, tmp_path):
     voxel, named = write_model(tmp_path), ["--memories", "voxel,voxel", "--metrics", "psnr", "--controls", "copy"]
     twice = [*named, "--data", walks, "--data", walks, "--seeds", 1, "--steps", 1]
     ended = persist("eval", voxel, *twice, "--out", tmp_path / "o")
@@ -102,31 +102,31 @@ def test_what_is_named_twice_is_measured_once(persist, walks, tmp_path):
     assert len(rows["voxel"]["psnr"]["per_clip"]) == 2
 
 
-def test_a_finished_evaluation_leaves_its_report_again_without_predicting(persist, walks, tmp_path, monkeypatch):
+def test_a_second_report_of_a_finished_evaluation_predicts_nothing(persist, walks, tmp_path, monkeypatch):
     command = ["eval", write_model(tmp_path), "--data", walks, *ONE, "--steps", 1, "--out", tmp_path / "o"]
     assert persist(*command, "--report", tmp_path / "a").code == 0
-    for place in ("run", "pictures"):
-        monkeypatch.setattr(f"persist_cli.evaluate.{place}.predict", lambda *given: pytest.fail("predicts again"))
+    for module in ("measure_rows", "example_clips"):
+        monkeypatch.setattr(f"persist_cli.evaluate.{module}.predict", lambda *_: pytest.fail("predicts again"))
     assert persist(*command, "--report", tmp_path / "b").code == 0
     first, again = ({path.name: path.read_bytes() for path in (tmp_path / name / "sheets").iterdir()} for name in "ab")
     assert first == again
     assert len(first) == 3
 
 
-def test_an_exported_model_still_knows_what_it_was_trained_on(persist, stage1, voxel, walks, tmp_path):
+def test_unseen_refuses_the_training_scenes_of_an_exported_model(persist, stage1, voxel, walks, tmp_path):
     assert persist("export", stage1, voxel, "--out", tmp_path / "model").code == 0
     command = ["eval", tmp_path / "model", "--data", walks, "--protocol", "unseen", *ONE, "--out", tmp_path / "o"]
     assert "the model was trained on its scene 'room-0'" in refused(persist, *command)
     assert not (tmp_path / "o").exists()
 
 
-def test_another_precision_is_another_evaluation_and_slices_of_the_codec_are_not(persist, walks, tmp_path):
+def test_another_precision_is_another_evaluation_and_slicing_the_codec_is_not(persist, walks, tmp_path):
     model, out = write_model(tmp_path / "a"), tmp_path / "o"
     run = ["eval", model, "--data", walks, *ONE, "--steps", 1, "--out", out]
     assert persist(*run).code == 0
     assert persist(*run, "--save-memory", "vae-slicing").code == 0
     assert "dtype" not in read_json(out / "metrics.json")["sampling"]
-    told = refused(persist, *run, "--dtype", "bfloat16")
-    assert "holds another evaluation (sampling dtype: None, now bfloat16)" in told
+    error = refused(persist, *run, "--dtype", "bfloat16")
+    assert "holds another evaluation (sampling dtype: None, now bfloat16)" in error
     assert persist(*run[:-1], tmp_path / "p", "--dtype", "bfloat16").code == 0
     assert read_json(tmp_path / "p/metrics.json")["sampling"]["dtype"] == "bfloat16"

@@ -1,4 +1,4 @@
-"""tests.evaluate.test_protocols."""
+"""Protocols: which clips they find, and what the memory holds when a clip begins."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.coverage import held_frames, recalled_share, seen_share
-from persist_cli.evaluate.protocols import PROTOCOLS, Selected, turning_point
+from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, turning_point
 from tests.support.rooms import Room, look
 from tests.support.walking import smoothed, without_depth
 
 
-def asked(folder, frames=0, most=8, clip=8, scenes=()):
-    return Selected([folder], frames, most, clip, frozenset(scenes))
+def search(folder, frames=0, scenes=()):
+    """A search for at most eight clips, for a model that predicts eight frames at once."""
+    return ClipSearch([folder], frames, 8, 8, frozenset(scenes))
 
 
-def test_the_way_back_recalls_what_the_way_out_saw(walks):
+def test_clips_of_a_revisit_are_on_the_way_back(walks):
     seen = Store(walks)[0].read().observations
-    cases = PROTOCOLS["revisit"].find(asked(walks))
+    cases = PROTOCOLS["revisit"].find(search(walks))
     assert len(cases) == 2
     assert all(recalled_share(seen, case.start, case.start + 8) > 0.3 for case in cases if case.trajectory == "walk-0")
     assert recalled_share(seen, 9, 9) == 0
 
 
 def test_a_revisit_remembers_every_frame_up_to_the_first_and_none_of_the_clip(walks):
-    case = PROTOCOLS["revisit"].find(asked(walks))[0]
+    case = PROTOCOLS["revisit"].find(search(walks))[0]
     clip = read_case(case)
     assert case.context == case.start + 1
     assert torch.equal(clip.context.rgb[-1], clip.observations.rgb[0])
@@ -42,13 +43,13 @@ def test_a_revisit_remembers_every_frame_up_to_the_first_and_none_of_the_clip(wa
 def test_a_path_that_never_returns_has_no_clip_to_evaluate(tmp_path):
     Room(32, 32).write(tmp_path / "a.parquet", smoothed(24))
     with pytest.raises(DataError, match=r"no clip of 9 frames returns to a place seen before"):
-        PROTOCOLS["revisit"].find(asked(tmp_path))
+        PROTOCOLS["revisit"].find(search(tmp_path))
     with pytest.raises(DataError, match=r"no trajectory goes away and comes back"):
-        PROTOCOLS["return"].find(asked(tmp_path))
+        PROTOCOLS["return"].find(search(tmp_path))
 
 
-def test_there_and_back_pairs_frames_of_one_pose(walks):
-    for case in PROTOCOLS["return"].find(asked(walks)):
+def test_first_visits_of_there_and_back_have_the_same_pose(walks):
+    for case in PROTOCOLS["return"].find(search(walks)):
         poses = read_case(case).observations.cameras.world_from_camera
         pairs = [(number, visit) for number, visit in enumerate(case.first_visits) if visit >= 0]
         assert len(pairs) >= 9
@@ -68,46 +69,46 @@ def test_the_turning_point_may_lie_on_a_frame_or_between_two():
 def test_standing_still_is_no_return(tmp_path):
     Room(32, 32).write(tmp_path / "a.parquet", np.repeat(smoothed(1), 24, axis=0))
     with pytest.raises(DataError, match="comes back"):
-        PROTOCOLS["return"].find(asked(tmp_path))
+        PROTOCOLS["return"].find(search(tmp_path))
 
 
-def test_long_wants_112_frames_to_predict(walks, tmp_path):
+def test_a_long_clip_needs_112_frames_to_predict(walks, tmp_path):
     with pytest.raises(DataError, match="no trajectory has 113 frames, the longest has 24"):
-        PROTOCOLS["long"].find(asked(walks))
+        PROTOCOLS["long"].find(search(walks))
     with pytest.raises(DataError, match="--frames 50 are too few"):
-        PROTOCOLS["long"].find(asked(walks, frames=50))
+        PROTOCOLS["long"].find(search(walks, frames=50))
     turning = [look((0.0, 1.3, 0.0), 6.0 * number, 0.0) for number in range(115)]
     Room(16, 16).write(tmp_path / "a.parquet", np.stack(turning))
-    (case,) = PROTOCOLS["long"].find(asked(tmp_path))
+    (case,) = PROTOCOLS["long"].find(search(tmp_path))
     assert (case.frames, case.context) == (113, 0)
     assert case.seen_before[100] > 0.9  # after a full turn
 
 
-def test_unseen_refuses_what_was_trained_on(walks, tmp_path):
+def test_unseen_refuses_scenes_that_were_trained_on(walks, tmp_path):
     with pytest.raises(DataError, match="trained on its scene 'room-1'"):
-        PROTOCOLS["unseen"].find(asked(walks, scenes=["room-1"]))
-    assert len(PROTOCOLS["unseen"].find(asked(walks))) == 2
+        PROTOCOLS["unseen"].find(search(walks, scenes=["room-1"]))
+    assert len(PROTOCOLS["unseen"].find(search(walks))) == 2
     info = replace(Room(32, 32).info, source={"simulator": "miniworld", "split": "train"})
     write_trajectory(tmp_path / "a.parquet", info, Room(32, 32).frames(smoothed(24)))
     with pytest.raises(DataError, match="of the training split"):
-        PROTOCOLS["unseen"].find(asked(tmp_path))
+        PROTOCOLS["unseen"].find(search(tmp_path))
 
 
-def test_data_without_depth_says_which_protocols_remain(walks, tmp_path):
+def test_the_error_for_data_without_depth_names_the_protocols_that_remain(walks, tmp_path):
     without_depth(walks, tmp_path)
     with pytest.raises(DataError, match=r"no frame has depth.*--protocol return or long"):
-        PROTOCOLS["revisit"].find(asked(tmp_path))
-    case = PROTOCOLS["return"].find(asked(tmp_path))[0]
+        PROTOCOLS["revisit"].find(search(tmp_path))
+    case = PROTOCOLS["return"].find(search(tmp_path))[0]
     assert set(case.seen_before) == {None}
 
 
-def test_what_the_memory_holds_grows_by_whole_clips_where_output_is_written():
-    assert held_frames(start=0, context=0, frame=8, clip=8, writes=True) == [0]
-    assert held_frames(start=0, context=0, frame=9, clip=8, writes=True) == list(range(9))
-    assert held_frames(start=5, context=6, frame=9, clip=8, writes=False) == list(range(6))
+def test_the_memory_grows_by_whole_clips_where_output_is_written():
+    assert held_frames(start=0, context=0, frame=8, predicted_at_once=8, writes=True) == [0]
+    assert held_frames(start=0, context=0, frame=9, predicted_at_once=8, writes=True) == list(range(9))
+    assert held_frames(start=5, context=6, frame=9, predicted_at_once=8, writes=False) == list(range(6))
 
 
-def test_a_view_is_wholly_seen_by_itself_and_not_by_nothing(walks):
+def test_a_view_is_wholly_seen_by_its_own_frame_and_not_at_all_by_none(walks):
     seen = Store(walks)[0].read().observations
     assert seen_share(seen, 3, [3]) == 1.0
     assert seen_share(seen, 3, []) == 0.0

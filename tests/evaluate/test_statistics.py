@@ -1,4 +1,4 @@
-"""tests.evaluate.test_statistics."""
+"""Means, deviations and bootstrap intervals of the figures."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ def test_a_figure_is_the_mean_over_clips_with_the_deviation_over_seeds():
     assert mean_figure(values[:1]).std is None
 
 
-def test_the_interval_is_that_of_the_normal_approximation():
+def test_the_bootstrap_interval_is_near_that_of_the_normal_approximation():
     per_clip = clips(count=400).mean(axis=0)
     figure = mean_figure(clips(count=400))
     assert figure.high - figure.low == pytest.approx(2 * 1.96 * per_clip.std(ddof=1) / 20, rel=0.1)
 
 
-def test_a_constant_gap_between_rows_is_certain_however_much_clips_differ():
+def test_a_constant_difference_between_rows_has_an_interval_of_no_width():
     changed = difference(mean_figure(clips(offset=0.5)), mean_figure(clips()))
     assert changed == pytest.approx({"mean": 0.5, "low": 0.5, "high": 0.5})
 
 
-def test_a_gap_that_is_noise_has_an_interval_around_zero():
-    other = np.random.default_rng(1).normal(20, 4, (3, 50))
-    changed = difference(mean_figure(other), mean_figure(clips()))
+def test_a_difference_that_is_noise_has_an_interval_around_zero():
+    independent = np.random.default_rng(1).normal(20, 4, (3, 50))
+    changed = difference(mean_figure(independent), mean_figure(clips()))
     assert changed["low"] < 0 < changed["high"]
 
 
@@ -57,7 +57,7 @@ def test_the_interval_of_a_distance_between_sets_lies_around_it():
     assert figure.per_clip is None
 
 
-def test_frames_are_gathered_by_how_much_of_them_was_seen_before():
+def test_frames_are_binned_by_the_share_of_their_view_seen_before():
     values, shares = np.array([[1.0, 2.0, 3.0, np.nan]]), np.array([[0.05, 0.95, 1.0, 0.5]])
     assert seen_bins(values, shares) == [
         {"low": 0.0, "high": 0.1, "mean": 1.0, "count": 1},

@@ -1,4 +1,4 @@
-"""Two runs side by side, when they measured the same."""
+"""Compare two runs side by side, when they measured the same clips by the same metrics."""
 
 from __future__ import annotations
 
@@ -11,33 +11,26 @@ import numpy as np
 
 from persist_cli.errors import DataError
 from persist_cli.evaluate.report.agreement import differing_notes, measured_differently
-from persist_cli.evaluate.report.result_file import (
-    Cell,
-    ColumnRecord,
-    Difference,
-    Evaluation,
-    difference_texts,
-    digits_of,
-    heading,
-    number,
-    read_results,
-)
-from persist_cli.evaluate.report.tables import NOT_AVAILABLE
-from persist_cli.evaluate.report.text import Lines, fitting, markdown_table
+from persist_cli.evaluate.report.result_file import Cell, ColumnRecord, Difference, EvalResults, read_results
+from persist_cli.evaluate.report.tables import NOT_AVAILABLE, difference_texts, digits_of, heading, number_text
+from persist_cli.evaluate.report.text import PrintedTable, fit_columns, markdown_table
 
 RESAMPLES = 1000
 
-LEAST_PAIRS = 2  # below, an interval would be a single point
+LEAST_PAIRS = 2  # of fewer clips an interval would be a single point
 
-LEGEND = (
+DIFFERENCE_LEGEND = (
     f"B − A: paired over clips where both have them, with its 95 % interval ({RESAMPLES:,} bootstrap resamples of "
     "the clips); * the interval leaves zero out"
 )
 
 
 @dataclass(frozen=True)
-class Compared:
-    """One figure in both runs; ``pairs`` counts the clips behind the difference, 0 where it is one of means."""
+class ComparedCell:
+    """One figure in both runs with the difference B − A.
+
+    ``pairs`` counts the clips behind the difference; it is 0 where only the means could be subtracted.
+    """
 
     a: float | None
     b: float | None
@@ -49,15 +42,15 @@ class Compared:
 
 @dataclass(frozen=True)
 class ComparedTable:
-    """Rows and columns that both runs have: figures by row and column."""
+    """The figures of the rows and columns that both runs have, by row and column."""
 
     name: str
-    rows: dict[str, dict[str, Compared]]
+    rows: dict[str, dict[str, ComparedCell]]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two runs that measured the same; ``notes`` say in what else they differ."""
+    """Two runs that measured the same clips; ``notes`` say in what else they differ."""
 
     a: str
     b: str
@@ -66,16 +59,20 @@ class Comparison:
     notes: list[str]
 
     def to_json(self) -> dict[str, Any]:
-        """JSON values."""
-        columns = {name: {"title": each.title, "better": each.better} for name, each in self.columns.items()}
+        """The comparison as JSON values."""
+        columns = {name: {"title": column.title, "better": column.better} for name, column in self.columns.items()}
         return {
-            "a": self.a, "b": self.b, "difference": LEGEND, "notes": self.notes, "columns": columns,
+            "a": self.a, "b": self.b, "difference": DIFFERENCE_LEGEND, "notes": self.notes, "columns": columns,
             "tables": [asdict(table) for table in self.tables],
         }  # fmt: skip
 
 
 def compare(a: Path, b: Path) -> Comparison:
-    """Figures of two runs and their paired differences, from the JSON of ``persist eval`` or a report's folder.
+    """Compare the figures of two runs clip by clip.
+
+    Args:
+        a: the JSON of ``persist eval``, or the folder of an evaluation or a report.
+        b: the other run, in either form.
 
     Raises:
         DataError: when a file cannot be used, when both have no row or column in common, or when they measured
@@ -93,7 +90,14 @@ def compare(a: Path, b: Path) -> Comparison:
 
 
 def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
-    """Print two runs side by side; with ``out`` leave ``compare.json`` and ``compare.md`` in that folder."""
+    """Print two runs side by side, as tables or as JSON.
+
+    Args:
+        a: first run, as ``compare`` takes it.
+        b: second run.
+        json: whether JSON is printed.
+        out: folder that gets ``compare.json`` and ``compare.md``, ``None`` for none.
+    """
     from rich.markup import escape
 
     from persist_cli.io.files import write_json, write_text
@@ -106,58 +110,58 @@ def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
     if json:
         print_json(comparison.to_json())
         return
-    for title, columns, cells in comparison_tables(comparison, OUT.width):
-        print_table(escape(title), [escape(each) for each in columns], [[escape(x) for x in row] for row in cells])
+    for title, heads, rows in comparison_tables(comparison, OUT.width):
+        print_table(escape(title), [escape(head) for head in heads], [[escape(text) for text in row] for row in rows])
     for line in _remarks(comparison):
         say(escape(line))
 
 
-def comparison_tables(comparison: Comparison, width: int = 0) -> Lines:
-    """Title, columns and cells of each table; columns beyond ``width`` go into a further table, 0 keeps all."""
-    tables: Lines = []
-    heads = ["row", "run", *(heading(column) for column in comparison.columns.values())]
+def comparison_tables(comparison: Comparison, width: int = 0) -> list[PrintedTable]:
+    """The tables as texts; columns beyond ``width`` go into a further table, 0 keeps all in one."""
+    tables: list[PrintedTable] = []
+    heads = ["row", "run", *(heading(column.title, column.better) for column in comparison.columns.values())]
     for table in comparison.tables:
-        cells = list(_lines(table, list(comparison.columns)))
-        for chosen in fitting(heads, cells, width, fixed=2) if width else [range(len(heads))]:
-            tables.append((table.name, [heads[each] for each in chosen], [[row[x] for x in chosen] for row in cells]))
+        rows = list(_text_rows(table, list(comparison.columns)))
+        for places in fit_columns(heads, rows, width, fixed=2) if width else [range(len(heads))]:
+            tables.append((table.name, [heads[at] for at in places], [[row[at] for at in places] for row in rows]))
     return tables
 
 
 def comparison_text(comparison: Comparison) -> str:
     """The comparison as Markdown."""
-    tables = [markdown_table(*each) for each in comparison_tables(comparison)]
+    tables = [markdown_table(*table) for table in comparison_tables(comparison)]
     remarks = [f"- {line}" for line in _remarks(comparison)]
     return "\n\n".join(["# Two runs compared", *tables, "\n".join(remarks)]) + "\n"
 
 
-def _compared_tables(one: Evaluation, two: Evaluation, columns: dict[str, ColumnRecord]) -> Iterator[ComparedTable]:
-    for table, other in zip(one.tables, two.tables, strict=True):
-        rows = {
-            name: {key: compared(row.columns.get(key), other.rows[name].columns.get(key)) for key in columns}
-            for name, row in table.rows.items()
-            if name in other.rows
-        }
-        yield ComparedTable(table.name, rows)
-
-
-def compared(a: Cell | None, b: Cell | None) -> Compared:
-    """A figure of two runs with the paired difference where both have one for each clip, else that of the means."""
+def compare_cells(a: Cell | None, b: Cell | None) -> ComparedCell:
+    """Compare a figure of two runs clip by clip, or by their means where figures of single clips are missing."""
     first, second = (cell.mean if cell else None for cell in (a, b))
     if a is None or b is None or first is None or second is None:
-        return Compared(first, second, None)
+        return ComparedCell(first, second, None)
     pairs = zip(a.per_clip or [], b.per_clip or [], strict=False)
-    gaps = np.array([theirs - ours for ours, theirs in pairs if ours is not None and theirs is not None])
+    gaps = np.array([in_b - in_a for in_a, in_b in pairs if in_a is not None and in_b is not None])
     if not len(gaps):
-        return Compared(first, second, second - first)
+        return ComparedCell(first, second, second - first)
     if len(gaps) < LEAST_PAIRS:
-        return Compared(first, second, float(gaps.mean()), pairs=len(gaps))
-    chosen = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLES, len(gaps)))
-    low, high = np.percentile(gaps[chosen].mean(axis=1), [2.5, 97.5])
-    return Compared(first, second, float(gaps.mean()), float(low), float(high), len(gaps))
+        return ComparedCell(first, second, float(gaps.mean()), pairs=len(gaps))
+    draws = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLES, len(gaps)))
+    low, high = np.percentile(gaps[draws].mean(axis=1), [2.5, 97.5])
+    return ComparedCell(first, second, float(gaps.mean()), float(low), float(high), len(gaps))
 
 
-def _lines(table: ComparedTable, columns: list[str]) -> Iterator[list[str]]:
-    """Three lines a row: A, B and the difference."""
+def _compared_tables(one: EvalResults, two: EvalResults, columns: dict[str, ColumnRecord]) -> Iterator[ComparedTable]:
+    for table_a, table_b in zip(one.tables, two.tables, strict=True):
+        rows = {
+            name: {key: compare_cells(row.columns.get(key), table_b.rows[name].columns.get(key)) for key in columns}
+            for name, row in table_a.rows.items()
+            if name in table_b.rows
+        }
+        yield ComparedTable(table_a.name, rows)
+
+
+def _text_rows(table: ComparedTable, columns: list[str]) -> Iterator[list[str]]:
+    """Three lines for each row: A, B and the difference."""
     digits = {
         key: digits_of(value for row in table.rows.values() for value in (row[key].a, row[key].b)) for key in columns
     }
@@ -168,10 +172,10 @@ def _lines(table: ComparedTable, columns: list[str]) -> Iterator[list[str]]:
 
 
 def _value(value: float | None, digits: int) -> str:
-    return NOT_AVAILABLE if value is None else number(value, digits)
+    return NOT_AVAILABLE if value is None else number_text(value, digits)
 
 
-def _gap(cell: Compared, digits: int) -> str:
+def _gap(cell: ComparedCell, digits: int) -> str:
     if cell.difference is None:
         return ""
     gap = Difference(mean=cell.difference, low=cell.low, high=cell.high)
@@ -180,4 +184,4 @@ def _gap(cell: Compared, digits: int) -> str:
 
 def _remarks(comparison: Comparison) -> list[str]:
     notes = [f"differs: {note}" for note in comparison.notes]
-    return [f"A: {comparison.a}", f"B: {comparison.b}", LEGEND, *notes]
+    return [f"A: {comparison.a}", f"B: {comparison.b}", DIFFERENCE_LEGEND, *notes]

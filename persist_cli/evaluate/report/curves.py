@@ -1,4 +1,4 @@
-"""Curves of every row, laid out for the report: a metric against frame number and against what was seen before."""
+"""Curves of every row, laid out for the report: each metric against frame number and against the share seen before."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from persist_cli.evaluate.report.result_file import ARROWS, Bin, Curve, Evaluation, Table, digits_of, number
-from persist_cli.evaluate.report.tables import KINDS
+from persist_cli.evaluate.report.result_file import Bin, Curve, EvalResults, TableRecord
+from persist_cli.evaluate.report.tables import KINDS, digits_of, heading, number_text
 
-# Colours of Okabe and Ito, told apart with any colour vision; and lighter ones in their order for a dark page.
+# Colours of Okabe and Ito, distinguishable with any colour vision; then lighter ones in their order for a dark page.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666")
 
 DARK_COLORS = ("#3b8ee0", "#ff7f2a", "#1fc998", "#e59ac4", "#f0b429", "#8ad4ff", "#b8b8b8")
@@ -37,7 +37,7 @@ class Style:
 
 @dataclass(frozen=True)
 class Dot:
-    """A point of a line with what a reader sees when pointing at it."""
+    """A point of a line with the tip that a reader sees when pointing at it."""
 
     x: float
     y: float
@@ -90,34 +90,34 @@ class Series:
     names: Sequence[str]
 
 
-def row_styles(results: Evaluation) -> dict[str, Style]:
-    """A style for each row, the same in every table and plot: models solid, controls dashed."""
+def row_styles(results: EvalResults) -> dict[str, Style]:
+    """A style for each row, equal in every table and plot: models solid, controls dashed."""
     kinds: dict[str, str] = {}
     for table in results.tables:
         for name, row in table.rows.items():
             kinds.setdefault(name, row.kind)
     ordered = [name for kind in KINDS for name in kinds if kinds[name] == kind]
-    within = {kind: [name for name in ordered if kinds[name] == kind] for kind in KINDS}
+    names_by_kind = {kind: [name for name in ordered if kinds[name] == kind] for kind in KINDS}
     return {
         name: Style(
             place, name, kinds[name], place % len(COLORS), DASHES[kinds[name]],
-            within[kinds[name]].index(name) >= len(COLORS),
+            names_by_kind[kinds[name]].index(name) >= len(COLORS),
         )
         for place, name in enumerate(ordered)
     }  # fmt: skip
 
 
-def plots(results: Evaluation, table: Table, styles: dict[str, Style]) -> list[Plot]:
+def plots(results: EvalResults, table: TableRecord, styles: dict[str, Style]) -> list[Plot]:
     """For each metric the plot against frame number, and the one against the seen-before share."""
-    drawn = []
+    metric_plots = []
     for name, metric in results.measured.metrics.items():
-        curves = [(styles[row], each.curves[name]) for row, each in table.rows.items() if name in each.curves]
+        curves = [(styles[key], row.curves[name]) for key, row in table.rows.items() if name in row.curves]
         curves.sort(key=lambda pair: -pair[0].number)  # the first rows on top
-        title = f"{metric.title} {ARROWS.get(metric.better or '', '')}".strip()
+        title = heading(metric.title, metric.better)
         over_frames = _frame_plot(name, title, curves, results.measured.protocol.frames)
         over_share = _share_plot(name, title, curves)
-        drawn += [plot for plot in (over_frames, over_share) if plot is not None]
-    return drawn
+        metric_plots += [plot for plot in (over_frames, over_share) if plot is not None]
+    return metric_plots
 
 
 def _frame_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]], frames: int) -> Plot | None:
@@ -125,45 +125,52 @@ def _frame_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]], fr
     for style, curve in curves:
         # the last value is that of the last frame, whether or not the given first frame has one
         numbers = range(frames - len(curve.per_frame), frames)
-        series.append(Series(style, list(numbers), curve.per_frame, [f"frame {each}" for each in numbers]))
+        series.append(Series(style, list(numbers), curve.per_frame, [f"frame {number}" for number in numbers]))
     known = _known(series)
     if not known:
         return None
     low, high = min(place for place, _ in known), max(place for place, _ in known)
-    ticks = [each for each in nice_ticks(low, high, 8) if each == int(each)]
-    return _laid_out(f"{name}-frames", title, "frame", series, (low, high), [(each, f"{each:.0f}") for each in ticks])
+    ticks = [(tick, f"{tick:.0f}") for tick in nice_ticks(low, high, 8) if tick == int(tick)]
+    return _lay_out(f"{name}-frames", title, "frame", series, (low, high), ticks)
 
 
 def _share_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]]) -> Plot | None:
     series = []
     for style, curve in curves:
-        bins = _without_gaps(curve.by_seen_before)
-        names = [f"{each.low:.0%} to {each.high:.0%} seen before, n = {each.count}" for each in bins]
-        places = [(each.low + each.high) / 2 for each in bins]
-        series.append(Series(style, places, [each.mean for each in bins], names))
+        bins = _fill_gaps(curve.by_seen_before)
+        names = [
+            f"{share_bin.low:.0%} to {share_bin.high:.0%} seen before, n = {share_bin.count}" for share_bin in bins
+        ]
+        series.append(
+            Series(style, [_middle(share_bin) for share_bin in bins], [share_bin.mean for share_bin in bins], names)
+        )
     if not _known(series):
         return None
-    counted: dict[float, Bin] = {}
+    bins_by_low: dict[float, Bin] = {}
     for _, curve in curves:
-        for each in curve.by_seen_before:
-            counted.setdefault(each.low, each)
+        for share_bin in curve.by_seen_before:
+            bins_by_low.setdefault(share_bin.low, share_bin)
     across = "share of the view seen before the clip"
     ticks = [(edge / 5, f"{edge / 5:.0%}") for edge in range(6)]
-    counts = [((each.low + each.high) / 2, f"{each.count}") for each in counted.values()]
-    return _laid_out(f"{name}-seen-before", title, across, series, (0.0, 1.0), ticks, counts)
+    counts = [(_middle(share_bin), f"{share_bin.count}") for share_bin in bins_by_low.values()]
+    return _lay_out(f"{name}-seen-before", title, across, series, (0.0, 1.0), ticks, counts)
 
 
-def _without_gaps(bins: Sequence[Bin]) -> list[Bin]:
-    """The bins with empty ones where some are left out, so that lines break there."""
-    whole: list[Bin] = []
-    for each in bins:
-        if whole and each.low > whole[-1].high + 1e-6:
-            whole.append(Bin(low=whole[-1].high, high=each.low, mean=None, count=0))
-        whole.append(each)
-    return whole
+def _middle(share_bin: Bin) -> float:
+    return (share_bin.low + share_bin.high) / 2
 
 
-def _laid_out(  # noqa: PLR0913
+def _fill_gaps(bins: Sequence[Bin]) -> list[Bin]:
+    """The bins with an empty one in each gap between them, so that lines break there."""
+    filled: list[Bin] = []
+    for share_bin in bins:
+        if filled and share_bin.low > filled[-1].high + 1e-6:
+            filled.append(Bin(low=filled[-1].high, high=share_bin.low, mean=None, count=0))
+        filled.append(share_bin)
+    return filled
+
+
+def _lay_out(  # noqa: PLR0913
     name: str,
     title: str,
     across: str,
@@ -172,7 +179,7 @@ def _laid_out(  # noqa: PLR0913
     ticks: Sequence[tuple[float, str]],
     counts: Sequence[tuple[float, str]] = (),
 ) -> Plot:
-    """Values turned into picture units."""
+    """Turn values into picture units."""
     values = [value for _, value in _known(series)]
     pad = 0.05 * (max(values) - min(values)) or 0.05 * abs(max(values)) or 0.05
     bottom, top = min(values) - pad, max(values) + pad
@@ -186,23 +193,22 @@ def _laid_out(  # noqa: PLR0913
         return round(HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * (value - bottom) / (top - bottom), 1)
 
     lines = []
-    for each in series:
-        strokes = [[(x(place), y(value)) for place, value in run] for run in _runs(each)]
-        dots = [
-            Dot(x(place), y(value), f"{each.style.row}: {where}, {number(value, digits)}", bool(counts))
-            for place, value, where in zip(each.places, each.values, each.names, strict=True)
-            if value is not None
-        ]
+    for row in series:
+        strokes = [[(x(place), y(value)) for place, value in run] for run in _runs(row)]
         alone = {stroke[0] for stroke in strokes if len(stroke) == 1}
-        kept = dots if len(dots) <= MOST_DOTS else [dot for dot in dots if (dot.x, dot.y) in alone]
-        kept = [Dot(dot.x, dot.y, dot.tip, dot.shown or each.style.marked or (dot.x, dot.y) in alone) for dot in kept]
-        lines.append(Line(each.style, [" ".join(f"{a},{b}" for a, b in stroke) for stroke in strokes], kept))
+        dots = []
+        for place, value, where in zip(row.places, row.values, row.names, strict=True):
+            if value is not None:
+                at, tip = (x(place), y(value)), f"{row.style.row}: {where}, {number_text(value, digits)}"
+                dots.append(Dot(*at, tip, bool(counts) or row.style.marked or at in alone))
+        if len(dots) > MOST_DOTS:
+            dots = [dot for dot in dots if (dot.x, dot.y) in alone]
+        lines.append(Line(row.style, [" ".join(f"{a},{b}" for a, b in stroke) for stroke in strokes], dots))
     marks = nice_ticks(bottom, top, 5)
     decimals = max((len(f"{mark:.10g}".partition(".")[2]) for mark in marks), default=0)
-    return Plot(
-        name, title, across, lines, [Tick(x(place), text) for place, text in ticks],
-        [Tick(y(mark), number(mark, decimals)) for mark in marks], [Tick(x(place), text) for place, text in counts],
-    )  # fmt: skip
+    x_ticks, count_ticks = ([Tick(x(place), text) for place, text in labels] for labels in (ticks, counts))
+    y_ticks = [Tick(y(mark), number_text(mark, decimals)) for mark in marks]
+    return Plot(name, title, across, lines, x_ticks, y_ticks, count_ticks)
 
 
 def nice_ticks(low: float, high: float, most: int) -> list[float]:
@@ -222,8 +228,8 @@ def nice_ticks(low: float, high: float, most: int) -> list[float]:
 def _known(series: Sequence[Series]) -> list[tuple[float, float]]:
     return [
         (place, value)
-        for each in series
-        for place, value in zip(each.places, each.values, strict=True)
+        for row in series
+        for place, value in zip(row.places, row.values, strict=True)
         if value is not None
     ]
 

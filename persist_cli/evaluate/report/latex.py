@@ -1,13 +1,13 @@
-"""The tables for a paper: LaTeX with booktabs."""
+"""The tables for a paper, in LaTeX with booktabs."""
 
 from __future__ import annotations
 
 import unicodedata
 from collections.abc import Callable, Sequence
 
-from persist_cli.evaluate.report.result_file import Evaluation
+from persist_cli.evaluate.report.result_file import EvalResults
 from persist_cli.evaluate.report.tables import CellView, CompactTable, RowView, TableView, compact_tables
-from persist_cli.evaluate.report.text import fitting
+from persist_cli.evaluate.report.text import fit_columns
 
 SPECIAL = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "_": r"\_", "%": r"\%",
@@ -18,18 +18,18 @@ SPECIAL = {
     "²": "$^2$", "³": "$^3$", "’": "'", "‘": "`", "“": "``", "”": "''",
 }  # fmt: skip
 
-Texts = Callable[[CellView], list[str]]  # the lines of a cell
+CellWriter = Callable[[CellView], list[str]]  # gives the lines of a cell
 
 Groups = list[tuple[str, list[RowView]]]
 
-PAGE, HALF_PAGE = 108, 60  # signs, with three more a column, that fit beside each other
+PAGE, HALF_PAGE = 108, 60  # characters that fit beside each other, with three more for each column
 
-END = " \\\\"  # of a tabular's line
+LINE_END = " \\\\"
 
 HEAD = "% \\usepackage{booktabs} in the preamble; \\input{table} where the tables belong.\n"
 
 
-def latex_tables(results: Evaluation) -> str:
+def latex_tables(results: EvalResults) -> str:
     """A ``table`` with mean ± deviation and one with differences for each table of the results."""
     blocks = []
     for number, table in enumerate(compact_tables(results)):
@@ -42,46 +42,48 @@ def latex_tables(results: Evaluation) -> str:
                 f"Paired difference to {escape(results.first_row or '')} with 95\\,\\% interval (bootstrap over "
                 "clips); $^*$ the interval leaves zero out."
             )
-            groups = [(title, kept) for title, group in view.kind_groups() if (kept := [x for x in group if x in rows])]
+            groups = [(title, [row for row in group if row in rows]) for title, group in view.kind_groups()]
+            groups = [(title, group) for title, group in groups if group]
             blocks.append(_float(view, groups, _difference, caption, f"{label}-differences"))
     return HEAD + "\n".join(blocks)
 
 
 def escape(text: str) -> str:
     """Text that LaTeX prints as it stands; Greek letters become mathematics, control characters blanks."""
-    return "".join(_sign(sign) for sign in text)
+    return "".join(_escape_character(character) for character in text)
 
 
-def _sign(sign: str) -> str:
-    if sign in SPECIAL:
-        return SPECIAL[sign]
-    if unicodedata.category(sign).startswith("C"):
+def _escape_character(character: str) -> str:
+    if character in SPECIAL:
+        return SPECIAL[character]
+    if unicodedata.category(character).startswith("C"):
         return " "
-    name = unicodedata.name(sign, "").split()
+    name = unicodedata.name(character, "").split()
     if name[:1] == ["GREEK"] and name[2:3] == ["LETTER"] and len(name) == 4 and len(name[3]) > 1:
         return _greek(name[3].lower(), capital=name[1] == "CAPITAL")
-    return sign
+    return character
 
 
 def _greek(letter: str, capital: bool) -> str:
-    known = "alpha beta gamma delta epsilon zeta eta theta iota kappa mu nu xi pi rho sigma tau phi chi psi omega"
+    letters = "alpha beta gamma delta epsilon zeta eta theta iota kappa mu nu xi pi rho sigma tau phi chi psi omega"
     capitals = "gamma delta theta xi pi sigma phi psi omega"
     letter = {"lamda": "lambda"}.get(letter, letter)
-    if letter not in [*(capitals if capital else known).split(), "lambda"]:
+    if letter not in [*(capitals if capital else letters).split(), "lambda"]:
         return "?"
     return f"$\\{letter.capitalize() if capital else letter}$"
 
 
-def _caption(results: Evaluation, table: CompactTable) -> str:
+def _caption(results: EvalResults, table: CompactTable) -> str:
     view = table.view
     measured, protocol = results.measured, results.measured.protocol
     height, width = measured.image_size
     seeds = len(results.sampling.seeds)
-    which = f" ({view.name})" if len(results.tables) > 1 else ""
+    domain = f" ({view.name})" if len(results.tables) > 1 else ""
     clips = f"{view.clips} clips of {protocol.frames} frames at {height}×{width}"
-    notes = "".join([f" ({number}) {note}." for number, note in view.notes.items()] + [f" {x}." for x in table.absent])
-    text = f"{protocol.title or protocol.name}{which}: {clips}"
-    return escape(f"{text}; mean ± standard deviation over {seeds} sampling seed{'s' * (seeds != 1)}.{notes}")
+    notes = [*(f"({number}) {note}" for number, note in view.notes.items()), *table.absent]
+    deviation = f"mean ± standard deviation over {seeds} sampling seed{'s' * (seeds != 1)}"
+    text = f"{protocol.title or protocol.name}{domain}: {clips}; {deviation}"
+    return escape(" ".join(f"{sentence}." for sentence in [text, *notes]))
 
 
 def _figure(cell: CellView) -> list[str]:
@@ -94,35 +96,35 @@ def _difference(cell: CellView) -> list[str]:
     return [marked, f"\\scriptsize {escape(cell.difference_interval)}"]
 
 
-def _float(view: TableView, groups: Groups, text: Texts, caption: str, label: str) -> str:
-    """A float; columns that do not fit the page's width go into further ones."""
+def _float(view: TableView, groups: Groups, write_cell: CellWriter, caption: str, label: str) -> str:
+    """A LaTeX float; columns that do not fit the page's width go into further floats."""
     rows = [row for _, group in groups for row in group]
-    plain = [[row.name, *(_widest(cell, text) for cell in row.cells)] for row in rows]
+    plain = [[row.name, *(_plain_text(cell, write_cell) for cell in row.cells)] for row in rows]
     heads = ["", *(column.heading for column in view.columns)]
-    blocks = [[number - 1 for number in chosen[1:]] for chosen in fitting(heads, plain, PAGE)]
-    form = "table" if next(fitting(heads, plain, HALF_PAGE)) == list(range(len(heads))) else "table*"
+    blocks = [[number - 1 for number in columns[1:]] for columns in fit_columns(heads, plain, PAGE)]
+    form = "table" if next(fit_columns(heads, plain, HALF_PAGE)) == list(range(len(heads))) else "table*"
     head = f"\\begin{{{form}}}\n\\centering\n\\footnotesize\n\\setlength{{\\tabcolsep}}{{4pt}}\n"
     floats = []
     for place, columns in enumerate(blocks):
         names = f"\\caption{{{caption if not place else 'The table before, further columns.'}}}\n"
         names += f"\\label{{{label}{f'-{place}' * bool(place)}}}\n"
-        floats.append(f"{head}{names}{_tabular(view, groups, text, columns)}\n\\end{{{form}}}\n")
+        floats.append(f"{head}{names}{_tabular(view, groups, write_cell, columns)}\n\\end{{{form}}}\n")
     return "\n".join(floats)
 
 
-def _tabular(view: TableView, groups: Groups, text: Texts, columns: Sequence[int]) -> str:
+def _tabular(view: TableView, groups: Groups, write_cell: CellWriter, columns: Sequence[int]) -> str:
     heads = [view.columns[number] for number in columns]
     lines = [f"\\begin{{tabular}}{{@{{}}l{'r' * len(columns)}@{{}}}}", "\\toprule"]
-    lines.append(" & ".join(["", *(escape(head.heading) for head in heads)]) + END)
+    lines.append(" & ".join(["", *(escape(head.heading) for head in heads)]) + LINE_END)
     for _, rows in groups:
         lines.append("\\midrule")
         for row in rows:  # the braces keep a name that begins with [ from being the argument of the line before
-            texts = zip(*(text(row.cells[each]) for each in columns), strict=True)
+            texts = zip(*(write_cell(row.cells[number]) for number in columns), strict=True)
             names = [f"{{{escape(row.name)}}}", ""]
-            lines += [" & ".join([name, *line]) + END for name, line in zip(names, texts, strict=False)]
-            lines += ["\\addlinespace[2pt]"] if text is _difference else []
+            lines += [" & ".join([name, *line]) + LINE_END for name, line in zip(names, texts, strict=False)]
+            lines += ["\\addlinespace[2pt]"] if write_cell is _difference else []
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}"])
 
 
-def _widest(cell: CellView, text: Texts) -> str:
-    return cell.text if text is _figure else f"{cell.difference}\n{cell.difference_interval}"
+def _plain_text(cell: CellView, write_cell: CellWriter) -> str:
+    return cell.text if write_cell is _figure else f"{cell.difference}\n{cell.difference_interval}"

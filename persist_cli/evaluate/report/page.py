@@ -1,10 +1,10 @@
-"""The report of an evaluation: one page that needs nothing else, and its parts as files beside it."""
+"""The report of an evaluation: one page that needs no other file, and its parts as files beside it."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,13 +16,12 @@ from persist_cli.evaluate.report.curves import (
     HEIGHT,
     WIDTH,
     Plot,
-    Style,
     plots,
     row_styles,
 )
 from persist_cli.evaluate.report.latex import latex_tables
 from persist_cli.evaluate.report.pictures import Pictures, ShownRow, file_name, show_rows, show_sheets
-from persist_cli.evaluate.report.result_file import FILE, Evaluation, check_results
+from persist_cli.evaluate.report.result_file import FILE, EvalResults, check_results
 from persist_cli.evaluate.report.tables import TableView, view_tables
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json, write_text
@@ -46,12 +45,12 @@ class Section:
 
 
 def write_report(results: Mapping[str, Any], pictures: Pictures, folder: Path) -> None:
-    """Leave ``report.html``, tables, curves, sheets and clips in a folder; the page comes last, whole or not at all.
+    """Write ``report.html``, tables, curves, sheets and clips; the page comes last, whole or not at all.
 
     Args:
-        results: of ``persist eval``, as its JSON holds them.
+        results: results of ``persist eval`` as JSON values.
         pictures: clips to show.
-        folder: is made; an earlier report in it is replaced, other files stay.
+        folder: folder of the report; an earlier report in it is replaced, other files stay.
 
     Raises:
         DataError: when the results are damaged.
@@ -71,44 +70,38 @@ def write_report(results: Mapping[str, Any], pictures: Pictures, folder: Path) -
         raise PersistError(f"{folder}: the report cannot be written there ({error})") from error
 
 
-def _page(results: Evaluation, pictures: Pictures, folder: Path) -> str:
+def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
     """The page's HTML; curves, sheets and clips are left in the folder."""
     jinja = _jinja()
+    curve = jinja.get_template("curve.svg.jinja")
     styles = row_styles(results)
-    shown = show_rows(pictures, folder)
+    rows = show_rows(pictures, folder)
+    common = {"styles": list(styles.values()), "colors": COLORS, "width": WIDTH, "height": HEIGHT}
     sections = []
     for place, (table, view) in enumerate(zip(results.tables, view_tables(results), strict=True)):
-        drawn = plots(results, table, styles)
-        for plot in drawn:
+        table_plots = plots(results, table, styles)
+        for plot in table_plots:
             name = plot.name if len(results.tables) == 1 else file_name(place, table.name, plot.name)
-            write_text(folder / "curves" / f"{name}.svg", draw_plot(jinja, plot, list(styles.values()), legend=True))
-        sections.append(Section(view, drawn, [each for each in shown if each.table == table.name]))
+            write_text(folder / "curves" / f"{name}.svg", curve.render(plot=plot, legend=True, **common))
+        sections.append(Section(view, table_plots, [row for row in rows if row.table == table.name]))
     return jinja.get_template("report.html.jinja").render(
-        results=results, sections=sections, styles=list(styles.values()), sheets=show_sheets(pictures, folder),
-        colors=COLORS, dark_colors=DARK_COLORS, width=WIDTH, height=HEIGHT, facts=environment_facts(results),
-        lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
+        results=results, sections=sections, sheets=show_sheets(pictures, folder), dark_colors=DARK_COLORS,
+        facts=_environment_facts(results), lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
+        **common,
     )  # fmt: skip
 
 
-def draw_plot(jinja: Environment, plot: Plot, styles: list[Style], legend: bool) -> str:
-    """A plot as SVG, with the rows' names beside it when it is to stand alone."""
-    template = jinja.get_template("curve.svg.jinja")
-    return template.render(plot=plot, styles=styles, legend=legend, colors=COLORS, width=WIDTH, height=HEIGHT)
-
-
-def environment_facts(results: Evaluation) -> list[tuple[str, str]]:
-    """Name and text of everything the environment says, packages one by one."""
+def _environment_facts(results: EvalResults) -> list[tuple[str, str]]:
+    """Name and text of each entry of the environment, packages one by one."""
     facts: list[tuple[str, str]] = []
     for name, value in results.environment.items():
-        if isinstance(value, Mapping):
-            facts += [(str(inner), str(each)) for inner, each in value.items()]
-        else:
-            facts.append((name, str(value)))
+        entries = value if isinstance(value, Mapping) else {name: value}
+        facts += [(str(key), str(entry)) for key, entry in entries.items()]
     return facts
 
 
 def _jinja() -> Environment:
-    """Templates of this package; everything that is filled in is escaped."""
+    """The templates of this package; all values that are filled in are escaped."""
     import shlex
 
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -126,15 +119,12 @@ def _last_seen(shares: list[float | None]) -> str:
 
 
 def _move_in(aside: Path, folder: Path) -> None:
-    """Replace what an earlier report left by the new files, the page last."""
+    """Replace the files of an earlier report by the new ones, the page last."""
     if (folder / PAGE).exists():
         for name in FOLDERS:
             shutil.rmtree(folder / name, ignore_errors=True)
-    for file in sorted(_files(aside), key=lambda path: path.name == PAGE):
+    files = [path for path in aside.rglob("*") if path.is_file()]
+    for file in sorted(files, key=lambda path: path.name == PAGE):
         target = folder / file.relative_to(aside)
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(file, target)
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    return (path for path in folder.rglob("*") if path.is_file())

@@ -1,10 +1,10 @@
-"""The results of ``persist eval`` as its JSON holds them, checked."""
+"""The result file of ``persist eval``, read from JSON and checked."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,28 +16,26 @@ FORMAT = "persist-evaluation"
 
 VERSION = 1
 
-FILE = "results.json"  # in a report's folder
+FILE = "results.json"  # in the folder of a report
 
-FILES = (FILE, "metrics.json")  # that one, or the one in the folder of ``persist eval --out``
-
-Kind = Literal["model", "control", "memory control"]
+FILES = (FILE, "metrics.json")  # the latter in the folder of ``persist eval --out``
 
 
-def _defined(value: Any) -> Any:
+def _finite_or_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-Figure = Annotated[float | None, BeforeValidator(_defined)]
+FiniteOrNone = Annotated[float | None, BeforeValidator(_finite_or_none)]
 
 
 class ResultModel(BaseModel):
-    """A part of the results; keys that are not known here are kept out, so that later minor additions still read."""
+    """A part of the results; unknown keys are ignored, so that results of a later persist can still be read."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class Protocol(ResultModel):
-    """Which clips were asked of the model, and how."""
+class ProtocolRecord(ResultModel):
+    """The protocol that chose the clips and filled the memory."""
 
     name: str
     title: str = ""
@@ -52,22 +50,22 @@ class DataSet(ResultModel):
     trajectories: dict[str, str]
 
 
-class Clip(ResultModel):
-    """One measured clip; ``data`` is the number of its data set, ``seen_before`` a share for each frame."""
+class ClipRecord(ResultModel):
+    """One clip; ``data`` is the number of its data set, ``seen_before`` holds a share for each frame."""
 
     data: int
     trajectory: str
     scene: str | int | None = None
     start: int
     frames: int
-    seen_before: list[Figure] = []
-    path_metres: Figure = None
-    farthest_metres: Figure = None
-    turned_degrees: Figure = None
+    seen_before: list[FiniteOrNone] = []
+    path_metres: FiniteOrNone = None
+    farthest_metres: FiniteOrNone = None
+    turned_degrees: FiniteOrNone = None
 
 
-class MetricFacts(ResultModel):
-    """What a metric is, with the hash of each weight it used."""
+class MetricRecord(ResultModel):
+    """A metric's definition with the hash of each weight it used."""
 
     title: str
     better: str | None = None
@@ -78,11 +76,11 @@ class MetricFacts(ResultModel):
 class Measured(ResultModel):
     """Everything that two runs must share to be comparable."""
 
-    protocol: Protocol
+    protocol: ProtocolRecord
     data: list[DataSet]
     image_size: tuple[int, int]
-    clips: list[Clip]
-    metrics: dict[str, MetricFacts]
+    clips: list[ClipRecord]
+    metrics: dict[str, MetricRecord]
 
 
 class ColumnRecord(ResultModel):
@@ -98,9 +96,9 @@ class ColumnRecord(ResultModel):
 class Difference(ResultModel):
     """Paired difference to another row with its 95 % interval."""
 
-    mean: Figure
-    low: Figure = None
-    high: Figure = None
+    mean: FiniteOrNone
+    low: FiniteOrNone = None
+    high: FiniteOrNone = None
 
     @property
     def clear(self) -> bool:
@@ -109,15 +107,15 @@ class Difference(ResultModel):
 
 
 class Cell(ResultModel):
-    """A figure with its spread, or why there is none."""
+    """A figure with its spread, or in ``na`` the reason why there is none."""
 
     na: str | None = None
-    mean: Figure = None
-    std: Figure = None
-    low: Figure = None
-    high: Figure = None
+    mean: FiniteOrNone = None
+    std: FiniteOrNone = None
+    low: FiniteOrNone = None
+    high: FiniteOrNone = None
     count: int | None = None
-    per_clip: list[Figure] | None = None
+    per_clip: list[FiniteOrNone] | None = None
     difference: Difference | None = None
     differences: dict[str, Difference | None] = {}
 
@@ -127,21 +125,21 @@ class Bin(ResultModel):
 
     low: float
     high: float
-    mean: Figure
+    mean: FiniteOrNone
     count: int
 
 
 class Curve(ResultModel):
     """A metric frame by frame, the last value at the clip's last frame, and by the seen-before share of the view."""
 
-    per_frame: list[Figure] = []
+    per_frame: list[FiniteOrNone] = []
     by_seen_before: list[Bin] = []
 
 
-class Row(ResultModel):
+class RowRecord(ResultModel):
     """A row of the table."""
 
-    kind: Kind
+    kind: Literal["model", "control", "memory control"]
     definition: str = ""
     checkpoint: str | None = None
     memory: str | None = None
@@ -149,12 +147,12 @@ class Row(ResultModel):
     curves: dict[str, Curve] = {}
 
 
-class Table(ResultModel):
+class TableRecord(ResultModel):
     """A table over some of the clips."""
 
     name: str
     clips: list[int]
-    rows: dict[str, Row]
+    rows: dict[str, RowRecord]
 
 
 class KnownScenes(ResultModel):
@@ -164,8 +162,8 @@ class KnownScenes(ResultModel):
     complete: bool
 
 
-class CheckpointFacts(ResultModel):
-    """A checkpoint by what is in it."""
+class CheckpointRecord(ResultModel):
+    """A checkpoint with the hashes of its parts."""
 
     name: str
     path: str = ""
@@ -176,7 +174,7 @@ class CheckpointFacts(ResultModel):
 
 
 class SamplingRecord(ResultModel):
-    """How clips were drawn from the models."""
+    """The sampling of every row of a model."""
 
     steps: int | None = None
     sampler: str | None = None
@@ -187,21 +185,21 @@ class SamplingRecord(ResultModel):
     batch: int | None = None
 
 
-class Evaluation(ResultModel):
+class EvalResults(ResultModel):
     """All results of one ``persist eval``."""
 
     measured: Measured
     sampling: SamplingRecord
     environment: dict[str, Any] = {}
     command: list[str] = []
-    checkpoints: list[CheckpointFacts] = []
+    checkpoints: list[CheckpointRecord] = []
     columns: dict[str, ColumnRecord]
-    tables: list[Table]
+    tables: list[TableRecord]
     first_row: str | None = None
 
 
-def read_results(path: Path) -> Evaluation:
-    """Results from a JSON file, or from the folder of an evaluation or a report.
+def read_results(path: Path) -> EvalResults:
+    """Read results from a JSON file, or from the folder of an evaluation or a report.
 
     Raises:
         DataError: one line when it is missing, not JSON, not results, or of another version.
@@ -222,10 +220,14 @@ def read_results(path: Path) -> Evaluation:
     return check_results(value, str(file))
 
 
-def check_results(value: Mapping[str, Any], where: str) -> Evaluation:
-    """Results from JSON values; ``DataError`` names ``where`` and the first key that does not fit."""
+def check_results(value: Mapping[str, Any], where: str) -> EvalResults:
+    """Check results that are JSON values.
+
+    Raises:
+        DataError: one line that names ``where`` and the first key that does not fit.
+    """
     try:
-        results = Evaluation.model_validate(value)
+        results = EvalResults.model_validate(value)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -241,68 +243,3 @@ def check_results(value: Mapping[str, Any], where: str) -> Evaluation:
                         f"figures for {len(table.clips)} clips"
                     )
     return results
-
-
-ARROWS = {"higher": "↑", "lower": "↓"}
-
-UNDEFINED = "–"  # a figure that was measured and has no value
-
-MARK = "*"  # behind a difference whose interval leaves zero out
-
-MORE_DIGITS = 3  # for a clear difference that would read as zero
-
-
-def digits_of(values: Iterable[float | None]) -> int:
-    """Decimals that show about four figures of a usual value of a column; an outlier changes nothing."""
-    sizes = sorted(abs(value) for value in values if value)
-    usual = sizes[(len(sizes) - 1) // 2] if sizes else 0.0
-    for digits, least in enumerate((100.0, 10.0, 0.1, 0.01), start=1):
-        if usual >= least:
-            return digits
-    return 5 if usual else 2
-
-
-def number(value: float | None, digits: int, signed: bool = False) -> str:
-    """A number with a true minus sign; a value that rounds to zero has no sign."""
-    if value is None:
-        return UNDEFINED
-    if not round(value, digits):
-        value = 0.0
-    return f"{value:{'+' if signed and value else ''}.{digits}f}".replace("-", "−")
-
-
-def spread_text(cell: Cell, digits: int) -> str:
-    """``mean ± std``; the mean alone where there is one seed or nothing random."""
-    mean = number(cell.mean, digits)
-    return mean if cell.std is None or cell.mean is None else f"{mean} ± {number(cell.std, digits)}"
-
-
-def interval_text(low: float | None, high: float | None, digits: int, signed: bool = False) -> str:
-    """``[low, high]``; empty when there is none."""
-    if low is None or high is None:
-        return ""
-    return f"[{number(low, digits, signed)}, {number(high, digits, signed)}]"
-
-
-def difference_texts(difference: Difference, digits: int) -> tuple[str, str]:
-    """The signed difference, marked when its interval leaves zero out, and that interval.
-
-    A clear difference too small for the column's digits gets up to three more; below that it is zero, unmarked.
-    """
-    mean = difference.mean
-    if mean is not None and difference.clear:
-        digits = next((more for more in range(digits, digits + MORE_DIGITS + 1) if round(mean, more)), digits)
-    mark = MARK if difference.clear and mean is not None and round(mean, digits) else ""
-    return number(mean, digits, signed=True) + mark, interval_text(difference.low, difference.high, digits, signed=True)
-
-
-def heading(column: ColumnRecord) -> str:
-    """The column's title with the arrow of what is better."""
-    return f"{column.title} {ARROWS.get(column.better or '', '')}".strip()
-
-
-def verdict(difference: Difference, better: str | None) -> str:
-    """``better`` or ``worse`` when the difference is clear, else ``open``."""
-    if not difference.clear or better not in ARROWS or difference.mean is None:
-        return "open"
-    return "better" if (difference.mean > 0) == (better == "higher") else "worse"

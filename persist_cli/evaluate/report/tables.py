@@ -1,24 +1,17 @@
-"""The table as every form of it shows it: texts of cells, what is best, why a figure is missing."""
+"""The tables as every form of them shows them: texts of cells, the best figures, and reasons of missing ones."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from persist_cli.evaluate.report.result_file import (
-    MARK,
     Cell,
     ColumnRecord,
-    Evaluation,
-    Row,
-    Table,
-    difference_texts,
-    digits_of,
-    heading,
-    interval_text,
-    number,
-    spread_text,
-    verdict,
+    Difference,
+    EvalResults,
+    RowRecord,
+    TableRecord,
 )
 
 KINDS = {
@@ -29,6 +22,14 @@ KINDS = {
 
 NOT_AVAILABLE = "n/a"
 
+UNDEFINED = "–"  # a figure that was measured and has no value
+
+MARK = "*"  # behind a difference whose interval leaves zero out
+
+MORE_DIGITS = 3  # for a clear difference that would read as zero
+
+ARROWS = {"higher": "↑", "lower": "↓"}
+
 
 @dataclass(frozen=True)
 class CellView:
@@ -36,12 +37,12 @@ class CellView:
 
     Args:
         text: mean ± deviation, or ``n/a``.
-        interval: of the mean, empty when there is none.
-        difference: to the first row, signed and marked; empty when there is none.
-        difference_interval: of that.
+        interval: interval of the mean, empty when there is none.
+        difference: difference to the first row, signed and marked; empty when there is none.
+        difference_interval: interval of that difference.
         verdict: ``better``, ``worse`` or ``open``.
         best: whether no model row of the column has a better figure.
-        note: number of the footnote that says why it is ``n/a``, 0 for none.
+        note: number of the footnote that says why the cell is ``n/a``, 0 for none.
         count: clips or videos behind the figure.
     """
 
@@ -77,7 +78,7 @@ class RowView:
 
 @dataclass(frozen=True)
 class TableView:
-    """A table; ``notes`` are the reasons of what is ``n/a`` in it by their number, which all tables share."""
+    """A table; ``notes`` are the reasons of its ``n/a`` cells by their number, which all tables share."""
 
     name: str
     clips: int
@@ -86,7 +87,7 @@ class TableView:
     notes: dict[int, str]
 
     def kind_groups(self) -> list[tuple[str, list[RowView]]]:
-        """What each group of rows is, with its rows."""
+        """The rows of each kind under the title of that kind, kinds without rows left out."""
         groups = [(title, [row for row in self.rows if row.kind == kind]) for kind, title in KINDS.items()]
         return [(title, rows) for title, rows in groups if rows]
 
@@ -99,32 +100,84 @@ class CompactTable:
     absent: list[str]
 
 
-def compact_tables(results: Evaluation) -> list[CompactTable]:
-    """Every table, for the forms that have no room for empty columns."""
-    compact = []
-    for view in view_tables(results):
-        empty = [all(row.cells[place].note for row in view.rows) for place in range(len(view.columns))]
-        reasons = [
-            " / ".join(dict.fromkeys(view.notes[row.cells[place].note] for row in view.rows)) if empty[place] else ""
-            for place in range(len(view.columns))
-        ]
-        absent = [f"{column.heading}: n/a ({why})" for column, why in zip(view.columns, reasons, strict=True) if why]
-        kept = [place for place, nothing in enumerate(empty) if not nothing]
-        rows = [replace(row, cells=[row.cells[place] for place in kept]) for row in view.rows]
-        used = {cell.note for row in rows for cell in row.cells}
-        notes = {number: note for number, note in view.notes.items() if number in used}
-        smaller = replace(view, columns=[view.columns[place] for place in kept], rows=rows, notes=notes)
-        compact.append(CompactTable(smaller, absent))
-    return compact
-
-
-def view_tables(results: Evaluation) -> list[TableView]:
+def view_tables(results: EvalResults) -> list[TableView]:
     """Every table of the results."""
     notes: list[str] = []
     return [_view_table(results, table, notes) for table in results.tables]
 
 
-def _view_table(results: Evaluation, table: Table, notes: list[str]) -> TableView:
+def compact_tables(results: EvalResults) -> list[CompactTable]:
+    """Every table, for the forms that have no room for empty columns."""
+    tables = []
+    for view in view_tables(results):
+        places, absent = [], []
+        for place, column in enumerate(view.columns):
+            column_notes = [row.cells[place].note for row in view.rows]
+            reasons = " / ".join(dict.fromkeys(view.notes[note] for note in column_notes if note))
+            if not all(column_notes):
+                places.append(place)
+            elif reasons:
+                absent.append(f"{column.heading}: n/a ({reasons})")
+        rows = [replace(row, cells=[row.cells[place] for place in places]) for row in view.rows]
+        used_notes = {cell.note for row in rows for cell in row.cells}
+        notes = {number: note for number, note in view.notes.items() if number in used_notes}
+        smaller = replace(view, columns=[view.columns[place] for place in places], rows=rows, notes=notes)
+        tables.append(CompactTable(smaller, absent))
+    return tables
+
+
+def digits_of(values: Iterable[float | None]) -> int:
+    """Decimals that show about four figures of a usual value of a column; an outlier changes nothing."""
+    sizes = sorted(abs(value) for value in values if value)
+    usual = sizes[(len(sizes) - 1) // 2] if sizes else 0.0
+    for digits, least in enumerate((100.0, 10.0, 0.1, 0.01), start=1):
+        if usual >= least:
+            return digits
+    return 5 if usual else 2
+
+
+def number_text(value: float | None, digits: int, signed: bool = False) -> str:
+    """A number with a true minus sign; a value that rounds to zero has no sign."""
+    if value is None:
+        return UNDEFINED
+    if not round(value, digits):
+        value = 0.0
+    return f"{value:{'+' if signed and value else ''}.{digits}f}".replace("-", "−")
+
+
+def interval_text(low: float | None, high: float | None, digits: int, signed: bool = False) -> str:
+    """``[low, high]``; empty when there is none."""
+    if low is None or high is None:
+        return ""
+    return f"[{number_text(low, digits, signed)}, {number_text(high, digits, signed)}]"
+
+
+def difference_texts(difference: Difference, digits: int) -> tuple[str, str]:
+    """The signed difference, marked when its interval leaves zero out, and that interval.
+
+    A clear difference too small for the column's digits gets up to three more; below that it is zero, unmarked.
+    """
+    mean = difference.mean
+    if mean is not None and difference.clear:
+        digits = next((more for more in range(digits, digits + MORE_DIGITS + 1) if round(mean, more)), digits)
+    mark = MARK if difference.clear and mean is not None and round(mean, digits) else ""
+    interval = interval_text(difference.low, difference.high, digits, signed=True)
+    return number_text(mean, digits, signed=True) + mark, interval
+
+
+def heading(title: str, better: str | None) -> str:
+    """The title of a column or a metric with the arrow of the better direction."""
+    return f"{title} {ARROWS.get(better or '', '')}".strip()
+
+
+def verdict(difference: Difference, better: str | None) -> str:
+    """``better`` or ``worse`` when the difference is clear, else ``open``."""
+    if not difference.clear or better not in ARROWS or difference.mean is None:
+        return "open"
+    return "better" if (difference.mean > 0) == (better == "higher") else "worse"
+
+
+def _view_table(results: EvalResults, table: TableRecord, notes: list[str]) -> TableView:
     """One table of the results; new reasons are added to ``notes``."""
     names = [name for kind in KINDS for name, row in table.rows.items() if row.kind == kind]
     cells: dict[str, list[CellView]] = {name: [] for name in names}
@@ -137,20 +190,20 @@ def _view_table(results: Evaluation, table: Table, notes: list[str]) -> TableVie
         for name in names
     ]
     columns = [_column_head(results, key, table) for key in results.columns]
-    used = sorted({cell.note for row in rows for cell in row.cells} - {0})
-    return TableView(table.name, len(table.clips), columns, rows, {number: notes[number - 1] for number in used})
+    used_notes = sorted({cell.note for row in rows for cell in row.cells} - {0})
+    return TableView(table.name, len(table.clips), columns, rows, {number: notes[number - 1] for number in used_notes})
 
 
-def _column_views(key: str, column: ColumnRecord, rows: Sequence[Row], notes: list[str]) -> list[CellView]:
-    """The column's cells; reasons of what is missing are added to ``notes``."""
+def _column_views(key: str, column: ColumnRecord, rows: Sequence[RowRecord], notes: list[str]) -> list[CellView]:
+    """The column's cells; reasons of missing figures are added to ``notes``."""
     cells = [row.columns.get(key, Cell(na="not measured for this row")) for row in rows]
     digits = digits_of(cell.mean for cell in cells)
     means = [cell.mean for cell, row in zip(cells, rows, strict=True) if row.kind == "model" and cell.mean is not None]
     best = None
     if len(means) > 1 and column.better:
-        best = number(max(means) if column.better == "higher" else min(means), digits)
+        best = number_text(max(means) if column.better == "higher" else min(means), digits)
     return [
-        _cell_view(cell, column, digits, notes, row.kind == "model" and number(cell.mean, digits) == best)
+        _cell_view(cell, column, digits, notes, row.kind == "model" and number_text(cell.mean, digits) == best)
         for cell, row in zip(cells, rows, strict=True)
     ]
 
@@ -160,22 +213,23 @@ def _cell_view(cell: Cell, column: ColumnRecord, digits: int, notes: list[str], 
         if cell.na not in notes:
             notes.append(cell.na)
         return CellView(NOT_AVAILABLE, note=notes.index(cell.na) + 1)
-    view = CellView(
-        spread_text(cell, digits), interval_text(cell.low, cell.high, digits), best=best, count=cell.count
-    )  # fmt: skip
+    spread = "" if cell.std is None or cell.mean is None else f" ± {number_text(cell.std, digits)}"
+    text = number_text(cell.mean, digits) + spread
+    view = CellView(text, interval_text(cell.low, cell.high, digits), best=best, count=cell.count)
     gap = cell.difference
     if gap is None or gap.mean is None:
         return view
     text, interval = difference_texts(gap, digits)
-    judged = verdict(gap, column.better) if text.endswith(MARK) else "open"
-    return replace(view, difference=text, difference_interval=interval, verdict=judged)
+    judgement = verdict(gap, column.better) if text.endswith(MARK) else "open"
+    return replace(view, difference=text, difference_interval=interval, verdict=judgement)
 
 
-def _column_head(results: Evaluation, key: str, table: Table) -> ColumnView:
+def _column_head(results: EvalResults, key: str, table: TableRecord) -> ColumnView:
     column = results.columns[key]
     metric = results.measured.metrics.get(column.metric)
     counts = sorted({cell.count for row in table.rows.values() if (cell := row.columns.get(key)) and cell.count})
     return ColumnView(
-        heading(column), column.definition or (metric.definition if metric else ""),
+        heading(column.title, column.better),
+        column.definition or (metric.definition if metric else ""),
         " to ".join(str(count) for count in dict.fromkeys([*counts[:1], *counts[-1:]])),
-    )  # fmt: skip
+    )

@@ -1,4 +1,4 @@
-"""The tables as text: for the console and as Markdown."""
+"""The tables as text, for the console and as Markdown."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 
 from rich.markup import escape
 
-from persist_cli.evaluate.report.result_file import Evaluation, check_results
+from persist_cli.evaluate.report.result_file import EvalResults, check_results
 from persist_cli.evaluate.report.tables import CellView, ColumnView, RowView, compact_tables
 
-Lines = list[tuple[str, list[str], list[list[str]]]]
+PrintedTable = tuple[str, list[str], list[list[str]]]  # title, headings, and the texts of each row
 
-NAME = 28  # signs of a row's name beside each other on the console
+TextTable = tuple[str, list[RowView], list[ColumnView], Callable[[CellView], str]]  # the last writes a cell
+
+NAME_WIDTH = 28  # characters of a row's name on the console before it goes on in the next line
 
 LEGEND = (
     "mean ± standard deviation over sampling seeds; [95 % interval, bootstrap over clips]; "
@@ -22,31 +24,30 @@ LEGEND = (
 )
 
 
-def console_tables(results: Mapping[str, Any] | Evaluation, width: int | None = None) -> Lines:
-    """Title, columns and cells of each table, made for ``print_table``, no wider than the console where it can be.
+def console_tables(results: Mapping[str, Any] | EvalResults, width: int | None = None) -> list[PrintedTable]:
+    """The tables as ``print_table`` takes them, no wider than the console where that is possible.
 
     First the figures with their intervals, then the differences to the first row; columns that do not fit go into a
     further table.
     """
     from persist_cli.viewing.console import OUT
 
-    tables: Lines = []
-    for name, rows, columns, cell_text in _parts(_checked(results)):
+    tables: list[PrintedTable] = []
+    for name, rows, columns, cell_text in _text_tables(_checked(results)):
         cells = [
-            ["\n".join(wrap(row.name, NAME)) + _kind(row), *(cell_text(cell) for cell in row.cells)] for row in rows
+            ["\n".join(wrap(row.name, NAME_WIDTH)) + _kind(row), *(cell_text(cell) for cell in row.cells)]
+            for row in rows
         ]
         heads = ["row", *(column.heading for column in columns)]
-        for chosen in fitting(heads, cells, width or OUT.width):
-            title = name if chosen[1] == 1 else f"{name} (goes on)"
-            tables.append(
-                (escape(title), [escape(heads[each]) for each in chosen],
-                 [[escape(row[each]) for each in chosen] for row in cells])
-            )  # fmt: skip
+        for places in fit_columns(heads, cells, width or OUT.width):
+            title = name if places[1] == 1 else f"{name} (goes on)"
+            texts = [[escape(row[place]) for place in places] for row in cells]
+            tables.append((escape(title), [escape(heads[place]) for place in places], texts))
     return tables
 
 
-def print_tables(results: Mapping[str, Any] | Evaluation) -> None:
-    """Every table on standard output, with what marks and ``n/a`` mean and the definitions."""
+def print_tables(results: Mapping[str, Any] | EvalResults) -> None:
+    """Print every table, the reasons of missing figures, and the definitions of columns and rows."""
     from persist_cli.viewing.console import print_table, say
 
     checked = _checked(results)
@@ -57,11 +58,11 @@ def print_tables(results: Mapping[str, Any] | Evaluation) -> None:
         say(escape(line))
 
 
-def table_text(results: Mapping[str, Any] | Evaluation) -> str:
+def table_text(results: Mapping[str, Any] | EvalResults) -> str:
     """Every table as Markdown: figures, differences, notes and definitions."""
     checked = _checked(results)
     blocks = [f"# {_plain(checked.measured.protocol.title or checked.measured.protocol.name)}", LEGEND]
-    for name, rows, columns, cell_text in _parts(checked):
+    for name, rows, columns, cell_text in _text_tables(checked):
         heads = ["row", *(column.heading for column in columns)]
         cells = [[row.name + _kind(row), *map(cell_text, row.cells)] for row in rows]
         blocks.append(markdown_table(name, heads, cells, _best(rows) if cell_text is _figure else ()))
@@ -72,16 +73,16 @@ def table_text(results: Mapping[str, Any] | Evaluation) -> str:
 def markdown_table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[str]], bold: Collection[tuple[int, int]] = ()
 ) -> str:
-    """A Markdown table under its title; ``bold`` are row and column of cells whose first line is."""
+    """A Markdown table under its title; ``bold`` holds row and column of the cells whose first line is bold."""
     lines = [[_plain(head) for head in heads], ["---", *["---:"] * (len(heads) - 1)]]
     for place, row in enumerate(rows):
         lines.append([_emphasis(_plain(text), (place, column) in bold) for column, text in enumerate(row)])
-    table = "\n".join("| " + " | ".join(each.replace("\n", "<br>") for each in line) + " |" for line in lines)
+    table = "\n".join("| " + " | ".join(text.replace("\n", "<br>") for text in line) + " |" for line in lines)
     return f"## {_plain(title)}\n\n{table}"
 
 
-def remark_lines(results: Evaluation) -> list[str]:
-    """Why figures or whole columns are missing, then what each column and each row is."""
+def remark_lines(results: EvalResults) -> list[str]:
+    """Lines that say why figures or whole columns are missing, then define each column and each row."""
     tables = compact_tables(results)
     views = [table.view for table in tables]
     notes = {number: note for view in views for number, note in view.notes.items()}
@@ -96,11 +97,26 @@ def remark_lines(results: Evaluation) -> list[str]:
     ]
 
 
-TextTable = tuple[str, list[RowView], list[ColumnView], Callable[[CellView], str]]
+def fit_columns(
+    heads: Sequence[str], cells: Sequence[Sequence[str]], width: int, fixed: int = 1
+) -> Iterator[list[int]]:
+    """Split columns into tables that fit a width, by number; the first ``fixed`` columns are in all of them."""
+    needed = [
+        max(len(line) for text in (heads[column], *(row[column] for row in cells)) for line in text.split("\n")) + 3
+        for column in range(len(heads))
+    ]
+    columns, used = list(range(fixed)), sum(needed[:fixed]) + 1
+    for column in range(fixed, len(heads)):
+        if len(columns) > fixed and used + needed[column] > width:
+            yield columns
+            columns, used = list(range(fixed)), sum(needed[:fixed]) + 1
+        columns.append(column)
+        used += needed[column]
+    yield columns
 
 
-def _parts(results: Evaluation) -> Iterator[TextTable]:
-    """Figures, then differences, of each table."""
+def _text_tables(results: EvalResults) -> Iterator[TextTable]:
+    """For each table one of figures, then one of differences to the first row where there are any."""
     several = len(results.tables) > 1
     for view in (table.view for table in compact_tables(results)):
         title = f"{view.name}: {view.clips} clips" if several else f"{view.clips} clips"
@@ -119,22 +135,6 @@ def _difference(cell: CellView) -> str:
     return f"{cell.difference}\n{cell.difference_interval}".rstrip()
 
 
-def fitting(heads: Sequence[str], cells: Sequence[Sequence[str]], width: int, fixed: int = 1) -> Iterator[list[int]]:
-    """Numbers of the columns of each printed table that fits a width; the first ``fixed`` are in all of them."""
-    needed = [
-        max(len(line) for text in (heads[column], *(row[column] for row in cells)) for line in text.split("\n")) + 3
-        for column in range(len(heads))
-    ]
-    chosen, used = list(range(fixed)), sum(needed[:fixed]) + 1
-    for column in range(fixed, len(heads)):
-        if len(chosen) > fixed and used + needed[column] > width:
-            yield chosen
-            chosen, used = list(range(fixed)), sum(needed[:fixed]) + 1
-        chosen.append(column)
-        used += needed[column]
-    yield chosen
-
-
 def _kind(row: RowView) -> str:
     return "" if row.kind == "model" else f"\n({row.kind})"
 
@@ -149,10 +149,10 @@ def _emphasis(text: str, best: bool) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text whose signs Markdown does not read as its own; the lines stay."""
+    """Escape what Markdown would read as its own; line breaks stay."""
     escaped = re.sub(r"([\\`*_|#~$])", r"\\\1", text).replace("<", "&lt;").replace("](", "]\\(")
     return escaped.replace("\r", " ")
 
 
-def _checked(results: Mapping[str, Any] | Evaluation) -> Evaluation:
-    return results if isinstance(results, Evaluation) else check_results(results, "results")
+def _checked(results: Mapping[str, Any] | EvalResults) -> EvalResults:
+    return results if isinstance(results, EvalResults) else check_results(results, "results")

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from persist_cli.api.backbone import Backbone
+from persist_cli.api.backbone import Backbone, Clip, Clips
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.observations import Observations
@@ -19,7 +19,6 @@ from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.coverage import held_frames
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.rows.warp import Surface, warp
-from persist_cli.rollout.world_model import ClipRequest, batch_of
 
 Shower = Callable[[Cameras, Tensor], tuple[Tensor, Tensor]]
 
@@ -52,6 +51,7 @@ class Truth(Row):
 class CodecReconstruction(Row):
     """Ground truth after the codec."""
 
+    uses_model = True
     definition = "true frames encoded and decoded, clip after clip as the model predicts them: the codec's ceiling"
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -64,7 +64,7 @@ class CodecReconstruction(Row):
         )
         for first in range(0, len(truths[0]) - 1, length):
             wanted = min(length, len(truths[0]) - 1 - first)
-            colors, metres = backbone.reconstruct(batch_of([part_of(truth, first, length) for truth in truths]))
+            colors, metres = backbone.reconstruct(Clips.stack([part_of(truth, first, length) for truth in truths]))
             rgb.append(colors[:, 1 : wanted + 1].cpu())
             depth.append(metres[:, 1 : wanted + 1].cpu())
         return torch.cat(rgb, dim=1), torch.cat(depth, dim=1)
@@ -143,8 +143,8 @@ def pose_distances(cameras: Cameras, asked: Cameras) -> Float[Tensor, " frame"]:
     return metres + torch.deg2rad(degrees)
 
 
-def part_of(truth: Observations, first: int, length: int) -> ClipRequest:
+def part_of(truth: Observations, first: int, length: int) -> Clip:
     """The frames ``first`` to ``first + length`` as a batch's sample, the last repeated to fill it."""
     numbers = [min(number, len(truth) - 1) for number in range(first, first + length + 1)]
     part = truth[numbers]
-    return ClipRequest(part, part.cameras, (None,) * length, None, 0)
+    return Clip(part, (None,) * length, seed=0)

@@ -1,4 +1,4 @@
-"""What the memory of a row is made of: the truth, or what shows whether it is used."""
+"""Memory interventions: what a row's memory is made of, to show whether and how the model uses it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from persist_cli.evaluate.cases import Case, CaseFrames, read_case
 
 
 class MemoryIntervention(ABC):
-    """What is written into a row's memory; ``writes`` says whether the model's own output may follow."""
+    """A rule for what is written into a row's memory.
+
+    ``writes`` says whether the model's own output may follow.
+    """
 
     name: ClassVar[str]
     writes: ClassVar[bool] = False
@@ -26,19 +29,19 @@ class MemoryIntervention(ABC):
     @property
     @abstractmethod
     def definition(self) -> str:
-        """What the memory holds."""
+        """A few words that say what the memory holds."""
 
     @abstractmethod
     def context(self, clip: CaseFrames) -> Observations | None:
-        """The frames that a clip's memory is made of before it begins."""
+        """The frames that a clip's memory is made of before the clip begins; ``None`` for none."""
 
     def disturb(self, seen: Observations, draws: torch.Generator) -> Observations:
-        """Frames as they come into the memory; as they are by default."""
+        """Change frames on their way into the memory; by default they stay as they are."""
         return seen
 
 
 class Unmodified(MemoryIntervention):
-    """The memory that the protocol says."""
+    """The memory of the protocol, without an intervention."""
 
     name = ""
     writes = True
@@ -50,52 +53,56 @@ class Unmodified(MemoryIntervention):
 
 
 class Emptied(MemoryIntervention):
-    """No memory at all."""
+    """A memory that is always empty."""
 
     name = "emptied"
     definition = "its memory is always empty"
 
     def context(self, clip: CaseFrames) -> Observations | None:
-        """Nothing."""
+        """Always ``None``: the memory begins empty."""
         return None
 
 
 class Oracle(MemoryIntervention):
-    """A memory that has seen the future."""
+    """A memory that holds the true frames to be predicted, too."""
 
     name = "oracle"
     definition = "its memory holds the true frames of the clip too"
 
     def context(self, clip: CaseFrames) -> Observations | None:
         """The frames before the clip and those of the clip."""
-        parts = [clip.observations] if clip.context is None else [clip.context, clip.observations]
-        return Observations.concatenate(parts)
+        earlier = [] if clip.context is None else [clip.context]
+        return Observations.concatenate([*earlier, clip.observations])
 
 
 class Shuffled(MemoryIntervention):
-    """The wrong memory.
+    """The memory of another clip, in another scene.
 
     Args:
-        cases: of the evaluation; a clip gets the memory of the next one in another scene.
+        cases: all cases of the evaluation; each gets the memory of the next one in another scene.
+
+    Raises:
+        DataError: when all cases are in one scene.
     """
 
     name = "shuffled"
     definition = "its memory is that of the next clip in another scene, moved to where this clip begins"
 
     def __init__(self, cases: Sequence[Case]) -> None:
-        self.partners = {case: partner(cases, number) for number, case in enumerate(cases)}
+        self.partners = {case: next_in_another_scene(cases, number) for number, case in enumerate(cases)}
 
     def context(self, clip: CaseFrames) -> Observations | None:
-        """The other clip's frames, in this clip's world: where it begins is where this one begins."""
-        other = read_case(self.partners[clip.case])
-        frames = other.context if other.context is not None else other.observations
-        here, there = (each.observations.cameras.world_from_camera[0] for each in (clip, other))
-        return replace(frames, cameras=moved(frames.cameras, here @ invert_rigid(there)))
+        """The partner's frames, moved so that the partner begins where this clip begins."""
+        partner = read_case(self.partners[clip.case])
+        frames = partner.context if partner.context is not None else partner.observations
+        here = clip.observations.cameras.world_from_camera[0]
+        there = partner.observations.cameras.world_from_camera[0]
+        return replace(frames, cameras=move_cameras(frames.cameras, here @ invert_rigid(there)))
 
 
 @dataclass(frozen=True)
 class NoisyPoses(MemoryIntervention):
-    """A memory whose poses are wrong.
+    """A memory that is written with wrong poses.
 
     Args:
         centimetres: standard deviation of the error along each axis.
@@ -109,7 +116,7 @@ class NoisyPoses(MemoryIntervention):
 
     @property
     def definition(self) -> str:
-        """With its figures."""
+        """A sentence with both standard deviations."""
         return (
             f"every pose written to its memory is off by σ = {self.centimetres:g} cm along and {self.degrees:g}° about "
             "each camera axis"
@@ -120,32 +127,31 @@ class NoisyPoses(MemoryIntervention):
         return clip.context
 
     def disturb(self, seen: Observations, draws: torch.Generator) -> Observations:
-        """Each pose moved and turned by its own error."""
+        """Move and turn each pose by an error of its own."""
         errors = torch.randn(len(seen), 6, generator=draws, dtype=torch.float64)
         metres, radians = errors[:, :3] * self.centimetres / 100, errors[:, 3:] * math.radians(self.degrees)
         wrong = seen.cameras.world_from_camera @ small_motions(metres, radians)
         return replace(seen, cameras=replace(seen.cameras, world_from_camera=wrong))
 
 
-def partner(cases: Sequence[Case], number: int) -> Case:
-    """The next case, cyclically, in another scene.
+def next_in_another_scene(cases: Sequence[Case], number: int) -> Case:
+    """The case after this number, cyclically, that is in another scene.
 
     Raises:
         DataError: when all are in one scene.
     """
-    own = (cases[number].data, cases[number].scene)
-    for step in range(1, len(cases)):
-        other = cases[(number + step) % len(cases)]
-        if (other.data, other.scene) != own:
-            return other
+    scene = (cases[number].data, cases[number].scene)
+    for case in (*cases[number + 1 :], *cases[:number]):
+        if (case.data, case.scene) != scene:
+            return case
     raise DataError(
         f"the control 'shuffled' needs clips of two scenes, all are of {cases[number].scene!r}; "
         "leave it out of --controls or add scenes"
     )
 
 
-def moved(cameras: Cameras, motion: Tensor) -> Cameras:
-    """The cameras after a rigid motion of the world."""
+def move_cameras(cameras: Cameras, motion: Tensor) -> Cameras:
+    """The cameras after a rigid motion ``[4, 4]`` of the world."""
     return replace(cameras, world_from_camera=motion @ cameras.world_from_camera)
 
 

@@ -18,7 +18,7 @@ from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.rows.interventions import MemoryIntervention, Unmodified
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.rollout.world_model import WorldModel, imagine_together
+from persist_cli.rollout.world_model import Agent, WorldModel
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class ModelRow(Row):
         adapter: its name; ``None`` is plain stage 1.
         sampling: how clips are drawn.
         row_memory: with which memory.
-        gives_depth: whether the model does.
     """
 
     random = True
+    uses_model = True
 
     def __init__(
         self,
@@ -57,11 +57,9 @@ class ModelRow(Row):
         adapter: str | None,
         sampling: Sampling,
         row_memory: RowMemory,
-        gives_depth: bool = True,
     ) -> None:
         super().__init__(name, checkpoint)
         self.checkpoint, self.adapter, self.sampling, self.row_memory = checkpoint, adapter, sampling, row_memory
-        self.gives_depth = gives_depth
         self.kind = "model" if isinstance(row_memory.recall, Unmodified) else "memory control"
 
     @property
@@ -78,23 +76,20 @@ class ModelRow(Row):
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Rollouts from each clip's first frame along its cameras."""
-        models = [self.start(backbone, clip, seed) for clip, seed in zip(clips, seeds, strict=True)]
+        agents = [self.agent(clip, seed) for clip, seed in zip(clips, seeds, strict=True)]
+        model = WorldModel(backbone, agents, self.sampling)
+        model.reset([clip.observations[:1] for clip in clips], [clip.info for clip in clips])
         cameras = [clip.observations.cameras[1:] for clip in clips]
         parts = [[clip.observations[:1] for clip in clips]]
-        parts += imagine_together(models, cameras, [clip.interactions for clip in clips])
-        return (
-            torch.stack([torch.cat([part[number].rgb for part in parts]) for number in range(len(clips))]),
-            torch.stack([torch.cat([part[number].depth for part in parts]) for number in range(len(clips))]),
-        )
+        parts += model.imagine(cameras, [clip.interactions for clip in clips])
+        videos = [Observations.concatenate(frames) for frames in zip(*parts, strict=True)]
+        return torch.stack([video.rgb for video in videos]), torch.stack([video.depth for video in videos])
 
-    def start(self, backbone: Backbone, clip: CaseFrames, seed: int) -> WorldModel:
-        """A world model at the clip's first frame."""
-        recall = self.row_memory.recall
-        disturb = partial(recall.disturb, draws=torch.Generator().manual_seed(seed))
-        writes = self.row_memory.writes and recall.writes
-        model = WorldModel(backbone, self.memory(clip, disturb), self.sampling, seed, writes, disturb)
-        model.reset(clip.observations[:1], clip.info)
-        return model
+    def agent(self, clip: CaseFrames, seed: int) -> Agent:
+        """An agent with the clip's memory."""
+        intervention = self.row_memory.recall
+        disturb = partial(intervention.disturb, draws=torch.Generator().manual_seed(seed))
+        return Agent(self.memory(clip, disturb), seed, self.row_memory.writes and intervention.writes, disturb)
 
     def memory(self, clip: CaseFrames, disturb: Callable[[Observations], Observations]) -> Memory | None:
         """The clip's memory before it begins."""

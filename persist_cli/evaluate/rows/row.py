@@ -1,4 +1,4 @@
-"""The abstract row."""
+"""The abstract row: one line of the table, which makes a video for each clip."""
 
 from __future__ import annotations
 
@@ -13,22 +13,24 @@ from persist_cli.api.inference import InferenceOptions
 from persist_cli.checkpoints.checkpoint import Checkpoint
 from persist_cli.evaluate.cases import CaseFrames
 
-Kind = Literal["model", "control", "memory control"]
+RowKind = Literal["model", "control", "memory control"]
 
 
 class Row(ABC):
-    """What one line of the table gives for a clip.
+    """One line of the table: a model or a control that makes a video for each clip.
 
-    ``random`` says whether another sampling seed gives another result, ``gives_depth`` whether its depth is one.
+    ``random`` says whether another sampling seed gives another video, ``uses_model`` whether the base's model makes
+    the videos, and ``adapter`` which of its memory adapters reads a memory for that.
 
     Args:
-        name: in the table.
-        base: the checkpoint whose backbone it needs.
+        name: name in the table.
+        base: checkpoint whose backbone the row needs.
     """
 
-    kind: Kind = "control"
+    kind: RowKind = "control"
     random: ClassVar[bool] = False
-    gives_depth: bool = True
+    uses_model: ClassVar[bool] = False
+    adapter: str | None = None
 
     def __init__(self, name: str, base: Checkpoint) -> None:
         self.name, self.base = name, base
@@ -36,10 +38,10 @@ class Row(ABC):
     @property
     @abstractmethod
     def definition(self) -> str:
-        """What the row shows, in a few words."""
+        """A few words that say what the row shows."""
 
     def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
-        """Make the backbone ready for this row, placed like this."""
+        """Make the backbone ready for this row, with this device and precision."""
         backbone.prepare_inference(placement)
 
     @abstractmethod
@@ -47,7 +49,12 @@ class Row(ABC):
         """RGB uint8 ``[clip, frame, height, width, 3]`` and depth in metres of every frame, the given one first.
 
         Args:
-            backbone: prepared for this row.
-            clips: all of one number of frames.
-            seeds: of the sampling noise, one for each clip.
+            backbone: backbone that was prepared for this row.
+            clips: clips with equally many frames.
+            seeds: seed of the sampling noise of each clip.
         """
+
+
+def unique_bases(checkpoints: Sequence[Checkpoint]) -> list[Checkpoint]:
+    """One checkpoint for each base, in order of first appearance."""
+    return list({checkpoint.fingerprint: checkpoint for checkpoint in checkpoints}.values())

@@ -1,4 +1,4 @@
-"""Two runs side by side."""
+"""Two runs are compared side by side when they measured the same."""
 
 from __future__ import annotations
 
@@ -14,23 +14,29 @@ from persist_cli.evaluate.report.pictures import Pictures
 from tests.support.example_results import ROWS, example_results
 
 
-def written(tmp_path, name, change=lambda results: None):
-    """The example's JSON, changed."""
+def write_results(tmp_path, name, change=lambda results: None):
+    """Write the example's JSON after a change."""
     results = copy.deepcopy(example_results())
     change(results)
     (tmp_path / name).write_text(json.dumps(results))
     return tmp_path / name
 
 
-def better(results):
-    """One dB more for the voxel row on every clip."""
+def add_one_decibel(results):
+    """Give the voxel row one dB more on every clip."""
     cell = results["tables"][0]["rows"]["voxel"]["columns"]["psnr"]
     cell["mean"] += 1
     cell["per_clip"] = [value + 1 for value in cell["per_clip"]]
 
 
+def compared_psnr(tmp_path, change):
+    """The voxel row's PSNR in the example, compared with the example after a change."""
+    comparison = compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
+    return comparison.tables[0].rows["voxel"]["psnr"]
+
+
 def test_a_run_compared_with_itself_differs_nowhere(tmp_path):
-    same = written(tmp_path, "a.json")
+    same = write_results(tmp_path, "a.json")
     comparison = compare(same, same)
     figures = [cell for row in comparison.tables[0].rows.values() for cell in row.values() if cell.a is not None]
     assert {(cell.difference, cell.low, cell.high) for cell in figures} == {(0.0, 0.0, 0.0)}
@@ -38,29 +44,28 @@ def test_a_run_compared_with_itself_differs_nowhere(tmp_path):
 
 
 def test_the_difference_is_paired_clip_by_clip(tmp_path):
-    comparison = compare(written(tmp_path, "a.json"), written(tmp_path, "b.json", better))
-    cell = comparison.tables[0].rows["voxel"]["psnr"]
+    cell = compared_psnr(tmp_path, add_one_decibel)
     assert (cell.difference, cell.low, cell.high) == (pytest.approx(1), pytest.approx(1), pytest.approx(1))
     assert cell.pairs == 6
 
 
-def test_clips_without_a_figure_in_either_run_are_no_pair(tmp_path):
+def test_a_clip_without_a_figure_in_one_run_is_no_pair(tmp_path):
     def change(results):
-        better(results)
+        add_one_decibel(results)
         cell = results["tables"][0]["rows"]["voxel"]["columns"]["psnr"]
         cell["per_clip"][0] = None
         cell["per_clip"][1] = float("nan")
 
-    cell = compare(written(tmp_path, "a.json"), written(tmp_path, "b.json", change)).tables[0].rows["voxel"]["psnr"]
+    cell = compared_psnr(tmp_path, change)
     assert (cell.pairs, cell.difference) == (4, pytest.approx(1))
 
 
 def test_without_figures_clip_by_clip_there_is_a_difference_of_means_and_no_interval(tmp_path):
     def change(results):
-        better(results)
+        add_one_decibel(results)
         results["tables"][0]["rows"]["voxel"]["columns"]["psnr"]["per_clip"] = None
 
-    cell = compare(written(tmp_path, "a.json"), written(tmp_path, "b.json", change)).tables[0].rows["voxel"]["psnr"]
+    cell = compared_psnr(tmp_path, change)
     assert (cell.difference, cell.low, cell.pairs) == (pytest.approx(1), None, 0)
 
 
@@ -69,34 +74,36 @@ def test_the_interval_covers_the_true_difference_and_excludes_zero_only_when_it_
         cell = results["tables"][0]["rows"]["voxel"]["columns"]["psnr"]
         cell["per_clip"] = [value + (-1) ** place * 2 + 0.1 for place, value in enumerate(cell["per_clip"])]
 
-    cell = compare(written(tmp_path, "a.json"), written(tmp_path, "b.json", shift)).tables[0].rows["voxel"]["psnr"]
+    cell = compared_psnr(tmp_path, shift)
     assert cell.low < 0 < cell.difference < cell.high
     assert -2 <= cell.low < cell.high <= 2.1
 
 
-DIFFERENT = {
-    "protocol: revisit and return": lambda each: each["measured"]["protocol"].update(name="return"),
-    "frames a clip: 9 and 112": lambda each: each["measured"]["protocol"].update(frames=112),
-    "image size: 64×64 and 128×64": lambda each: each["measured"].update(image_size=[128, 64]),
-    "clip 2: 0/house-2:24+9 and 0/house-2:25+9": lambda each: each["measured"]["clips"][2].update(start=25),
-    "trajectory house-1 of data set 0: 000000000000 and abababababab": lambda each: each["measured"]["data"][0][
+DIFFERENCES = {
+    "protocol: revisit and return": lambda results: results["measured"]["protocol"].update(name="return"),
+    "frames a clip: 9 and 112": lambda results: results["measured"]["protocol"].update(frames=112),
+    "image size: 64×64 and 128×64": lambda results: results["measured"].update(image_size=[128, 64]),
+    "clip 2: 0/house-2:24+9 and 0/house-2:25+9": lambda results: results["measured"]["clips"][2].update(start=25),
+    "trajectory house-1 of data set 0: 000000000000 and abababababab": lambda results: results["measured"]["data"][0][
         "trajectories"
     ].update({"house-1": "ab" * 32}),
-    "definition of SSIM: Gaussian window 11, sigma 1.5 and window 7": lambda each: each["measured"]["metrics"][
+    "definition of SSIM: Gaussian window 11, sigma 1.5 and window 7": lambda results: results["measured"]["metrics"][
         "ssim"
     ].update(definition="window 7"),
-    "weights lpips-alex of LPIPS: aaaaaaaaaaaa and bbbbbbbbbbbb": lambda each: each["measured"]["metrics"][
+    "weights lpips-alex of LPIPS: aaaaaaaaaaaa and bbbbbbbbbbbb": lambda results: results["measured"]["metrics"][
         "lpips-alex"
     ].update(weights={"lpips-alex": "b" * 64}),
-    "frames of column psnr-last: last and return": lambda each: each["columns"]["psnr-last"].update(frames="return"),
-    "number of tables: 1 and 2": lambda each: each["tables"].append(each["tables"][0]),
-    "clips of a table: 6 in all and 6 in all, not the same": lambda each: each["tables"][0]["clips"].reverse(),
+    "frames of column psnr-last: last and return": lambda results: results["columns"]["psnr-last"].update(
+        frames="return"
+    ),
+    "number of tables: 1 and 2": lambda results: results["tables"].append(results["tables"][0]),
+    "clips of a table: 6 in all and 6 in all, not the same": lambda results: results["tables"][0]["clips"].reverse(),
 }
 
 
-@pytest.mark.parametrize("reason", DIFFERENT)
-def test_what_was_measured_differently_is_refused_with_both_values(tmp_path, reason):
-    a, b = written(tmp_path, "a.json"), written(tmp_path, "b.json", DIFFERENT[reason])
+@pytest.mark.parametrize("reason", DIFFERENCES)
+def test_runs_that_measured_differently_are_refused_with_both_values(tmp_path, reason):
+    a, b = write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", DIFFERENCES[reason])
     with pytest.raises(DataError) as error:
         compare(a, b)
     assert str(error.value) == f"{a} and {b} were measured differently: {reason}"
@@ -108,11 +115,11 @@ def test_a_run_over_fewer_clips_is_refused_in_one_line(tmp_path):
         results.update(measured=smaller["measured"], tables=smaller["tables"])
 
     with pytest.raises(DataError, match=r"number of clips: 6 and 5") as error:
-        compare(written(tmp_path, "a.json"), written(tmp_path, "b.json", change))
+        compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
     assert "\n" not in str(error.value)
 
 
-def test_other_sampling_versions_and_rows_are_notes_and_no_refusal(tmp_path):
+def test_other_sampling_versions_and_rows_are_noted_and_not_refused(tmp_path):
     def change(results):
         results["sampling"] |= {"steps": 25, "seeds": [0]}
         results["environment"]["torch"] = "2.14.0"
@@ -120,7 +127,7 @@ def test_other_sampling_versions_and_rows_are_notes_and_no_refusal(tmp_path):
         del results["tables"][0]["rows"]["voxel, shuffled"]
         del results["columns"]["ssim"]
 
-    comparison = compare(written(tmp_path, "a.json"), written(tmp_path, "b.json", change))
+    comparison = compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
     assert comparison.notes == [
         "steps: 50 and 25", "seeds: [0, 1, 2] and [0]", "torch: 2.13.0 and 2.14.0",
         "checkpoint voxel: ffffffffffff and 000000000000", "column ssim: only in A", "row voxel, shuffled: only in A",
@@ -143,20 +150,20 @@ def test_a_file_that_is_not_results_is_one_line(tmp_path, cause):
     if BROKEN[cause] is not None:
         (tmp_path / "b.json").write_text(BROKEN[cause])
     with pytest.raises(DataError) as error:
-        compare(written(tmp_path, "a.json"), tmp_path / "b.json")
+        compare(write_results(tmp_path, "a.json"), tmp_path / "b.json")
     assert cause in str(error.value)
     assert str(tmp_path / "b.json") in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_data_may_lie_elsewhere_and_results_in_the_folder_of_eval(tmp_path):
+def test_data_in_another_folder_and_results_named_by_their_folder_compare_alike(tmp_path):
     def change(results):
         results["measured"]["data"][0]["path"] = "elsewhere/houses-test"
         results["tables"][0]["name"] = "elsewhere/houses-test (miniworld)"
 
     (tmp_path / "eval").mkdir()
-    written(tmp_path / "eval", "metrics.json", change)
-    assert list(compare(written(tmp_path, "a.json"), tmp_path / "eval").tables[0].rows) == list(ROWS)
+    write_results(tmp_path / "eval", "metrics.json", change)
+    assert list(compare(write_results(tmp_path, "a.json"), tmp_path / "eval").tables[0].rows) == list(ROWS)
 
 
 def test_runs_without_a_common_row_are_one_line(tmp_path):
@@ -164,17 +171,17 @@ def test_runs_without_a_common_row_are_one_line(tmp_path):
         results["tables"][0]["rows"] = {"other": results["tables"][0]["rows"]["none"]}
 
     with pytest.raises(DataError, match="have no row in common"):
-        compare(written(tmp_path, "a.json"), written(tmp_path, "b.json", change))
+        compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
 
 
 def test_run_compare_prints_a_table_and_leaves_json_and_markdown(tmp_path, capsys):
     write_report(example_results(), Pictures(), tmp_path / "report")
-    run_compare(tmp_path / "report", written(tmp_path, "b.json", better), False, tmp_path / "out")
+    run_compare(tmp_path / "report", write_results(tmp_path, "b.json", add_one_decibel), False, tmp_path / "out")
     printed = capsys.readouterr().out
     assert "B − A" in printed
     assert "+1.00*" in printed
-    kept = json.loads((tmp_path / "out/compare.json").read_text())
-    assert kept["tables"][0]["rows"]["voxel"]["psnr"]["difference"] == pytest.approx(1)
+    comparison = json.loads((tmp_path / "out/compare.json").read_text())
+    assert comparison["tables"][0]["rows"]["voxel"]["psnr"]["difference"] == pytest.approx(1)
     assert "+1.00" in (tmp_path / "out/compare.md").read_text()
     run_compare(tmp_path / "report", tmp_path / "b.json", True, None)
-    assert json.loads(capsys.readouterr().out) == kept
+    assert json.loads(capsys.readouterr().out) == comparison

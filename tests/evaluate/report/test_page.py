@@ -1,4 +1,4 @@
-"""The report in a real browser."""
+"""The report as a real browser shows it."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ HOSTILE = "</style><script>alert(1)</script><img src=x onerror=alert(1)>"
 
 
 def look(folder, tmp_path, width=1280):
-    """What the browser makes of the report, told by a script in a copy of the page."""
+    """What the browser shows of the report, as a script in a copy of the page finds it."""
     text = (folder / "report.html").read_text(encoding="utf-8")
     copy = tmp_path / "copy.html"
     copy.write_text(POLICY.sub("", text, count=1).replace("</body>", f"{LOOK}</body>"), encoding="utf-8")
-    dom, said = open_page(copy, tmp_path / "profile", width)
+    dom, complaints = open_page(copy, tmp_path / "profile", width)
     truths = re.search(r'<pre id="truths">(.*?)</pre>', dom, re.DOTALL)
-    assert truths, said
+    assert truths, complaints
     return json.loads(html.unescape(truths.group(1)))
 
 
@@ -49,9 +49,9 @@ def test_the_page_is_never_wider_than_the_window(report, tmp_path, width):
     assert look(report, tmp_path, width)["across"] <= 0
 
 
-def test_the_page_asks_for_nothing_and_its_console_is_silent(report, tmp_path):
-    dom, said = open_page(report / "report.html", tmp_path / "profile")
-    assert said == []
+def test_the_page_loads_no_other_file_and_its_console_is_silent(report, tmp_path):
+    dom, complaints = open_page(report / "report.html", tmp_path / "profile")
+    assert complaints == []
     assert "codec reconstruction" in dom
     assert look(report, tmp_path)["fetched"] == []
 
@@ -63,7 +63,7 @@ def test_a_page_with_fifty_rows_keeps_its_layout(tmp_path):
     assert (len(seen["rows"]), seen["across"] <= 0) == (50, True)
 
 
-def test_a_hostile_name_is_text_and_nothing_else(tmp_path):
+def test_a_row_name_with_html_in_it_is_shown_as_text(tmp_path):
     results = example_results(rows={"none": "model", HOSTILE: "control"})
     results["measured"]["protocol"]["title"] = HOSTILE
     results["tables"][0]["rows"][HOSTILE]["columns"]["psnr"] = {"na": HOSTILE}

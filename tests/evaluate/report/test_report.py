@@ -1,4 +1,4 @@
-"""The report's folder."""
+"""The folder of a report: page, tables, curves, sheets and clips."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_folder_holds_page_tables_curves_sheets_and_clips(report):
 def test_the_page_refers_to_nothing_outside_itself(report):
     page = (report / "report.html").read_text(encoding="utf-8")
     assert "http" not in page.replace("http-equiv", "")
-    assert all(each.startswith("data:") for each in re.findall(r'(?:src|href)="([^"]*)', page))
+    assert all(link.startswith("data:") for link in re.findall(r'(?:src|href)="([^"]*)', page))
     assert "url(" not in page
     assert "<script" not in page
 
@@ -48,13 +48,13 @@ def test_results_in_the_folder_are_strict_json_with_everything(tmp_path):
     results = example_results()
     results["tables"][0]["rows"]["none"]["columns"]["psnr"]["std"] = math.nan
     write_report(results, Pictures(), tmp_path)
-    kept = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
-    assert kept["tables"][0]["rows"]["none"]["columns"]["psnr"].pop("std") is None
+    written = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
+    assert written["tables"][0]["rows"]["none"]["columns"]["psnr"].pop("std") is None
     results["tables"][0]["rows"]["none"]["columns"]["psnr"].pop("std")
-    assert kept == json.loads(json.dumps(results))
+    assert written == json.loads(json.dumps(results))
 
 
-def test_the_page_tells_how_to_measure_again(report):
+def test_the_page_holds_all_that_is_needed_to_measure_again(report):
     page = (report / "report.html").read_text(encoding="utf-8")
     for fact in ("runs/houses test&#39;", "f" * 64, "e" * 64, "d" * 64, "a" * 64, "2.13.0", "0.42.1", f"{1:064x}"):
         assert fact in page
@@ -78,7 +78,7 @@ def test_a_report_that_fails_leaves_the_old_one_whole(tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_a_folder_that_cannot_take_the_report_is_one_line_and_gets_no_page(tmp_path):
+def test_a_file_in_the_way_of_the_report_is_one_line_and_no_page_is_written(tmp_path):
     (tmp_path / "curves").write_text("a file in the way")
     with pytest.raises(PersistError, match="the report cannot be written there"):
         write_report(example_results(), Pictures(), tmp_path)
@@ -98,9 +98,9 @@ def test_damaged_results_are_one_line(tmp_path):
 
 def test_curve_files_are_svg_with_a_line_for_each_row(report):
     root = ElementTree.parse(report / "curves/psnr-frames.svg").getroot()
-    lines = [each for each in root.iter("{http://www.w3.org/2000/svg}polyline")]
+    lines = list(root.iter("{http://www.w3.org/2000/svg}polyline"))
     assert len(lines) == len(ROWS)
-    assert sum("stroke-dasharray" in each.attrib for each in lines) == 3  # the controls
+    assert sum("stroke-dasharray" in line.attrib for line in lines) == 3  # the controls
 
 
 def test_a_curve_is_broken_where_a_figure_is_missing_and_ends_at_the_last_frame():
@@ -109,7 +109,7 @@ def test_a_curve_is_broken_where_a_figure_is_missing_and_ends_at_the_last_frame(
     curve["per_frame"][3] = math.nan
     checked = check_results(results, "example")
     plot = plots(checked, checked.tables[0], row_styles(checked))[0]
-    line = next(each for each in plot.lines if each.style.row == "voxel")
+    line = next(line for line in plot.lines if line.style.row == "voxel")
     assert [len(stroke.split()) for stroke in line.strokes] == [3, 4]
     assert line.dots[-1].x == plot.box[2]
     assert line.dots[-1].tip.startswith("voxel: frame 8, ")
@@ -120,20 +120,20 @@ def test_a_line_is_broken_where_a_bin_of_seen_before_is_empty():
     del results["tables"][0]["rows"]["voxel"]["curves"]["psnr"]["by_seen_before"][2]
     checked = check_results(results, "example")
     plot = plots(checked, checked.tables[0], row_styles(checked))[1]
-    line = next(each for each in plot.lines if each.style.row == "voxel")
+    line = next(line for line in plot.lines if line.style.row == "voxel")
     assert [len(stroke.split()) for stroke in line.strokes] == [2, 2]
     assert len(plot.counts) == 5
 
 
-def test_a_row_has_one_look_in_every_plot_and_no_other_row_has_it():
+def test_every_row_has_a_style_of_its_own():
     many = {f"row {number}": kind for number, kind in enumerate(["model"] * 9 + ["control"] * 5)}
     styles = row_styles(check_results(example_results(rows=many), "example")).values()
-    assert len({(each.color, each.dash, each.marked) for each in styles}) == len(many)
-    assert {each.kind for each in styles if each.dash} == {"control"}
+    assert len({(style.color, style.dash, style.marked) for style in styles}) == len(many)
+    assert {style.kind for style in styles if style.dash} == {"control"}
 
 
 @pytest.mark.parametrize(("low", "high"), [(17.3, 26.1), (0.0, 1.0), (-3.0, 2.0), (0.0012, 0.0019), (5.0, 5.0)])
-def test_ticks_are_few_and_inside(low, high):
+def test_at_most_five_ticks_lie_within_the_range(low, high):
     ticks = nice_ticks(low, high, 5)
     assert 1 <= len(ticks) <= 5
     assert all(low - 1e-9 <= tick <= high + 1e-9 for tick in ticks)
