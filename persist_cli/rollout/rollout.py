@@ -25,7 +25,7 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
 from persist_cli.rollout.outputs import write_outputs
-from persist_cli.rollout.world_model import WorldModel, imagine_together
+from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import add_task, print_json, progress, say
 
 
@@ -36,9 +36,9 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     plan.placement.device()  # what cannot be is told before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = plan.adapter or checkpoint.default_adapter()
-    walks = plan_camera_paths(plan)
-    folders = check_folders(out, len(walks))
-    info = walks[0].info
+    paths = plan_camera_paths(plan)
+    folders = check_folders(out, len(paths))
+    info = paths[0].info
     backbone = load_backbone(checkpoint)
     check_size(info, backbone.image_size, plan.start)
     sampling = plan.sampling.over(checkpoint.sampling)
@@ -47,8 +47,9 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     load_adapter(backbone, checkpoint, adapter)
     backbone.prepare_inference(plan.placement)
     memory = open_memory(checkpoint, adapter, plan, info)
-    model = WorldModel(backbone, memory and memory.to(backbone.device), sampling, plan.seed, plan.write)
-    rollouts = roll(model, walks)
+    agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write)
+    model = WorldModel(backbone, [agent], sampling)
+    rollouts = roll(model, paths)
     pairs = list(zip(rollouts, folders, strict=True))
     figures = [write_outputs(each, folder, describe(checkpoint, adapter, plan, each)) for each, folder in pairs]
     if json:
@@ -56,7 +57,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
         return
     for rollout, folder in pairs:
         say(
-            f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {rollout.walk.actions!r}; written to {folder}"
+            f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {rollout.path.actions!r}; written to {folder}"
         )
 
 
@@ -100,33 +101,36 @@ def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
             raise CheckpointError(f"{path}: its {key.replace('_', ' ')} is {has[key]!r}, wanted here is {wants[key]!r}")
 
 
-def roll(model: WorldModel, walks: Sequence[CameraPath]) -> list[Rollout]:
-    """Imagine walks from one start together, clip by clip, with a progress bar."""
-    before, began = None if model.memory is None else model.memory.copy(), time.monotonic()
-    model.reset(walks[0].start, walks[0].info)
-    models = model.branches(len(walks)) if len(walks) > 1 else [model]
-    cameras, parts = [walk.cameras for walk in walks], []
+def roll(model: WorldModel, paths: Sequence[CameraPath]) -> list[Rollout]:
+    """Imagine paths from one start together, clip by clip, with a progress bar."""
+    memory = model.agents[0].memory
+    before, began = None if memory is None else memory.copy(), time.monotonic()
+    model.reset([paths[0].start], [paths[0].info])
+    branches = model.branches(len(paths)) if len(paths) > 1 else model
+    cameras, clips = [path.cameras for path in paths], []
     with progress() as bar:
-        task = add_task(bar, "rollout", sum(len(path) for path in cameras), "frame")
-        for part in imagine_together(models, cameras, [walk.interactions for walk in walks]):
-            parts.append(part)
-            bar.advance(task, sum(len(seen) for seen in part))
+        task = add_task(bar, "rollout", sum(len(way) for way in cameras), "frame")
+        for frames in branches.imagine(cameras, [path.interactions for path in paths]):
+            clips.append(frames)
+            bar.advance(task, sum(len(seen) for seen in frames))
     seconds, depth = time.monotonic() - began, model.backbone.gives_depth
-    seen = [Observations.concatenate(each) for each in zip(*parts, strict=True)]
-    triples = zip(walks, seen, models, strict=True)
-    return [Rollout(walk, frames, before, each.memory, seconds, depth) for walk, frames, each in triples]
+    videos = [Observations.concatenate(parts) for parts in zip(*clips, strict=True)]
+    return [
+        Rollout(path, video, before, agent.memory, seconds, depth)
+        for path, video, agent in zip(paths, videos, branches.agents, strict=True)
+    ]
 
 
 def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
     """What is needed to roll out again, JSON values."""
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
-    options |= {"sampling": plan.sampling.given(), "placement": dataclasses.asdict(plan.placement)}
+    options |= {"sampling": plan.sampling.requested(), "placement": dataclasses.asdict(plan.placement)}
     memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
     together = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
     return {
         "checkpoint": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
-        "plan": options | {"adapter": adapter, "actions": rollout.walk.actions},
+        "plan": options | {"adapter": adapter, "actions": rollout.path.actions},
         "frames": len(rollout.seen),
         "seconds": rollout.seconds,
         "memory": memory,
