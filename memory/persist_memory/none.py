@@ -1,4 +1,4 @@
-"""The memory that remembers nothing: what a memory is compared with (the row "NWM" of the paper's Table 1)."""
+"""The memory that remembers nothing: the baseline of every other memory (the row "NWM" of the paper's Table 1)."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
 from persist_cli.api.tokens import MemoryTokens
-from persist_memory.stored_tensors import check_mergeable, check_tensors
+from persist_memory.validation import check_mergeable, check_tensors
 
 
 class NoMemory(Memory):
-    """Never gives a token, so that an adapter of the same size can be trained without a memory."""
+    """A memory that never gives a token, so that an adapter of the same size can be trained without one."""
 
     def write(self, observations: Observations) -> None:
-        """Forget the frames."""
+        """Ignore the frames."""
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
-        """No token."""
+        """Return no token."""
         return MemoryTokens.empty(self.encoder.channels)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Nothing."""
+        """Return no tensor."""
         return {}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Nothing to restore.
+        """Restore nothing.
 
         Raises:
-            CheckpointError: when there are tensors, which are not this memory's.
+            CheckpointError: when there is a tensor, since it belongs to another memory.
         """
         check_tensors(tensors, {}, f"memory {self.name!r}")
 
     def merge(self, other: Memory) -> None:
-        """Nothing and nothing are nothing."""
+        """Check that the other memory is of this kind; there is nothing to merge."""
         check_mergeable(self, other)

@@ -1,4 +1,4 @@
-"""DINOv2 patch features (PEWM, memory), of fetched weights, a local directory or the hub."""
+"""DINOv2 patch features (PEWM, memory), from fetched weights, a local directory or the hub."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from persist_cli.io.hub import cached_weight, hub_obstacle, in_hub_cache, withou
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-WIDTHS = {"dinov2-small": 384, "dinov2-base": 768, "dinov2-s-derived": 384}  # of weights known by name
-PUBLISHER = "facebook/"  # of hub ids that these names have there
-_UNUSABLE = (OSError, ValueError, RuntimeError, SafetensorError)
+WIDTHS = {"dinov2-small": 384, "dinov2-base": 768, "dinov2-s-derived": 384}  # channels of weights known by name
+PUBLISHER = "facebook/"  # the names of the first two on the hub begin with it
+_LOADING_ERRORS = (OSError, ValueError, RuntimeError, SafetensorError)
 
 
 @dataclass(frozen=True)
 class DinoV2Settings:
-    """Which weights, and what is taken from them.
+    """The weights and the block of the network that give the features.
 
     Args:
         weights: a directory that transformers wrote (``config.json`` and ``model.safetensors``); the name of weights
             that ``persist weights fetch`` brought (``dinov2-small``, ``dinov2-base``, ``dinov2-s-derived``); or a hub
-            id, which is downloaded when it is not in the hub's cache. None of them stands in for another.
-        size: pixels of the image's longer side when it is encoded; ``None`` keeps its own. Both sides are then
-            rounded to whole patches.
+            id, which is downloaded when it is not in the hub's cache. Missing weights are never replaced by others.
+        size: pixels of the image's longer side when it is encoded; ``None`` keeps the size of the image. Both sides
+            are then rounded to whole patches.
         layer: the block whose output is taken, counted from 1; ``None`` for the last. The final layer norm
             follows in either case. DINOv2-S-derived was tuned for another task in its last blocks: take its block 8.
         batch: frames encoded at once. More is faster on a GPU, but then the last bits of a feature depend on
-            the frames beside it, and a map on how its frames were grouped.
-        precision: ``bf16`` computes in it; features are float32 in either case.
+            the frames beside it, and those of a map on how its frames were grouped.
+        precision: type that the network computes in; features are float32 in either case.
     """
 
     weights: str = "dinov2-small"
@@ -66,7 +66,7 @@ class DinoV2(Encoder):
         """Width of the model.
 
         Raises:
-            CheckpointError: when its configuration is not to be had.
+            CheckpointError: when its configuration cannot be loaded.
         """
         return int(self._config.hidden_size)
 
@@ -74,36 +74,37 @@ class DinoV2(Encoder):
     def channels_by_name(self) -> int:
         """Width of the model, also of weights known by name that are not fetched yet."""
         weights = self.settings.weights
-        known = None if Path(weights).is_dir() else WIDTHS.get(weights.removeprefix(PUBLISHER))
-        return self.channels if known is None else known
+        width = None if Path(weights).is_dir() else WIDTHS.get(weights.removeprefix(PUBLISHER))
+        return self.channels if width is None else width
 
     def to(self, device: torch.device | str) -> DinoV2:
-        """The encoder on ``device``."""
+        """Encode on ``device`` from now on."""
         self._device = torch.device(device)
         return self
 
     @torch.no_grad()
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
-        """Normalised patch features of the chosen block, without class and register tokens."""
+        """Return the normalised patch features of the chosen block, without class and register tokens."""
         model = self._model.to(self._device)
         rows, columns = self._rows_and_columns(rgb.shape[1], rgb.shape[2])
         parts = []
         for part in torch.split(rgb, self.settings.batch):
             pixels = self._pixels(part.to(self._device), rows, columns)
-            with self._computing():
+            with self._autocast():
                 states = model(pixels).last_hidden_state
             parts.append(states[:, -rows * columns :].reshape(len(part), rows, columns, -1).float())
         return torch.cat(parts)
 
-    def _computing(self) -> AbstractContextManager[Any]:
-        exactly = self.settings.precision == "float32"
-        return nullcontext() if exactly else torch.autocast(self._device.type, torch.bfloat16)
+    def _autocast(self) -> AbstractContextManager[Any]:
+        if self.settings.precision == "float32":
+            return nullcontext()
+        return torch.autocast(self._device.type, torch.bfloat16)
 
     @cached_property
     def _config(self) -> Any:
         from transformers import Dinov2Config
 
-        config = self._opened(Dinov2Config)
+        config = self._from_pretrained(Dinov2Config)
         if self.settings.layer is not None and self.settings.layer > config.num_hidden_layers:
             raise CheckpointError(
                 f"{self.settings.weights}: it has {config.num_hidden_layers} blocks, no block {self.settings.layer}"
@@ -115,41 +116,41 @@ class DinoV2(Encoder):
         from transformers import Dinov2Model
 
         options = {"use_safetensors": True, "config": self._config, "dtype": torch.float32}
-        model = self._opened(Dinov2Model, **options).eval().requires_grad_(False)
+        model = self._from_pretrained(Dinov2Model, **options).eval().requires_grad_(False)
         reallocate(model)
-        del model.encoder.layer[self.settings.layer or len(model.encoder.layer) :]  # nobody looks at what they give
+        del model.encoder.layer[self.settings.layer or len(model.encoder.layer) :]  # their output is not used
         return model
 
-    def _opened(self, kind: Any, **options: Any) -> Any:
+    def _from_pretrained(self, kind: Any, **options: Any) -> Any:
         source, local = self._source
         try:
             with without_bars():
                 return kind.from_pretrained(source, local_files_only=local, **options)
-        except _UNUSABLE as error:
+        except _LOADING_ERRORS as error:
             cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-            raise self._without(f"{source} failed ({cause})") from error
+            raise self._unavailable(f"{source} failed ({cause})") from error
 
     @cached_property
     def _source(self) -> tuple[str, bool]:
-        """What to open, and whether it is here already."""
+        """What ``from_pretrained`` shall open, and whether it is on this machine already."""
         weights = self.settings.weights
         if Path(weights).is_dir():
             return weights, True
         if "/" not in weights:
             folder = cached_weight(weights)
             if folder is None:
-                raise self._without(f"not here: persist weights fetch {weights}")
+                raise self._unavailable(f"not here: persist weights fetch {weights}")
             return str(folder), True
         if weights.count("/") > 1:
-            raise self._without("no such directory")
+            raise self._unavailable("no such directory")
         if in_hub_cache(weights):
             return weights, True
         obstacle = hub_obstacle()
         if obstacle:
-            raise self._without(f"no such directory, not in the hub's cache, and the hub: {obstacle}")
+            raise self._unavailable(f"no such directory, not in the hub's cache, and the hub: {obstacle}")
         return weights, False
 
-    def _without(self, cause: str) -> CheckpointError:
+    def _unavailable(self, cause: str) -> CheckpointError:
         hint = "set encoder.weights to a directory or to fetched weights (persist weights list), or take 'patches'"
         return CheckpointError(f"DINOv2 weights {self.settings.weights!r}: {cause}; {hint}")
 

@@ -20,47 +20,37 @@ from persist_cli.io.files import read_tensors
 from persist_cli.io.hub import cached_weight
 
 WEIGHTS: Final = "efficientnet-lite0"
-EPSILON: Final = 1e-3  # of the batch norms
-# As in the original's preprocessing. The port with these weights shows ImageNet's mean and deviation in its example,
-# but with those the stem's outputs on real indoor frames vary 3.5 times what its batch norm was trained on, with these
-# 0.7 times.
+BATCH_NORM_EPSILON: Final = 1e-3
+# Those of the original's preprocessing. The PyTorch port that released the weights uses ImageNet's mean and deviation
+# in its example. With those the stem's outputs on real indoor frames have 3.5 times the variance that its batch norm
+# was trained on, with these 0.7 times.
 MEAN, DEVIATION = 127.0, 128.0
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Blocks of one width: how many, their kernel, the first one's stride, and channels out."""
+class Block:
+    """An inverted residual block: its stride and its output channels; the size of its kernel is that of its weights."""
 
-    blocks: int
-    kernel: int
     stride: int
     channels: int
 
 
-STAGES: Final = (
-    Stage(1, 3, 1, 16),
-    Stage(2, 3, 2, 24),
-    Stage(2, 5, 2, 40),
-    Stage(3, 3, 2, 80),
-    Stage(3, 5, 1, 112),
-    Stage(4, 5, 2, 192),
-    Stage(1, 3, 1, 320),
-)
+STAGES: Final = (  # number of blocks, stride of the first one, channels
+    (1, 1, 16), (2, 2, 24), (2, 2, 40), (3, 2, 80), (3, 1, 112), (4, 2, 192), (1, 1, 320),
+)  # fmt: skip
 BLOCKS: Final = tuple(
-    Stage(1, stage.kernel, stage.stride if number == 0 else 1, stage.channels)
-    for stage in STAGES
-    for number in range(stage.blocks)
+    Block(stride if number == 0 else 1, channels) for count, stride, channels in STAGES for number in range(count)
 )
 
 
 @dataclass(frozen=True)
 class EfficientNetLite0Settings:
-    """What is taken from the network.
+    """The block of the network that gives the features.
 
     Args:
         block: the block whose output is taken, counted from 0 as in the released weights. Block 10 is the last one at
             a sixteenth of the image's size, with 112 channels.
-        size: pixels of the image's longer side when it is encoded; ``None`` keeps its own.
+        size: pixels of the image's longer side when it is encoded; ``None`` keeps the size of the image.
     """
 
     block: int = 10
@@ -68,7 +58,7 @@ class EfficientNetLite0Settings:
 
 
 class EfficientNetLite0(Encoder):
-    """Features of a frozen EfficientNet-Lite0; its weights, fetched before, are opened when first needed."""
+    """Features of a frozen EfficientNet-Lite0; its fetched weights are opened when first needed."""
 
     settings_type = EfficientNetLite0Settings
     settings: EfficientNetLite0Settings
@@ -85,15 +75,15 @@ class EfficientNetLite0(Encoder):
         return BLOCKS[self.settings.block].channels
 
     def to(self, device: torch.device | str) -> EfficientNetLite0:
-        """The encoder on ``device``."""
+        """Encode on ``device`` from now on."""
         self._device = torch.device(device)
         return self
 
     @torch.no_grad()
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
-        """Output of the block, one frame at a time, so that a frame's features do not depend on its neighbours."""
+        """Return the block's output, computed frame by frame so that no frame depends on its neighbours."""
         weights = {name: tensor.to(self._device) for name, tensor in self._tensors.items()}
-        parts = [features(weights, self._pixels(each.to(self._device)), self.settings.block) for each in rgb.split(1)]
+        parts = [features(weights, self._pixels(frame.to(self._device)), self.settings.block) for frame in rgb.split(1)]
         return torch.cat(parts).permute(0, 2, 3, 1)
 
     @cached_property
@@ -120,37 +110,37 @@ def features(
     weights: dict[str, Tensor], image: Float[Tensor, "frame 3 height width"], last: int
 ) -> Float[Tensor, "frame channel rows columns"]:
     """Output of block ``last`` for normalised images."""
-    state = functional.relu6(_normed(weights, "_bn0", _convolved(image, weights["_conv_stem.weight"], 2)))
+    state = functional.relu6(_batch_norm(weights, "_bn0", _convolve(image, weights["_conv_stem.weight"], 2)))
     for number, block in enumerate(BLOCKS[: last + 1]):
         state = _block(weights, f"_blocks.{number}", state, block.stride)
     return state
 
 
 def tensor_names(last: int) -> Iterator[str]:
-    """Names of what ``features`` needs up to a block."""
-    norms = ("weight", "bias", "running_mean", "running_var")
-    yield from ("_conv_stem.weight", *(f"_bn0.{each}" for each in norms))
+    """Names of the weights that ``features`` needs for the blocks up to ``last``."""
+    norm_tensors = ("weight", "bias", "running_mean", "running_var")
+    yield from ("_conv_stem.weight", *(f"_bn0.{tensor}" for tensor in norm_tensors))
     for number in range(last + 1):
-        parts = (("_expand_conv", "_bn0"),) if number else ()
-        for convolution, norm in (*parts, ("_depthwise_conv", "_bn1"), ("_project_conv", "_bn2")):
+        expand = (("_expand_conv", "_bn0"),) if number else ()
+        for convolution, norm in (*expand, ("_depthwise_conv", "_bn1"), ("_project_conv", "_bn2")):
             yield f"_blocks.{number}.{convolution}.weight"
-            yield from (f"_blocks.{number}.{norm}.{each}" for each in norms)
+            yield from (f"_blocks.{number}.{norm}.{tensor}" for tensor in norm_tensors)
 
 
 def _block(weights: dict[str, Tensor], name: str, state: Tensor, stride: int) -> Tensor:
-    """Widen, filter each channel, narrow; and add what came in when the shape stayed."""
-    given = state
+    """Expand, depthwise convolution, project; and add the input when the shape is still that of the input."""
+    residual = state
     if f"{name}._expand_conv.weight" in weights:
         state = functional.conv2d(state, weights[f"{name}._expand_conv.weight"])
-        state = functional.relu6(_normed(weights, f"{name}._bn0", state))
+        state = functional.relu6(_batch_norm(weights, f"{name}._bn0", state))
     kernel = weights[f"{name}._depthwise_conv.weight"]
-    state = functional.relu6(_normed(weights, f"{name}._bn1", _convolved(state, kernel, stride, len(kernel))))
-    state = _normed(weights, f"{name}._bn2", functional.conv2d(state, weights[f"{name}._project_conv.weight"]))
-    return state + given if state.shape == given.shape else state
+    state = functional.relu6(_batch_norm(weights, f"{name}._bn1", _convolve(state, kernel, stride, len(kernel))))
+    state = _batch_norm(weights, f"{name}._bn2", functional.conv2d(state, weights[f"{name}._project_conv.weight"]))
+    return state + residual if state.shape == residual.shape else state
 
 
-def _convolved(state: Tensor, kernel: Tensor, stride: int, groups: int = 1) -> Tensor:
-    """Padded to ceil(size / stride) as TensorFlow does: the odd pixel of padding goes to the right and bottom."""
+def _convolve(state: Tensor, kernel: Tensor, stride: int, groups: int = 1) -> Tensor:
+    """A convolution to ceil(size / stride), padded as TensorFlow does: an odd pixel goes to the right and bottom."""
     pads: list[int] = []
     for size, side in zip(reversed(state.shape[-2:]), reversed(kernel.shape[-2:]), strict=True):
         total = max((math.ceil(size / stride) - 1) * stride + side - size, 0)
@@ -158,8 +148,8 @@ def _convolved(state: Tensor, kernel: Tensor, stride: int, groups: int = 1) -> T
     return functional.conv2d(functional.pad(state, pads), kernel, stride=stride, groups=groups)
 
 
-def _normed(weights: dict[str, Tensor], name: str, state: Tensor) -> Tensor:
-    mean, variance, weight, bias = (
-        weights[f"{name}.{each}"] for each in ("running_mean", "running_var", "weight", "bias")
+def _batch_norm(weights: dict[str, Tensor], name: str, state: Tensor) -> Tensor:
+    mean, variance = weights[f"{name}.running_mean"], weights[f"{name}.running_var"]
+    return functional.batch_norm(
+        state, mean, variance, weights[f"{name}.weight"], weights[f"{name}.bias"], eps=BATCH_NORM_EPSILON
     )
-    return functional.batch_norm(state, mean, variance, weight, bias, eps=EPSILON)

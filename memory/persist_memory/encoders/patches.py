@@ -13,7 +13,7 @@ from torch import Tensor
 from persist_cli.api.encoder import Encoder
 from persist_cli.errors import RecipeError
 
-DETAIL_GAIN = 8.0  # detail is weaker than colour; brought to the same order, not whitened: noise stays small
+DETAIL_GAIN = 8.0  # brings detail to the order of colour; it is not whitened, so that noise stays small
 EXACT = 2.0**20  # weights are multiples of 1 / EXACT
 
 
@@ -23,8 +23,8 @@ class PatchesSettings:
 
     Args:
         patch: pixels along the edge of a patch.
-        channels: the first three are the mean colour, the others mix the coarsest detail.
-        seed: of the mixture.
+        channels: number of channels; the first three are the mean colour, the others mix the coarsest detail.
+        seed: seed of the random mixture.
     """
 
     patch: PositiveInt = 8
@@ -57,7 +57,7 @@ class Patches(Encoder):
         return self.settings.channels
 
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
-        """Features of every patch, bit for bit the same whatever else is encoded at once, and on any device."""
+        """Return the features of every patch; no other frame and no device changes a bit of them."""
         patch = self.settings.patch
         rgb = _whole_patches(rgb, patch)
         frames, height, width, _ = rgb.shape
@@ -71,7 +71,7 @@ class Patches(Encoder):
 
 
 def projection(settings: PatchesSettings) -> Float[Tensor, "value channel"]:
-    """Weights of the features of a patch's ``[row, column, rgb]`` values, float64."""
+    """The matrix that turns the ``[row, column, rgb]`` values of a patch into its features, float64."""
     coarse = _cosines(settings.patch)[:, : math.ceil(settings.channels / 3)]
     basis = torch.einsum("pf,cd->pcfd", coarse, torch.eye(3, dtype=torch.float64))
     basis = basis.reshape(3 * settings.patch**2, -1)[:, : settings.channels]
@@ -94,6 +94,7 @@ def _cosines(size: int) -> Float[Tensor, "pixel frequency"]:
 
 
 def _whole_patches(rgb: Tensor, patch: int) -> Tensor:
+    """The images resized to the nearest multiple of the patch."""
     height, width = rgb.shape[1:3]
     whole = [max(1, round(side / patch)) * patch for side in (height, width)]
     if whole == [height, width]:

@@ -1,4 +1,4 @@
-"""The 3D feature map of the paper (PEWM, memory), sparse and without bounds."""
+"""The 3D voxel map of the paper (PEWM, memory), sparse and without bounds."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pydantic import PositiveFloat
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
-from persist_memory.grid.memory import GridMemory, GridSettings
-from persist_memory.grid.pooling import Lattice
+from persist_memory.grid.memory import GridMemory
+from persist_memory.grid.pooling import GridSettings, Lattice
 from persist_memory.grid.visibility import Views, frustums
 
 
@@ -22,7 +22,7 @@ class VoxelSettings(GridSettings):
     Args:
         cell: metres along the world's axes x, y and z in a world whose y axis is (nearly) vertical, the middle
             number being the height. Where another axis of the world is nearest to ``world_up``, that axis
-            takes the middle number and y takes its number. The grid is never tilted.
+            takes the middle number and y takes the number of that axis. The grid is never tilted.
     """
 
     cell: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (0.25, 1.0, 0.25)
@@ -35,7 +35,7 @@ class VoxelMemory(GridMemory):
     settings: VoxelSettings
 
     def make_lattice(self) -> Lattice:
-        """Cells along the world's axes, their height along the one nearest to up."""
+        """Return cells along the world's axes, their height along the one nearest to up."""
         size = list(self.settings.cell)
         across = max(size[0], size[2])
         vertical = int(torch.tensor(self.reference.world_up).abs().argmax())
@@ -43,9 +43,9 @@ class VoxelMemory(GridMemory):
         return Lattice(torch.tensor(size, dtype=torch.float64), torch.eye(3, dtype=torch.float64), across)
 
     def views(self, cameras: Cameras) -> Views:
-        """The cameras' frustums."""
+        """Return the cameras' frustums."""
         return frustums(cameras, self.lattice)
 
     def heights(self, positions: Float[Tensor, "token 3"], cameras: Cameras) -> Float[Tensor, " token"]:
-        """The cells' own."""
+        """Return the height of each cell's centre."""
         return positions[:, 1]

@@ -1,4 +1,4 @@
-"""Which snapshots show which places: seen again by others, or in view of the cameras that ask.
+"""Choice of snapshots: the most redundant one of an album, and the few that cover most of a view.
 
 Everything here is measured in images and along rays, so a rigid motion of the whole world changes nothing.
 """
@@ -12,44 +12,50 @@ from torch import Tensor
 from persist_cli.api.geometry import nearest_at
 from persist_memory.snapshots.store import SnapshotStore
 
-Located = tuple[
-    Int64[Tensor, "snapshot view patch"], Float[Tensor, "snapshot view patch"], Bool[Tensor, "snapshot view patch"]
-]
-
 SAME_PLACE = 0.25  # two depths along a ray agree within a quarter: a patch of oblique floor spans about as much
 
-ROUNDING = 1e-6  # patch centres love to lie on the rim of another grid's cells
+ROUNDING = 1e-6  # of a cell; patch centres often lie on the boundary between two cells of another grid
 
-MICRO = 1e6  # distances are compared in micrometres, so that ties do not hang on the last bit
+MICROMETRES = 1e6  # per metre; distances are compared in micrometres, so that ties do not depend on the last bit
 
 
-def seen_patches(store: SnapshotStore, by: SnapshotStore) -> Bool[Tensor, "snapshot by patch"]:
-    """Which patches of ``store`` each snapshot of ``by`` shows at the same depth."""
-    rows, columns = store.grid
-    cell, depth, inside = locate(store.points, by.world_from_camera, by.intrinsics, by.size, (rows, columns))
-    shown = by.depth.double().gather(1, cell.permute(1, 0, 2).flatten(1)).reshape(cell.permute(1, 0, 2).shape)
-    shown = shown.permute(1, 0, 2)
+def seen_patches(store: SnapshotStore, viewers: SnapshotStore) -> Bool[Tensor, "snapshot viewer patch"]:
+    """Whether each patch of ``store`` is shown at the same depth by each snapshot of ``viewers``."""
+    cell, depth, inside = locate(store.points, viewers.world_from_camera, viewers.intrinsics, viewers.size, store.grid)
+    by_viewer = cell.transpose(0, 1)
+    shown = viewers.depth.double().gather(1, by_viewer.flatten(1)).reshape(by_viewer.shape).transpose(0, 1)
     same = (depth - shown).abs() <= SAME_PLACE * shown
     return inside & same & (shown > 0) & (store.depth > 0)[:, None]
 
 
-def most_redundant(seen: Bool[Tensor, "snapshot by patch"], store: SnapshotStore) -> int:
-    """The snapshot of whose patches the greatest share is shown by another one too; the last of equal ones."""
-    others = seen & ~torch.eye(len(seen), dtype=torch.bool, device=seen.device)[..., None]
-    share = others.any(1).sum(-1) / (store.depth > 0).sum(-1)
+def most_redundant(seen: Bool[Tensor, "snapshot viewer patch"], store: SnapshotStore) -> int:
+    """The snapshot with the greatest share of patches that another one shows too; the last of equal ones.
+
+    Args:
+        seen: ``seen_patches(store, store)``.
+        store: the snapshots.
+    """
+    by_others = seen & ~torch.eye(len(seen), dtype=torch.bool, device=seen.device)[..., None]
+    share = by_others.any(1).sum(-1) / (store.depth > 0).sum(-1)
     return int((share == share.amax()).nonzero()[-1])
 
 
 def covered_view(
     store: SnapshotStore, world_from_camera: Tensor, intrinsics: Tensor, size: Int64[Tensor, "view 2"]
 ) -> Bool[Tensor, "snapshot place"]:
-    """Which places in the views each snapshot shows; a place is a cell of a grid over a view's image.
+    """Whether each snapshot shows each place in the views; a place is a cell of the token grid over a view's image.
 
     Of the patches that fall into a place only those not far behind its nearest one count: what a snapshot of the
     next room shows is hidden by the wall.
+
+    Args:
+        store: the snapshots.
+        world_from_camera: poses of the views, float64.
+        intrinsics: intrinsics of the views, float64.
+        size: height and width of each view in pixels.
     """
     rows, columns = store.grid
-    cell, depth, inside = locate(store.points, world_from_camera, intrinsics, size, (rows, columns))
+    cell, depth, inside = locate(store.points, world_from_camera, intrinsics, size, store.grid)
     inside = inside & (store.depth > 0)[:, None]
     places = len(world_from_camera) * rows * columns
     offset = torch.arange(len(world_from_camera), device=cell.device)[:, None] * (rows * columns)
@@ -63,12 +69,17 @@ def covered_view(
 def greedy_cover(
     covered: Bool[Tensor, "snapshot place"], distances: Float[Tensor, " snapshot"], count: int
 ) -> list[int]:
-    """At most ``count`` snapshots: each the one that shows most places that those before it do not.
+    """At most ``count`` snapshots, each the one that shows most places that the snapshots before it do not.
 
-    Among equals the nearest comes first. When all places are shown the cover starts anew with the snapshots that
-    are left; those that show no place at all are never taken.
+    Of equally good ones the nearest comes first. When no remaining snapshot shows a new place, the cover starts anew
+    with the remaining ones; those that show no place at all are never chosen.
+
+    Args:
+        covered: whether each snapshot shows each place.
+        distances: metres from each snapshot to the cameras.
+        count: the greatest number of snapshots.
     """
-    order = torch.argsort((distances * MICRO).round(), stable=True)
+    order = torch.argsort((distances * MICROMETRES).round(), stable=True)
     useful = order[covered.any(1)[order]].tolist()
     missing = torch.ones_like(covered[0]) if len(covered) else covered
     chosen: list[int] = []
@@ -92,16 +103,23 @@ def locate(
 ) -> tuple[
     Int64[Tensor, "snapshot view patch"], Float[Tensor, "snapshot view patch"], Bool[Tensor, "snapshot view patch"]
 ]:
-    """Where points fall in images: the cell of a grid over the image, the planar depth, whether inside at all."""
-    scale = torch.stack([grid[1] / size[:, 1].double(), grid[0] / size[:, 0].double()], dim=-1)[..., None]
-    ahead = intrinsics.new_tensor([[[0.0, 0.0, 1.0]]]).expand(len(intrinsics), -1, -1)
-    onto = torch.cat([intrinsics[:, :2] * scale, ahead], dim=1) @ world_from_camera[:, :3, :3].mT
-    origins = (onto @ world_from_camera[:, :3, 3:])[..., 0]
-    places = (onto.transpose(0, 1).flatten(0, 1) @ points.flatten(0, 1).mT).unflatten(0, (3, -1))  # axis, view, point
-    column, row, depth = places.sub_(origins.T[..., None]).unbind(0)
-    safe = depth.clamp(min=1e-9)
-    row, column = (each.div_(safe).add_(ROUNDING).floor_() for each in (row, column))
-    inside = (depth > 0) & (row >= 0) & (row < grid[0]) & (column >= 0) & (column < grid[1])
-    cell = torch.where(inside, row.mul_(grid[1]).add_(column), 0.0).long()
-    cell, depth, inside = (each.unflatten(1, points.shape[:2]).transpose(0, 1) for each in (cell, depth, inside))
+    """Project points into views: the cell of a grid over the image, the planar depth, whether it is in the image.
+
+    One matrix product of all views with all points gives coordinates in cells, since this projection is most of the
+    time of a read. ``api.geometry.project`` takes three times as long, and its depth has other last bits.
+    """
+    rows, columns = grid
+    scale = torch.stack([columns / size[:, 1].double(), rows / size[:, 0].double()], dim=-1)[..., None]
+    forward = intrinsics.new_tensor([[[0.0, 0.0, 1.0]]]).expand(len(intrinsics), -1, -1)
+    cells_from_world = torch.cat([intrinsics[:, :2] * scale, forward], dim=1) @ world_from_camera[:, :3, :3].mT
+    origins = (cells_from_world @ world_from_camera[:, :3, 3:])[..., 0]
+    by_axis = cells_from_world.transpose(0, 1).flatten(0, 1) @ points.flatten(0, 1).mT
+    by_axis = by_axis.unflatten(0, (3, -1)).sub_(origins.T[..., None])  # axis, view, point
+    column, row, depth = by_axis.unbind(0)
+    safe_depth = depth.clamp(min=1e-9)
+    column = column.div_(safe_depth).add_(ROUNDING).floor_()
+    row = row.div_(safe_depth).add_(ROUNDING).floor_()
+    inside = (depth > 0) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    cell = torch.where(inside, row.mul_(columns).add_(column), 0.0).long()
+    cell, depth, inside = (values.unflatten(1, points.shape[:2]).transpose(0, 1) for values in (cell, depth, inside))
     return cell, depth, inside

@@ -1,4 +1,4 @@
-"""Snapshots as tensors: patch features, the depth of each patch, and the camera of each image."""
+"""Snapshots stored as tensors: patch features, the depth of each patch, and the camera of each image."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from persist_cli.api.observations import Observations
 
 @dataclass(frozen=True)
 class SnapshotStore:
-    """Some images cut into the same grid of patches, in the order of their contents.
+    """Images cut into the same grid of patches, sorted by a hash of their contents.
 
     Args:
         grid: rows and columns of patches.
-        features: of each patch.
-        depth: planar metres of each patch's centre, 0 where nothing was measured.
+        features: the feature vector of each patch.
+        depth: median planar depth of each patch in metres, 0 where nothing was measured.
         colors: mean colour of each patch, for drawing.
-        world_from_camera: float64.
-        intrinsics: float64.
-        size: height and width of the images in pixels.
-        content: a number made from each image and its depth; the images are sorted by it.
+        world_from_camera: pose of each image, float64.
+        intrinsics: intrinsics of each image, float64.
+        size: height and width of each image in pixels.
+        content: a hash of each image and its depth; the images are sorted by it.
     """
 
     grid: tuple[int, int]
@@ -45,13 +45,13 @@ class SnapshotStore:
 
     @staticmethod
     def empty(grid: tuple[int, int], channels: int) -> SnapshotStore:
-        """No snapshot."""
-        places = grid[0] * grid[1]
+        """A store without a snapshot."""
+        patches = grid[0] * grid[1]
         return SnapshotStore(
             grid,
-            torch.zeros(0, places, channels),
-            torch.zeros(0, places),
-            torch.zeros(0, places, 3, dtype=torch.uint8),
+            torch.zeros(0, patches, channels),
+            torch.zeros(0, patches),
+            torch.zeros(0, patches, 3, dtype=torch.uint8),
             torch.zeros(0, 4, 4, dtype=torch.float64),
             torch.zeros(0, 3, 3, dtype=torch.float64),
             torch.zeros(0, 2, dtype=torch.int64),
@@ -62,7 +62,7 @@ class SnapshotStore:
     def of(
         observations: Observations, features: Float[Tensor, "frame rows columns channel"], grid: tuple[int, int]
     ) -> SnapshotStore:
-        """Snapshots of frames, their features averaged into the grid."""
+        """Snapshots of frames, whose feature maps are averaged into the grid of patches."""
         cameras, device = observations.cameras, observations.depth.device
         pooled = torch.nn.functional.adaptive_avg_pool2d(features.float().permute(0, 3, 1, 2), grid)
         colors = torch.nn.functional.adaptive_avg_pool2d(observations.rgb.permute(0, 3, 1, 2).float(), grid)
@@ -74,23 +74,23 @@ class SnapshotStore:
             cameras.world_from_camera.double(),
             cameras.intrinsics.double(),
             torch.tensor([[cameras.height, cameras.width]], device=device).expand(len(observations), 2),
-            torch.tensor(content_numbers(observations), dtype=torch.int64, device=device),
+            torch.tensor(content_hashes(observations), dtype=torch.int64, device=device),
         )
 
     def joined(self, other: SnapshotStore) -> SnapshotStore:
-        """Both, in the order of contents; those of ``other`` on the device of these, unless these are none."""
+        """The snapshots of both stores, on the device of this one, or of ``other`` when this one is empty."""
         device = (self if len(self) else other).content.device
-        mine, others = self.tensors(), other.tensors()
-        tensors = {name: torch.cat([mine[name].to(device), others[name].to(device)]) for name in mine}
+        others = other.tensors()
+        tensors = {name: torch.cat([own.to(device), others[name].to(device)]) for name, own in self.tensors().items()}
         return SnapshotStore(self.grid, **tensors)[tensors["content"].argsort(stable=True)]
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name."""
+        """All tensors by name; together with the grid they make the store."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "grid"}
 
     @property
     def points(self) -> Float[Tensor, "snapshot patch 3"]:
-        """The patches' centres in world metres, float64; the camera's own where nothing was measured."""
+        """The patches' centres in world metres, float64; the camera's centre where nothing was measured."""
         rows, columns = self.grid
         v = (torch.arange(rows, device=self.depth.device, dtype=torch.float64) + 0.5) / rows
         u = (torch.arange(columns, device=self.depth.device, dtype=torch.float64) + 0.5) / columns
@@ -106,19 +106,23 @@ class SnapshotStore:
 def patch_depth(
     depth: Float[Tensor, "frame height width"], grid: tuple[int, int]
 ) -> Float[Tensor, "frame rows columns"]:
-    """The median valid depth of each patch, 0 where there is none; an image that does not divide is repeated."""
-    whole = [math.ceil(side / cells) * cells for side, cells in zip(depth.shape[1:], grid, strict=True)]
-    depth = torch.nn.functional.interpolate(depth[:, None].float(), size=whole, mode="nearest-exact")[:, 0]
+    """The median valid depth of each patch, 0 where there is none.
+
+    An image whose sides are no multiples of the grid is first enlarged by repeating pixels.
+    """
+    height, width = (math.ceil(side / cells) * cells for side, cells in zip(depth.shape[1:], grid, strict=True))
+    depth = torch.nn.functional.interpolate(depth[:, None].float(), size=(height, width), mode="nearest-exact")[:, 0]
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.nan)
-    patches = depth.reshape(len(depth), grid[0], whole[0] // grid[0], grid[1], whole[1] // grid[1])
+    patches = depth.reshape(len(depth), grid[0], height // grid[0], grid[1], width // grid[1])
     median = torch.nanmedian(patches.transpose(2, 3).flatten(3), dim=-1).values
     return torch.where(torch.isnan(median), 0.0, median)
 
 
-def content_numbers(observations: Observations) -> list[int]:
-    """63 bits a frame that differ between images: an order that knows neither when nor where they were taken."""
+def content_hashes(observations: Observations) -> list[int]:
+    """A hash of 63 bits of each frame's pixels and depth, whenever and wherever the frame was taken."""
     rgb, depth = observations.rgb.cpu().contiguous().numpy(), observations.depth.float().cpu().contiguous().numpy()
-    digests = [hashlib.blake2b(image.tobytes(), digest_size=8) for image in rgb]
-    for digest, metres in zip(digests, depth, strict=True):
-        digest.update(metres.tobytes())
-    return [int.from_bytes(digest.digest(), "little") >> 1 for digest in digests]
+    hashes = []
+    for image, metres in zip(rgb, depth, strict=True):
+        digest = hashlib.blake2b(image.tobytes() + metres.tobytes(), digest_size=8).digest()
+        hashes.append(int.from_bytes(digest, "little") >> 1)
+    return hashes

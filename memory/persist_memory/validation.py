@@ -1,0 +1,62 @@
+"""Checks of what memories are given: observations, the tensors of a memory file, memories to merge."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from persist_cli.api.cameras import check_poses
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations
+from persist_cli.errors import CheckpointError, DataError
+
+Shape = tuple[int | None, ...]  # None first: as many rows as the first tensor has; None later: any size
+
+
+def check_observations(observations: Observations, where: str) -> None:
+    """Raise ``DataError`` naming ``where`` when poses are not finite and rigid or sizes do not agree."""
+    cameras = observations.cameras
+    size = (len(observations), cameras.height, cameras.width)
+    sizes = {tuple(observations.rgb.shape[:3]), tuple(observations.depth.shape), size}
+    if len(sizes) > 1 or len(cameras) != len(observations):
+        raise DataError(f"{where}: rgb, depth and cameras differ in frames or size: {sorted(sizes)}")
+    check_poses(cameras.world_from_camera.cpu(), where)
+
+
+def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, tuple[torch.dtype, Shape]], where: str) -> None:
+    """Check that a memory file holds finite tensors of the expected names, types and shapes, all of one length.
+
+    Raises:
+        CheckpointError: one line naming the tensor that is missing, unknown, not finite, or of another type or shape.
+    """
+    if mismatched := sorted(set(tensors) ^ set(expected)):
+        raise CheckpointError(f"{where}: its tensors are not those of this memory, see {', '.join(mismatched)}")
+    count = len(next(iter(tensors.values()))) if tensors else 0
+    for name, (dtype, shape) in expected.items():
+        tensor = tensors[name]
+        wanted = (count, *shape[1:])
+        fits = len(tensor.shape) == len(wanted) and all(
+            want is None or have == want for have, want in zip(tensor.shape, wanted, strict=True)
+        )
+        if tensor.dtype != dtype or not fits:
+            actual = f"{tensor.dtype} {list(tensor.shape)}"
+            raise CheckpointError(f"{where}: tensor {name!r} is {actual}, expected {dtype} {list(wanted)}")
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(f"{where}: tensor {name!r} has numbers that are not finite")
+
+
+def check_mergeable(memory: Memory, other: Memory) -> None:
+    """Raise ``CheckpointError`` naming the first difference that keeps two memories apart."""
+    pairs = {
+        "memory": (memory.name, other.name),
+        "frame of reference": (memory.reference.name, other.reference.name),
+        "up axis": (memory.reference.world_up, other.reference.world_up),
+        "settings": (memory.settings, other.settings),
+        "encoder": (memory.encoder.name, other.encoder.name),
+        "encoder settings": (memory.encoder.settings, other.encoder.settings),
+    }
+    for what, (first, second) in pairs.items():
+        if first != second:
+            raise CheckpointError(f"memories differ in {what} and cannot be merged: {first} and {second}")
