@@ -12,11 +12,11 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.cli.app import main
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.store import Store
-from persist_cli.memorize.factory import MemoryFactory, recall
+from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder
 from persist_cli.recipe import MemoryConfig
-from persist_cli.rollout.world_model import WorldModel, step_together
+from persist_cli.rollout.world_model import Agent, WorldModel
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
 from tests.support.room_views import empty, same_bits, walked
 from tests.support.walking import MICRO_SETTINGS, SIZE, losses, stage, train_here
@@ -56,7 +56,9 @@ def test_a_memory_is_built_and_read_where_its_frames_lie_and_is_that_of_the_cpu(
 @pytest.mark.parametrize("name", MAPS)
 def test_what_a_clip_remembers_is_made_where_it_trains(name, walks):
     clip = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))[5]
-    here, there = (recall(clip, MemoryFactory.of(MemoryConfig(name), device), 64) for device in ("cpu", DEVICE))
+    here, there = (
+        with_memory(clip, MemoryFactory.of(MemoryConfig(name), device), 64).tokens for device in ("cpu", DEVICE)
+    )
     assert everywhere([there.features, there.positions, there.mask])
     assert len(here) > 0
     assert close(here.features, there.features)
@@ -120,8 +122,8 @@ def world(walks):
         backbone.add_adapter(name, make_encoder("patches", {}).channels, {"width": 16, "heads": 2})
         shaken(backbone, 0.02)
         memory = empty(name, up=first.info.world_up)
-        model = WorldModel(backbone.to(device, precision), memory, sampling)
-        model.reset(first.observations, first.info)
+        model = WorldModel(backbone.to(device, precision), [Agent(memory)], sampling)
+        model.reset([first.observations], [first.info])
         return model
 
     return make
@@ -130,22 +132,22 @@ def world(walks):
 @pytest.mark.parametrize("name", MAPS)
 def test_a_rollout_sees_what_it_sees_on_the_cpu_and_maps_it_where_it_computes(name, world):
     here, there = world(name, "cpu"), world(name, DEVICE)
-    mine, others = here.step(["left"] * 12), there.step(["left"] * 12)
-    assert everywhere(there.memory.tensors().values())
+    mine, others = (model.step([["left"] * 12])[0] for model in (here, there))
+    assert everywhere(there.agents[0].memory.tensors().values())
     assert (mine.rgb.int() - others.rgb.int()).abs().float().mean() < 1
     assert torch.allclose(mine.depth, others.depth, rtol=0.05, atol=0.05)
 
 
 def test_a_rollout_in_bfloat16_sees_nearly_the_same(world):
-    mine, others = (world("voxel", DEVICE, kind).step(["left"] * 8) for kind in (torch.float32, torch.bfloat16))
+    mine, others = (world("voxel", DEVICE, kind).step([["left"] * 8])[0] for kind in (torch.float32, torch.bfloat16))
     assert (mine.rgb.int() - others.rgb.int()).abs().float().mean() < 8
 
 
 def test_branches_see_what_rollouts_alone_see(world):
     ways = [["left"] * 8, ["forward"] * 8]
-    together = step_together(world("voxel", DEVICE).branches(2), ways)
+    together = world("voxel", DEVICE).branches(2).step(ways)
     for seen, way in zip(together, ways, strict=True):
-        alone = world("voxel", DEVICE).step(way)
+        alone = world("voxel", DEVICE).step([way])[0]
         assert (seen.rgb.int() - alone.rgb.int()).abs().float().mean() < 0.5
 
 

@@ -16,6 +16,7 @@ from persist_cli.data.clips import interactions_of
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import DataError
+from persist_cli.rollout.world_model import cameras_along
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Rollout:
     """What a rollout gave.
 
     Args:
-        walk: where it went.
+        path: where it went.
         seen: the frames imagined.
         before: the memory as it was, ``None`` without one.
         memory: the memory as it is now.
@@ -68,7 +69,7 @@ class Rollout:
         gives_depth: whether the depth of the imagined frames is one.
     """
 
-    walk: CameraPath
+    path: CameraPath
     seen: Observations
     before: Memory | None
     memory: Memory | None
@@ -88,11 +89,9 @@ def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:
 
 def path_along_actions(start: Trajectory, text: str) -> CameraPath:
     """The way from a single frame along actions."""
-    vocabulary, camera = start.info.vocabulary, start.observations.cameras
-    names = vocabulary.parse(text)
-    poses = vocabulary.follow(camera.world_from_camera[0], names, start.world_up)
-    cameras = Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
-    interactions = interactions_of(names, vocabulary)
+    names = start.info.vocabulary.parse(text)
+    cameras = cameras_along(start.observations.cameras, start.info, names)
+    interactions = interactions_of(names, start.info.vocabulary)
     return CameraPath(start.observations, cameras, interactions, format_actions(names), None, start.info)
 
 

@@ -53,7 +53,7 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
     """Write everything into ``out`` in the place of an earlier rollout; gives the figures with those against truth."""
     for name in SOMETIMES:
         (out / name).unlink(missing_ok=True)
-    start, seen, truth = rollout.walk.start, rollout.seen, rollout.walk.truth
+    start, seen, truth = rollout.path.start, rollout.seen, rollout.path.truth
     rgb = torch.cat([start.rgb, seen.rgb])
     depth = torch.cat([start.depth, seen.depth])
     write_video(out / "rgb.mp4", rgb)
@@ -98,7 +98,7 @@ def compare(
 
 def path_of(rollout: Rollout) -> torch.Tensor:
     """Poses of the start and every imagined frame."""
-    return Cameras.concatenate([rollout.walk.start.cameras, rollout.seen.cameras]).world_from_camera
+    return Cameras.concatenate([rollout.path.start.cameras, rollout.seen.cameras]).world_from_camera
 
 
 def write_maps(rollout: Rollout, out: Path) -> None:

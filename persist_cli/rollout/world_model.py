@@ -1,14 +1,20 @@
-"""The world model: backbone, memory and where the agent is, stepped by actions."""
+"""The world model: what agents will see when they act, imagined clip by clip and remembered.
+
+``WorldModel.imagine`` is the one loop of the tool: recall, denoise, observe, memorize. Rollouts, evaluations and all
+that acts inside the model stand on it; a single agent is its batch of one.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
-from persist_cli.api.backbone import Backbone, Clips, Interactions, Sampling
+from persist_cli.api.backbone import Backbone, Clip, Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, TrajectoryInfo
@@ -17,219 +23,185 @@ from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
 
 
-@dataclass(frozen=True)
-class ClipRequest:
-    """What a backbone is asked for one clip.
-
-    Args:
-        now: the present frame.
-        path: cameras of the whole clip, the present one first.
-        interactions: for each step.
-        tokens: of the memory, ``None`` without one.
-        seed: of the sampling noise.
-    """
-
-    now: Observations
-    path: Cameras
-    interactions: Interactions
-    tokens: MemoryTokens | None
-    seed: int
-
-
 def unchanged(seen: Observations) -> Observations:
     """The same frames."""
     return seen
 
 
 @dataclass
-class WorldModel:
-    """Predicts what an agent will see, clip by clip, and remembers it.
+class Agent:
+    """Where one rollout stands: its memory, its present frame and how many clips it has imagined.
 
     Args:
-        backbone: with the adapter to use, if any, already in use.
-        memory: what the adapter reads; ``None`` without adapter.
-        sampling: how clips are drawn.
+        memory: that the adapter reads; ``None`` without adapter.
         seed: of the sampling noise.
-        write: whether what is seen and generated goes into the memory.
+        write: whether what is seen and imagined goes into the memory.
         disturb: changes frames before they are written, as an evaluation with noisy poses does.
-        shared: whether others read this memory too, so that it is copied before it is written.
+        shared: whether other agents read this memory too, so that it is copied before it is written.
     """
 
-    backbone: Backbone
     memory: Memory | None
-    sampling: Sampling
     seed: int = 0
     write: bool = True
     disturb: Callable[[Observations], Observations] = unchanged
     shared: bool = False
+    now: Observations = field(init=False)
+    info: TrajectoryInfo = field(init=False)
+    clips: int = field(default=0, init=False)
 
-    def reset(self, observation: Observations, info: TrajectoryInfo) -> None:
-        """Begin at one observed frame of the world that ``info`` describes."""
-        self.now, self.vocabulary, self.clips = observation, info.vocabulary, 0
-        self.world_up = torch.tensor(info.world_up, dtype=torch.float64)
-        self.memorize(observation)
+    def cameras_after(self, actions: Sequence[str]) -> Cameras:
+        """The cameras after each of the actions."""
+        return cameras_along(self.now.cameras, self.info, actions)
 
-    def step(self, actions: Sequence[str]) -> Observations:
-        """The frames after each of the actions."""
-        interactions = interactions_of(actions, self.vocabulary)
-        return Observations.concatenate(list(self.imagine(self.cameras_after(actions), interactions)))
+    def observe(self, seen: Observations) -> None:
+        """Go to the last of the frames."""
+        self.now, self.clips = seen[-1:], self.clips + 1
 
-    def branches(self, count: int) -> list[WorldModel]:
-        """So many world models that go on from here, each on its own, with the same sampling noise.
+    def memorize(self, seen: Observations, device: torch.device) -> None:
+        """Write frames into the memory, which is made where the backbone computes."""
+        if self.memory is None or not self.write:
+            return
+        if self.shared:
+            self.memory, self.shared = self.memory.copy(), False
+        self.memory.write(self.disturb(seen).to(device))
 
-        Each imagines what this one would. They hold one present frame and one memory until they go on, each of them
-        copying the memory when it first writes; this one is not changed.
+
+class WorldModel:
+    """Predicts what agents will see, clip by clip, and remembers it; each clip of all agents is denoised as one batch.
+
+    Args:
+        backbone: with the adapter to use, if any, already in use.
+        agents: one for each rollout.
+        sampling: how clips are drawn.
+    """
+
+    def __init__(self, backbone: Backbone, agents: Sequence[Agent], sampling: Sampling) -> None:
+        self.backbone, self.agents, self.sampling = backbone, list(agents), sampling
+
+    def reset(self, observations: Sequence[Observations], infos: Sequence[TrajectoryInfo]) -> None:
+        """Let each agent begin at one observed frame of the world that its info describes."""
+        for agent, observation, info in zip(self.agents, observations, infos, strict=True):
+            agent.now, agent.info, agent.clips = observation, info, 0
+            agent.memorize(observation, self.backbone.device)
+
+    def step(self, actions: Sequence[Sequence[str]]) -> list[Observations]:
+        """The frames that each agent sees after each of its actions.
+
+        Raises:
+            PersistError: when there is not a list of actions for each agent, or no action in one.
+        """
+        if not self.agents or len(self.agents) != len(actions) or not all(actions):
+            raise PersistError(
+                f"{len(self.agents)} branches were given {len(actions)} lists of {[len(each) for each in actions]} "
+                "actions; each needs one of at least one action"
+            )
+        pairs = list(zip(self.agents, actions, strict=True))
+        cameras = [agent.cameras_after(names) for agent, names in pairs]
+        clips = list(self.imagine(cameras, [interactions_of(names, agent.info.vocabulary) for agent, names in pairs]))
+        return [Observations.concatenate(parts) for parts in zip(*clips, strict=True)]
+
+    def branches(self, count: int) -> WorldModel:
+        """So many agents that go on from where the first one is, each on its own, with the same sampling noise.
+
+        Each imagines what the first agent would. They hold one present frame and one memory until they go on, each of
+        them copying the memory when it first writes; this world model is not changed.
 
         Raises:
             PersistError: when none are asked for.
         """
         if count < 1:
             raise PersistError(f"{count} branches of a rollout; it must be at least 1")
-        memory = None if self.memory is None else self.memory.copy()
-        made = [copy(self) for _ in range(count)]
-        for branch in made:
-            branch.memory, branch.shared = memory, memory is not None
-        return made
+        agent = self.agents[0]
+        memory = None if agent.memory is None else agent.memory.copy()
+        agents = [Agent(memory, agent.seed, agent.write, agent.disturb, memory is not None) for _ in range(count)]
+        for branch in agents:
+            branch.now, branch.info, branch.clips = agent.now, agent.info, agent.clips
+        return WorldModel(self.backbone, agents, self.sampling)
 
-    def imagine(self, cameras: Cameras, interactions: Interactions) -> Iterator[Observations]:
-        """The frames that the cameras will see, one clip after the other."""
-        length = self.backbone.frames_per_clip - 1
-        for first in range(0, len(cameras), length):
-            part = slice(first, first + length)
-            yield self.next_clip(cameras[part], interactions[part])
+    def imagine(self, cameras: Sequence[Cameras], interactions: Sequence[Interactions]) -> Iterator[list[Observations]]:
+        """The next frames of every agent, one clip of all of them after the other.
 
-    def next_clip(self, cameras: Cameras, interactions: Interactions) -> Observations:
-        """MemoryIntervention, denoise, observe, memorize."""
-        request = self.recall(cameras, interactions)
-        rgb, depth = self.denoise(request)
-        return self.observe(rgb, depth, cameras)
-
-    def recall(self, cameras: Cameras, interactions: Interactions) -> ClipRequest:
-        """What the backbone is asked for the next clip, with what the memory says to its cameras."""
-        return recall_together([self], [cameras], [interactions])[0]
-
-    def denoise(self, request: ClipRequest) -> tuple[torch.Tensor, torch.Tensor]:
-        """RGB and depth of the clip asked for, its present frame first."""
-        rgb, depth = self.backbone.generate(batch_of([request]), self.sampling)
-        return rgb[0].cpu(), depth[0].cpu()
-
-    def observe(self, rgb: torch.Tensor, depth: torch.Tensor, cameras: Cameras) -> Observations:
-        """The generated frames at the cameras asked for, after going there and memorizing them.
+        As long as agents stand at one present frame and read one memory, as those of ``branches`` do at first, the
+        frame is encoded once and the memory is looked through once. An agent that has reached the end of its way sees
+        no more frames, and its clips are no longer imagined.
 
         Args:
-            rgb: uint8 ``[frame, height, width, 3]``, the present frame first.
-            depth: metres, likewise.
-            cameras: of the frames after the present one.
+            cameras: of the frames to come, for each agent.
+            interactions: one for each of them.
         """
-        seen = Observations(rgb[1 : len(cameras) + 1], depth[1 : len(cameras) + 1], cameras)
-        self.memorize(seen)
-        self.now, self.clips = seen[-1:], self.clips + 1
-        return seen
+        length = self.backbone.frames_per_clip - 1
+        for first in range(0, max(len(way) for way in cameras), length):
+            clip = slice(first, first + length)
+            moving = [number for number, way in enumerate(cameras) if len(way) > first]
+            ways = [cameras[number][clip] for number in moving]
 
-    def memorize(self, seen: Observations) -> None:
-        """Write frames into the memory, which is made where the backbone computes."""
-        if self.memory is None or not self.write:
-            return
-        if self.shared:
-            self.memory, self.shared = self.memory.copy(), False
-        self.memory.write(self.disturb(seen).to(self.backbone.device))
+            clips = self.recall(moving, ways, [interactions[number][clip] for number in moving])
+            rgb, depth = self.denoise(clips)
+            frames = [agent.now[:0] for agent in self.agents]
+            for row, (number, way) in enumerate(zip(moving, ways, strict=True)):
+                seen = Observations(rgb[row, 1 : len(way) + 1], depth[row, 1 : len(way) + 1], way)
+                self.agents[number].observe(seen)
+                self.agents[number].memorize(seen, self.backbone.device)
+                frames[number] = seen
+            yield frames
 
-    def cameras_after(self, actions: Sequence[str]) -> Cameras:
-        """The cameras after each of the actions."""
-        now = self.now.cameras
-        poses = self.vocabulary.follow(now.world_from_camera[0], actions, self.world_up)
-        return Cameras(poses, now.intrinsics.expand(len(poses), 3, 3), now.height, now.width)
+    def recall(self, moving: Sequence[int], ways: Sequence[Cameras], interactions: Sequence[Interactions]) -> Clips:
+        """The clips that the backbone shall predict: the present frames, and what the memories say to the cameras.
 
-    def clip_path(self, cameras: Cameras) -> Cameras:
-        """The present camera and the next ones, the last repeated to fill a clip."""
-        missing = self.backbone.frames_per_clip - 1 - len(cameras)
-        parts = [self.now.cameras, cameras, *[cameras[-1:]] * missing]
-        return Cameras.concatenate(parts)
-
-
-def step_together(models: Sequence[WorldModel], actions: Sequence[Sequence[str]]) -> list[Observations]:
-    """The frames that each of several world models with one backbone sees after its actions; see ``imagine_together``.
-
-    Raises:
-        PersistError: when there is no world model, not a list of actions for each, or no action in one.
-    """
-    if not models or len(models) != len(actions) or not all(actions):
-        raise PersistError(
-            f"{len(models)} branches were given {len(actions)} lists of {[len(each) for each in actions]} actions; "
-            "each needs one of at least one action"
+        Args:
+            moving: numbers of the agents that go on.
+            ways: their next cameras, a clip's at most.
+            interactions: one for each of these.
+        """
+        agents = [self.agents[number] for number in moving]
+        paths = [self.clip_path(agent, way) for agent, way in zip(agents, ways, strict=True)]
+        tokens = self.read_memories(agents, paths)
+        clips = Clips.stack(
+            [
+                Clip(Observations(agent.now.rgb, agent.now.depth, path), done, clip_seed(agent.seed, agent.clips), read)
+                for agent, path, done, read in zip(agents, paths, interactions, tokens, strict=True)
+            ]
         )
-    pairs = list(zip(models, actions, strict=True))
-    cameras = [model.cameras_after(each) for model, each in pairs]
-    clips = list(imagine_together(models, cameras, [interactions_of(each, model.vocabulary) for model, each in pairs]))
-    return [Observations.concatenate([clip[number] for clip in clips]) for number in range(len(models))]
+        if all(agent.now is agents[0].now for agent in agents):  # one frame for all is encoded once
+            clips = dataclasses.replace(clips, rgb=clips.rgb[:1], depth=clips.depth[:1])
+        return clips
+
+    def denoise(
+        self, clips: Clips
+    ) -> tuple[UInt8[Tensor, "agent frame height width 3"], Float[Tensor, "agent frame height width"]]:
+        """RGB and depth of the clips, the present frames first, on the CPU."""
+        rgb, depth = self.backbone.generate(clips, self.sampling)
+        return rgb.cpu(), depth.cpu()
+
+    def clip_path(self, agent: Agent, way: Cameras) -> Cameras:
+        """The present camera and the next ones, the last repeated to fill a clip."""
+        missing = self.backbone.frames_per_clip - 1 - len(way)
+        return Cameras.concatenate([agent.now.cameras, way, *[way[-1:]] * missing])
+
+    def read_memories(self, agents: Sequence[Agent], paths: Sequence[Cameras]) -> list[MemoryTokens | None]:
+        """What each agent's memory says to its path; a memory that several agents read is looked through once."""
+        tokens: list[MemoryTokens | None] = [None] * len(agents)
+        for memory in {id(agent.memory): agent.memory for agent in agents}.values():
+            if memory is None:
+                continue
+            readers = [number for number, agent in enumerate(agents) if agent.memory is memory]
+            reads = memory.read_batch([paths[number] for number in readers], self.backbone.token_budget)
+            for number, read in zip(readers, reads, strict=True):
+                tokens[number] = read
+        return tokens
 
 
-def imagine_together(
-    models: Sequence[WorldModel], cameras: Sequence[Cameras], interactions: Sequence[Interactions]
-) -> Iterator[list[Observations]]:
-    """The next frames of several world models with one backbone, each clip of all of them denoised as one batch.
-
-    As long as they stand at one present frame and read one memory, as ``WorldModel.branches`` do at first, the frame
-    is encoded once and the memory is looked through once. A model that has reached the end of its way gives no more
-    frames, and its clips are no longer imagined.
+def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str]) -> Cameras:
+    """The cameras after each of the actions.
 
     Args:
-        models: with one backbone and one way of sampling.
-        cameras: of the frames to come, for each model.
-        interactions: one for each of them.
+        camera: one, where the way begins.
+        info: of the world, with the vocabulary of its actions.
+        actions: names in the vocabulary.
     """
-    backbone, sampling = models[0].backbone, models[0].sampling
-    length = backbone.frames_per_clip - 1
-    for first in range(0, max(len(path) for path in cameras), length):
-        part = slice(first, first + length)
-        going = [number for number, path in enumerate(cameras) if len(path) > first]
-        movers, paths = [models[number] for number in going], [cameras[number][part] for number in going]
-        requests = recall_together(movers, paths, [interactions[number][part] for number in going])
-        rgb, depth = backbone.generate(batch_of(requests), sampling)
-        answers = zip(movers, rgb.cpu(), depth.cpu(), paths, strict=True)
-        seen = dict(zip(going, (model.observe(*answer) for model, *answer in answers), strict=True))
-        yield [seen.get(number, model.now[:0]) for number, model in enumerate(models)]
-
-
-def recall_together(
-    models: Sequence[WorldModel], cameras: Sequence[Cameras], interactions: Sequence[Interactions]
-) -> list[ClipRequest]:
-    """What the backbone is asked for the next clip of each model; a memory that several read is looked through once."""
-    paths = [model.clip_path(each) for model, each in zip(models, cameras, strict=True)]
-    readers: dict[int, list[int]] = {}
-    for number, model in enumerate(models):
-        readers.setdefault(id(model.memory), []).append(number)
-    tokens: dict[int, MemoryTokens] = {}
-    for numbers in readers.values():
-        memory, budget = models[numbers[0]].memory, models[numbers[0]].backbone.token_budget
-        if memory is not None:
-            told = memory.read_batch([paths[number] for number in numbers], budget)
-            tokens |= dict(zip(numbers, told, strict=True))
-    return [
-        ClipRequest(model.now, path, done, tokens.get(number), clip_seed(model.seed, model.clips))
-        for number, (model, path, done) in enumerate(zip(models, paths, interactions, strict=True))
-    ]
-
-
-def batch_of(requests: Sequence[ClipRequest]) -> Clips:
-    """A batch for the backbone, the given frame of each question first, or once for all that share one."""
-    tokens = [request.tokens for request in requests if request.tokens is not None]
-    first = requests[0].path
-    given = [request.now for request in requests]
-    given = given[:1] if all(now is given[0] for now in given) else given
-    return Clips(
-        rgb=torch.stack([now.rgb for now in given]),
-        depth=torch.stack([now.depth for now in given]),
-        cameras=Cameras(
-            torch.stack([request.path.world_from_camera for request in requests]),
-            torch.stack([request.path.intrinsics for request in requests]),
-            first.height,
-            first.width,
-        ),
-        interactions=[request.interactions for request in requests],
-        tokens=MemoryTokens.stack(tokens) if tokens else None,
-        seeds=[request.seed for request in requests],
-    )
+    world_up = torch.tensor(info.world_up, dtype=torch.float64)
+    poses = info.vocabulary.follow(camera.world_from_camera[0], actions, world_up)
+    return Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
 
 
 def clip_seed(seed: int, clip: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from persist_cli.data.clips import ClipDataset, ClipPlan
-from persist_cli.memorize.factory import MemoryFactory, recall
+from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import MemoryConfig
 from tests.support.walking import SIZE
 
@@ -24,5 +24,6 @@ def test_an_encoder_computes_where_its_maker_is_told(tmp_path):
 def test_a_batch_holds_tokens_of_a_memory_that_saw_something_and_of_one_that_did_not(walks):
     clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
     aware = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))
-    maker = MemoryFactory.of(MemoryConfig("voxel"), torch.device("cpu"))
-    assert len(recall(clips[5], maker, 64)) == 0 < len(recall(aware[5], maker, 64)) <= 64
+    factory = MemoryFactory.of(MemoryConfig("voxel"), torch.device("cpu"))
+    nothing, something = (with_memory(sample, factory, 64).tokens for sample in (clips[5], aware[5]))
+    assert len(nothing) == 0 < len(something) <= 64

@@ -9,7 +9,7 @@ from persist_cli.data.clips import interactions_of
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
 from persist_cli.plugins import make_encoder, make_memory
-from persist_cli.rollout.world_model import WorldModel, recall_together, step_together
+from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_memory.grid.visibility import Views
 from tests.support.micro_model import micro, shaken
 
@@ -33,8 +33,8 @@ def start(backbone, walks):
     def begin(kind="voxel", **options):
         memory = make_memory(kind, {}, make_encoder("patches", {}), FrameOfReference("room-0", whole.info.world_up))
         memory.write(whole.observations[:8])
-        model = WorldModel(backbone, memory, Sampling(2), **options)
-        model.reset(whole.observations[8:9], whole.info)
+        model = WorldModel(backbone, [Agent(memory, **options)], Sampling(2))
+        model.reset([whole.observations[8:9]], [whole.info])
         return model
 
     return begin
@@ -59,8 +59,8 @@ def counted(monkeypatch, owner, name):
 
 
 def test_a_branch_imagines_what_a_rollout_alone_does(start):
-    together = step_together(start(seed=5).branches(3), WAYS)
-    alone = [start(seed=5).step(way) for way in WAYS]
+    together = start(seed=5).branches(3).step(WAYS)
+    alone = [start(seed=5).step([way])[0] for way in WAYS]
     assert all(alike(one, other) for one, other in zip(together, alone, strict=True))
     assert not alike(together[0], together[1])
 
@@ -68,61 +68,64 @@ def test_a_branch_imagines_what_a_rollout_alone_does(start):
 @pytest.mark.parametrize("kind", ["voxel", "map2d", "snapshots"])
 def test_a_branch_is_told_by_the_memory_what_a_rollout_alone_is_told_to_the_bit(start, kind):
     branches = start(kind).branches(3)
-    cameras = [model.cameras_after(way) for model, way in zip(branches, WAYS, strict=True)]
-    done = [interactions_of(way, branches[0].vocabulary) for way in WAYS]
-    for request, path, interactions in zip(recall_together(branches, cameras, done), cameras, done, strict=True):
-        alone = start(kind).recall(path, interactions)
-        assert torch.equal(request.tokens.features, alone.tokens.features)
-        assert torch.equal(request.tokens.positions, alone.tokens.positions)
-        assert question.seed == alone.seed
+    vocabulary = branches.agents[0].info.vocabulary
+    cameras = [agent.cameras_after(way) for agent, way in zip(branches.agents, WAYS, strict=True)]
+    interactions = [interactions_of(way, vocabulary) for way in WAYS]
+    together = branches.recall(range(3), cameras, interactions)
+    for number in range(3):
+        alone = start(kind).recall([0], cameras[number : number + 1], interactions[number : number + 1])
+        there = together.tokens.mask[number]
+        assert torch.equal(together.tokens.features[number, there], alone.tokens.features[alone.tokens.mask])
+        assert torch.equal(together.tokens.positions[number, there], alone.tokens.positions[alone.tokens.mask])
+        assert together.seeds[number] == alone.seeds[0]
 
 
 def test_branches_encode_their_frame_once_and_look_through_the_memory_once(start, backbone, monkeypatch):
     branches = start().branches(3)
     encoded = counted(monkeypatch, backbone.codec, "encode")
-    looked = counted(monkeypatch, Views, "look")
-    step_together(branches, WAYS)
+    looked = counted(monkeypatch, Views, "visible_distances")
+    branches.step(WAYS)
     assert encoded == [1]
     assert looked == [21, 21]  # blocks, then cells: the first camera and four turns to the left are the same for two
-    step_together(branches, WAYS)
+    branches.step(WAYS)
     assert encoded == [1, 3]  # each stands at a frame of its own by now
 
 
 def test_branches_write_into_memories_of_their_own(start):
     model = start()
-    before = model.memory.tensors()
+    before = model.agents[0].memory.tensors()
     branches = model.branches(2)
-    step_together(branches, WAYS[:2])
-    held = [branch.memory.tensors() for branch in branches]
-    assert all(torch.equal(model.memory.tensors()[name], value) for name, value in before.items())
+    branches.step(WAYS[:2])
+    held = [agent.memory.tensors() for agent in branches.agents]
+    assert all(torch.equal(model.agents[0].memory.tensors()[name], value) for name, value in before.items())
     assert len(held[0]["cells"]) > len(before["cells"])
     assert held[0]["cells"].shape != held[1]["cells"].shape or not torch.equal(held[0]["features"], held[1]["features"])
-    model.step(["forward"])
-    assert all(torch.equal(branches[0].memory.tensors()[name], value) for name, value in held[0].items())
+    model.step([["forward"]])
+    assert all(torch.equal(branches.agents[0].memory.tensors()[name], value) for name, value in held[0].items())
 
 
 def test_branches_that_may_not_write_keep_one_memory(start):
     branches = start(write=False).branches(2)
-    step_together(branches, WAYS[:2])
-    assert branches[0].memory is branches[1].memory
+    branches.step(WAYS[:2])
+    assert branches.agents[0].memory is branches.agents[1].memory
 
 
 def test_branches_of_different_lengths_each_go_as_far_as_asked(start):
     ways = [["left"] * 3, ["right"] * 12]
-    together = step_together(start().branches(2), ways)
+    together = start().branches(2).step(ways)
     assert [len(seen) for seen in together] == [3, 12]
-    assert all(alike(seen, start().step(way)) for seen, way in zip(together, ways, strict=True))
+    assert all(alike(seen, start().step([way])[0]) for seen, way in zip(together, ways, strict=True))
 
 
 def test_a_branch_can_branch_again_and_the_first_goes_on_as_if_nothing_was(start):
     model = start()
-    branch = model.branches(1)[0]
-    branch.step(["left"] * 8)
+    branch = model.branches(1)
+    branch.step([["left"] * 8])
     twigs = branch.branches(2)
-    again = step_together(twigs, [["left"] * 8, ["forward"] * 8])[0]
-    expected = start().step(["left"] * 16)
+    again = twigs.step([["left"] * 8, ["forward"] * 8])[0]
+    expected = start().step([["left"] * 16])[0]
     assert alike(again, expected[8:])
-    assert alike(model.step(["left"] * 8), expected[:8])
+    assert alike(model.step([["left"] * 8])[0], expected[:8])
 
 
 def test_what_cannot_branch_is_one_line(start):
@@ -130,9 +133,9 @@ def test_what_cannot_branch_is_one_line(start):
     with pytest.raises(PersistError, match="0 branches of a rollout; it must be at least 1"):
         model.branches(0)
     with pytest.raises(PersistError, match="2 branches were given 1 lists"):
-        step_together(model.branches(2), [["left"]])
+        model.branches(2).step([["left"]])
     with pytest.raises(PersistError, match=r"lists of \[1, 0\] actions"):
-        step_together(model.branches(2), [["left"], []])
+        model.branches(2).step([["left"], []])
 
 
 def test_several_actions_leave_a_folder_each_with_what_one_alone_leaves(persist, voxel, walks, tmp_path):

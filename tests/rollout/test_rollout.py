@@ -12,7 +12,7 @@ from persist_cli.data.store import Store
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.outputs import quaternion
-from persist_cli.rollout.world_model import WorldModel
+from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.video import read_video
 from tests.support.walking import SIZE
 
@@ -115,10 +115,10 @@ def test_the_loop_memorizes_what_it_imagines(walks):
     memory = make_memory("voxel", {}, encoder, FrameOfReference("room-0", trajectory.info.world_up))
     backbone = micro()
     backbone.add_adapter("voxel", encoder.channels, {"width": 16, "heads": 2})
-    model = WorldModel(backbone, memory, Sampling(1))
-    model.reset(trajectory.observations, trajectory.info)
+    model = WorldModel(backbone, [Agent(memory)], Sampling(1))
+    model.reset([trajectory.observations], [trajectory.info])
     cells = memory.figures().cells
-    seen = model.step(["left"] * 12)
+    seen = model.step([["left"] * 12])[0]
     assert len(seen) == 12
     assert memory.figures().cells > cells
     expected = trajectory.info.vocabulary.follow(

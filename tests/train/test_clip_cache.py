@@ -11,6 +11,7 @@ import pytest
 import torch
 from accelerate import Accelerator
 
+from persist_cli.api.backbone import ClipLatents
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
 from persist_cli.data.clips import ClipDataset, ClipPlan
@@ -82,8 +83,8 @@ def test_a_long_trajectory_is_encoded_in_pieces_and_gives_the_same_latents(walks
     for pixels in (1 << 22, 7 * SIZE * SIZE):
         monkeypatch.setattr(sources, "PIXELS_AT_ONCE", pixels)
         cache = ClipCache(Cache(CacheSettings(tmp_path / str(pixels), 1)), CacheKeys({}, None, backbone.framewise))
-        ClipEncoder(backbone, None, Accelerator(cpu=True), cache).all_latents([CachedClips(clips, cache)[0]])
-        made.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["latents"])
+        ClipEncoder(backbone, None, Accelerator(cpu=True), cache).with_latents(CachedClips(clips, cache)[0])
+        made.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["video"])
     assert len(made[0]) == 24
     assert torch.equal(*made)
 
@@ -175,24 +176,26 @@ TOKENS = {"features": torch.ones(2, 3), "positions": torch.ones(2, 3).double(), 
 def test_a_known_clip_is_given_without_reading_an_image(walks, tmp_path):
     clips = clips_in(walks, tmp_path)
     before = clips[5]
-    assert len(before.clip.observations) == 9
-    clips.cache.put_latents(before.choice, torch.ones(4, 8))
-    clips.cache.put_tokens(before.choice, MemoryTokens(**TOKENS))
-    after = clips[5]
-    assert len(after.clip.observations) == 0
-    assert after.clip.context is None
-    assert torch.equal(after.latents, torch.ones(4, 8))
-    assert torch.equal(after.tokens.positions, TOKENS["positions"])
-    cameras = before.clip.observations.cameras
-    assert torch.equal(after.clip.observations.cameras.world_from_camera, cameras.world_from_camera)
-    assert torch.equal(after.clip.observations.cameras.intrinsics, cameras.intrinsics)
-    assert (after.clip.interactions, after.clip.seed) == (before.clip.interactions, before.clip.seed)
+    clip = before.sample.clip
+    assert len(clip.observations) == 9
+    clips.cache.put_latents(before.frames, ClipLatents(torch.ones(4, 8), torch.zeros(1, 8)))
+    clips.cache.put_tokens(before.frames, MemoryTokens(**TOKENS))
+    sample = clips[5].sample
+    assert len(sample.clip.observations) == 0
+    assert sample.context is None
+    assert torch.equal(sample.clip.latents.video, torch.ones(4, 8))
+    assert torch.equal(sample.clip.latents.image, torch.zeros(1, 8))
+    assert torch.equal(sample.clip.tokens.positions, TOKENS["positions"])
+    cameras = sample.clip.observations.cameras
+    assert torch.equal(cameras.world_from_camera, clip.observations.cameras.world_from_camera)
+    assert torch.equal(cameras.intrinsics, clip.observations.cameras.intrinsics)
+    assert (sample.clip.interactions, sample.clip.seed) == (clip.interactions, clip.seed)
 
 
 def test_tokens_of_a_clip_without_context_are_found_again(walks, tmp_path):
     clips = clips_in(walks, tmp_path, context_frames=0)
-    clips.cache.put_tokens(clips[5].choice, MemoryTokens(**TOKENS))
-    assert torch.equal(clips[5].tokens.features, TOKENS["features"])
+    clips.cache.put_tokens(clips[5].frames, MemoryTokens(**TOKENS))
+    assert torch.equal(clips[5].sample.clip.tokens.features, TOKENS["features"])
 
 
 def test_other_frames_contexts_or_trajectories_have_other_keys(walks, tmp_path):
