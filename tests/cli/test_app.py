@@ -23,16 +23,17 @@ for command in sys.argv[1:]:
     try:
         main([*command.split(), "--help"])
     except SystemExit:
-        pass
-print([name for name in ("torch", "numpy", "diffusers", "pydantic") if name in sys.modules])
+        print([name for name in ("torch", "numpy", "diffusers", "pydantic") if name in sys.modules])
 """
 
 
 def test_no_help_imports_torch():
     command = [sys.executable, "-c", HELP, "", *COMMANDS, "weights list", "weights fetch", "weights path"]
     out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    assert out.count("Usage") == len(COMMANDS) + 4
-    assert out.splitlines()[-1] == "[]"
+    imports = [line for line in out.splitlines() if line.startswith("[")]
+    assert len(imports) == len(COMMANDS) + 4
+    assert imports[0] == "[]"
+    assert set(imports) <= {"[]", "['pydantic']"}  # which typer imports for the help of a command
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -61,7 +62,7 @@ def test_a_wrong_option_is_a_usage_error(persist):
     [["finetune", "tiny-codec", "--data", "{walks}"], ["rollout", "{stage1}", "--start", "{walks}#0:0", "--follow"],
      ["eval", "{stage1}", "--data", "{walks}"], ["export", "{stage1}"], ["memorize", "{walks}#0:0-3"]],
 )  # fmt: skip
-def test_a_file_in_the_place_of_an_output_folder_is_reported_before_any_work_is_done(persist, walks, stage1, tmp_path, command):
+def test_a_file_in_the_place_of_an_output_folder_is_reported_before_any_work(persist, walks, stage1, tmp_path, command):
     (tmp_path / "file").touch()
     arguments = [argument.format(walks=walks, stage1=stage1) for argument in command]
     ended = persist(*arguments, "--out", tmp_path / "file" / "there" / "x")
