@@ -1,4 +1,4 @@
-"""Metrics of generated videos, each a small named thing that says what it measures."""
+"""Metrics of generated videos, each with a name and a definition that is printed beside its figures."""
 
 from persist_cli.metrics.depth import AbsRel, Delta1, Rmse
 from persist_cli.metrics.dreamsim import DreamSim

@@ -1,4 +1,4 @@
-"""Metrics of generated depth in the image."""
+"""Metrics that compare generated with true depth, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ SCOPE = "over pixels with true depth z*, no alignment of scale, missing depth co
 
 
 class DepthMetric(FrameMetric):
-    """A figure for each frame that compares generated with true depth."""
+    """A metric that compares generated with true depth and has a figure for each frame."""
 
     def obstacle(self, setup: Setup) -> str | None:
-        """It needs true and generated depth."""
+        """The reason when true or generated depth is missing."""
         if not setup.depth:
             return "the data has no depth"
         return None if setup.generated_depth else "the model gives no depth"
 
 
 class AbsRel(DepthMetric):
-    """Relative error of depth."""
+    """Mean relative error of depth."""
 
     name = "absrel"
     title = "AbsRel"
@@ -29,7 +29,7 @@ class AbsRel(DepthMetric):
     definition = f"mean |z - z*| / z* {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Error of each frame, NaN without any true depth."""
+        """The relative error of each frame, NaN without any true depth."""
         depth, truth, known = _depths(prediction)
         return _mean((depth - truth).abs() / truth.clamp_min(1e-6), known)
 
@@ -43,13 +43,13 @@ class Rmse(DepthMetric):
     definition = f"metres, root of the mean (z - z*)² of a frame {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Metres for each frame, NaN without any true depth."""
+        """The error of each frame in metres, NaN without any true depth."""
         depth, truth, known = _depths(prediction)
         return _mean((depth - truth).square(), known).sqrt()
 
 
 class Delta1(DepthMetric):
-    """Share of pixels whose depth is nearly right."""
+    """Share of pixels whose depth is right within a quarter."""
 
     name = "delta1"
     title = "δ<1.25"
@@ -57,7 +57,7 @@ class Delta1(DepthMetric):
     definition = f"share of pixels with max(z / z*, z* / z) < 1.25 {SCOPE}"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Share for each frame between 0 and 1, NaN without any true depth."""
+        """The share of each frame between 0 and 1, NaN without any true depth."""
         depth, truth, known = _depths(prediction)
         return _mean(((depth < 1.25 * truth) & (truth < 1.25 * depth)).double(), known)
 
@@ -68,5 +68,5 @@ def _depths(prediction: Prediction) -> tuple[Tensor, Tensor, Bool[Tensor, "frame
 
 
 def _mean(values: Float[Tensor, "frame height width"], known: Bool[Tensor, "frame height width"]) -> Tensor:
-    """Mean over known pixels; the others may hold anything."""
+    """Mean of each frame over its known pixels; the others may hold any value."""
     return values.masked_fill(~known, 0.0).sum((1, 2)) / known.sum((1, 2))

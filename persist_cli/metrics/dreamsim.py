@@ -1,10 +1,10 @@
 """DreamSim, single branch: distance of a DINO ViT-B/16 tuned on human judgements (Fu et al. 2023).
 
-Its weights are in no source that ``persist weights fetch`` can convert: they are released as a checkpoint of DINO with
-a LoRA adapter beside it, both pickled. Who has them (``dino_vitb16`` of the release) adds the adapter's product, scaled
-by alpha / rank, to ``qkv`` of every block and writes ``model.safetensors`` into a folder for ``--from``: DINO's own
-tensor names without head, float32, as ``tensor_shapes`` lists them. The ensemble of three branches is another metric
-and is not measured here.
+``persist weights fetch`` cannot convert its weights from any source: they are released as a checkpoint of DINO with a
+LoRA adapter beside it, both pickled. To prepare them from the release (``dino_vitb16``), add the adapter's product,
+scaled by alpha / rank, to ``qkv`` of every block, and write ``model.safetensors`` into a folder for ``--from``: DINO's
+own tensor names without head, float32, as ``tensor_shapes`` lists them. The ensemble of three branches is another
+metric and is not measured here.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ class DreamSim(FrameMetric):
     )
 
     def obstacle(self, setup: Setup) -> str | None:
-        """It needs its weights, which only a folder can bring."""
+        """The reason when the weights are not cached; only a folder can bring them."""
         missing = missing_weights(WEIGHTS)
         return missing and f"{missing} --from DIR"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Distance of each frame, 0 for an exact copy."""
+        """The distance of each frame, 0 for an exact copy."""
         weights = network_weights(WEIGHTS, tensor_shapes())
-        pair = (resized(each.cpu()) for each in (prediction.rgb, prediction.truth.rgb))
+        pair = (resize(rgb.cpu()) for rgb in (prediction.rgb, prediction.truth.rgb))
         return run_network(lambda rgb, truth: distance(weights, rgb, truth), *pair)
 
 
@@ -75,21 +75,21 @@ def tensor_shapes() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def resized(rgb: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame 224 224 3"]:
-    """Frames as the released preprocessing makes them: Pillow's bicubic on 8-bit pixels."""
+def resize(rgb: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame 224 224 3"]:
+    """Resize frames as the released preprocessing does, by Pillow's bicubic filter on 8-bit pixels."""
     from PIL import Image
 
-    frames = [Image.fromarray(each.numpy()).resize((SIZE, SIZE), Image.Resampling.BICUBIC) for each in rgb]
-    return torch.from_numpy(np.stack([np.asarray(each) for each in frames]))
+    images = [Image.fromarray(frame.numpy()).resize((SIZE, SIZE), Image.Resampling.BICUBIC) for frame in rgb]
+    return torch.from_numpy(np.stack([np.asarray(image) for image in images]))
 
 
 def distance(
     weights: Mapping[str, Tensor], rgb: UInt8[Tensor, "frame 224 224 3"], truth: UInt8[Tensor, "frame 224 224 3"]
 ) -> Float[Tensor, " frame"]:
-    """1 - cosine similarity of class tokens less their means."""
-    tokens = [class_token(weights, each).double() for each in (rgb, truth)]
-    one, other = (each - each.mean(-1, keepdim=True) for each in tokens)
-    return 1 - torch.cosine_similarity(one, other, dim=-1)
+    """One minus the cosine similarity of class tokens less their means, for each frame."""
+    tokens = [class_token(weights, frames).double() for frames in (rgb, truth)]
+    centred, true_centred = (token - token.mean(-1, keepdim=True) for token in tokens)
+    return 1 - torch.cosine_similarity(centred, true_centred, dim=-1)
 
 
 def class_token(weights: Mapping[str, Tensor], rgb: UInt8[Tensor, "frame 224 224 3"]) -> Float[Tensor, "frame channel"]:

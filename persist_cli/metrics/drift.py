@@ -16,7 +16,7 @@ from persist_cli.metrics.metric import Prediction
 
 VOXEL = 0.05  # metres
 TRUE_GRID = 256  # pixels along the longer side that are fused
-PROBE_GRID = 64  # and that are measured
+PROBE_GRID = 64  # pixels along the longer side that are measured
 
 
 class Drift(DepthMetric):
@@ -33,18 +33,18 @@ class Drift(DepthMetric):
     )
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Metres for each frame, NaN without any true depth."""
+        """The drift of each frame in metres, NaN without any true depth."""
         truth = in_own_frame(prediction.truth)
         known = on_grid(truth.depth, PROBE_GRID) > 0
         if not bool(known.any()):
             return torch.full((len(truth),), math.nan, dtype=torch.float64)
         points = on_grid(unproject(prediction.depth.cpu(), truth.cameras), PROBE_GRID)
         tree = _tree(fuse(truth))
-        return torch.stack([_mean_distance(tree, each[mask]) for each, mask in zip(points, known, strict=True)])
+        return torch.stack([_mean_distance(tree, frame[mask]) for frame, mask in zip(points, known, strict=True)])
 
 
 def in_own_frame(observations: Observations) -> Observations:
-    """The same frames on the CPU in a world whose origin is their first camera: where the world's lies is no matter."""
+    """Move frames to the CPU and to a world whose origin is their first camera, so that the old origin is no matter."""
     observations = observations.to("cpu")
     cameras = observations.cameras
     return Observations(
@@ -59,7 +59,7 @@ def on_grid(images: Float[Tensor, "frame height width *rest"], most: int) -> Ten
 
 
 def fuse(observations: Observations) -> Float[Tensor, "point 3"]:
-    """World points of all frames, one a voxel: the mean of those in it."""
+    """World points of all frames, fused to one for each voxel: the mean of the points in it."""
     depth = on_grid(observations.depth, TRUE_GRID)
     points = on_grid(unproject(observations.depth, observations.cameras), TRUE_GRID)[depth > 0]
     cells = (points / VOXEL).floor().long()

@@ -1,4 +1,4 @@
-"""Metrics of a frame's colours, without a network."""
+"""Metrics of the colours of single frames that need no network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Psnr(FrameMetric):
     definition = "dB, 8-bit RGB over the whole frame (torchmetrics); an exact copy counts as 100"
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """dB of each frame; an exact copy counts as 100 dB, so that means stay finite."""
+        """The ratio of each frame in dB; an exact copy counts as 100 dB, so that means stay finite."""
         from torchmetrics.functional.image import peak_signal_noise_ratio
 
         ratios = peak_signal_noise_ratio(
@@ -41,17 +41,20 @@ class Ssim(FrameMetric):
     )
 
     def obstacle(self, setup: Setup) -> str | None:
-        """The window must fit."""
+        """The reason when the window does not fit into the images."""
         if min(setup.height, setup.width) < WINDOW:
             return f"images of {setup.width}×{setup.height} are smaller than the window of {WINDOW} px"
         return None
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Similarity of each frame, at most 1; frames one by one, whose last bits would depend on their neighbours."""
+        """The similarity of each frame, at most 1.
+
+        Frames are measured one by one: in a batch, the last bits of a frame would depend on the other frames.
+        """
         from torchmetrics.functional.image import structural_similarity_index_measure
 
-        images = [part.permute(0, 3, 1, 2).float() / 255 for part in (prediction.rgb, prediction.truth.rgb)]
-        frames = zip(*(part.split(1) for part in images), strict=True)
+        images = [rgb.permute(0, 3, 1, 2).float() / 255 for rgb in (prediction.rgb, prediction.truth.rgb)]
+        pairs = zip(*(frames.split(1) for frames in images), strict=True)
         return torch.stack(
-            [torch.as_tensor(structural_similarity_index_measure(*pair, data_range=1.0)).double() for pair in frames]
+            [torch.as_tensor(structural_similarity_index_measure(*pair, data_range=1.0)).double() for pair in pairs]
         )

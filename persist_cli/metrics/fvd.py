@@ -1,8 +1,8 @@
-"""The Fréchet distance of two Gaussians, without the square root of a matrix that is hardly one.
+"""Fréchet video distance: the Fréchet distance of two Gaussians, fitted to features of generated and true videos.
 
 d² = |μ₁ − μ₂|² + tr Σ₁ + tr Σ₂ − 2 tr (Σ₁Σ₂)^½. With Σ = FᵀF the eigenvalues of Σ₁Σ₂ are the squared singular values
-of F₁F₂ᵀ, so the last trace is the sum of these: real and not negative whatever the rank, where a matrix square root of
-Σ₁Σ₂ turns complex as soon as there are fewer samples than channels.
+of F₁F₂ᵀ, so the last trace is the sum of these: real and not negative whatever the rank. A matrix square root of Σ₁Σ₂
+would turn complex as soon as there are fewer samples than channels.
 """
 
 from __future__ import annotations
@@ -18,40 +18,6 @@ from persist_cli.errors import DataError
 from persist_cli.metrics import i3d
 from persist_cli.metrics.metric import SetMetric, Setup
 from persist_cli.metrics.networks import missing_weights, network_weights, run_network
-
-
-def frechet_distance(features: Float[Tensor, "sample channel"], other: Float[Tensor, "sample channel"]) -> float:
-    """The squared distance of the Gaussians with the means and covariances (n − 1) of two sets of features.
-
-    Works on matrices of the smaller of samples and channels.
-
-    Raises:
-        DataError: when a set has fewer than two samples, the channels differ, or a feature is not finite.
-    """
-    for name, each in (("first", features), ("second", other)):
-        if each.ndim != 2 or len(each) < 2 or each.shape[1] != features.shape[1]:
-            shapes = f"{list(features.shape)} and {list(other.shape)}"
-            raise DataError(f"Fréchet distance of features {shapes}: wanted [sample, channel], at least two samples")
-        if not bool(each.isfinite().all()):
-            raise DataError(f"Fréchet distance: the {name} features are not finite")
-    means = [each.double().mean(0) for each in (features, other)]
-    factors = [_factor(each.double() - mean) for each, mean in zip((features, other), means, strict=True)]
-    return _distance(means[0] - means[1], factors[0], factors[1])
-
-
-def _distance(shift: Tensor, factor: Tensor, other: Tensor) -> float:
-    """From the difference of means and F with FᵀF = Σ of either."""
-    common = torch.linalg.svdvals(factor @ other.T).sum()
-    squared = shift.square().sum() + factor.square().sum() + other.square().sum() - 2 * common
-    return max(0.0, float(squared))
-
-
-def _factor(centred: Float[Tensor, "sample channel"]) -> Tensor:
-    """F with FᵀF the covariance, of at most as many rows as channels."""
-    samples, channels = centred.shape
-    factor = torch.linalg.qr(centred, mode="r").R if samples > channels else centred
-    return factor / math.sqrt(samples - 1)
-
 
 WEIGHTS = "i3d-kinetics-400"
 
@@ -77,7 +43,7 @@ class Fvd(SetMetric):
     )
 
     def obstacle(self, setup: Setup) -> str | None:
-        """It needs its weights, long and many clips."""
+        """The reason when clips are too short or too few, or weights are missing."""
         if setup.frames < LEAST_FRAMES:
             return f"{setup.frames} frames a clip, FVD needs {LEAST_FRAMES}"
         if setup.clips < LEAST_VIDEOS:
@@ -93,7 +59,7 @@ class Fvd(SetMetric):
         if len(rgb) < LEAST_FRAMES:
             raise DataError(f"a video of {len(rgb)} frames, FVD needs {LEAST_FRAMES}")
         weights = network_weights(WEIGHTS, i3d.tensor_shapes())
-        return run_network(lambda videos: i3d.logits(weights, torch.stack([*map(resized, videos)])), rgb[None])[0]
+        return run_network(lambda videos: i3d.logits(weights, torch.stack([*map(resize, videos)])), rgb[None])[0]
 
     def distance(
         self, features: Float[Tensor, "video channel"], true_features: Float[Tensor, "video channel"]
@@ -102,8 +68,37 @@ class Fvd(SetMetric):
         return frechet_distance(features, true_features)
 
 
-def resized(rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "3 frame 224 224"]:
-    """A video as the network takes it."""
+def resize(rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "3 frame 224 224"]:
+    """Resize a video as the network takes it, RGB in [-1, 1]."""
     frames = rgb.permute(0, 3, 1, 2).float()
     frames = functional.interpolate(frames, size=(SIZE, SIZE), mode="bilinear", align_corners=False)
     return frames.permute(1, 0, 2, 3) / 127.5 - 1
+
+
+def frechet_distance(first: Float[Tensor, "sample channel"], second: Float[Tensor, "sample channel"]) -> float:
+    """The squared distance of the Gaussians with the means and covariances (n − 1) of two sets of features.
+
+    It works on matrices of the smaller of samples and channels.
+
+    Raises:
+        DataError: when a set has fewer than two samples, the channels differ, or a feature is not finite.
+    """
+    for name, features in (("first", first), ("second", second)):
+        if features.ndim != 2 or len(features) < 2 or features.shape[1] != first.shape[1]:
+            shapes = f"{list(first.shape)} and {list(second.shape)}"
+            raise DataError(f"Fréchet distance of features {shapes}: wanted [sample, channel], at least two samples")
+        if not bool(features.isfinite().all()):
+            raise DataError(f"Fréchet distance: the {name} features are not finite")
+    means = [features.double().mean(0) for features in (first, second)]
+    shift = means[0] - means[1]
+    factors = [_factor(features.double() - mean) for features, mean in zip((first, second), means, strict=True)]
+    common = torch.linalg.svdvals(factors[0] @ factors[1].T).sum()
+    squared = shift.square().sum() + factors[0].square().sum() + factors[1].square().sum() - 2 * common
+    return max(0.0, float(squared))
+
+
+def _factor(centred: Float[Tensor, "sample channel"]) -> Tensor:
+    """The matrix F with FᵀF the covariance, of at most as many rows as channels."""
+    samples, channels = centred.shape
+    factor = torch.linalg.qr(centred, mode="r").R if samples > channels else centred
+    return factor / math.sqrt(samples - 1)

@@ -18,7 +18,7 @@ EPSILON = 1e-3  # of the batch normalisation, which has no scale
 CLASSES = 400
 STEM = {"Conv3d_1a_7x7": (3, 64, 7), "Conv3d_2b_1x1": (64, 64, 1), "Conv3d_2c_3x3": (64, 192, 3)}
 LOGITS = "Logits/Conv3d_0c_1x1"
-# input channels; then those of branch 0, of the two units of branches 1 and 2, and of branch 3
+# input channels, then output channels of branch 0, of the two units of branches 1 and 2, and of branch 3
 MIXED = {
     "Mixed_3b": (192, 64, 96, 128, 16, 32, 32),
     "Mixed_3c": (256, 128, 128, 192, 32, 96, 64),

@@ -24,10 +24,10 @@ class Convolution:
     """One convolution with its ReLU.
 
     Args:
-        channels: in and out.
-        kernel: pixels a side.
-        stride: pixels.
-        padding: pixels.
+        channels: input and output channels.
+        kernel: side of the kernel in pixels.
+        stride: stride in pixels.
+        padding: padding in pixels.
         pool: side of the max pooling of stride 2 before it, 0 for none.
         tap: whether its output is compared.
     """
@@ -62,11 +62,11 @@ class Lpips(FrameMetric):
     better = "lower"
     network: ClassVar[tuple[Convolution, ...]]
     layers: ClassVar[str]
-    least_size: ClassVar[int]  # pixels, below which a pooling has nothing left
+    least_size: ClassVar[int]  # pixels; of smaller images a pooling leaves nothing
 
     @property
     def definition(self) -> str:
-        """Version, network, layers and size."""
+        """A sentence with version, network, layers and image size."""
         return (
             f"LPIPS v0.1 ({self.layers}, learnt heads), RGB in [-1, 1], no resize (images of at least "
             f"{self.least_size} px), float32"
@@ -74,17 +74,17 @@ class Lpips(FrameMetric):
 
     @property
     def weights(self) -> tuple[str, ...]:
-        """Network and heads."""
+        """The one set of weights that holds network and heads."""
         return (self.name,)
 
     def obstacle(self, setup: Setup) -> str | None:
-        """It needs its weights and images that the network does not pool away."""
+        """The reason when images are too small for the network's poolings, or weights are missing."""
         if min(setup.height, setup.width) < self.least_size:
             return f"images of {setup.width}×{setup.height} are smaller than the network's least, {self.least_size} px"
         return missing_weights(self.name)
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Distance of each frame, 0 for an exact copy."""
+        """The distance of each frame, 0 for an exact copy."""
         weights = network_weights(self.name, tensor_shapes(self.network))
         return run_network(
             lambda rgb, truth: perceptual_distance(weights, self.network, rgb, truth),
@@ -142,7 +142,7 @@ def perceptual_distance(
 def features(
     weights: Mapping[str, Tensor], network: tuple[Convolution, ...], rgb: UInt8[Tensor, "frame height width 3"]
 ) -> list[Float[Tensor, "frame channel rows columns"]]:
-    """Outputs of the taps, each pixel's channels of unit length."""
+    """Outputs of the taps, the channels of each pixel normalised to unit length."""
     image = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1
     shift, scale = (image.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
     state, taps = (image - shift) / scale, []

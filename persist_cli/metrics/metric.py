@@ -1,4 +1,4 @@
-"""The abstract metrics: each a small named thing that says what it measures and whether it can."""
+"""The abstract metrics, which say what they measure and whether they can measure it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from persist_cli.errors import DataError
 
 @dataclass(frozen=True)
 class Prediction:
-    """A generated video beside what is really seen from the same cameras.
+    """A generated video beside the true frames from the same cameras.
 
     Args:
-        rgb: generated; the first frame is the given one.
-        depth: generated, metres, 0 = missing.
-        truth: what is really seen, with the cameras of both.
+        rgb: generated frames; the first one is the given frame.
+        depth: generated depth in metres, 0 where it is missing.
+        truth: true frames, with the cameras of both videos.
         first_visits: for each frame the number of the earlier frame whose pose it returns to, -1 for none.
     """
 
@@ -48,15 +48,15 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is going to be measured.
+    """Properties of the clips and the model that decide whether a metric can be measured.
 
     Args:
-        clips: how many.
-        frames: of a clip, the given first one left out.
-        height: pixels.
-        width: pixels.
+        clips: number of clips.
+        frames: predicted frames of a clip, without the given first one.
+        height: height of the images in pixels.
+        width: width of the images in pixels.
         depth: whether the data has true depth.
-        generated_depth: whether what is measured gives depth.
+        generated_depth: whether the model or control gives depth.
         returns: whether clips return to poses they had before.
     """
 
@@ -70,9 +70,11 @@ class Setup:
 
 
 class Metric(ABC):
-    """A figure. ``definition`` is printed beside it; ``better`` says which way is good, ``None`` that neither is.
+    """A measure of generated videos.
 
-    ``guards`` are the names of metrics without which its figure could be misread: they are measured with it.
+    ``definition`` is printed beside its figures. ``better`` says whether a higher or a lower figure is good, ``None``
+    that neither is. ``guards`` are the names of metrics without which its figures could be misread; they are measured
+    with it.
     """
 
     name: ClassVar[str]
@@ -83,20 +85,20 @@ class Metric(ABC):
     @property
     @abstractmethod
     def definition(self) -> str:
-        """What exactly is measured: unit, network, layer, resize, library."""
+        """A sentence that says exactly what is measured: unit, network, layer, resize, library."""
 
     @property
     def weights(self) -> tuple[str, ...]:
-        """Names of the weights it needs, as ``persist weights list`` shows them."""
+        """Names of the weights that it needs, as ``persist weights list`` shows them."""
         return ()
 
     def obstacle(self, setup: Setup) -> str | None:
-        """Why it cannot be measured here, ``None`` when it can."""
+        """The reason why it cannot be measured, ``None`` when it can."""
         return None
 
 
 class FrameMetric(Metric):
-    """A figure for each frame."""
+    """A metric that has a figure for each frame."""
 
     @abstractmethod
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
@@ -104,7 +106,7 @@ class FrameMetric(Metric):
 
 
 class SetMetric(Metric):
-    """A distance between two sets of videos, from features of each video."""
+    """A metric that is a distance between two sets of videos, computed from features of each video."""
 
     @abstractmethod
     def features(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, " channel"]:

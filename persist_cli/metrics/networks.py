@@ -1,4 +1,4 @@
-"""What metrics with a network share: its cached weights, loaded once, and how it is run."""
+"""Networks behind metrics: their cached weights, loaded once, and running them in chunks at full precision."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from persist_cli.io.hub import cached_weight
 Shapes = Mapping[str, tuple[int, ...]]
 
 CHUNK = 16  # frames at once
-CPU_PIXELS = 65536  # and at most so many on a CPU: small frames are faster together, of large ones the memory counts
+CPU_PIXELS = 65536  # at once on a CPU: small frames are faster together, large ones would take too much memory
 
 
 def missing_weights(*names: str) -> str | None:
-    """Why a network cannot run when none of its weights is cached, with the command that mends it."""
+    """The reason why a network cannot run when none of these weights is cached, with the command that fetches them."""
     if any(cached_weight(name) for name in names):
         return None
     return f"weights {' or '.join(names)} are not here: persist weights fetch {names[0]}"
 
 
 def network_device() -> torch.device:
-    """Where networks run: CUDA when there is any."""
+    """The device that networks run on: CUDA where there is any."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -55,9 +55,9 @@ def _read(file: Path, shapes: tuple[tuple[str, tuple[int, ...]], ...], device: t
 def check_shapes(tensors: Mapping[str, Tensor], shapes: Shapes, file: Path) -> None:
     """Raise ``CheckpointError`` naming the file and the first tensor that is missing, of another shape or unknown."""
     for name, shape in shapes.items():
-        found = tuple(tensors[name].shape) if name in tensors else "none"
-        if found != shape:
-            raise CheckpointError(f"{file}: tensor {name!r} is {found}, wanted {shape}; fetch the weights again")
+        file_shape = tuple(tensors[name].shape) if name in tensors else "none"
+        if file_shape != shape:
+            raise CheckpointError(f"{file}: tensor {name!r} is {file_shape}, wanted {shape}; fetch the weights again")
     unknown = sorted(set(tensors) - set(shapes))
     if unknown:
         raise CheckpointError(f"{file}: unknown tensor {unknown[0]!r}; fetch the weights again")
@@ -65,7 +65,10 @@ def check_shapes(tensors: Mapping[str, Tensor], shapes: Shapes, file: Path) -> N
 
 @contextmanager
 def exact_inference() -> Iterator[None]:
-    """No gradients, and on CUDA full float32 by deterministic kernels: by default convolutions round to TF32."""
+    """Compute without gradients, and on CUDA in full float32 by deterministic kernels.
+
+    By default, convolutions on CUDA would round to TF32.
+    """
     with (
         torch.inference_mode(),
         torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False),
@@ -74,11 +77,11 @@ def exact_inference() -> Iterator[None]:
 
 
 def run_network(network: Callable[..., Tensor], *images: Tensor) -> Tensor:
-    """What a network says of each frame, float64 on the CPU.
+    """Run a network on chunks of frames and join its outputs, float64 on the CPU.
 
     Args:
-        network: takes a chunk of each of ``images``, gives one row a frame.
-        images: the frame first, all with equally many.
+        network: takes a chunk of each of ``images`` and gives one row for each frame.
+        images: tensors whose first axis is the frame, all with equally many frames.
     """
     device = network_device()
     chunk = CHUNK if device.type == "cuda" else max(1, min(CHUNK, CPU_PIXELS // math.prod(images[0].shape[1:-1])))

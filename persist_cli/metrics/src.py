@@ -1,4 +1,4 @@
-"""Frames that return to an earlier pose, and how far the path went in between."""
+"""SRC, scene revisit consistency: do frames that return to an earlier pose look as the video did there before?"""
 
 from __future__ import annotations
 
@@ -19,6 +19,97 @@ from persist_cli.io.hub import cached_weight
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
 from persist_cli.metrics.networks import exact_inference, missing_weights, network_device
 
+SIZE = 224  # pixels of the longer side
+
+
+@dataclass(frozen=True)
+class EncoderWeights:
+    """Weights of an encoder whose features are compared.
+
+    Args:
+        name: their name in the cache.
+        title: name of encoder and layer in the metric's definition.
+        layer: block whose output is used, ``None`` for the last.
+    """
+
+    name: str
+    title: str
+    layer: int | None
+
+
+ENCODERS = (
+    EncoderWeights("dinov2-small", "DINOv2-S, block 12", None),
+    EncoderWeights("dinov2-s-derived", "DINOv2-S-derived, block 8", 8),  # its last blocks look tuned for another task
+)
+
+
+class ReturnSimilarity(FrameMetric):
+    """Similarity of two generated frames for each frame that returns to an earlier pose."""
+
+    pairing: ClassVar[str]
+
+    @abstractmethod
+    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
+        """For each frame that returns the two frames that are compared."""
+
+    @property
+    def definition(self) -> str:
+        """A sentence with encoder, layer, pooling and pairing."""
+        return (
+            f"100 × cosine similarity of {chosen_encoder().title} with the final layer norm, mean of patch tokens, "
+            f"longer side resized to {SIZE} px (bicubic, antialiased), {self.pairing}"
+        )
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """The weights of the encoder that is used, the first that is cached."""
+        return (chosen_encoder().name,)
+
+    def obstacle(self, setup: Setup) -> str | None:
+        """The reason when no clip returns or no encoder is cached."""
+        if not setup.returns:
+            return "no clip returns to a pose it had before"
+        return missing_weights(*(encoder.name for encoder in ENCODERS))
+
+    def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
+        """The similarity at each frame that returns, at most 100; NaN at the others."""
+        figures = torch.full((len(prediction.rgb),), math.nan, dtype=torch.float64)
+        features = _last_video_features(prediction.rgb)
+        for frame, (first, second) in self.pairs(prediction).items():
+            figures[frame] = 100 * (features.encode(first) @ features.encode(second)).clamp_max(1.0)
+        return figures
+
+
+class Src(ReturnSimilarity):
+    """Similarity of a frame that returns to the generated frame of the first visit."""
+
+    name = "src"
+    title = "SRC"
+    better = "higher"
+    guards = ("src-away",)
+    pairing = "each frame that returns to an earlier pose against what the video shows at its first visit there"
+
+    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
+        """For each frame that returns the first visit and the frame itself."""
+        return {frame: (first, frame) for frame, first in returns(prediction.first_visits)}
+
+
+class SrcAway(ReturnSimilarity):
+    """The motion guard of SRC: similarity of the first visit to the farthest frame before the return."""
+
+    name = "src-away"
+    title = "SRC away"
+    better = None
+    pairing = (
+        "at each frame that returns, the generated frame of the first visit against that frame in between whose true "
+        "camera is farthest from it (metres + radians), so that a frozen video has 100"
+    )
+
+    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
+        """For each frame that returns the first visit and the farthest frame in between."""
+        cameras = prediction.truth.cameras
+        return {frame: (first, farthest(cameras, first, frame)) for frame, first in returns(prediction.first_visits)}
+
 
 def returns(first_visits: Int64[Tensor, " frame"]) -> list[tuple[int, int]]:
     """Each frame that returns, with the frame of its first visit."""
@@ -32,105 +123,13 @@ def farthest(cameras: Cameras, first: int, last: int) -> int:
     return first + int((metres + torch.deg2rad(degrees)).argmax())
 
 
-SIZE = 224  # pixels of the longer side
-
-
-@dataclass(frozen=True)
-class Backbone:
-    """An encoder whose features are compared.
-
-    Args:
-        weights: their name in the cache.
-        title: printed.
-        layer: block whose output is taken, ``None`` for the last.
-    """
-
-    weights: str
-    title: str
-    layer: int | None
-
-
-BACKBONES = (
-    Backbone("dinov2-small", "DINOv2-S, block 12", None),
-    Backbone("dinov2-s-derived", "DINOv2-S-derived, block 8", 8),  # its last blocks look tuned for something else
-)
-
-
-class Likeness(FrameMetric):
-    """Likeness of two generated frames for each frame that returns to an earlier pose."""
-
-    pairing: ClassVar[str]
-
-    @abstractmethod
-    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
-        """For each frame that returns the two frames that are compared."""
-
-    @property
-    def definition(self) -> str:
-        """Encoder, layer, pooling, pairing and average."""
-        return (
-            f"100 × cosine similarity of {chosen_backbone().title} with the final layer norm, mean of patch tokens, "
-            f"longer side resized to {SIZE} px (bicubic, antialiased), {self.pairing}"
-        )
-
-    @property
-    def weights(self) -> tuple[str, ...]:
-        """Those of the encoder that is used: the first that is cached."""
-        return (chosen_backbone().weights,)
-
-    def obstacle(self, setup: Setup) -> str | None:
-        """It needs clips that return, and an encoder."""
-        if not setup.returns:
-            return "no clip returns to a pose it had before"
-        return missing_weights(*(each.weights for each in BACKBONES))
-
-    def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """Similarity at each frame that returns, at most 100; NaN at the others."""
-        figures = torch.full((len(prediction.rgb),), math.nan, dtype=torch.float64)
-        features = _encoded(prediction.rgb)
-        for frame, (one, other) in self.pairs(prediction).items():
-            figures[frame] = 100 * (features.of(one) @ features.of(other)).clamp_max(1.0)
-        return figures
-
-
-class Src(Likeness):
-    """Likeness of a generated frame to the generated frame of the first visit."""
-
-    name = "src"
-    title = "SRC"
-    better = "higher"
-    guards = ("src-away",)
-    pairing = "each frame that returns to an earlier pose against what the video shows at its first visit there"
-
-    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
-        """The first visit and the frame itself."""
-        return {frame: (first, frame) for frame, first in returns(prediction.first_visits)}
-
-
-class SrcAway(Likeness):
-    """The motion guard of SRC: likeness of the first visit to the farthest frame before the return."""
-
-    name = "src-away"
-    title = "SRC away"
-    better = None
-    pairing = (
-        "at each frame that returns, the generated frame of the first visit against that frame in between whose true "
-        "camera is farthest from it (metres + radians), so that a frozen video has 100"
-    )
-
-    def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
-        """The first visit and the farthest frame in between."""
-        cameras = prediction.truth.cameras
-        return {frame: (first, farthest(cameras, first, frame)) for frame, first in returns(prediction.first_visits)}
-
-
-def chosen_backbone() -> Backbone:
-    """The first whose weights are cached, else the first."""
-    return next((each for each in BACKBONES if cached_weight(each.weights)), BACKBONES[0])
+def chosen_encoder() -> EncoderWeights:
+    """The first encoder whose weights are cached, else the first of all."""
+    return next((encoder for encoder in ENCODERS if cached_weight(encoder.name)), ENCODERS[0])
 
 
 class VideoFeatures:
-    """Features of a video's frames, each encoded once, when first asked for.
+    """Features of a video's frames, each encoded once, when it is first needed.
 
     Args:
         rgb: the video.
@@ -138,28 +137,28 @@ class VideoFeatures:
 
     def __init__(self, rgb: UInt8[Tensor, "frame height width 3"]) -> None:
         self.rgb = rgb
-        self.found: dict[int, Float[Tensor, " channel"]] = {}
+        self.features: dict[int, Float[Tensor, " channel"]] = {}
 
-    def of(self, frame: int) -> Float[Tensor, " channel"]:
-        """Mean patch features of unit length, float64 on the CPU."""
-        if frame not in self.found:
-            backbone = chosen_backbone()
+    def encode(self, frame: int) -> Float[Tensor, " channel"]:
+        """Mean patch features of a frame, of unit length, float64 on the CPU."""
+        if frame not in self.features:
+            weights = chosen_encoder()
             with exact_inference():
-                encoder = _encoder(str(cached_weight(backbone.weights)), backbone.layer, network_device())
+                encoder = _load_encoder(str(cached_weight(weights.name)), weights.layer, network_device())
                 grid = encoder.encode(self.rgb[frame : frame + 1])
                 features = torch.nn.functional.normalize(grid.flatten(1, 2).double().mean(1), dim=-1)
-            self.found[frame] = features[0].cpu()
-        return self.found[frame]
+            self.features[frame] = features[0].cpu()
+        return self.features[frame]
 
 
 @lru_cache(maxsize=1)
-def _encoded(rgb: Tensor) -> VideoFeatures:
-    """Those of the last video, so that both metrics share them."""
+def _last_video_features(rgb: Tensor) -> VideoFeatures:
+    """The features of the last video, so that both metrics share them."""
     return VideoFeatures(rgb)
 
 
 @lru_cache(maxsize=2)
-def _encoder(weights: str, layer: int | None, device: torch.device) -> Encoder:
+def _load_encoder(weights: str, layer: int | None, device: torch.device) -> Encoder:
     from persist_cli.plugins import make_encoder
 
     return make_encoder("dinov2", {"weights": weights, "size": SIZE, "layer": layer}).to(device)

@@ -13,13 +13,13 @@ from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
 from persist_cli.evaluate.rows.controls import CodecReconstruction, Copy, Nearest, Warp
 from persist_cli.evaluate.rows.warp import Surface, warp
-from tests.support.predictions import seen
+from tests.support.predictions import observe_room
 from tests.support.rooms import Room, look
 
 
 def room(*poses: np.ndarray) -> Observations:
     """Views of the furnished room from these poses."""
-    return seen(np.stack(poses), Room(64, 64))
+    return observe_room(np.stack(poses), Room(64, 64))
 
 
 def warped(earlier: Observations, view: Observations) -> tuple[torch.Tensor, torch.Tensor]:

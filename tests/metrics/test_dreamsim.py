@@ -1,13 +1,15 @@
+"""DreamSim on random weights, against transformers' network."""
+
 import pytest
 import torch
 
 from persist_cli.metrics import METRICS, dreamsim
-from tests.support.predictions import cache_random, noise, prediction, setup, still
+from tests.support.predictions import cache_random, prediction, random_frames, setup, still_camera
 
 DREAMSIM = METRICS["dreamsim"]
 
 
-def test_it_is_not_measured_without_weights_that_only_a_folder_can_bring(tmp_path, monkeypatch):
+def test_missing_weights_are_an_obstacle_that_names_the_folder_option(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     assert DREAMSIM.obstacle(setup()) == ("weights dreamsim are not here: persist weights fetch dreamsim --from DIR")
 
@@ -20,17 +22,17 @@ def narrow(tmp_path, monkeypatch):
     cache_random(tmp_path, "dreamsim", dreamsim.tensor_shapes())
 
 
-def test_a_copy_has_no_distance_and_another_image_has_some(narrow):
-    (rgb, depth), (other, _) = noise(0, frames=3), noise(1, frames=3)
-    truth = still(rgb, depth)
+def test_only_a_copy_has_no_distance_and_a_frame_counts_alone_as_among_others(narrow):
+    (rgb, depth), (other, _) = random_frames(0, frames=3), random_frames(1, frames=3)
+    truth = still_camera(rgb, depth)
     assert DREAMSIM.measure(prediction(rgb, depth, truth)).tolist() == pytest.approx([0.0] * 3, abs=1e-12)
     figures = DREAMSIM.measure(prediction(other, depth, truth))
     assert figures.min() > 0
-    alone = DREAMSIM.measure(prediction(other[1:2], depth[1:2], still(rgb[1:2], depth[1:2])))
+    alone = DREAMSIM.measure(prediction(other[1:2], depth[1:2], still_camera(rgb[1:2], depth[1:2])))
     assert torch.equal(alone, figures[1:2])
 
 
-def test_the_network_is_that_of_transformers(narrow):
+def test_the_class_token_equals_the_one_of_transformers(narrow):
     from transformers import ViTConfig, ViTModel
 
     from persist_cli.metrics.networks import network_weights
@@ -38,16 +40,16 @@ def test_the_network_is_that_of_transformers(narrow):
     weights = network_weights("dreamsim", dreamsim.tensor_shapes())
     sizes = {"hidden_size": 24, "intermediate_size": 96, "num_hidden_layers": 12, "num_attention_heads": 12}
     network = ViTModel(ViTConfig(layer_norm_eps=1e-6, **sizes), add_pooling_layer=False).eval()
-    network.load_state_dict(renamed(weights))
-    rgb, _ = noise(0, frames=1, size=224)
-    mean, std = (torch.tensor(each)[:, None, None] for each in (dreamsim.MEAN, dreamsim.STD))
+    network.load_state_dict(rename_tensors(weights))
+    rgb, _ = random_frames(0, frames=1, size=224)
+    mean, std = (torch.tensor(values)[:, None, None] for values in (dreamsim.MEAN, dreamsim.STD))
     with torch.no_grad():
         states = network((rgb.permute(0, 3, 1, 2) / 255 - mean) / std, output_hidden_states=True).hidden_states
     torch.testing.assert_close(dreamsim.class_token(weights, rgb), states[-1][:, 0], atol=1e-4, rtol=1e-4)
 
 
-def renamed(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The tensors by the names that transformers gives them."""
+def rename_tensors(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Give the tensors the names that transformers uses."""
     names = {
         "cls_token": "embeddings.cls_token", "pos_embed": "embeddings.position_embeddings", "norm1": "layernorm_before",
         "norm2": "layernorm_after", "blocks": "layers", "attn.proj": "attention.o_proj", "norm.": "layernorm.",
@@ -56,11 +58,11 @@ def renamed(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     tensors = {}
     for name, tensor in weights.items():
         new = name
-        for old, theirs in names.items():
-            new = new.replace(old, theirs)
+        for old, replacement in names.items():
+            new = new.replace(old, replacement)
         if "attn.qkv" in name:
-            for part, each in zip("qkv", tensor.chunk(3), strict=True):
-                tensors[new.replace("attn.qkv", f"attention.{part}_proj")] = each
+            for letter, chunk in zip("qkv", tensor.chunk(3), strict=True):
+                tensors[new.replace("attn.qkv", f"attention.{letter}_proj")] = chunk
         else:
             tensors[new] = tensor
     return tensors

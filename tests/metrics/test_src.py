@@ -1,3 +1,5 @@
+"""SRC and its motion guard on a turn there and back."""
+
 from dataclasses import replace
 
 import pytest
@@ -6,16 +8,16 @@ import torch
 from persist_cli.io.files import write_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS
-from persist_cli.metrics.src import BACKBONES, farthest
+from persist_cli.metrics.src import ENCODERS, farthest
 from tests.support.predictions import setup, there_and_back
 
 SRC, AWAY = METRICS["src"], METRICS["src-away"]
-any_encoder = pytest.mark.skipif(
-    not any(cached_weight(each.weights) for each in BACKBONES), reason="no weights of an encoder for SRC"
+needs_encoder = pytest.mark.skipif(
+    not any(cached_weight(encoder.name) for encoder in ENCODERS), reason="no weights of an encoder for SRC"
 )
 
 
-def cache_tiny(folder):
+def cache_random_encoder(folder):
     """A random DINOv2 of nine blocks as a cached weight."""
     from transformers import Dinov2Config, Dinov2Model
 
@@ -25,10 +27,10 @@ def cache_tiny(folder):
     write_json(folder / "weight.json", {})
 
 
-@pytest.fixture(params=[each.weights for each in BACKBONES])
+@pytest.fixture(params=[encoder.name for encoder in ENCODERS])
 def encoder(request, tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
-    cache_tiny(tmp_path / "weights" / request.param)
+    cache_random_encoder(tmp_path / "weights" / request.param)
 
 
 def test_the_truth_has_100_at_returns_and_no_figure_elsewhere(encoder):
@@ -38,7 +40,7 @@ def test_the_truth_has_100_at_returns_and_no_figure_elsewhere(encoder):
     assert figures[4:].max() <= 100
 
 
-def test_a_place_that_looks_otherwise_on_return_has_less(encoder):
+def test_a_place_that_looks_different_on_return_has_less(encoder):
     clip = there_and_back()
     changed = clip.rgb.clone()
     changed[5] = 255 - changed[5]
@@ -60,14 +62,14 @@ def test_a_frame_counts_the_same_alone_and_among_others_to_the_bit(encoder):
     assert SRC.measure(replace(changed, first_visits=clip.first_visits))[4] == SRC.measure(changed)[4]
 
 
-@any_encoder
-def test_real_features_tell_the_way_there_from_the_place():
+@needs_encoder
+def test_real_features_distinguish_the_way_there_from_the_place():
     clip = there_and_back()
     assert (AWAY.measure(clip)[4:] < 97).all()
     assert (SRC.measure(clip)[4:] > 99.99).all()
 
 
-def test_the_definition_says_which_weights_are_used(tmp_path, monkeypatch):
+def test_the_definition_names_the_weights_that_are_used(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     assert SRC.obstacle(setup()) == (
         "weights dinov2-small or dinov2-s-derived are not here: persist weights fetch dinov2-small"

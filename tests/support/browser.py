@@ -1,4 +1,4 @@
-"""A real browser, headless and offline, to look at pages."""
+"""A real browser, headless and offline, that opens pages and reports what it shows."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ QUIET = (
     "--disable-component-update", "--disable-sync", "--virtual-time-budget=10000", "--enable-logging=stderr",
 )  # fmt: skip
 
-# Run inside a copy of the page, which its own rules would forbid: what a reader's browser makes of it.
-LOOK = """<script>
+# A script that describes the page from inside. It runs in a copy, because the page's own policy forbids scripts.
+DESCRIBE_PAGE = """<script>
 addEventListener("load", () => {
   const whole = image => image.complete && image.naturalWidth > 0;
   const truths = {
@@ -25,16 +25,16 @@ addEventListener("load", () => {
     drawn: [...document.querySelectorAll(".plot")].filter(plot => plot.getBBox().width > 300).length,
     across: document.documentElement.scrollWidth - innerWidth,
     scripts: document.scripts.length,
-    fetched: performance.getEntriesByType("resource").map(each => each.name).filter(name => !name.startsWith("data:")),
+    fetched: performance.getEntriesByType("resource").map(file => file.name).filter(name => !name.startsWith("data:")),
   };
   const videos = [...document.querySelectorAll("video")];
   const ready = videos.map(video => video.readyState ? 1 : new Promise(done => {
     video.onloadedmetadata = () => done(1); video.onerror = () => done(0);
   }));
   Promise.all(ready).then(playable => {
-    truths.playable = playable.reduce((sum, each) => sum + each, 0);
-    const said = document.createElement("pre");
-    said.id = "truths"; said.textContent = JSON.stringify(truths); document.body.append(said);
+    truths.playable = playable.reduce((sum, one) => sum + one, 0);
+    const report = document.createElement("pre");
+    report.id = "truths"; report.textContent = JSON.stringify(truths); document.body.append(report);
   });
 });
 </script>"""
@@ -43,7 +43,7 @@ POLICY = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
 
 
 def open_page(page: Path, profile: Path, width: int = 1280) -> tuple[str, list[str]]:
-    """The page's DOM after loading, and what the browser complained about in its console."""
+    """Open a page and return its DOM after loading and the complaints in the browser's console."""
     ended = subprocess.run(
         [str(CHROMIUM), *QUIET, f"--window-size={width},900", f"--user-data-dir={profile}", "--dump-dom",
          page.as_uri()],

@@ -35,7 +35,7 @@ DREAMSIM = "weights dreamsim are not here: persist weights fetch dreamsim"
 
 
 def cell(metric: str, gain: float, clips: int, first: bool, random: bool) -> dict[str, Any]:
-    """A figure that is better than the metric's usual one by a share."""
+    """A cell whose figure is better than the metric's usual one by the share ``gain``."""
     _, better, _, usual, _ = METRICS[metric]
     noise = np.random.default_rng(500 + round(1000 * gain)).normal(0, 0.02, clips)
     factor = gain if better == "higher" else -gain
@@ -79,8 +79,8 @@ def example_results(clips: int = 6, frames: int = 9, rows: dict[str, str] = ROWS
     metrics["dreamsim"] = {"title": "DreamSim", "better": "lower", "definition": "ensemble", "weights": {}}
     columns = {
         key: {"metric": metric, "title": title, "better": METRICS[metric][1], "definition": METRICS[metric][2],
-              "frames": part}
-        for key, (metric, title, part) in COLUMNS.items()
+              "frames": selection}
+        for key, (metric, title, selection) in COLUMNS.items()
     }  # fmt: skip
     columns["dreamsim"] = {"metric": "dreamsim", "title": "DreamSim", "better": "lower", "definition": "ensemble",
                            "frames": "all"}  # fmt: skip
@@ -100,40 +100,42 @@ def example_results(clips: int = 6, frames: int = 9, rows: dict[str, str] = ROWS
 
 
 def measured(clips: int, frames: int, metrics: dict[str, Any]) -> dict[str, Any]:
-    """What two runs must share."""
+    """The part of the results that two runs must share to be compared."""
     return {
         "protocol": {"name": "revisit", "title": "Revisit", "definition": "Clips that look at places visited before.",
                      "frames": frames},
-        "data": [{"path": "runs/houses-test", "trajectories": {f"house-{each}": f"{each:064x}" for each in range(3)}}],
+        "data": [{"path": "runs/houses-test", "trajectories": {f"house-{n}": f"{n:064x}" for n in range(3)}}],
         "image_size": [64, 64],
         "clips": [
-            {"data": 0, "trajectory": f"house-{each % 3}", "scene": f"{each % 3}", "start": 12 * each,
+            {"data": 0, "trajectory": f"house-{clip % 3}", "scene": f"{clip % 3}", "start": 12 * clip,
              "frames": frames, "seen_before": [None, *np.linspace(0.3, 0.9, frames - 1)], "path_metres": 1.5}
-            for each in range(clips)
+            for clip in range(clips)
         ],
         "metrics": metrics,
     }  # fmt: skip
 
 
 def example_pictures(results: dict[str, Any], size: int = 32) -> Pictures:
-    """Walks past coloured stripes: every row's video is the truth under noise of its own."""
+    """Pictures of walks past coloured stripes; every row's video is the truth with some noise."""
     frames = results["measured"]["protocol"]["frames"]
     names = list(results["tables"][0]["rows"])
 
-    def walk(clip: int, noise: float) -> torch.Tensor:
+    def make_video(clip: int, noise: float) -> torch.Tensor:
         across = torch.arange(size)[None, None, :] + 2 * torch.arange(frames)[:, None, None] + 5 * clip
         waves = [(torch.sin(across * pitch) * 90 + 128).expand(frames, size, size) for pitch in (0.2, 0.31, 0.47)]
         clean = torch.stack(waves, dim=-1) * torch.linspace(0.6, 1.1, size)[None, :, None, None]
-        shaken = clean + noise * torch.randn(clean.shape, generator=torch.Generator().manual_seed(clip))
-        return shaken.clamp(0, 255).to(torch.uint8)
+        noisy = clean + noise * torch.randn(clean.shape, generator=torch.Generator().manual_seed(clip))
+        return noisy.clamp(0, 255).to(torch.uint8)
 
-    def clip(number: int, noise: float) -> ClipPicture:
-        depth = walk(number, 0.0)[..., 0].float() / 50
-        return ClipPicture(number, f"PSNR {30 - noise:.2f}", walk(number, noise), walk(number, 0.0), depth + 0.2, depth)
+    def make_clip(number: int, noise: float) -> ClipPicture:
+        depth = make_video(number, 0.0)[..., 0].float() / 50
+        return ClipPicture(
+            number, f"PSNR {30 - noise:.2f}", make_video(number, noise), make_video(number, 0.0), depth + 0.2, depth
+        )
 
     rows = tuple(
-        RowPictures("all", name, clip(0, 5.0), clip(1, 15.0 + number), clip(2, 30.0))
+        RowPictures("all", name, make_clip(0, 5.0), make_clip(1, 15.0 + number), make_clip(2, 30.0))
         for number, name in enumerate(names)
     )
-    sheet = Sheet("clip 0", (("ground truth", walk(0, 0.0)), *((name, walk(0, 9.0)) for name in names)))
+    sheet = Sheet("clip 0", (("ground truth", make_video(0, 0.0)), *((name, make_video(0, 9.0)) for name in names)))
     return Pictures(rows, (sheet,))
