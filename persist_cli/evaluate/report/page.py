@@ -10,17 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.errors import PersistError
-from persist_cli.evaluate.report.curves import (
-    COLORS,
-    DARK_COLORS,
-    HEIGHT,
-    WIDTH,
-    Plot,
-    plots,
-    row_styles,
-)
+from persist_cli.evaluate.report.curves import COLORS, DARK_COLORS, HEIGHT, WIDTH, Plot, plots, row_styles
 from persist_cli.evaluate.report.latex import latex_tables
-from persist_cli.evaluate.report.pictures import Pictures, ShownRow, file_name, show_rows, show_sheets
+from persist_cli.evaluate.report.pictures import Pictures, RowClips, file_name, write_row_clips, write_sheets
 from persist_cli.evaluate.report.result_file import FILE, EvalResults, check_results
 from persist_cli.evaluate.report.tables import TableView, view_tables
 from persist_cli.evaluate.report.text import table_text
@@ -41,7 +33,7 @@ class Section:
 
     view: TableView
     plots: list[Plot]
-    rows: list[ShownRow]
+    rows: list[RowClips]
 
 
 def write_report(results: Mapping[str, Any], pictures: Pictures, folder: Path) -> None:
@@ -75,7 +67,7 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
     jinja = _jinja()
     curve = jinja.get_template("curve.svg.jinja")
     styles = row_styles(results)
-    rows = show_rows(pictures, folder)
+    rows = write_row_clips(pictures, folder)
     common = {"styles": list(styles.values()), "colors": COLORS, "width": WIDTH, "height": HEIGHT}
     sections = []
     for place, (table, view) in enumerate(zip(results.tables, view_tables(results), strict=True)):
@@ -85,7 +77,7 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
             write_text(folder / "curves" / f"{name}.svg", curve.render(plot=plot, legend=True, **common))
         sections.append(Section(view, table_plots, [row for row in rows if row.table == table.name]))
     return jinja.get_template("report.html.jinja").render(
-        results=results, sections=sections, sheets=show_sheets(pictures, folder), dark_colors=DARK_COLORS,
+        results=results, sections=sections, sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
         facts=_environment_facts(results), lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
         **common,
     )  # fmt: skip

@@ -17,20 +17,20 @@ from persist_cli.viewing.video import SMALLEST, below, beside, color_depth, enla
 
 SHEET_FRAMES = 9  # of a clip on a contact sheet, so that they are large enough to look at on a page
 
-CHUNK = 16  # frames made smaller at once, as floats
+CHUNK = 16  # frames that are averaged down at once, as floats
 
 
 @dataclass(frozen=True)
 class ClipPicture:
-    """A generated clip beside what is really seen.
+    """A generated clip beside the true one.
 
     Args:
-        clip: number in the results' ``measured.clips``.
-        figure: what made it best, median or worst, as in ``PSNR 21.30``.
+        clip: number of the clip in ``measured.clips`` of the results.
+        figure: figure that made it best, median or worst, as in ``PSNR 21.30``.
         generated: frames of the row.
-        truth: frames really seen, as many and as large.
-        depth: generated, metres, 0 = missing.
-        true_depth: metres, 0 = missing.
+        truth: true frames, as many and as large.
+        depth: generated depth in metres, 0 where it is missing.
+        true_depth: true depth in metres, 0 where it is missing.
     """
 
     clip: int
@@ -52,16 +52,16 @@ class RowPictures:
     worst: ClipPicture
 
     def picks(self) -> list[tuple[str, ClipPicture]]:
-        """Each clip once, with what it is: ``best``, or ``best, median`` when it is both."""
-        chosen: dict[int, tuple[list[str], ClipPicture]] = {}
+        """Each clip once, under ``best``, or under ``best, median`` when it is both."""
+        picks: dict[int, tuple[list[str], ClipPicture]] = {}
         for name, clip in (("best", self.best), ("median", self.median), ("worst", self.worst)):
-            chosen.setdefault(clip.clip, ([], clip))[0].append(name)
-        return [(", ".join(names), clip) for names, clip in chosen.values()]
+            picks.setdefault(clip.clip, ([], clip))[0].append(name)
+        return [(", ".join(names), clip) for names, clip in picks.values()]
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A contact sheet of one clip: each row's name with its frames."""
+    """A contact sheet of one clip, with the name and the frames of each row."""
 
     title: str
     rows: tuple[tuple[str, UInt8[Tensor, "frame height width 3"]], ...]
@@ -69,15 +69,15 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Pictures:
-    """All that a report shows beside figures; nothing is a report without pictures."""
+    """The pictures of a report; both parts may be empty."""
 
     rows: tuple[RowPictures, ...] = ()
     sheets: tuple[Sheet, ...] = ()
 
 
 @dataclass(frozen=True)
-class ShownClip:
-    """A clip in the report, its video and contact sheet as data URIs."""
+class ClipView:
+    """A clip in the report, with its video and contact sheet as data URIs."""
 
     pick: str
     clip: int
@@ -87,55 +87,55 @@ class ShownClip:
 
 
 @dataclass(frozen=True)
-class ShownRow:
-    """A row's clips in the report."""
+class RowClips:
+    """The clips of a row in the report."""
 
     table: str
     row: str
-    clips: list[ShownClip]
+    clips: list[ClipView]
 
 
-def show_rows(pictures: Pictures, folder: Path) -> list[ShownRow]:
-    """Write ``clips/*.mp4`` and ``sheets/*.png`` of every row and give them for the page."""
-    shown = []
-    for place, each in enumerate(pictures.rows):
+def write_row_clips(pictures: Pictures, folder: Path) -> list[RowClips]:
+    """Write ``clips/*.mp4`` and ``sheets/*.png`` of every row, and return them for the page."""
+    rows = []
+    for place, row in enumerate(pictures.rows):
         clips = []
-        for pick, clip in each.picks():
-            name = file_name(place, each.table, each.row, pick)
+        for pick, clip in row.picks():
+            name = file_name(place, row.table, row.row, pick)
             video, sheet = folder / "clips" / f"{name}.mp4", folder / "sheets" / f"{name}.png"
             write_video(video, side_by_side(clip))
             write_sheet(sheet, sheet_rows(clip), most=SHEET_FRAMES)
-            clips.append(ShownClip(pick, clip.clip, clip.figure, data_uri(video, "video/mp4"), picture_uri(sheet)))
-        shown.append(ShownRow(each.table, each.row, clips))
-    return shown
+            clips.append(ClipView(pick, clip.clip, clip.figure, data_uri(video, "video/mp4"), picture_uri(sheet)))
+        rows.append(RowClips(row.table, row.row, clips))
+    return rows
 
 
-def show_sheets(pictures: Pictures, folder: Path) -> list[tuple[str, str]]:
-    """Write the common ``sheets/*.png`` and give title and data URI of each."""
-    shown = []
+def write_sheets(pictures: Pictures, folder: Path) -> list[tuple[str, str]]:
+    """Write the common ``sheets/*.png``, and return title and data URI of each."""
+    titled_uris = []
     for place, sheet in enumerate(pictures.sheets):
         path = folder / "sheets" / f"{file_name(place, 'rows', sheet.title)}.png"
         write_sheet(path, sheet.rows, most=SHEET_FRAMES)
-        shown.append((sheet.title, picture_uri(path)))
-    return shown
+        titled_uris.append((sheet.title, picture_uri(path)))
+    return titled_uris
 
 
 def side_by_side(clip: ClipPicture) -> UInt8[Tensor, "frame height width 3"]:
-    """Truth left and generated right under their names, depth below where both have it."""
+    """The true video left and the generated one right, with depth below where both have it."""
     videos = beside([labelled(_fit(clip.truth), "truth"), labelled(_fit(clip.generated), "generated")])
     pair = _depths(clip)
     return videos if pair is None else below([videos, beside([_fit(depth) for depth in pair])])
 
 
 def sheet_rows(clip: ClipPicture) -> list[tuple[str, UInt8[Tensor, "frame height width 3"]]]:
-    """Rows of the clip's contact sheet."""
+    """The rows of the clip's contact sheet, by name."""
     rows = [("truth", clip.truth), ("generated", clip.generated)]
     pair = _depths(clip)
     return rows if pair is None else [*rows, ("true depth", pair[0]), ("depth", pair[1])]
 
 
 def _depths(clip: ClipPicture) -> tuple[Tensor, Tensor] | None:
-    """True and generated depth in colours of one scale."""
+    """True and generated depth in colours of one scale, ``None`` where one is missing."""
     if clip.depth is None or clip.true_depth is None:
         return None
     known = clip.true_depth[clip.true_depth > 0]
@@ -144,7 +144,7 @@ def _depths(clip: ClipPicture) -> tuple[Tensor, Tensor] | None:
 
 
 def _fit(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame height width 3"]:
-    """Large frames averaged down and small ones enlarged, so that a report stays light and can be seen."""
+    """Average large frames down and enlarge small ones, so that a report stays light and can be seen."""
     factor = min(video.shape[1:3]) // SMALLEST
     if factor < 2:
         return enlarge(video.cpu())
@@ -156,21 +156,21 @@ def _fit(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame h
 
 
 def file_name(place: int, *parts: str) -> str:
-    """A name that any file system takes, different for each place."""
+    """A file name that any file system takes, different for each place."""
     words = [re.sub(r"[^a-z0-9]+", "-", part.lower()).strip("-")[:40] for part in parts]
     return "-".join([f"{place:02d}", *(word for word in words if word)])
 
 
 def data_uri(path: Path, kind: str) -> str:
-    """A file as a data URI of a MIME type."""
+    """The file's content as a data URI of a MIME type."""
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 
 def picture_uri(path: Path) -> str:
-    """A PNG file as a data URI, in WebP because a page holds many."""
+    """The picture in a PNG file as a data URI, in WebP because a page holds many."""
     from PIL import Image
 
-    packed = io.BytesIO()
+    webp = io.BytesIO()
     with Image.open(path) as picture:
-        picture.save(packed, format="WEBP", quality=90)
-    return f"data:image/webp;base64,{base64.b64encode(packed.getvalue()).decode('ascii')}"
+        picture.save(webp, format="WEBP", quality=90)
+    return f"data:image/webp;base64,{base64.b64encode(webp.getvalue()).decode('ascii')}"
