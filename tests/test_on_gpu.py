@@ -18,7 +18,7 @@ from persist_cli.plugins import make_encoder
 from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
-from tests.support.room_views import empty, same_bits, walked
+from tests.support.room_views import empty_memory, room_walk, same_bits
 from tests.support.walking import MICRO_SETTINGS, SIZE, losses, stage, train_here
 
 DEVICE = os.environ.get("PERSIST_TEST_DEVICE", "cuda")
@@ -40,8 +40,8 @@ def close(one, other):
 
 @pytest.mark.parametrize("name", MAPS)
 def test_a_memory_is_built_and_read_where_its_frames_lie_and_is_that_of_the_cpu(name):
-    seen = walked(6)
-    here, there = empty(name), empty(name)
+    seen = room_walk(6)
+    here, there = empty_memory(name), empty_memory(name)
     here.write(seen)
     there.write(seen.to(DEVICE))
     assert everywhere(there.tensors().values())
@@ -66,8 +66,8 @@ def test_what_a_clip_remembers_is_made_where_it_trains(name, walks):
 
 
 def test_a_map_of_means_is_that_of_the_cpu_but_for_the_order_of_sums():
-    seen = walked(6)
-    here, there = empty("voxel", pooling="mean"), empty("voxel", pooling="mean")
+    seen = room_walk(6)
+    here, there = empty_memory("voxel", pooling="mean"), empty_memory("voxel", pooling="mean")
     here.write(seen)
     there.write(seen.to(DEVICE))
     mine, others = here.tensors(), there.tensors()
@@ -76,8 +76,8 @@ def test_a_map_of_means_is_that_of_the_cpu_but_for_the_order_of_sums():
 
 
 def test_a_full_album_drops_the_same_snapshots_as_on_the_cpu():
-    seen = walked(12)
-    here, there = empty("snapshots", capacity=5), empty("snapshots", capacity=5)
+    seen = room_walk(12)
+    here, there = empty_memory("snapshots", capacity=5), empty_memory("snapshots", capacity=5)
     here.write(seen)
     there.write(seen.to(DEVICE))
     assert torch.equal(here.tensors()["content"], there.tensors()["content"].cpu())
@@ -85,12 +85,12 @@ def test_a_full_album_drops_the_same_snapshots_as_on_the_cpu():
 
 @pytest.mark.parametrize("name", MAPS)
 def test_a_memory_file_is_read_where_the_model_computes(name, tmp_path):
-    memory = empty(name)
-    memory.write(walked(3))
+    memory = empty_memory(name)
+    memory.write(room_walk(3))
     memory.save(tmp_path / "m.safetensors")
     loaded = load_memory(tmp_path / "m.safetensors").to(DEVICE)
     assert everywhere(loaded.tensors().values())
-    assert len(loaded.read(walked(3).cameras, 16)) == 16
+    assert len(loaded.read(room_walk(3).cameras, 16)) == 16
 
 
 @pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
@@ -121,7 +121,7 @@ def world(walks):
         backbone = micro()
         backbone.add_adapter(name, make_encoder("patches", {}).channels, {"width": 16, "heads": 2})
         shaken(backbone, 0.02)
-        memory = empty(name, up=first.info.world_up)
+        memory = empty_memory(name, up=first.info.world_up)
         model = WorldModel(backbone.to(device, precision), [Agent(memory)], sampling)
         model.reset([first.observations], [first.info])
         return model

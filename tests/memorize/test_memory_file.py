@@ -11,13 +11,13 @@ from safetensors.torch import save_file
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import read_tensors
 from persist_cli.memorize.memory_file import load_memory, read_header
-from tests.support.room_views import MEMORIES, same_bits, walked, written
+from tests.support.room_views import MEMORIES, room_walk, same_bits, written_memory
 
 
 @pytest.fixture
 def saved(tmp_path):
     path = tmp_path / "room.safetensors"
-    written("voxel", walked(3), cell=(0.5, 1.0, 0.5), encoder={"channels": 8}).save(path)
+    written_memory("voxel", room_walk(3), cell=(0.5, 1.0, 0.5), encoder={"channels": 8}).save(path)
     return path
 
 
@@ -31,19 +31,19 @@ def with_header(path, **changes):
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_a_memory_survives_save_and_load_bit_for_bit(tmp_path, name):
-    memory = written(name, walked())
+    memory = written_memory(name, room_walk())
     memory.save(tmp_path / "memory.safetensors")
     loaded = load_memory(tmp_path / "memory.safetensors")
     assert same_bits(memory, loaded)
     assert (type(loaded), loaded.settings, loaded.reference) == (type(memory), memory.settings, memory.reference)
-    cameras = walked().cameras
+    cameras = room_walk().cameras
     assert torch.equal(memory.read(cameras, 99).features, loaded.read(cameras, 99).features)
 
 
 def test_the_file_does_not_depend_on_the_order_of_writing(tmp_path):
-    forward, backward = walked(4), walked(4)[[3, 2, 1, 0]]
+    forward, backward = room_walk(4), room_walk(4)[[3, 2, 1, 0]]
     for name, observations in (("a", forward), ("b", backward)):
-        written("voxel", observations).save(tmp_path / name)
+        written_memory("voxel", observations).save(tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 

@@ -1,95 +1,112 @@
-"""tests.memory.test_batched_reads."""
+"""Reading a memory for several camera paths at once, as the branches of a rollout do, and copies of memories."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from torch.profiler import ProfilerActivity, profile
 
-from persist_memory.grid.visibility import Views
-from tests.support.room_views import MEMORIES, empty, observe, same_bits, walked, written
+from persist_memory.batched_reads import distinct_cameras
+from tests.support.room_views import MEMORIES, empty_memory, observe, room_walk, same_bits, written_memory
 from tests.support.rooms import look
 
 
-def branches(start=30.0):
-    """Cameras of four ways from one place: two turn alike at first, one stays, one is shorter."""
-    ways = ([0, 8, 16, 24], [0, 8, 16, 0], [0, 0, 0, 0], [0, -20])
-    return [observe([look((0.0, 1.4, 0.0), start + turn, 0.0) for turn in way]).cameras for way in ways]
+def branches():
+    """Camera paths from one place: two that turn alike at first, one that stays, and a shorter one."""
+    turns = ([0, 8, 16, 24], [0, 8, 16, 0], [0, 0, 0, 0], [0, -20])
+    return [observe([look((0.0, 1.4, 0.0), 30.0 + turn, 0.0) for turn in path]).cameras for path in turns]
 
 
-def same(one, other):
+def equal_tokens(one, other):
     return all(torch.equal(getattr(one, name), getattr(other, name)) for name in ("features", "positions", "mask"))
+
+
+def allocated_bytes(work):
+    """Bytes that torch allocates on the CPU during a piece of work, whether freed again or not."""
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
+        work()
+    return sum(max(event.self_cpu_memory_usage, 0) for event in profiler.events())
+
+
+def each_path_gets_what_it_gets_alone(memory, paths, budget):
+    batch = memory.read_batch(paths, budget)
+    alone = [memory.read(path, budget) for path in paths]
+    return all(equal_tokens(*pair) for pair in zip(batch, alone, strict=True))
 
 
 @pytest.mark.parametrize("budget", [0, 7, 300])
 @pytest.mark.parametrize("name", MEMORIES)
-def test_each_of_several_askers_gets_what_it_would_get_alone(name, budget):
-    memory, cameras = written(name, walked(8)), branches()
-    together = memory.read_batch(cameras, budget)
-    assert all(same(tokens, memory.read(each, budget)) for tokens, each in zip(together, cameras, strict=True))
-    assert max(len(tokens) for tokens in together) <= budget
+def test_a_batched_read_gives_every_path_what_it_gets_alone(name, budget):
+    memory = written_memory(name, room_walk(8))
+    assert each_path_gets_what_it_gets_alone(memory, branches(), budget)
+    assert max(len(tokens) for tokens in memory.read_batch(branches(), budget)) <= budget
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_askers_of_an_empty_memory_get_nothing_each(name):
-    assert [len(tokens) for tokens in empty(name).read_batch(branches(), 9)] == [0, 0, 0, 0]
+def test_a_batched_read_of_an_empty_memory_gives_every_path_no_token(name):
+    assert [len(tokens) for tokens in empty_memory(name).read_batch(branches(), 9)] == [0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_askers_with_images_of_two_sizes_get_what_they_would_get_alone(name):
-    memory, cameras = written(name, walked(8)), branches()
-    cameras[1] = cameras[1].resized(24, 32)
-    together = memory.read_batch(cameras, 50)
-    assert all(same(tokens, memory.read(each, 50)) for tokens, each in zip(together, cameras, strict=True))
+def test_a_batched_read_takes_paths_of_different_image_sizes(name):
+    paths = branches()
+    paths[1] = paths[1].resized(24, 32)
+    assert each_path_gets_what_it_gets_alone(written_memory(name, room_walk(8)), paths, 50)
 
 
-def test_a_camera_that_several_have_is_looked_through_once(monkeypatch):
-    looked, look_through = [], Views.look
-    monkeypatch.setattr(
-        Views, "look", lambda self, *boxes: looked.append(len(self.apexes)) or look_through(self, *boxes)
-    )
-    written("voxel", walked(8)).read_batch(branches(), 100)
-    assert looked == [5, 5]  # blocks, then cells; 14 cameras, of which five differ
+def test_distinct_cameras_holds_every_camera_once_and_gives_every_path_its_own():
+    paths = branches()
+    cameras, positions = distinct_cameras(paths)
+    assert len(cameras) == 5  # of 14
+    for path, path_positions in zip(paths, positions, strict=True):
+        assert torch.equal(cameras[path_positions].world_from_camera, path.world_from_camera)
 
 
-def test_many_cells_are_found_for_askers_who_see_many_and_few():
-    memory = written("voxel", walked(8), cell=(0.05, 0.05, 0.05))
-    cameras = [*branches(), observe([look((0.0, 1.4, 0.0), 0.0, -89.0)]).cameras]
-    together = memory.read_batch(cameras, 3000)
-    assert all(same(tokens, memory.read(each, 3000)) for tokens, each in zip(together, cameras, strict=True))
-    assert len({len(tokens) for tokens in together}) > 1
+def test_a_batched_read_computes_the_view_of_every_distinct_camera_once(monkeypatch):
+    memory, calls = written_memory("voxel", room_walk(8)), []
+    views = memory.views
+    monkeypatch.setattr(memory, "views", lambda cameras: calls.append(len(cameras)) or views(cameras))
+    memory.read_batch(branches(), 100)
+    assert calls == [5]
+
+
+def test_a_batched_read_finds_many_cells_for_one_path_and_few_for_another():
+    memory = written_memory("voxel", room_walk(8), cell=(0.05, 0.05, 0.05))
+    paths = [*branches(), observe([look((0.0, 1.4, 0.0), 0.0, -89.0)]).cameras]
+    assert each_path_gets_what_it_gets_alone(memory, paths, 3000)
+    assert len({len(tokens) for tokens in memory.read_batch(paths, 3000)}) > 1
+
+
+def test_a_batched_read_of_no_path_gives_nothing():
+    assert written_memory("voxel", room_walk(2)).read_batch([], 5) == []
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_what_is_written_into_a_copy_leaves_the_memory_as_it_was_and_the_other_way_round(name):
-    observations = walked(9)
+def test_writing_into_a_copy_does_not_change_the_memory_nor_the_other_way_round(name):
+    observations = room_walk(9)
     first, second = observations[:3], observations[:6]
-    memory = written(name, first)
+    memory = written_memory(name, first)
     copies = [memory.copy(), memory.copy()]
     copies[0].write(observations[3:6])
-    assert same_bits(memory, written(name, first))
+    assert same_bits(memory, written_memory(name, first))
     memory.write(observations[6:])
-    assert same_bits(copies[0], written(name, second))
-    assert same_bits(copies[1], written(name, first))
+    assert same_bits(copies[0], written_memory(name, second))
+    assert same_bits(copies[1], written_memory(name, first))
     copies[1].write(observations[6:])
     assert same_bits(copies[1], memory)
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_a_copy_of_a_cleared_memory_and_a_cleared_copy_hold_nothing_else(name):
-    memory = written(name, walked(3))
+def test_clearing_a_copy_leaves_the_memory_as_it_was_and_its_own_copies_empty(name):
+    memory = written_memory(name, room_walk(3))
     copy = memory.copy()
     copy.clear()
-    assert same_bits(memory, written(name, walked(3)))
-    assert same_bits(copy.copy(), empty(name))
+    assert same_bits(memory, written_memory(name, room_walk(3)))
+    assert same_bits(copy.copy(), empty_memory(name))
 
 
-def test_a_copy_takes_no_room_until_it_is_written():
-    memory = written("voxel", walked(3))
-    copy = memory.copy()
-    assert copy.grid._buffers["features"].data_ptr() == memory.grid._buffers["features"].data_ptr()
-    copy.write(walked(1))
-    assert copy.grid._buffers["features"].data_ptr() != memory.grid._buffers["features"].data_ptr()
-
-
-def test_nobody_asks_for_nothing():
-    assert written("voxel", walked(2)).read_batch([], 5) == []
+def test_a_copy_takes_no_memory_of_its_own_until_it_is_written():
+    memory = written_memory("voxel", room_walk(3), encoder={"channels": 192})
+    stored = memory.figures().bytes
+    assert allocated_bytes(memory.tensors) >= stored
+    assert allocated_bytes(memory.copy) < stored / 10

@@ -2,17 +2,18 @@ import shutil
 
 import pytest
 import torch
+from torch.nn.modules.module import register_module_forward_hook
 
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import write_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.plugins import make_encoder
 from persist_memory.encoders.patches import EXACT, PatchesSettings, projection
-from tests.support.room_views import walked
+from tests.support.room_views import room_walk
 
 
 @pytest.fixture(scope="module")
-def tiny_dino(tmp_path_factory):
+def tiny_dinov2(tmp_path_factory):
     from transformers import Dinov2Config, Dinov2Model
 
     torch.manual_seed(0)
@@ -24,6 +25,12 @@ def tiny_dino(tmp_path_factory):
     return folder
 
 
+def normalized(rgb):
+    """Images in the range that DINOv2 was trained on, channels first."""
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    return ((rgb / 255 - mean) / std).permute(0, 3, 1, 2)
+
+
 def test_the_first_three_channels_of_a_patch_are_its_mean_colour():
     rgb = torch.randint(0, 256, (1, 16, 24, 3), dtype=torch.uint8)
     features = make_encoder("patches", {}).encode(rgb)
@@ -31,8 +38,8 @@ def test_the_first_three_channels_of_a_patch_are_its_mean_colour():
     torch.testing.assert_close(features[..., :3], mean, atol=1e-4, rtol=0)
 
 
-def test_features_do_not_depend_on_what_else_is_encoded_to_the_bit():
-    rgb = walked(5).rgb
+def test_no_bit_of_a_frames_features_depends_on_the_other_frames():
+    rgb = room_walk(5).rgb
     encoder = make_encoder("patches", {})
     assert torch.equal(encoder.encode(rgb)[3], encoder.encode(rgb[3:4])[0])
 
@@ -50,8 +57,8 @@ def test_detail_channels_are_orthogonal_to_each_other_and_to_colour():
     assert (gram - gram.diag().diag()).abs().max() < 1e-4 * gram.diag().max()
 
 
-def test_features_of_real_looking_images_are_of_order_one():
-    spread = make_encoder("patches", {}).encode(walked(6).rgb).std((0, 1, 2))
+def test_features_of_textured_images_are_of_order_one():
+    spread = make_encoder("patches", {}).encode(room_walk(6).rgb).std((0, 1, 2))
     assert spread.min() > 0.01
     assert spread.max() < 3
 
@@ -69,97 +76,103 @@ def test_more_channels_than_numbers_in_a_patch_are_refused():
         make_encoder("patches", {"patch": 2, "channels": 13})
 
 
-def test_dinov2_gives_the_patch_tokens_of_the_last_block_after_the_layer_norm(tiny_dino):
+def test_dinov2_gives_the_patch_tokens_of_the_last_block_after_the_layer_norm(tiny_dinov2):
     from transformers import Dinov2Model
 
-    encoder = make_encoder("dinov2", {"weights": str(tiny_dino)})
-    rgb = walked(1).rgb[:, :42, :56]
+    encoder = make_encoder("dinov2", {"weights": str(tiny_dinov2)})
+    rgb = room_walk(1).rgb[:, :42, :56]
     features = encoder.encode(rgb)
     assert features.shape == (1, 3, 4, encoder.channels)
-    model = Dinov2Model.from_pretrained(tiny_dino).eval()
-    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
-    pixels = ((rgb / 255 - mean) / std).permute(0, 3, 1, 2)
+    model = Dinov2Model.from_pretrained(tiny_dinov2).eval()
     with torch.no_grad():
-        expected = model(pixels).last_hidden_state[:, 1:].reshape(1, 3, 4, 24)
+        expected = model(normalized(rgb)).last_hidden_state[:, 1:].reshape(1, 3, 4, 24)
     torch.testing.assert_close(features, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_dinov2_takes_any_size_and_a_block_in_the_middle(tiny_dino):
-    settings = {"weights": str(tiny_dino), "size": 100, "layer": 2}
-    features = make_encoder("dinov2", settings).encode(walked(3).rgb)
+def test_dinov2_takes_any_size_and_a_block_in_the_middle(tiny_dinov2):
+    settings = {"weights": str(tiny_dinov2), "size": 100, "layer": 2}
+    features = make_encoder("dinov2", settings).encode(room_walk(3).rgb)
     assert features.shape == (3, 5, 7, 24)  # 75 × 100 pixels in patches of 14
-    last = make_encoder("dinov2", settings | {"layer": None}).encode(walked(3).rgb)
+    last = make_encoder("dinov2", settings | {"layer": None}).encode(room_walk(3).rgb)
     assert not torch.allclose(features, last)
 
 
 @pytest.mark.parametrize("layer", [1, 2, None])
-def test_dinov2_gives_what_transformers_has_behind_a_block_and_computes_no_further(tiny_dino, layer, capfd):
+def test_dinov2_gives_the_output_of_the_chosen_block_and_computes_no_further_block(tiny_dinov2, layer, capfd):
     from transformers import Dinov2Model
+    from transformers.models.dinov2.modeling_dinov2 import Dinov2Layer
 
-    encoder, rgb = make_encoder("dinov2", {"weights": str(tiny_dino), "layer": layer}), walked(1).rgb[:, :42, :56]
+    encoder, rgb = make_encoder("dinov2", {"weights": str(tiny_dinov2), "layer": layer}), room_walk(1).rgb[:, :42, :56]
+    computed: list[Dinov2Layer] = []
+    hook = register_module_forward_hook(
+        lambda module, *_: computed.append(module) if isinstance(module, Dinov2Layer) else None
+    )
     features = encoder.encode(rgb)
-    assert capfd.readouterr().err == ""  # not even a bar
-    model = Dinov2Model.from_pretrained(tiny_dino).eval()
+    hook.remove()
+    assert capfd.readouterr().err == ""  # no progress bar either
+    model = Dinov2Model.from_pretrained(tiny_dinov2).eval()
     with torch.no_grad():
-        states = model(encoder._pixels(rgb, 3, 4), output_hidden_states=True).hidden_states
+        states = model(normalized(rgb), output_hidden_states=True).hidden_states
         expected = model.layernorm(states[-1 if layer is None else layer])[:, 1:].reshape(1, 3, 4, 24)
     assert torch.equal(features, expected)
-    assert len(encoder._model.encoder.layer) == (layer or len(states) - 1)
+    assert len(computed) == (layer or len(states) - 1)
 
 
-def test_dinov2_in_bf16_gives_nearly_the_same_features_in_float32(tiny_dino):
+def test_dinov2_in_bf16_gives_nearly_the_same_features_in_float32(tiny_dinov2):
     exact, half = (
-        make_encoder("dinov2", {"weights": str(tiny_dino), "precision": each}) for each in ("float32", "bf16")
+        make_encoder("dinov2", {"weights": str(tiny_dinov2), "precision": name}) for name in ("float32", "bf16")
     )
-    rgb = walked(2).rgb
-    likeness = torch.nn.functional.cosine_similarity(exact.encode(rgb), half.encode(rgb), dim=-1)
+    rgb = room_walk(2).rgb
+    similarity = torch.nn.functional.cosine_similarity(exact.encode(rgb), half.encode(rgb), dim=-1)
     assert half.encode(rgb).dtype == torch.float32
-    assert 0.99 < likeness.min() < 1
+    assert 0.99 < similarity.min() < 1
 
 
-def test_dinov2_frames_do_not_depend_on_their_neighbours_to_the_bit(tiny_dino):
-    encoder, rgb = make_encoder("dinov2", {"weights": str(tiny_dino)}), walked(3).rgb
+def test_no_bit_of_a_frames_dinov2_features_depends_on_its_neighbours(tiny_dinov2):
+    encoder, rgb = make_encoder("dinov2", {"weights": str(tiny_dinov2)}), room_walk(3).rgb
     assert torch.equal(encoder.encode(rgb)[1], encoder.encode(rgb[1:2])[0])
 
 
 @pytest.mark.parametrize("broken", ["absent", "no_weights", "truncated", "pickle"])
-def test_dinov2_without_usable_weights_says_in_one_line_what_to_do(tiny_dino, tmp_path, monkeypatch, broken):
+def test_unusable_dinov2_weights_are_an_error_of_one_line_that_says_what_to_do(
+    tiny_dinov2, tmp_path, monkeypatch, broken
+):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     folder = tmp_path / "dino"
     if broken != "absent":
         folder.mkdir()
-        (folder / "config.json").write_bytes((tiny_dino / "config.json").read_bytes())
+        (folder / "config.json").write_bytes((tiny_dinov2 / "config.json").read_bytes())
     if broken == "truncated":
-        (folder / "model.safetensors").write_bytes((tiny_dino / "model.safetensors").read_bytes()[:500])
+        (folder / "model.safetensors").write_bytes((tiny_dinov2 / "model.safetensors").read_bytes()[:500])
     if broken == "pickle":
         torch.save({}, folder / "pytorch_model.bin")
     with pytest.raises(CheckpointError) as caught:
-        make_encoder("dinov2", {"weights": str(folder)}).encode(walked(1).rgb)
+        make_encoder("dinov2", {"weights": str(folder)}).encode(room_walk(1).rgb)
     message = str(caught.value)
     assert "\n" not in message
     assert str(folder) in message
     assert "patches" in message
 
 
-def test_a_block_that_dinov2_does_not_have_is_refused(tiny_dino):
+def test_a_block_number_beyond_the_dinov2_weights_is_refused(tiny_dinov2):
     with pytest.raises(CheckpointError, match="has 3 blocks, no block 9"):
-        _ = make_encoder("dinov2", {"weights": str(tiny_dino), "layer": 9}).channels
+        _ = make_encoder("dinov2", {"weights": str(tiny_dinov2), "layer": 9}).channels
 
 
-def test_dinov2_takes_fetched_weights_by_their_name(tiny_dino, tmp_path, monkeypatch):
+def test_dinov2_opens_fetched_weights_by_their_name(tiny_dinov2, tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
-    shutil.copytree(tiny_dino, tmp_path / "weights" / "dinov2-small")
-    rgb = walked(1).rgb
+    shutil.copytree(tiny_dinov2, tmp_path / "weights" / "dinov2-small")
+    rgb = room_walk(1).rgb
     with pytest.raises(CheckpointError, match="'dinov2-small': not here: persist weights fetch dinov2-small"):
         make_encoder("dinov2", {}).encode(rgb)
     write_json(tmp_path / "weights" / "dinov2-small" / "weight.json", {"name": "dinov2-small"})
-    expected = make_encoder("dinov2", {"weights": str(tiny_dino)}).encode(rgb)
+    expected = make_encoder("dinov2", {"weights": str(tiny_dinov2)}).encode(rgb)
     assert torch.equal(make_encoder("dinov2", {}).encode(rgb), expected)
     with pytest.raises(CheckpointError, match="persist weights fetch dinov2-s-derived"):  # none stands in for another
         make_encoder("dinov2", {"weights": "dinov2-s-derived"}).encode(rgb)
 
 
-def test_a_hub_id_is_opened_from_the_hubs_cache_or_refused_without_waiting(tmp_path, tiny_dino, monkeypatch):
+def test_a_hub_id_outside_the_cache_is_refused_at_once_when_the_hub_does_not_answer(tmp_path, tiny_dinov2, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(CheckpointError, match="not in the hub's cache, and the hub: HF_HUB_OFFLINE is set"):
@@ -173,11 +186,12 @@ def test_a_hub_id_is_opened_from_the_hubs_cache_or_refused_without_waiting(tmp_p
 
 
 @pytest.mark.skipif(cached_weight("dinov2-s-derived") is None, reason="persist weights fetch dinov2-s-derived")
-def test_the_derived_dinov2_gives_block_8_and_sees_the_same_wall_from_elsewhere():
+def test_features_of_the_derived_dinov2_move_with_the_image():
     encoder = make_encoder("dinov2", {"weights": "dinov2-s-derived", "layer": 8})
-    rgb = walked(1).rgb[:, :42, :56].repeat(2, 1, 1, 1)
+    rgb = room_walk(1).rgb[:, :42, :56].repeat(2, 1, 1, 1)
     rgb[1] = rgb[0].roll(14, dims=1)  # by one patch
-    one, two = torch.nn.functional.normalize(encoder.encode(rgb), dim=-1)
-    assert one.shape == (3, 4, 384)
-    same, other = (one[:, :3] * two[:, 1:]).sum(-1).mean(), (one[:, :3] * two[:, :3]).sum(-1).mean()
-    assert same > other
+    features, rolled = torch.nn.functional.normalize(encoder.encode(rgb), dim=-1)
+    assert features.shape == (3, 4, 384)
+    same_place = (features[:, :3] * rolled[:, 1:]).sum(-1).mean()
+    same_pixels = (features[:, :3] * rolled[:, :3]).sum(-1).mean()
+    assert same_place > same_pixels

@@ -6,14 +6,14 @@ import torch
 from persist_cli.api.memory import FORMAT_VERSION
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
-from tests.support.room_views import MEMORIES, empty, observe, same_bits, walked, written
+from tests.support.room_views import MEMORIES, empty_memory, observe, room_walk, same_bits, written_memory
 from tests.support.rooms import look
 
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_an_empty_memory_gives_no_token_and_has_no_bounds(name):
-    memory = empty(name)
-    tokens = memory.read(walked(2).cameras, 100)
+    memory = empty_memory(name)
+    tokens = memory.read(room_walk(2).cameras, 100)
     assert tokens.features.shape == (0, 32)
     assert memory.figures().cells == memory.figures().bytes == 0
     assert memory.figures().bounds is None
@@ -21,28 +21,28 @@ def test_an_empty_memory_gives_no_token_and_has_no_bounds(name):
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_a_frame_without_valid_depth_writes_nothing(name):
-    observations = walked(1)
-    memory = written(name, replace(observations, depth=torch.zeros_like(observations.depth)))
+    observations = room_walk(1)
+    memory = written_memory(name, replace(observations, depth=torch.zeros_like(observations.depth)))
     assert memory.tensors() == {}
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_no_frame_writes_nothing(name):
-    assert written(name, walked(1)[0:0]).tensors() == {}
+def test_writing_no_frames_writes_nothing(name):
+    assert written_memory(name, room_walk(1)[0:0]).tensors() == {}
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_a_budget_is_kept_and_none_gives_none(name):
-    observations = walked(3)
-    memory = written(name, observations)
+def test_a_read_gives_at_most_the_budget_and_no_token_for_a_budget_of_zero(name):
+    observations = room_walk(3)
+    memory = written_memory(name, observations)
     assert len(memory.read(observations.cameras, 7)) == (0 if name == "none" else 7)
     assert len(memory.read(observations.cameras, 0)) == 0
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_a_memory_is_restored_bit_for_bit_and_goes_on_as_if_never_stored(name):
-    observations = walked()
-    memory, restored = written(name, observations[:4]), empty(name)
+def test_a_restored_memory_is_equal_to_the_bit_and_so_is_what_is_written_afterwards(name):
+    observations = room_walk()
+    memory, restored = written_memory(name, observations[:4]), empty_memory(name)
     restored.restore(memory.tensors())
     assert same_bits(memory, restored)
     memory.write(observations[4:])
@@ -51,8 +51,8 @@ def test_a_memory_is_restored_bit_for_bit_and_goes_on_as_if_never_stored(name):
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_a_cleared_memory_is_an_empty_one(name):
-    memory = written(name, walked(2))
+def test_a_cleared_memory_is_empty(name):
+    memory = written_memory(name, room_walk(2))
     memory.clear()
     assert memory.tensors() == {}
     assert len(memory.points().positions) == 0
@@ -60,7 +60,7 @@ def test_a_cleared_memory_is_an_empty_one(name):
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_the_header_says_what_made_the_memory(name):
-    memory = written(name, walked(2))
+    memory = written_memory(name, room_walk(2))
     header = memory.header()
     assert (header["memory"], header["encoder"], header["version"]) == (name, "patches", FORMAT_VERSION)
     assert header["cells"] == memory.figures().cells
@@ -68,25 +68,25 @@ def test_the_header_says_what_made_the_memory(name):
 
 @pytest.mark.parametrize("name", MEMORIES)
 def test_memories_of_two_scenes_cannot_be_merged(name):
-    memory, other = empty(name), empty(name)
+    memory, other = empty_memory(name), empty_memory(name)
     other.reference = replace(other.reference, name="cellar")
     with pytest.raises(CheckpointError, match="frame of reference"):
         memory.merge(other)
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_merging_equals_writing_both(name):
-    observations = walked(6)
-    memory = written(name, observations[:2])
-    memory.merge(written(name, observations[2:]))
-    assert same_bits(memory, written(name, observations))
+def test_merging_two_memories_equals_writing_both_into_one(name):
+    observations = room_walk(6)
+    memory = written_memory(name, observations[:2])
+    memory.merge(written_memory(name, observations[2:]))
+    assert same_bits(memory, written_memory(name, observations))
 
 
 @pytest.mark.parametrize("name", ["voxel", "map2d", "snapshots"])
 @pytest.mark.parametrize("damage", ["missing", "unknown", "dtype", "shape", "nan"])
-def test_tensors_that_are_not_the_memorys_own_are_refused_and_change_nothing(name, damage):
-    memory = written(name, walked(2))
-    before, tensors = written(name, walked(2)), memory.tensors()
+def test_restoring_tensors_that_do_not_fit_is_refused_and_changes_nothing(name, damage):
+    memory = written_memory(name, room_walk(2))
+    before, tensors = written_memory(name, room_walk(2)), memory.tensors()
     match damage:
         case "missing":
             del tensors["features"]
@@ -103,25 +103,25 @@ def test_tensors_that_are_not_the_memorys_own_are_refused_and_change_nothing(nam
     assert same_bits(memory, before)
 
 
-def test_none_never_gives_a_token_whatever_was_written():
-    memory = written("none", walked(2))
-    assert len(memory.read(walked(2).cameras, 100)) == 0
+def test_the_memory_none_never_gives_a_token():
+    memory = written_memory("none", room_walk(2))
+    assert len(memory.read(room_walk(2).cameras, 100)) == 0
     with pytest.raises(CheckpointError):
         memory.restore({"features": torch.zeros(1, 32)})
 
 
-def test_a_batch_may_hold_a_sample_without_a_token_and_pads_behind_the_mask():
-    observations = walked(2)
-    full = written("voxel", observations).read(observations.cameras, 9)
-    batch = MemoryTokens.stack([empty("voxel").read(observations.cameras, 9), full])
+def test_a_sample_without_a_token_is_padding_in_a_batch_of_tokens():
+    observations = room_walk(2)
+    full = written_memory("voxel", observations).read(observations.cameras, 9)
+    batch = MemoryTokens.stack([empty_memory("voxel").read(observations.cameras, 9), full])
     assert batch.mask.sum(1).tolist() == [0, 9]
     assert batch.features[0].abs().sum() == 0
     assert torch.equal(batch.features[1], full.features)
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_frames_of_several_sizes_go_into_one_memory(name):
-    memory = written(name, walked(2))
+def test_one_memory_takes_frames_of_several_sizes(name):
+    memory = written_memory(name, room_walk(2))
     wide = observe([look((0.0, 1.4, 0.0), 45.0)], 40, 90)
     memory.write(wide)
     assert len(memory.read(wide.cameras, 20)) == (0 if name == "none" else 20)

@@ -4,104 +4,105 @@ import torch
 
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.geometry import unproject
-from tests.support.room_views import empty, moved, observe, same_bits, shift, walked, written
+from tests.support.room_views import empty_memory, moved, observe, room_walk, same_bits, translation, written_memory
 from tests.support.rooms import look
 
 
 def test_any_rigid_motion_of_the_world_changes_no_token_relative_to_the_camera():
-    observations = walked(12)
-    motion = shift(31.7, -4.1, 127.3)
+    observations = room_walk(12)
+    motion = translation(31.7, -4.1, 127.3)
     motion[:3, :3] = rotation_about(torch.nn.functional.normalize(torch.tensor([1.0, 2.0, -0.5]), dim=0), 2.1)
     there = moved(observations, motion)
-    tokens = written("snapshots", observations, count=4).read(observations.cameras[3:6], 200)
-    others = written("snapshots", there, count=4).read(there.cameras[3:6], 200)
+    tokens = written_memory("snapshots", observations, count=4).read(observations.cameras[3:6], 200)
+    moved_tokens = written_memory("snapshots", there, count=4).read(there.cameras[3:6], 200)
     here = observations.cameras.relative_to(observations.cameras.world_from_camera[3])
-    assert torch.equal(tokens.features, others.features)
+    assert torch.equal(tokens.features, moved_tokens.features)
     inverse = [cameras.world_from_camera[3].inverse() for cameras in (observations.cameras, there.cameras)]
     local = [
-        (pose[:3, :3] @ part.positions.T).T + pose[:3, 3] for pose, part in zip(inverse, (tokens, others), strict=True)
+        (pose[:3, :3] @ part.positions.T).T + pose[:3, 3]
+        for pose, part in zip(inverse, (tokens, moved_tokens), strict=True)
     ]
     torch.testing.assert_close(local[0], local[1], atol=1e-4, rtol=0)
     assert here.centers[3].abs().max() < 1e-9
 
 
-def test_a_memory_of_one_frame_recalls_the_frame_to_the_same_camera():
-    observations = walked(1)
-    tokens = written("snapshots", observations).read(observations.cameras, 1000)
+def test_reading_with_the_camera_of_the_only_frame_gives_all_its_patches():
+    observations = room_walk(1)
+    tokens = written_memory("snapshots", observations).read(observations.cameras, 1000)
     assert len(tokens) == 64
     surface = unproject(observations.depth, observations.cameras).flatten(0, 2)
     assert torch.cdist(tokens.positions, surface).amin(1).max() < 0.15
 
 
-def test_the_first_snapshot_is_the_one_taken_where_the_camera_stands():
+def test_the_first_tokens_are_those_of_the_snapshot_with_nearly_the_same_view():
     observations = observe([look((0.0, 1.4, 0.0), yaw) for yaw in range(0, 360, 60)])
-    memory = written("snapshots", observations)
-    asked = observe([look((0.05, 1.4, 0.0), 122.0)]).cameras
-    alone = written("snapshots", observations[2:3])
-    assert torch.equal(memory.read(asked, 64).features, alone.read(asked, 64).features)
+    memory = written_memory("snapshots", observations)
+    camera = observe([look((0.05, 1.4, 0.0), 122.0)]).cameras
+    alone = written_memory("snapshots", observations[2:3])
+    assert torch.equal(memory.read(camera, 64).features, alone.read(camera, 64).features)
 
 
-def test_each_snapshot_adds_what_the_ones_before_do_not_show():
+def test_the_second_snapshot_shows_what_the_first_does_not():
     poses = [look((0.0, 1.4, 0.0), yaw) for yaw in (0.0, 2.0, 4.0, 180.0)]
     observations = observe(poses)
-    memory = written("snapshots", observations, count=2)
+    memory = written_memory("snapshots", observations, count=2)
     tokens = memory.read(observations.cameras[[0, 3]], 128)
     behind = tokens.positions[:, 2] > 0
     assert behind[:64].all() != behind[64:].all()
 
 
-def test_snapshots_of_what_is_not_in_view_are_not_taken():
-    memory = written("snapshots", observe([look((0.0, 1.4, -1.5), 0.0)]))
+def test_snapshots_of_nothing_in_view_give_no_token():
+    memory = written_memory("snapshots", observe([look((0.0, 1.4, -1.5), 0.0)]))
     assert len(memory.read(observe([look((0.0, 1.4, 1.0), 180.0)]).cameras, 512)) == 0
 
 
-def test_no_more_images_are_kept_than_the_capacity_and_repeated_views_go_first():
+def test_a_full_album_drops_repeated_views_first():
     turn = [look((0.0, 1.4, 0.0), yaw) for yaw in range(0, 360, 90)]
     lingering = [look((0.001 * step, 1.4, 0.0), 0.0) for step in range(1, 9)]
-    memory = written("snapshots", observe(lingering + turn + lingering), capacity=4)
+    memory = written_memory("snapshots", observe(lingering + turn + lingering), capacity=4)
     assert memory.figures().cells == 4
     headings = memory.tensors()["world_from_camera"][:, :3, 2]
     yaws = torch.atan2(-headings[:, 0], -headings[:, 2]).rad2deg().round().sort().values % 360
     assert sorted(yaws.tolist()) == [0.0, 90.0, 180.0, 270.0]
 
 
-def test_below_the_capacity_order_and_repetition_change_not_one_bit():
-    observations = walked()
-    memory = empty("snapshots")
+def test_below_the_capacity_the_order_and_repetition_of_frames_change_no_bit():
+    observations = room_walk()
+    memory = empty_memory("snapshots")
     for frame in (5, 0, 7, 2, 1, 6, 4, 3, 5):
         memory.write(observations[frame : frame + 1])
-    assert same_bits(memory, written("snapshots", observations))
+    assert same_bits(memory, written_memory("snapshots", observations))
 
 
-def test_how_frames_are_grouped_changes_nothing_even_beyond_the_capacity():
-    observations = walked(20)
-    one_by_one = empty("snapshots", capacity=6)
+def test_grouping_of_frames_changes_no_bit_even_beyond_the_capacity():
+    observations = room_walk(20)
+    one_by_one = empty_memory("snapshots", capacity=6)
     for frame in range(20):
         one_by_one.write(observations[frame : frame + 1])
-    assert same_bits(one_by_one, written("snapshots", observations, capacity=6))
+    assert same_bits(one_by_one, written_memory("snapshots", observations, capacity=6))
 
 
-def test_patches_without_depth_give_no_token_and_frames_without_any_are_not_kept():
-    observations = walked(2)
+def test_patches_without_depth_give_no_token_and_frames_without_depth_are_not_stored():
+    observations = room_walk(2)
     depth = observations.depth.clone()
     depth[0, :, :32] = 0.0
     depth[1] = torch.nan
-    memory = written("snapshots", type(observations)(observations.rgb, depth, observations.cameras))
+    memory = written_memory("snapshots", type(observations)(observations.rgb, depth, observations.cameras))
     assert memory.figures().cells == 1
     assert len(memory.read(observations.cameras, 1000)) == 32
 
 
 def test_the_depth_of_a_patch_is_the_median_of_its_valid_pixels():
-    observations = walked(1)
+    observations = room_walk(1)
     depth = torch.full_like(observations.depth, 2.0)
     depth[0, :2] = 9.0
     depth[0, 2] = 0.0
-    memory = written("snapshots", type(observations)(observations.rgb, depth, observations.cameras))
+    memory = written_memory("snapshots", type(observations)(observations.rgb, depth, observations.cameras))
     assert (memory.tensors()["depth"] == 2.0).all()
 
 
 def test_image_sizes_that_are_no_multiple_of_the_grid_still_cover_the_image():
     observations = observe([look((0.0, 1.4, 0.0), 0.0)], 37, 53)
-    tokens = written("snapshots", observations).read(observations.cameras, 1000)
+    tokens = written_memory("snapshots", observations).read(observations.cameras, 1000)
     assert len(tokens) == 64
     assert math.isclose(float(tokens.positions[:, 2].amin()), -2.0, abs_tol=0.6)

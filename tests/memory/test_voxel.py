@@ -9,7 +9,7 @@ from persist_cli.api.observations import Observations
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.plugins import make_encoder
 from persist_memory.grid.pooling import CENTERED
-from tests.support.room_views import empty, moved, observe, same_bits, shift, walked, written
+from tests.support.room_views import empty_memory, moved, observe, room_walk, same_bits, translation, written_memory
 from tests.support.rooms import look
 
 SIZE = torch.tensor([0.25, 1.0, 0.25], dtype=torch.float64)
@@ -30,8 +30,8 @@ def pooled_by_hand(observations: Observations) -> dict[tuple[int, ...], torch.Te
 
 @pytest.mark.parametrize("pooling", ["max", "mean"])
 def test_cells_hold_what_pooling_every_upsampled_pixel_gives(pooling):
-    observations = walked(3)
-    memory = written("voxel", observations, pooling=pooling)
+    observations = room_walk(3)
+    memory = written_memory("voxel", observations, pooling=pooling)
     expected = pooled_by_hand(observations)
     tokens = memory.read(observations.cameras, 10**6)
     cells = [tuple(cell) for cell in (tokens.positions / SIZE).round().long().tolist()]
@@ -41,61 +41,61 @@ def test_cells_hold_what_pooling_every_upsampled_pixel_gives(pooling):
         torch.testing.assert_close(features, wanted, atol=1e-4, rtol=1e-4)
 
 
-def test_a_frame_written_twice_changes_not_one_bit():
-    observations = walked()
-    memory = written("voxel", observations)
+def test_writing_a_frame_twice_changes_no_bit():
+    observations = room_walk()
+    memory = written_memory("voxel", observations)
     memory.write(observations[3:4])
-    assert same_bits(memory, written("voxel", observations))
+    assert same_bits(memory, written_memory("voxel", observations))
 
 
-def test_the_order_and_grouping_of_frames_change_not_one_bit():
-    observations = walked()
-    together, one_by_one = written("voxel", observations), empty("voxel")
+def test_the_order_and_grouping_of_frames_change_no_bit():
+    observations = room_walk()
+    together, one_by_one = written_memory("voxel", observations), empty_memory("voxel")
     for frame in (5, 0, 7, 2, 1, 6, 4, 3):
         one_by_one.write(observations[frame : frame + 1])
     assert same_bits(together, one_by_one)
 
 
 def test_merging_two_maps_equals_writing_both_into_one():
-    observations = walked()
-    memory = written("voxel", observations[:5])
-    memory.merge(written("voxel", observations[3:]))
-    assert same_bits(memory, written("voxel", observations))
+    observations = room_walk()
+    memory = written_memory("voxel", observations[:5])
+    memory.merge(written_memory("voxel", observations[3:]))
+    assert same_bits(memory, written_memory("voxel", observations))
 
 
 @pytest.mark.parametrize("change", [{"cell": (0.5, 1.0, 0.5)}, {"pooling": "mean"}, {"encoder": {"seed": 1}}])
-def test_maps_that_differ_in_their_making_cannot_be_merged(change):
+def test_maps_of_different_settings_or_encoders_cannot_be_merged(change):
     with pytest.raises(CheckpointError, match="cannot be merged"):
-        empty("voxel").merge(empty("voxel", **change))
+        empty_memory("voxel").merge(empty_memory("voxel", **change))
 
 
-def test_missing_and_impossible_depth_is_left_out():
-    observations = walked(2)
+def test_pixels_with_missing_or_impossible_depth_are_left_out():
+    observations = room_walk(2)
     depth = observations.depth.clone()
     depth[0] = torch.tensor([0.0, torch.nan, torch.inf, -1.0]).repeat(48, 16)
-    memory = written("voxel", replace(observations, depth=depth))
-    assert same_bits(memory, written("voxel", observations[1:]))
+    memory = written_memory("voxel", replace(observations, depth=depth))
+    assert same_bits(memory, written_memory("voxel", observations[1:]))
 
 
-def test_a_point_beyond_the_grid_is_left_out():
-    observations = walked(1)
+def test_points_beyond_the_grid_are_left_out():
+    observations = room_walk(1)
     depth = torch.full_like(observations.depth, 1e9)
-    assert written("voxel", replace(observations, depth=depth)).figures().cells == 0
+    assert written_memory("voxel", replace(observations, depth=depth)).figures().cells == 0
 
 
-def test_what_is_farther_than_the_greatest_depth_is_left_out():
-    observations = walked(4)
+def test_pixels_farther_than_the_greatest_depth_are_left_out():
+    observations = room_walk(4)
     near = torch.where(observations.depth <= 2.0, observations.depth, 0.0)
     assert same_bits(
-        written("voxel", observations, max_depth=2.0),
-        written("voxel", replace(observations, depth=near), max_depth=2.0),
+        written_memory("voxel", observations, max_depth=2.0),
+        written_memory("voxel", replace(observations, depth=near), max_depth=2.0),
     )
 
 
-def test_a_stride_takes_a_subset_of_the_cells():
-    observations = walked(4)
+def test_a_stride_fills_a_subset_of_the_cells():
+    observations = room_walk(4)
     cells = [
-        {tuple(cell) for cell in written("voxel", observations, stride=stride).tensors()["cells"].tolist()}
+        {tuple(cell) for cell in written_memory("voxel", observations, stride=stride).tensors()["cells"].tolist()}
         for stride in (1, 3)
     ]
     assert cells[1] < cells[0]
@@ -104,39 +104,39 @@ def test_a_stride_takes_a_subset_of_the_cells():
 
 @pytest.mark.parametrize("name", ["voxel", "map2d", "snapshots"])
 def test_a_pose_that_is_not_finite_is_refused_and_nothing_is_written(name):
-    observations = walked(3)
+    observations = room_walk(3)
     poses = observations.cameras.world_from_camera.clone()
     poses[2, 0, 3] = torch.nan
-    memory = empty(name)
+    memory = empty_memory(name)
     with pytest.raises(DataError, match="the pose of frame 2 is not finite"):
         memory.write(replace(observations, cameras=replace(observations.cameras, world_from_camera=poses)))
     assert memory.figures().cells == 0
 
 
-def test_a_memory_of_one_frame_recalls_the_frame_to_the_same_camera():
-    observations = walked(1)
-    memory = written("voxel", observations)
+def test_reading_with_the_camera_of_the_only_frame_gives_every_cell():
+    observations = room_walk(1)
+    memory = written_memory("voxel", observations)
     assert len(memory.read(observations.cameras, 10**6)) == memory.figures().cells > 50
 
 
 def test_voxel_memory_recalls_a_revisited_place():
-    observations = walked(12)
-    first = written("voxel", observations[:1])
-    memory = written("voxel", observations)
+    observations = room_walk(12)
+    first = written_memory("voxel", observations[:1])
+    memory = written_memory("voxel", observations)
     seen = {tuple(position) for position in first.read(observations[:1].cameras, 4096).positions.tolist()}
     recalled = {tuple(position) for position in memory.read(observations[:1].cameras, 4096).positions.tolist()}
     assert seen <= recalled
 
 
-def test_a_camera_that_looks_away_recalls_nothing_that_it_cannot_see():
-    memory = written("voxel", observe([look((0.0, 1.4, -1.8), 0.0)]))
+def test_a_camera_that_looks_away_gets_no_token():
+    memory = written_memory("voxel", observe([look((0.0, 1.4, -1.8), 0.0)]))
     away = observe([look((0.0, 1.4, 1.0), 180.0)]).cameras
     assert len(memory.read(away, 4096)) == 0
 
 
 def test_tokens_come_nearest_first_and_a_smaller_budget_gives_the_first_of_them():
-    observations = walked()
-    memory = written("voxel", observations)
+    observations = room_walk()
+    memory = written_memory("voxel", observations)
     camera = observations.cameras[2:3]
     tokens = memory.read(camera, 500)
     distances = (tokens.positions - camera.centers).norm(dim=-1)
@@ -145,22 +145,22 @@ def test_tokens_come_nearest_first_and_a_smaller_budget_gives_the_first_of_them(
 
 
 def test_a_cell_counts_as_near_as_the_nearest_camera_that_sees_it():
-    observations = walked()
-    memory = written("voxel", observations)
+    observations = room_walk()
+    memory = written_memory("voxel", observations)
     back_to_back = observe([look((0.0, 1.4, 0.0), 0.0), look((0.0, 1.4, -1.9), 180.0)]).cameras
-    one, other = (memory.read(back_to_back[[index]], 30) for index in (0, 1))
+    first, second = (memory.read(back_to_back[[index]], 30) for index in (0, 1))
     both = memory.read(back_to_back, 30)
-    parts = zip((one, other), back_to_back.centers, strict=True)
+    parts = zip((first, second), back_to_back.centers, strict=True)
     nearest = torch.cat([(part.positions - center).norm(dim=-1) for part, center in parts])
     farthest_taken = (both.positions[-1] - back_to_back.centers).norm(dim=-1).amin()
     assert farthest_taken <= nearest.sort().values[59]
-    union = torch.cat([one.positions, other.positions])
+    union = torch.cat([first.positions, second.positions])
     assert torch.cdist(both.positions, union).amin(1).max() == 0
 
 
-def test_reading_finds_the_same_cells_as_asking_each_cell():
-    observations = walked()
-    memory = written("voxel", observations, cell=(0.1, 0.1, 0.1))
+def test_reading_finds_every_cell_that_projects_into_the_image():
+    observations = room_walk()
+    memory = written_memory("voxel", observations, cell=(0.1, 0.1, 0.1))
     camera = observe([look((0.5, 1.2, 0.3), 130.0, -20.0)]).cameras
     centers = memory.points().positions
     corners = torch.tensor([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]).double() * 0.05
@@ -168,39 +168,40 @@ def test_reading_finds_the_same_cells_as_asking_each_cell():
     pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
     inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < torch.tensor([64, 48])).all(-1)
     certainly = inside.any(1)
-    found = {tuple(position) for position in memory.read(camera, 10**6).positions.tolist()}
-    assert {tuple(center) for center in centers[certainly].tolist()} <= found
-    assert len(found) < 1.4 * int(certainly.sum())  # besides, cells whose corners alone reach in
+    positions = {tuple(position) for position in memory.read(camera, 10**6).positions.tolist()}
+    assert {tuple(center) for center in centers[certainly].tolist()} <= positions
+    assert len(positions) < 1.4 * int(certainly.sum())  # besides, cells whose corners alone reach in
 
 
 @pytest.mark.parametrize("name", ["voxel", "map2d"])
 def test_moving_the_origin_by_whole_cells_changes_no_token_relative_to_the_camera(name):
-    observations = walked(12)
-    motion = shift(-41 * 0.25, 7 * 1.0, 1003 * 0.25)
+    observations = room_walk(12)
+    motion = translation(-41 * 0.25, 7 * 1.0, 1003 * 0.25)
     there = moved(observations, motion)
-    tokens = written(name, observations).read(observations.cameras[2:5], 120)
-    others = written(name, there).read(there.cameras[2:5], 120)
+    tokens = written_memory(name, observations).read(observations.cameras[2:5], 120)
+    moved_tokens = written_memory(name, there).read(there.cameras[2:5], 120)
     assert len(tokens) == 120
-    back = others.positions - there.cameras.centers[2]
+    back = moved_tokens.positions - there.cameras.centers[2]
     torch.testing.assert_close(back, tokens.positions - observations.cameras.centers[2], atol=1e-4, rtol=0)
-    torch.testing.assert_close(others.features, tokens.features, atol=1e-4, rtol=0)
+    torch.testing.assert_close(moved_tokens.features, tokens.features, atol=1e-4, rtol=0)
 
 
 def test_the_height_of_a_cell_goes_along_the_axis_nearest_to_up():
-    sizes = [empty("voxel", up=up, cell=(0.2, 1.0, 0.3)).lattice.size.tolist() for up in ((0, -1, 0), (0, 0.1, 0.9))]
+    ups = ((0, -1, 0), (0, 0.1, 0.9))
+    sizes = [empty_memory("voxel", up=up, cell=(0.2, 1.0, 0.3)).lattice.size.tolist() for up in ups]
     assert sizes == [[0.2, 1.0, 0.3], [0.2, 0.3, 1.0]]
 
 
 def test_bounds_hold_every_written_point():
-    observations = walked()
-    low, high = written("voxel", observations).figures().bounds
+    observations = room_walk()
+    low, high = written_memory("voxel", observations).figures().bounds
     points = unproject(observations.depth, observations.cameras).flatten(0, 2)
     assert (points >= torch.tensor(low) - 1e-5).all()
     assert (points <= torch.tensor(high) + 1e-5).all()
 
 
 def test_reading_takes_cameras_of_another_size_than_those_that_wrote():
-    observations = walked(1)
+    observations = room_walk(1)
     cameras: Cameras = observations.cameras.resized(480, 640)
-    memory = written("voxel", observations)
+    memory = written_memory("voxel", observations)
     assert torch.equal(memory.read(cameras, 200).positions, memory.read(observations.cameras, 200).positions)

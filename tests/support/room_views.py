@@ -1,7 +1,8 @@
-"""Observations of the furnished room and of the real kitchen, and empty memories of them."""
+"""Observations of the furnished room and of the real kitchen, and memories of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,33 +23,33 @@ KITCHEN = Path(__file__).resolve().parents[3] / "shared/data/kitchen"
 MEMORIES = ("none", "voxel", "map2d", "snapshots")
 
 
-def observe(poses: np.ndarray, height: int = 48, width: int = 64) -> Observations:
-    """What the room looks like from these world_from_camera."""
+def observe(poses: Sequence[np.ndarray] | np.ndarray, height: int = 48, width: int = 64) -> Observations:
+    """Views of the furnished room from these poses (world_from_camera)."""
     room = Room(height, width)
     frames = [room.see(pose) for pose in poses]
     intrinsics = torch.from_numpy(room.intrinsics).expand(len(poses), 3, 3)
     return Observations(
         torch.from_numpy(np.stack([frame.rgb for frame in frames])),
         torch.from_numpy(np.stack([frame.depth for frame in frames])),
-        Cameras(torch.from_numpy(np.asarray(poses)), intrinsics, height, width),
+        Cameras(torch.from_numpy(np.stack(poses)), intrinsics, height, width),
     )
 
 
-def walked(frames: int = 8) -> Observations:
-    """A walk through the room."""
+def room_walk(frames: int = 8) -> Observations:
+    """Views on a walk around the middle of the room."""
     return observe(walk(frames))
 
 
-def empty(
+def empty_memory(
     name: str, encoder: dict[str, Any] | None = None, up: tuple[float, float, float] = UP, **settings: Any
 ) -> Memory:
-    """An empty memory of the room."""
+    """An empty memory of the room with the encoder ``patches``."""
     return make_memory(name, settings, make_encoder("patches", encoder or {}), FrameOfReference("room", up))
 
 
-def written(name: str, observations: Observations, **settings: Any) -> Memory:
-    """A memory of some frames."""
-    memory = empty(name, **settings)
+def written_memory(name: str, observations: Observations, **settings: Any) -> Memory:
+    """A memory into which these frames were written."""
+    memory = empty_memory(name, **settings)
     memory.write(observations)
     return memory
 
@@ -59,21 +60,21 @@ def moved(observations: Observations, motion: torch.Tensor) -> Observations:
     return replace(observations, cameras=replace(cameras, world_from_camera=motion @ cameras.world_from_camera))
 
 
-def shift(x: float, y: float, z: float) -> torch.Tensor:
-    """A move of the world without turning."""
+def translation(x: float, y: float, z: float) -> torch.Tensor:
+    """A rigid motion by these metres, without a rotation."""
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, 3] = torch.tensor([x, y, z])
     return motion
 
 
 def same_bits(one: Memory, other: Memory) -> bool:
-    """Whether two memories hold the same to the bit."""
-    mine, others = one.tensors(), other.tensors()
-    return mine.keys() == others.keys() and all(torch.equal(mine[name], others[name]) for name in mine)
+    """Whether two memories hold equal tensors."""
+    first, second = one.tensors(), other.tensors()
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
-def kitchen(numbers: list[int]) -> Observations:
-    """Some of the 120 real Kinect frames; skips where they are not at hand."""
+def kitchen_frames(numbers: list[int]) -> Observations:
+    """Some of the 120 real Kinect frames; skips the test where they are not on this machine."""
     if not KITCHEN.is_dir():
         pytest.skip("the Kinect frames of ../shared/data/kitchen are not here")
     stems = sorted(path.name.removesuffix(".color.jpg") for path in KITCHEN.glob("*.color.jpg"))

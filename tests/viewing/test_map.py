@@ -5,7 +5,7 @@ from PIL import Image
 
 from persist_cli.api.memory import MapPoints
 from persist_cli.viewing.map import draw_map, ground_axes, paint
-from tests.support.room_views import walked, written
+from tests.support.room_views import room_walk, written_memory
 from tests.support.rooms import UP
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -44,9 +44,9 @@ def test_when_everything_is_over_the_cameras_all_of_it_is_drawn():
 
 
 def test_a_map_with_several_paths_is_a_picture_in_true_scale(tmp_path):
-    observations = walked()
+    observations = room_walk()
     poses = observations.cameras.world_from_camera
-    memory = written("voxel", observations)
+    memory = written_memory("voxel", observations)
     draw_map(memory.points(), UP, {"ground truth": poses, "rollout": poses[:3]}, tmp_path / "map.png")
     picture = np.asarray(Image.open(tmp_path / "map.png").convert("RGB")).astype(int)
     assert min(picture.shape[:2]) > 500
@@ -63,7 +63,7 @@ def test_an_empty_memory_and_a_short_path_still_give_a_picture(tmp_path, paths):
 
 
 def test_the_same_map_is_the_same_picture(tmp_path):
-    memory = written("voxel", walked(2))
+    memory = written_memory("voxel", room_walk(2))
     for name in ("a.png", "b.png"):
         draw_map(memory.points(), UP, {}, tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
