@@ -1,4 +1,4 @@
-"""The one error family: whatever a user can cause ends in one line and exit code 1."""
+"""Errors that a user can cause: each ends a command with one line and exit code 1."""
 
 from __future__ import annotations
 
@@ -6,32 +6,37 @@ import difflib
 from collections.abc import Iterable
 from typing import Final
 
-
-def hint(name: str, known: Iterable[str], otherwise: str = "known") -> str:
-    """What was meant by an unknown name, or else which names there are."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"{otherwise}: {', '.join(names) or 'none'}"
+INTERRUPTED: Final = 130  # exit code after Ctrl-C
 
 
 class PersistError(Exception):
-    """Something the user can mend; its message is one line that says what is wrong and what to do."""
+    """An error that the user can mend; its message is one line that says what is wrong and what to do."""
 
 
 class DataError(PersistError):
-    """A data set, trajectory, image or pose that cannot be used; names the file and the cause."""
+    """A data set, trajectory, image or pose cannot be used; the message names the file and the cause."""
 
 
 class PluginError(PersistError):
-    """A plugin that is unknown, broken, or of the wrong kind; names plugin, package and cause."""
+    """A plugin is unknown, broken or of the wrong kind; the message names plugin, package and cause."""
 
 
 class RecipeError(PersistError):
-    """A recipe or setting that cannot be used; names every wrong key at once."""
+    """A recipe or setting cannot be used; the message names every wrong key at once."""
 
 
 class CheckpointError(PersistError):
-    """A checkpoint, adapter or memory file that is missing, corrupt, or does not fit."""
+    """A checkpoint, adapter or memory file is missing or damaged, or does not fit."""
 
 
-INTERRUPTED: Final = 130  # exit code after Ctrl-C
+def hint(name: str, known: Iterable[str], otherwise: str = "known") -> str:
+    """The end of a message about an unknown name: the known name nearest to it, else all known names.
+
+    Args:
+        name: the unknown name.
+        known: the names that exist.
+        otherwise: the word before the list of all names.
+    """
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"{otherwise}: {', '.join(names) or 'none'}"

@@ -1,16 +1,15 @@
-"""Plugins by entry point: the only door to backbones, memories, encoders, simulators and importers.
+"""Plugins by entry point: backbones, memories, encoders, simulators and importers, those of persist itself too.
 
-Listing imports nothing. Loading imports one plugin, checks its base class and wraps any failure in one line
-that names plugin, package, version, target and cause.
+Listing plugins imports none. Loading imports one and checks its base class; any failure becomes one line that names
+plugin, package, version, target and cause.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections import defaultdict
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.errors import PluginError, hint
 
@@ -21,9 +20,8 @@ if TYPE_CHECKING:
     from persist_cli.api.memory import FrameOfReference, Memory
     from persist_cli.api.simulator import Simulator
 
-
-# kind -> (entry point group, module and class of the abstract base)
-KINDS = {
+# for each kind of plugin, the group of its entry points and the abstract base class
+KINDS: Final = {
     "backbone": ("persist.backbones", "persist_cli.api.backbone:Backbone"),
     "memory": ("persist.memories", "persist_cli.api.memory:Memory"),
     "encoder": ("persist.encoders", "persist_cli.api.encoder:Encoder"),
@@ -38,10 +36,10 @@ class Plugin:
 
     Args:
         kind: a key of ``KINDS``.
-        name: what users call it.
-        target: ``module:class``.
-        package: the distribution that brings it.
-        version: of that distribution.
+        name: the name that users choose it by.
+        target: its class, as ``module:class``.
+        package: the distribution that it comes with.
+        version: the version of that distribution.
     """
 
     kind: str
@@ -55,27 +53,27 @@ class Plugin:
 
 
 def list_plugins(kind: str) -> list[Plugin]:
-    """Every installed plugin of a kind, sorted by name; imports none of them."""
+    """All installed plugins of a kind, sorted by name; none is imported."""
     group, _ = KINDS[kind]
     plugins = {_describe(kind, entry) for entry in entry_points(group=group)}
     return sorted(plugins, key=lambda plugin: (plugin.name, plugin.package))
 
 
 def find_plugin(kind: str, name: str) -> Plugin:
-    """A plugin by name, not imported yet.
+    """The plugin of a name, which is not imported yet.
 
     Raises:
         PluginError: when the name is unknown or claimed by two packages.
     """
-    named: dict[str, list[Plugin]] = defaultdict(list)
-    for plugin in list_plugins(kind):
-        named[plugin.name].append(plugin)
-    if name not in named:
-        raise PluginError(f"unknown {kind} {name!r}; {hint(name, sorted(named), 'installed')}")
-    if len(named[name]) > 1:
-        packages = " and ".join(plugin.package for plugin in named[name])
+    installed = list_plugins(kind)
+    plugins = [plugin for plugin in installed if plugin.name == name]
+    if not plugins:
+        names = sorted({plugin.name for plugin in installed})
+        raise PluginError(f"unknown {kind} {name!r}; {hint(name, names, 'installed')}")
+    if len(plugins) > 1:
+        packages = " and ".join(plugin.package for plugin in plugins)
         raise PluginError(f"{kind} {name!r} is claimed by {packages}; uninstall one of them")
-    return named[name][0]
+    return plugins[0]
 
 
 def load_plugin(kind: str, name: str) -> type[Any]:
@@ -88,12 +86,16 @@ def load_plugin(kind: str, name: str) -> type[Any]:
 
 
 def import_plugin(plugin: Plugin) -> type[Any]:
-    """Import a plugin and check that it is of its kind."""
+    """Import the class of a plugin.
+
+    Raises:
+        PluginError: when that fails, or the class is not of the plugin's kind.
+    """
     _, base_target = KINDS[plugin.kind]
     base = _resolve(base_target)
     try:
         loaded = _resolve(plugin.target)
-    except Exception as error:  # the plugin border: whatever a foreign module raises
+    except Exception as error:  # the module of another package may raise anything
         cause = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}"
         raise PluginError(f"{plugin} is broken: {cause}") from error
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
@@ -103,27 +105,27 @@ def import_plugin(plugin: Plugin) -> type[Any]:
 
 
 def make_encoder(name: str, settings: dict[str, Any]) -> Encoder:
-    """An encoder by name with plain settings."""
+    """Make the encoder of a name with plain settings."""
     return _make("encoder", name, settings)  # type: ignore[no-any-return]
 
 
 def make_memory(name: str, settings: dict[str, Any], encoder: Encoder, reference: FrameOfReference) -> Memory:
-    """An empty memory by name with plain settings."""
+    """Make an empty memory of a name with plain settings."""
     return _make("memory", name, settings, encoder, reference)  # type: ignore[no-any-return]
 
 
 def make_backbone(name: str, settings: dict[str, Any]) -> Backbone:
-    """A backbone by name with plain settings, its weights not loaded yet."""
+    """Make the backbone of a name with plain settings; no checkpoint is loaded into it."""
     return _make("backbone", name, settings)  # type: ignore[no-any-return]
 
 
 def make_simulator(name: str, settings: dict[str, Any]) -> Simulator:
-    """A simulator by name with plain settings."""
+    """Make the simulator of a name with plain settings."""
     return _make("simulator", name, settings)  # type: ignore[no-any-return]
 
 
 def make_importer(name: str) -> Importer:
-    """An importer by name."""
+    """Make the importer of a name."""
     return load_plugin("importer", name)()  # type: ignore[no-any-return]
 
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 import os
 from importlib import resources
 from pathlib import Path
+from typing import Final
 
-ENVIRONMENT = "PERSIST_REFERENCE"
+ENVIRONMENT: Final = "PERSIST_REFERENCE"
 
 
 def bundled_folder(name: str) -> Path:
-    """A folder of this name beside the recipes, or where the environment variable says; it may not be there."""
-    named = os.environ.get(ENVIRONMENT)
-    home = Path(named) if named else Path(str(resources.files("persist_recipes")))
-    return home / name
+    """The folder of this name beside the recipes, or where the environment variable says; it need not exist."""
+    return Path(os.environ.get(ENVIRONMENT) or str(resources.files("persist_recipes"))) / name

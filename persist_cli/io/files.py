@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written aside, synced and renamed; safetensors read with one-line errors."""
+"""Files and folders that are whole or absent: they are written aside, synced and renamed."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.errors import CheckpointError, PersistError
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-
-ASIDE = ".partial-"
+ASIDE: Final = ".partial-"  # the beginning of the names of files and folders that are being written
 
 
 def check_folder(path: Path) -> None:
-    """Raise ``PersistError`` when a file stands where this folder is or would be made, before any work is done."""
-    there = next((each for each in (path, *path.parents) if each.exists()), path)
-    if there.exists() and not there.is_dir():
-        raise PersistError(f"{path}: no folder can be made there, {there} is a file; choose another --out")
+    """Raise ``PersistError`` when a file is in the place of this folder or of one above it, before any work is done."""
+    nearest = next((folder for folder in (path, *path.parents) if folder.exists()), path)
+    if nearest.exists() and not nearest.is_dir():
+        raise PersistError(f"{path}: no folder can be made there, {nearest} is a file; choose another --out")
 
 
 @contextlib.contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
     """A temporary path in the same folder that becomes ``path`` when the block ends well."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = _place_aside(path)
+    aside = _path_aside(path)
     try:
         yield aside
         with aside.open("rb") as file:
@@ -56,11 +55,11 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """JSON values without NaN and infinity, which JSON does not have: they become null."""
+    """The value in the types of JSON; NaN and infinity, which JSON does not have, become ``None``."""
     if isinstance(value, Mapping):
-        return {str(key): plain(each) for key, each in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -74,21 +73,22 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     from safetensors.torch import save_file
 
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # safetensors writes a nameless temporary file beside its target: a folder around both can be found after a kill
-    with empty_folder_aside(path) as around:
-        with written_aside(around / path.name) as aside:
+    # safetensors writes a temporary file of its own beside its target: after a kill, a folder around both can be found
+    with empty_folder_aside(path) as folder:
+        with written_aside(folder / path.name) as aside:
             try:
                 save_file(contiguous, aside, dict(metadata or {}))
             except SafetensorError as error:
-                raise _of_the_system(path, str(error).splitlines()[0]) from error
-        (around / path.name).replace(path)
+                raise _os_error(path, str(error).splitlines()[0]) from error
+        (folder / path.name).replace(path)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file, the tensors in memory that torch allocated.
+    """The tensors and metadata of a safetensors file, the tensors in memory that torch allocated.
 
-    Those that safetensors gives lie where they lie in the file. At addresses that are not aligned as torch's own are,
-    some processors' kernels round differently, so a model that was read would not compute what the written one did.
+    The tensors of safetensors are aligned in memory as they are in the file. Where torch would have aligned them in
+    another way, some processors' kernels round differently, and a model that is read would not compute to the bit what
+    the written one did.
 
     Raises:
         CheckpointError: one line when the file is missing, truncated or not safetensors.
@@ -102,6 +102,32 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {name: file.get_tensor(name).clone() for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
     except (SafetensorError, ValueError, OSError) as error:
         raise CheckpointError(f"{path}: not a whole safetensors file ({str(error).splitlines()[0]})") from error
+
+
+def load_exactly(module: nn.Module, tensors: dict[str, Tensor], names: set[str], path: Path) -> None:
+    """Load tensors into a module, which keeps its precision whatever theirs is.
+
+    Args:
+        module: the module, which may be on the meta device.
+        tensors: the tensors of a file by name.
+        names: the names of the module's tensors that the file must hold, no more and no less.
+        path: the file, which error messages name.
+
+    Raises:
+        CheckpointError: when names or shapes differ.
+    """
+    import torch
+
+    state = module.state_dict()
+    different = sorted(names ^ set(tensors))
+    different += sorted(name for name in names & set(tensors) if state[name].shape != tensors[name].shape)
+    if different:
+        raise CheckpointError(
+            f"{path}: does not fit this model; {len(different)} tensors differ, first {different[0]!r}"
+        )
+    cast = {name: value.to(state[name].dtype) for name, value in tensors.items()}
+    with torch.no_grad():
+        module.load_state_dict(cast, strict=False, assign=any(state[name].is_meta for name in names))
 
 
 def reallocate(module: nn.Module) -> None:
@@ -132,8 +158,8 @@ def file_sha256(path: Path) -> str:
 
 @contextlib.contextmanager
 def empty_folder_aside(path: Path) -> Iterator[Path]:
-    """A temporary folder beside ``path``; what is still in it when the block ends is removed with it."""
-    aside = _place_aside(path)
+    """A temporary folder beside ``path``, which is removed with all that is still in it when the block ends."""
+    aside = _path_aside(path)
     aside.mkdir(parents=True)
     try:
         yield aside
@@ -143,15 +169,15 @@ def empty_folder_aside(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def folder_aside(path: Path) -> Iterator[Path]:
-    """A temporary folder that becomes ``path`` when the block ends well, in the place of what is there by then.
+    """A temporary folder that becomes ``path`` when the block ends well and replaces what is there.
 
-    What a killed writer of ``path`` left aside is removed first.
+    Whatever a killed writer of ``path`` left aside is removed first.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path.parent, path.name)
     with empty_folder_aside(path) as aside:
         yield aside
-        if path.exists():  # no folder can be renamed over one that holds something: the old one steps aside first
+        if path.exists():  # a folder cannot be renamed over one that is not empty, so the old one is moved aside first
             with empty_folder_aside(path) as old:
                 path.rename(old / path.name)
                 aside.rename(path)
@@ -160,7 +186,7 @@ def folder_aside(path: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path, name: str = "") -> None:
-    """Delete what a killed writer left aside in ``folder``, of all files or of those of one ``name``."""
+    """Delete what killed writers left aside in ``folder``, for all files or for those of one ``name``."""
     for leftover in folder.glob(f"{ASIDE}*"):
         owner = leftover.name.removeprefix(ASIDE).partition("-")[2]
         if name and owner != name:
@@ -171,30 +197,11 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
             leftover.unlink(missing_ok=True)
 
 
-def _of_the_system(path: Path, said: str) -> OSError:
-    """The system's error that another language reports as text."""
-    found = re.search(r"os error (\d+)", said)
-    return OSError(int(found[1]), os.strerror(int(found[1])), str(path)) if found else OSError(f"{path}: {said}")
+def _os_error(path: Path, message: str) -> OSError:
+    """The error of the operating system that safetensors, which is written in Rust, reports as text."""
+    match = re.search(r"os error (\d+)", message)
+    return OSError(int(match[1]), os.strerror(int(match[1])), str(path)) if match else OSError(f"{path}: {message}")
 
 
-def _place_aside(path: Path) -> Path:
+def _path_aside(path: Path) -> Path:
     return path.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{path.name}"
-
-
-def load_exactly(module: nn.Module, tensors: dict[str, Tensor], names: set[str], path: Path) -> None:
-    """Load tensors under exactly these names and shapes, or raise a one-line ``CheckpointError``.
-
-    The module keeps its precision, whatever the file's.
-    """
-    state = module.state_dict()
-    different = sorted(names ^ set(tensors))
-    different += sorted(name for name in names & set(tensors) if state[name].shape != tensors[name].shape)
-    if different:
-        raise CheckpointError(
-            f"{path}: does not fit this model; {len(different)} tensors differ, first {different[0]!r}"
-        )
-    import torch
-
-    cast = {name: value.to(state[name].dtype) for name, value in tensors.items()}
-    with torch.no_grad():
-        module.load_state_dict(cast, strict=False, assign=any(state[name].is_meta for name in names))

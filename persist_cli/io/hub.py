@@ -1,4 +1,4 @@
-"""Weights of others: whether the Hugging Face hub can be asked, where fetched weights are kept, and quiet loading."""
+"""Weights of others: whether the Hugging Face hub is in reach, where fetched weights are kept, and quiet loading."""
 
 from __future__ import annotations
 
@@ -11,46 +11,46 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-PATIENCE: Final = 3.0  # seconds
+TIMEOUT: Final = 3.0  # seconds
 
 MODEL_FILES: Final = ("config.json", "model.safetensors")
 
 
 def hub_obstacle() -> str | None:
-    """Why the hub is out of reach, in a few words; ``None`` when it answers. The network is asked once a process."""
+    """The reason why the hub is out of reach, ``None`` when it answers; each process tries once."""
     from huggingface_hub import constants
 
-    return "HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _silence(constants.ENDPOINT)
+    return "HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _connection_failure(constants.ENDPOINT)
 
 
 def in_hub_cache(repository: str) -> bool:
-    """Whether the hub's own cache has a model's configuration and weights, so that no network is needed."""
+    """Whether the hub's own cache holds a model's configuration and weights, so that no network is needed."""
     from huggingface_hub import try_to_load_from_cache
 
     return all(isinstance(try_to_load_from_cache(repository, name), str) for name in MODEL_FILES)
 
 
 @functools.cache
-def _silence(endpoint: str) -> str | None:
+def _connection_failure(endpoint: str) -> str | None:
     import http.client
     import urllib.error
     import urllib.request
 
     try:
-        urllib.request.urlopen(urllib.request.Request(endpoint, method="HEAD"), timeout=PATIENCE).close()
+        urllib.request.urlopen(urllib.request.Request(endpoint, method="HEAD"), timeout=TIMEOUT).close()
     except urllib.error.HTTPError:
-        return None  # something answers: what it thinks of the request is for the hub's client to find out
+        return None  # it answers; the hub's client deals with the error
     except (OSError, http.client.HTTPException, ValueError) as error:
         reason = getattr(error, "reason", error)
         if isinstance(reason, ssl.SSLError):
-            return None  # the client has certificates of its own
+            return None  # the hub's client has certificates of its own
         return f"{endpoint} does not answer ({reason})"
     return None
 
 
 @contextlib.contextmanager
 def silent(name: str) -> Iterator[None]:
-    """Within the block the logger of this name says nothing."""
+    """Within the block the logger of this name is silent."""
     logger = logging.getLogger(name)
     before, logger.disabled = logger.disabled, True
     try:
@@ -61,20 +61,20 @@ def silent(name: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def without_bars() -> Iterator[None]:
-    """Within the block transformers draws no progress bars of the weights that it loads."""
-    from transformers.utils import logging as theirs
+    """Within the block transformers draws no progress bars for the weights that it loads."""
+    from transformers.utils import logging as transformers_logging
 
-    before = theirs.is_progress_bar_enabled()
-    theirs.disable_progress_bar()
+    enabled = transformers_logging.is_progress_bar_enabled()
+    transformers_logging.disable_progress_bar()
     try:
         yield
     finally:
-        if before:
-            theirs.enable_progress_bar()
+        if enabled:
+            transformers_logging.enable_progress_bar()
 
 
 def weights_home() -> Path:
-    """The folder of all cached weights: ``$PERSIST_CACHE/weights``, else below the user's cache folder."""
+    """The folder of all fetched weights: ``$PERSIST_CACHE/weights``, else a folder in the user's cache."""
     cache = os.environ.get("PERSIST_CACHE")
     if cache:
         return Path(cache) / "weights"
@@ -82,6 +82,6 @@ def weights_home() -> Path:
 
 
 def cached_weight(name: str) -> Path | None:
-    """The folder of a weight by its name in ``persist weights list``; ``None`` when it was not fetched yet."""
+    """The folder of weights by their name in ``persist weights list``, ``None`` when they are not fetched yet."""
     folder = weights_home() / name
     return folder if (folder / "weight.json").is_file() else None

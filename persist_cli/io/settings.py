@@ -17,14 +17,19 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class NoSettings:
-    """For plugins that have nothing to set."""
+    """The settings of plugins that have none."""
 
 
 def parse_settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     """An instance of the frozen dataclass ``kind`` made from plain values, as YAML gives them.
 
+    Args:
+        kind: a dataclass, whose fields may be dataclasses too.
+        values: plain values by the names of the fields.
+        where: the file or plugin that the values are for, with which error messages begin.
+
     Raises:
-        RecipeError: one line with every unknown key (and what was meant), missing key and wrong value.
+        RecipeError: one line with every unknown key and the known one nearest to it, missing key and wrong value.
     """
     from pydantic import TypeAdapter, ValidationError
 
@@ -42,7 +47,7 @@ def parse_settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
 
 
 def _unknown_keys(kind: Any, values: Any, prefix: str) -> typing.Iterator[str]:
-    """Every key of ``values`` that no field of the dataclass takes, nested dataclasses included."""
+    """A message for each key of ``values`` that no field of the dataclass has, nested dataclasses included."""
     if not dataclasses.is_dataclass(kind) or not isinstance(values, Mapping):
         return
     types_of = typing.get_type_hints(kind)
@@ -57,7 +62,7 @@ def _unknown_keys(kind: Any, values: Any, prefix: str) -> typing.Iterator[str]:
 
 
 def _dataclass_in(kind: Any) -> Any:
-    """The dataclass of ``X`` or ``X | None``."""
+    """The type itself, or the dataclass in a union such as ``X | None``."""
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
         return next((part for part in typing.get_args(kind) if dataclasses.is_dataclass(part)), None)
     return kind
