@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from persist_cli.api.backbone import Backbone, Sampling
-from persist_cli.api.inference import InferenceOptions
-from persist_cli.checkpoints.checkpoint import Checkpoint, load_backbone
-from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.api.checkpoint import Checkpoint
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError

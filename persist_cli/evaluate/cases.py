@@ -30,7 +30,7 @@ class Case:
         scene: name of the scene that the trajectory shows.
         start: number of the clip's first frame, which is given to the model.
         frames: length of the clip, the given frame included.
-        context: how many frames at the trajectory's beginning the memory is made of before the clip.
+        context: number of frames at the trajectory's beginning that the memory is made of before the clip.
         seen_before: for each frame the share of its view that the frames in memory have seen, ``None`` if unknown.
         first_visits: for each frame the number of the clip's earlier frame that it returns to, -1 for none.
     """

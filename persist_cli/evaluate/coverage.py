@@ -1,4 +1,4 @@
-"""How much of a view was seen before, measured by reprojecting a grid of its pixels into earlier frames."""
+"""Coverage: the share of a view that was seen before, by reprojecting a grid of its pixels into earlier frames."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def held_frames(start: int, context: int, frame: int, predicted_at_once: int, wr
 
     Args:
         start: number of the clip's first frame.
-        context: how many of the trajectory's first frames the memory was made of.
+        context: number of the trajectory's first frames that the memory was made of.
         frame: the frame's number within the clip.
         predicted_at_once: frames that the backbone predicts at once.
         writes: whether predicted frames are written to the memory.

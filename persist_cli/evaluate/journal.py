@@ -90,10 +90,10 @@ class Journal:
 
     def check(self, plan: dict[str, Any]) -> None:
         """Raise ``PersistError`` when the folder holds another evaluation than this one."""
-        kept_plan = read_json(self.folder / PLAN) if self.begun else plan
-        if kept_plan != plan:
+        earlier_plan = read_json(self.folder / PLAN) if self.begun else plan
+        if earlier_plan != plan:
             raise PersistError(
-                f"{self.folder.parent}: holds another evaluation ({first_difference(kept_plan, plan)}); choose another "
+                f"{self.folder.parent}: holds another evaluation ({first_difference(earlier_plan, plan)}); choose another "
                 "--out or delete it"
             )
         remove_leftovers(self.folder)
@@ -168,9 +168,9 @@ class Processes:
         self.state.wait_for_everyone()
 
 
-def first_difference(kept: Any, new: Any, where: str = "") -> str:
+def first_difference(earlier: Any, new: Any, where: str = "") -> str:
     """The first key that two plans differ in, with both values."""
-    if isinstance(kept, dict) and isinstance(new, dict):
-        key = next(key for key in sorted({*kept, *new}) if kept.get(key) != new.get(key))
-        return first_difference(kept.get(key), new.get(key), f"{where} {key}".strip())
-    return f"{where}: {kept}, now {new}"
+    if isinstance(earlier, dict) and isinstance(new, dict):
+        key = next(key for key in sorted({*earlier, *new}) if earlier.get(key) != new.get(key))
+        return first_difference(earlier.get(key), new.get(key), f"{where} {key}".strip())
+    return f"{where}: {earlier}, now {new}"

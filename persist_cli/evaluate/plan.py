@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.inference import InferenceOptions
-from persist_cli.checkpoints.checkpoint import Checkpoint, find_checkpoint
-from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader, check_bases, common_sampling
 from persist_cli.evaluate.cases import Case
@@ -44,7 +43,7 @@ class EvalPlan:
     placement: InferenceOptions
 
     def without_repeats(self) -> EvalPlan:
-        """The same plan without repeated names: a memory named twice would be two rows of one name."""
+        """This plan without repeated names, because a memory named twice would be two rows of one name."""
         data = {folder.resolve(): folder for folder in self.data}
         return replace(self, data=tuple(data.values()), memories=tuple(dict.fromkeys(self.memories)))
 
@@ -60,7 +59,7 @@ class Evaluation:
         protocol: the protocol that chose the clips.
         cases: the clips.
         rows: rows of the table.
-        suites: for each row the metrics that can be measured of it.
+        suites: metrics of each row, as far as they can be measured of it.
         journal: files that keep what was measured.
     """
 

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from persist_cli import __version__
+from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.checkpoints import lineage
-from persist_cli.checkpoints.checkpoint import Checkpoint
 from persist_cli.io.files import file_sha256, read_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.metrics.metric import Metric
@@ -55,7 +55,7 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def scenes_json(checkpoint: Checkpoint) -> dict[str, Any]:
-    """How many scenes a checkpoint is known to have been trained on, as JSON values.
+    """The number of scenes that a checkpoint is known to have been trained on, as JSON values.
 
     The number may change between runs: it depends on which earlier checkpoints and data sets can still be read.
     """

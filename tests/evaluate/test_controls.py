@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.observations import Observations
-from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.data.store import Store
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch

@@ -1,4 +1,4 @@
-"""What all metrics have in common: names, definitions, obstacles and checks of a prediction."""
+"""Names, definitions and obstacles of all metrics, and the checks of a prediction."""
 
 import subprocess
 import sys

@@ -1,1 +1,1 @@
-"""What people read of an evaluation: the report, tables for papers, and two runs side by side."""
+"""The results of an evaluation for readers: the report, tables for papers, and two runs side by side."""

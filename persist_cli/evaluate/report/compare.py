@@ -67,7 +67,7 @@ class Comparison:
         }  # fmt: skip
 
 
-def compare(a: Path, b: Path) -> Comparison:
+def compare_runs(a: Path, b: Path) -> Comparison:
     """Compare the figures of two runs clip by clip.
 
     Args:
@@ -93,7 +93,7 @@ def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
     """Print two runs side by side, as tables or as JSON.
 
     Args:
-        a: first run, as ``compare`` takes it.
+        a: first run, as ``compare_runs`` takes it.
         b: second run.
         json: whether JSON is printed.
         out: folder that gets ``compare.json`` and ``compare.md``, ``None`` for none.
@@ -103,7 +103,7 @@ def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
     from persist_cli.io.files import write_json, write_text
     from persist_cli.viewing.console import OUT, print_json, print_table, say
 
-    comparison = compare(a, b)
+    comparison = compare_runs(a, b)
     if out is not None:
         write_json(out / "compare.json", comparison.to_json())
         write_text(out / "compare.md", comparison_text(comparison))

@@ -25,7 +25,7 @@ MOST_DOTS = 32  # points of a line that still get a dot with its value
 
 @dataclass(frozen=True)
 class Style:
-    """How a row looks in every plot; ``marked`` tells rows of one colour and kind apart."""
+    """The look of a row in every plot; ``marked`` distinguishes rows of one colour and kind."""
 
     number: int
     row: str
@@ -108,7 +108,7 @@ def row_styles(results: EvalResults) -> dict[str, Style]:
 
 
 def plots(results: EvalResults, table: TableRecord, styles: dict[str, Style]) -> list[Plot]:
-    """For each metric the plot against frame number, and the one against the seen-before share."""
+    """Two plots of each metric: against frame number, and against the share of the view seen before."""
     metric_plots = []
     for name, metric in results.measured.metrics.items():
         curves = [(styles[key], row.curves[name]) for key, row in table.rows.items() if name in row.curves]

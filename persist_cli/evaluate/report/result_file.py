@@ -156,7 +156,7 @@ class TableRecord(ResultModel):
 
 
 class KnownScenes(ResultModel):
-    """How many scenes a checkpoint is known to have been trained on, and whether these are all."""
+    """The number of scenes that a checkpoint is known to have been trained on, and whether these are all."""
 
     known: int
     complete: bool

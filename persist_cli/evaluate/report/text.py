@@ -116,7 +116,7 @@ def fit_columns(
 
 
 def _text_tables(results: EvalResults) -> Iterator[TextTable]:
-    """For each table one of figures, then one of differences to the first row where there are any."""
+    """Each table as one of figures, then one of differences to the first row where there are any."""
     several = len(results.tables) > 1
     for view in (table.view for table in compact_tables(results)):
         title = f"{view.name}: {view.clips} clips" if several else f"{view.clips} clips"

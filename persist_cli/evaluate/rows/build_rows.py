@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.checkpoints.checkpoint import Checkpoint
+from persist_cli.api.checkpoint import PLAIN, Checkpoint
+from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.protocols import Protocol
@@ -21,7 +22,6 @@ from persist_cli.evaluate.rows.interventions import (
 )
 from persist_cli.evaluate.rows.model import ModelRow, RowMemory
 from persist_cli.evaluate.rows.row import Row, unique_bases
-from persist_cli.io.checkpoint_folder import PLAIN
 from persist_cli.memorize.factory import MemoryFactory
 
 NO_MEMORY = "none"  # name of the memory that never reads a token, so that no intervention can change anything
@@ -84,7 +84,7 @@ def build_model_rows(checkpoints: Sequence[Checkpoint], config: RowConfig, proto
         adapter = None if memory == PLAIN else memory
         owners = checkpoints_with(memory, checkpoints)
         for owner, label in zip(owners, labels(owners), strict=True):
-            maker = MemoryFactory.of(owner.memory_config(memory)) if adapter else None
+            maker = MemoryFactory.of(adapter_memory(owner, memory)) if adapter else None
             name = memory if len(owners) == 1 else f"{memory} ({label})"
             row_memory = RowMemory(maker, Unmodified(), protocol.writes)
             rows.append(ModelRow(name, owner, adapter, config.sampling, row_memory))

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from persist_cli.api.backbone import Backbone, Clip, Clips
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.observations import Observations
-from persist_cli.checkpoints.checkpoint import Checkpoint
 from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.coverage import held_frames
 from persist_cli.evaluate.rows.row import Row

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
-from persist_cli.checkpoints.checkpoint import Checkpoint, load_adapter
+from persist_cli.checkpoints.load import load_adapter
 from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.rows.interventions import MemoryIntervention, Unmodified
 from persist_cli.evaluate.rows.row import Row

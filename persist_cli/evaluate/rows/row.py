@@ -9,8 +9,8 @@ from typing import ClassVar, Literal
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone
+from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.inference import InferenceOptions
-from persist_cli.checkpoints.checkpoint import Checkpoint
 from persist_cli.evaluate.cases import CaseFrames
 
 RowKind = Literal["model", "control", "memory control"]

@@ -8,7 +8,7 @@ import json
 import pytest
 
 from persist_cli.errors import DataError
-from persist_cli.evaluate.report.compare import compare, run_compare
+from persist_cli.evaluate.report.compare import compare_runs, run_compare
 from persist_cli.evaluate.report.page import write_report
 from persist_cli.evaluate.report.pictures import Pictures
 from tests.support.example_results import ROWS, example_results
@@ -31,13 +31,13 @@ def add_one_decibel(results):
 
 def compared_psnr(tmp_path, change):
     """The voxel row's PSNR in the example, compared with the example after a change."""
-    comparison = compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
+    comparison = compare_runs(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
     return comparison.tables[0].rows["voxel"]["psnr"]
 
 
 def test_a_run_compared_with_itself_differs_nowhere(tmp_path):
     same = write_results(tmp_path, "a.json")
-    comparison = compare(same, same)
+    comparison = compare_runs(same, same)
     figures = [cell for row in comparison.tables[0].rows.values() for cell in row.values() if cell.a is not None]
     assert {(cell.difference, cell.low, cell.high) for cell in figures} == {(0.0, 0.0, 0.0)}
     assert (list(comparison.tables[0].rows), comparison.notes) == (list(ROWS), [])
@@ -105,7 +105,7 @@ DIFFERENCES = {
 def test_runs_that_measured_differently_are_refused_with_both_values(tmp_path, reason):
     a, b = write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", DIFFERENCES[reason])
     with pytest.raises(DataError) as error:
-        compare(a, b)
+        compare_runs(a, b)
     assert str(error.value) == f"{a} and {b} were measured differently: {reason}"
 
 
@@ -115,7 +115,7 @@ def test_a_run_over_fewer_clips_is_refused_in_one_line(tmp_path):
         results.update(measured=smaller["measured"], tables=smaller["tables"])
 
     with pytest.raises(DataError, match=r"number of clips: 6 and 5") as error:
-        compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
+        compare_runs(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
     assert "\n" not in str(error.value)
 
 
@@ -127,7 +127,7 @@ def test_other_sampling_versions_and_rows_are_noted_and_not_refused(tmp_path):
         del results["tables"][0]["rows"]["voxel, shuffled"]
         del results["columns"]["ssim"]
 
-    comparison = compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
+    comparison = compare_runs(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
     assert comparison.notes == [
         "steps: 50 and 25", "seeds: [0, 1, 2] and [0]", "torch: 2.13.0 and 2.14.0",
         "checkpoint voxel: ffffffffffff and 000000000000", "column ssim: only in A", "row voxel, shuffled: only in A",
@@ -150,7 +150,7 @@ def test_a_file_that_is_not_results_is_one_line(tmp_path, cause):
     if BROKEN[cause] is not None:
         (tmp_path / "b.json").write_text(BROKEN[cause])
     with pytest.raises(DataError) as error:
-        compare(write_results(tmp_path, "a.json"), tmp_path / "b.json")
+        compare_runs(write_results(tmp_path, "a.json"), tmp_path / "b.json")
     assert cause in str(error.value)
     assert str(tmp_path / "b.json") in str(error.value)
     assert "\n" not in str(error.value)
@@ -163,7 +163,7 @@ def test_data_in_another_folder_and_results_named_by_their_folder_compare_alike(
 
     (tmp_path / "eval").mkdir()
     write_results(tmp_path / "eval", "metrics.json", change)
-    assert list(compare(write_results(tmp_path, "a.json"), tmp_path / "eval").tables[0].rows) == list(ROWS)
+    assert list(compare_runs(write_results(tmp_path, "a.json"), tmp_path / "eval").tables[0].rows) == list(ROWS)
 
 
 def test_runs_without_a_common_row_are_one_line(tmp_path):
@@ -171,7 +171,7 @@ def test_runs_without_a_common_row_are_one_line(tmp_path):
         results["tables"][0]["rows"] = {"other": results["tables"][0]["rows"]["none"]}
 
     with pytest.raises(DataError, match="have no row in common"):
-        compare(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
+        compare_runs(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
 
 
 def test_run_compare_prints_a_table_and_leaves_json_and_markdown(tmp_path, capsys):

@@ -18,7 +18,7 @@ HOSTILE = "</style><script>alert(1)</script><img src=x onerror=alert(1)>"
 
 
 def describe(folder, tmp_path, width=1280):
-    """What the browser shows of the report, as a script in a copy of the page finds it."""
+    """The browser's view of the report, described by a script in a copy of the page."""
     text = (folder / "report.html").read_text(encoding="utf-8")
     copy = tmp_path / "copy.html"
     copy.write_text(POLICY.sub("", text, count=1).replace("</body>", f"{DESCRIBE_PAGE}</body>"), encoding="utf-8")
