@@ -1,1 +1,1 @@
-"""What a recipe needs, found out before anything is loaded: parameters, memory, and what would fit."""
+"""Estimates before a training: its parameters, the memory that it needs, and what makes it fit a machine."""

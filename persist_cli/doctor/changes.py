@@ -1,4 +1,4 @@
-"""What makes a training need less memory: each change by itself, and the smallest that makes it fit."""
+"""Changes that make a training need less memory: the single ones, and the smallest combination that makes it fit."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from persist_cli.doctor.machine import Machine
 from persist_cli.recipe import Recipe
@@ -17,40 +18,40 @@ class Change:
     """A change of settings or of the launch.
 
     Args:
-        name: what tables call it.
-        settings: as KEY=VALUE.
-        cost: how much one would rather not; rounding and time count less than another optimizer, and that less than
+        name: its name in tables.
+        settings: the settings that it changes, as KEY=VALUE.
+        cost: how little one wants it. Rounding and a slower step cost less than another optimizer, and that less than
             training something else.
-        flags: of ``accelerate launch`` beside the number of processes.
-        whole: whether it needs a model that is not sharded.
+        flags: the flags of ``accelerate launch`` that it adds.
+        unsharded_only: whether it works only without FSDP2.
     """
 
     name: str
     settings: tuple[str, ...]
     cost: int
     flags: tuple[str, ...] = ()
-    whole: bool = False
+    unsharded_only: bool = False
 
 
 @dataclass(frozen=True)
 class Strategy:
-    """Some changes made together; none is the recipe as it is."""
+    """Changes that are made together; without any it is the recipe as it is."""
 
     changes: tuple[Change, ...] = ()
 
     @property
     def name(self) -> str:
-        """The changes' names."""
+        """The names of the changes."""
         return " + ".join(change.name for change in self.changes) or "as it is"
 
     @property
     def settings(self) -> list[str]:
-        """All KEY=VALUE."""
+        """All changed settings, as KEY=VALUE."""
         return [setting for change in self.changes for setting in change.settings]
 
     @property
     def sharded(self) -> bool:
-        """Whether one of them is a launch with FSDP2."""
+        """Whether one of the changes is a launch with FSDP2."""
         return any(change.flags for change in self.changes)
 
     @property
@@ -60,59 +61,63 @@ class Strategy:
 
     @property
     def cost(self) -> int:
-        """Of all of them."""
+        """The cost of all changes."""
         return sum(change.cost for change in self.changes)
 
     @property
     def possible(self) -> bool:
         """Whether the changes work together."""
-        return not (self.sharded and any(change.whole for change in self.changes))
+        return not (self.sharded and any(change.unsharded_only for change in self.changes))
 
 
-SHARDED = "--use_fsdp --fsdp_version 2"  # flags of a launch with FSDP2
-OFFLOADED = "--fsdp_offload_params true"
-SLICING = Change("VAE slicing", ("training.vae_slicing=true",), 1)
-FROZEN = Change("frozen in bf16", ("training.frozen_precision=bf16",), 1)
-FROZEN_WHOLE = dataclasses.replace(FROZEN, whole=True)  # what FSDP2 refuses outside of stage 2
-AVERAGE = Change("EMA on the CPU", ("training.ema_device=cpu",), 2)
-CHECKPOINTING = Change("gradient checkpointing", ("training.gradient_checkpointing=true",), 3)
-EIGHT_BIT = Change("8-bit optimizer", ("training.optimizer=adamw-8bit",), 4, whole=True)
-OFFLOAD = Change("CPU offload", (), 8, (SHARDED, OFFLOADED))
-LORA = Change("LoRA", ("lora.rank=64",), 16)
-STAGE2 = Strategy((Change("stage 2 only", (), 0),))  # another recipe, of the weights that come after these
+SHARDED: Final = "--use_fsdp --fsdp_version 2"  # flags of a launch with FSDP2
+OFFLOADED: Final = "--fsdp_offload_params true"
+
+SLICING: Final = Change("VAE slicing", ("training.vae_slicing=true",), 1)
+FROZEN: Final = Change("frozen in bf16", ("training.frozen_precision=bf16",), 1)
+FROZEN_UNSHARDED: Final = dataclasses.replace(FROZEN, unsharded_only=True)  # in stages where FSDP2 refuses it
+AVERAGE: Final = Change("EMA on the CPU", ("training.ema_device=cpu",), 2)
+CHECKPOINTING: Final = Change("gradient checkpointing", ("training.gradient_checkpointing=true",), 3)
+EIGHT_BIT: Final = Change("8-bit optimizer", ("training.optimizer=adamw-8bit",), 4, unsharded_only=True)
+OFFLOAD: Final = Change("CPU offload", (), 8, (SHARDED, OFFLOADED))
+LORA: Final = Change("LoRA", ("lora.rank=64",), 16)
+
+STAGE2: Final = Strategy((Change("stage 2 only", (), 0),))  # no change but another recipe, that of the next stage
 
 
-def changes_of(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
+def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
     """The changes that can make this recipe need less on this machine and are not in force yet."""
     training, cuda = recipe.training, machine.kind == "cuda"
-    deep, averaged = recipe.stage != "codec", training.ema and training.ema_device != "cpu"
-    frozen, half = FROZEN if recipe.stage == "2" else FROZEN_WHOLE, training.frozen_precision == "bf16"
-    can_shard = deep and training.optimizer == "adamw" and not (half and frozen.whole)
-    found: list[tuple[bool, Change]] = [
+    transformer, averaged = recipe.stage != "codec", training.ema and training.ema_device != "cpu"
+    frozen, half = FROZEN if recipe.stage == "2" else FROZEN_UNSHARDED, training.frozen_precision == "bf16"
+    can_shard = transformer and training.optimizer == "adamw" and not (half and frozen.unsharded_only)
+    fsdp = Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))
+    changes: list[tuple[bool, Change]] = [
         (not training.vae_slicing, SLICING),
-        (training.precision == "bf16" and not half and not (sharded and frozen.whole), frozen),
+        (training.precision == "bf16" and not half and not (sharded and frozen.unsharded_only), frozen),
         (bool(averaged) and cuda, AVERAGE),
-        (training.samples_at_once(machine.devices) > 1, _one_by_one(recipe, machine)),
-        (machine.devices > 1 and not sharded and can_shard, Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))),
-        (not training.gradient_checkpointing and deep, CHECKPOINTING),
+        (training.samples_at_once(machine.devices) > 1, _single_samples(recipe, machine)),
+        (machine.devices > 1 and not sharded and can_shard, fsdp),
+        (not training.gradient_checkpointing and transformer, CHECKPOINTING),
         (training.optimizer == "adamw" and cuda and not sharded, EIGHT_BIT),
         (cuda and can_shard, OFFLOAD),
         (recipe.stage == "1" and recipe.lora is None, LORA),
     ]
-    return [change for able, change in found if able]
+    return [change for available, change in changes if available]
 
 
-def _one_by_one(recipe: Recipe, machine: Machine) -> Change:
-    parts = max(1, recipe.training.batch // machine.devices)
-    return Change("samples one by one", (f"training.accumulation={parts}",), 2)
+def _single_samples(recipe: Recipe, machine: Machine) -> Change:
+    micro_batches = max(1, recipe.training.batch // machine.devices)
+    return Change("samples one by one", (f"training.accumulation={micro_batches}",), 2)
 
 
 def strategies(changes: Sequence[Change]) -> Iterator[Strategy]:
-    """All that can be done together, the smallest first."""
-    sets = (each for count in range(len(changes) + 1) for each in itertools.combinations(changes, count))
-    yield from sorted(filter(lambda each: each.possible, map(Strategy, sets)), key=lambda each: each.cost)
+    """All combinations of changes that work together, those of the lowest cost first."""
+    counts = range(len(changes) + 1)
+    combined = [Strategy(combination) for count in counts for combination in itertools.combinations(changes, count)]
+    yield from sorted((strategy for strategy in combined if strategy.possible), key=lambda strategy: strategy.cost)
 
 
-def smallest(changes: Sequence[Change], fits: Callable[[Strategy], bool]) -> Strategy | None:
-    """The smallest strategy that fits, ``None`` when none does."""
+def smallest_fitting(changes: Sequence[Change], fits: Callable[[Strategy], bool]) -> Strategy | None:
+    """The strategy of the lowest cost that fits, ``None`` when none does."""
     return next(filter(fits, watched([*strategies(changes)], "together", "strategy")), None)

@@ -13,62 +13,51 @@ from persist_cli.viewing.console import print_json, print_table
 
 def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:
     """Print every part's parameters, how many are new and how many each stage trains; nothing is read or written."""
-    planned = build_meta_model(recipe, overrides)
-    record = dry_run(planned)
+    meta_model = build_meta_model(recipe, overrides)
+    record = dry_run(meta_model)
     if json:
         print_json({"recipe": recipe} | record)
         return
-    stages = list(record["total"]["trained"])
-    title = f"{recipe}: stage {planned.recipe.stage} of {planned.backbone.name}"
-    columns = ["part", "parameters", "GiB", "new", *(f"{_spoken(stage)} trains" for stage in stages)]
+    stages = ["codec" if stage == "codec" else f"stage {stage}" for stage in record["total"]["trained"]]
+    title = f"{recipe}: stage {meta_model.recipe.stage} of {meta_model.backbone.name}"
+    columns = ["part", "parameters", "GiB", "new", *(f"{stage} trains" for stage in stages)]
     print_table(title, columns, [_row(part) for part in [*record["parts"], record["total"]]])
 
 
-def dry_run(planned: MetaModel) -> dict[str, Any]:
-    """The same as plain values, with the name and shape of every parameter; sizes are those of the weights alone."""
-    parts = planned.backbone.parameter_groups()
-    trained = {stage: _trained(planned, stage) for stage in _stages(planned)}
-    records = [_record(part, trained) for part in parts]
+def dry_run(meta_model: MetaModel) -> dict[str, Any]:
+    """The parts of the model as JSON values, with the name and shape of every parameter; sizes are those of weights."""
+    stages: tuple[Stage, ...] = ("codec", "1") if meta_model.recipe.memory is None else ("codec", "1", "2")
+    groups = meta_model.backbone.parameter_groups()
+    trained = {stage: set(meta_model.backbone.trained_parameters(stage)) for stage in stages}
+    parts = [_part(group, trained) for group in groups]
     total = {
         "name": "total",
-        **{key: sum(each[key] for each in records) for key in ("parameters", "bytes", "new")},
-        "trained": {stage: sum(each["trained"][stage] for each in records) for stage in trained},
+        **{key: sum(part[key] for part in parts) for key in ("parameters", "bytes", "new")},
+        "trained": {stage: sum(part["trained"][stage] for part in parts) for stage in stages},
     }
     return {
-        "stage": planned.recipe.stage,
-        "backbone": planned.backbone.name,
-        "base": str(planned.base.folder) if planned.base else None,
-        "parts": records,
+        "stage": meta_model.recipe.stage,
+        "backbone": meta_model.backbone.name,
+        "base": str(meta_model.base.folder) if meta_model.base else None,
+        "parts": parts,
         "total": total,
     }
 
 
-def _stages(planned: MetaModel) -> tuple[Stage, ...]:
-    return ("codec", "1") if planned.recipe.memory is None else ("codec", "1", "2")
-
-
-def _trained(planned: MetaModel, stage: Stage) -> set[str]:
-    return set(planned.backbone.trained_parameters(stage))
-
-
-def _record(part: ParameterGroup, trained: dict[Stage, set[str]]) -> dict[str, Any]:
-    sizes = {name: parameter.numel() for name, parameter in part.parameters.items()}
+def _part(group: ParameterGroup, trained: dict[Stage, set[str]]) -> dict[str, Any]:
+    sizes = {name: parameter.numel() for name, parameter in group.parameters.items()}
     parameters = sum(sizes.values())
     return {
-        "name": part.name,
+        "name": group.name,
         "parameters": parameters,
-        "bytes": sum(each.numel() * each.element_size() for each in part.parameters.values()),
-        "new": parameters if part.new else 0,
+        "bytes": sum(parameter.numel() * parameter.element_size() for parameter in group.parameters.values()),
+        "new": parameters if group.new else 0,
         "trained": {stage: sum(sizes[name] for name in sizes if name in names) for stage, names in trained.items()},
-        "shapes": {name: list(parameter.shape) for name, parameter in part.parameters.items()},
+        "shapes": {name: list(parameter.shape) for name, parameter in group.parameters.items()},
     }
 
 
-def _row(record: dict[str, Any]) -> list[str]:
-    counts = [record["new"], *record["trained"].values()]
-    size = gib(record["bytes"])
-    return [record["name"], f"{record['parameters']:,}", size, *(f"{count:,}" if count else "-" for count in counts)]
-
-
-def _spoken(stage: Stage) -> str:
-    return "codec" if stage == "codec" else f"stage {stage}"
+def _row(part: dict[str, Any]) -> list[str]:
+    counts = [part["new"], *part["trained"].values()]
+    size = gib(part["bytes"])
+    return [part["name"], f"{part['parameters']:,}", size, *(f"{count:,}" if count else "-" for count in counts)]

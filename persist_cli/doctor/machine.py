@@ -1,4 +1,4 @@
-"""The machine that a training is planned for: how many devices, and how much memory each has."""
+"""The machine to train on: how many devices, and how much memory each has."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import torch
 from persist_cli.errors import PersistError
 
 GIB: Final = 2**30  # as makers of cards say GB
-RESERVE: Final = 0.1  # of a card's memory that is not planned with: its context, kernels' workspaces, fragmentation
+RESERVE: Final = 0.1  # share of a card's memory for its context, the workspaces of kernels and fragmentation
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Like devices that train together.
+    """Equal devices that train together.
 
     Args:
         kind: ``cuda`` or ``cpu``.
-        devices: how many.
-        memory: bytes of each.
+        devices: the number of devices.
+        memory: bytes of memory of each device.
     """
 
     kind: str
@@ -31,7 +31,7 @@ class Machine:
 
     @property
     def usable(self) -> int:
-        """Bytes of each device to plan with."""
+        """Bytes of each device that a training may take."""
         return round(self.memory * (1 - RESERVE))
 
     def __str__(self) -> str:
@@ -40,19 +40,19 @@ class Machine:
 
 
 def gib(size: float) -> str:
-    """Bytes in GiB, as tables have them."""
+    """A number of bytes in GiB, as tables show it."""
     return f"{size / GIB:.3g}" if size < GIB else f"{size / GIB:.1f}"
 
 
 def machine_of(gpus: int | None, gpu_memory: float | None) -> Machine:
-    """GPUs that are asked for, of the size of those here where none is given; else what is here.
+    """The machine of the options ``--gpus`` and ``--gpu-memory``, else the one that this process runs on.
 
     Args:
-        gpus: how many.
-        gpu_memory: GB of each, as cards are called: 2³⁰ bytes.
+        gpus: the number of GPUs; by default those that are here, or one.
+        gpu_memory: GB of each GPU, as cards are sold: 2³⁰ bytes. By default that of the first GPU here.
 
     Raises:
-        PersistError: when GPUs are asked for, none is here and their memory is not given, and when it is no number.
+        PersistError: when the memory of the GPUs is not finite, or is not given and there is no GPU here to ask.
     """
     if gpu_memory is not None and not math.isfinite(gpu_memory):
         raise PersistError(f"--gpu-memory {gpu_memory}: give the GB of a card, as in 80")

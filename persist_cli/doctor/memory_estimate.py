@@ -1,4 +1,4 @@
-"""What a process of a training needs in bytes, by what for."""
+"""How many bytes of memory a process of a training needs, for each purpose."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 from torch import nn
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.doctor.step import Activations, Encoding, StepKind, Twins
+from persist_cli.doctor.step import Activations, Encoding, ShallowCopies, StepKind
 from persist_cli.recipe import Recipe
 
 FLOAT32: Final = 4
@@ -24,13 +24,13 @@ MOMENTS: Final = {
 
 @dataclass(frozen=True)
 class Launch:
-    """How processes share the work.
+    """How a training is spread over processes.
 
     Args:
-        devices: processes, a device each.
-        cuda: whether they are GPUs.
-        sharded: FSDP2; else each has the whole model.
-        offloaded: sharded, and each share rests in the memory of the CPU, where the optimizer works too.
+        devices: the number of processes, of which each has a device.
+        cuda: whether the devices are GPUs.
+        sharded: whether FSDP2 shards the model; else each process has all of it.
+        offloaded: whether FSDP2 also keeps each share in the memory of the CPU and runs the optimizer there.
     """
 
     devices: int
@@ -40,29 +40,29 @@ class Launch:
 
     @property
     def share(self) -> float:
-        """Of what is sharded, the part that rests on one device."""
+        """The share of what is sharded that one device holds between steps."""
         return 0.0 if self.offloaded else 1 / self.devices if self.sharded else 1.0
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes on one device.
+    """Bytes of memory on one device.
 
-    Weights, moments and averages are always there. Beside them there are at most, one after the other: what encoding
-    the clips takes; activations, with gradients coming while they go; gradients with what the update of the weights
-    takes. With several micro-batches gradients are there from the first one on.
+    Weights, moments and averages are always there. Three peaks follow each other in a step: encoding the clips; the
+    activations, which go while the gradients come; the gradients together with the update of the weights. With several
+    micro-batches there are gradients from the first one on.
 
     Args:
-        weights: and buffers; with FSDP also what is gathered of other processes at once.
-        gradients: and with DDP the buckets that are sent.
-        optimizer: moments of AdamW.
-        average: EMA, where it is on the device.
-        update: of the optimizer's step.
+        weights: weights and buffers; with FSDP2 also what is gathered from other processes at once.
+        gradients: gradients; with DDP also the buckets that are sent.
+        optimizer: the moments of AdamW.
+        average: the moving average of the weights, where it is on the device.
+        update: what the optimizer takes for its step.
         kept: whether gradients stay while the next micro-batch is encoded and run.
-        encoding: of the codec.
-        activations: in forward and backward pass, most at once.
-        shallow: of these, what is left when all gradients are there.
-        host: beside the device, in the memory of the CPU, for all processes together.
+        encoding: what the codec takes to encode a micro-batch.
+        activations: what forward and backward pass take at most.
+        shallow: what of the activations is left when all gradients are there.
+        host: bytes in the memory of the CPU instead of the device, for all processes together.
     """
 
     weights: int
@@ -78,7 +78,7 @@ class MemoryEstimate:
 
     @property
     def peak(self) -> int:
-        """Most bytes at once."""
+        """The most bytes at once."""
         before = self.gradients if self.kept else 0
         step = max(self.activations + before, self.gradients + self.shallow)
         return self.always + max(self.encoding + before, step, self.gradients + self.update)
@@ -89,36 +89,36 @@ class MemoryEstimate:
         return self.weights + self.optimizer + self.average
 
     def to_json(self) -> dict[str, int | bool]:
-        """Plain values."""
+        """The estimate and its peak as JSON values."""
         return dataclasses.asdict(self) | {"peak": self.peak}
 
 
 class Estimator:
-    """Estimates what runs of one plan need under different settings; steps that it knows it does not run again.
+    """Estimates the memory that trainings of one backbone need with different settings; each kind of step runs once.
 
     Args:
-        backbone: a plan, on the meta device.
-        channels: of the memory's features, ``None`` without a memory.
+        backbone: a backbone on the meta device.
+        channels: the number of channels of the memory's features, ``None`` without a memory.
     """
 
     def __init__(self, backbone: Backbone, channels: int | None) -> None:
-        self.backbone, self.twins = backbone, Twins(backbone, channels)
+        self.backbone, self.copies = backbone, ShallowCopies(backbone, channels)
         self._encodings: dict[tuple[object, ...], Encoding] = {}
         self._steps: dict[tuple[object, ...], Activations] = {}
 
-    def need(self, recipe: Recipe, launch: Launch) -> MemoryEstimate:
-        """What one process of a run needs."""
+    def estimate(self, recipe: Recipe, launch: Launch) -> MemoryEstimate:
+        """The memory that one process of a training needs."""
         training = recipe.training
         batch = training.samples_at_once(launch.devices)
         kind = StepKind(batch, launch.cuda, launch.sharded and training.precision == "bf16")
         encoding, step = self.encoding(recipe, kind).peak, self.step(recipe, kind)
-        least = self.at_least(recipe, launch)
-        return dataclasses.replace(least, encoding=encoding, activations=step.peak, shallow=step.shallow)
+        without_step = self.without_step(recipe, launch)
+        return dataclasses.replace(without_step, encoding=encoding, activations=step.peak, shallow=step.shallow)
 
-    def at_least(self, recipe: Recipe, launch: Launch) -> MemoryEstimate:
-        """The same without what a step takes, which need not be run for that."""
+    def without_step(self, recipe: Recipe, launch: Launch) -> MemoryEstimate:
+        """A lower bound that is found without running a step: encoding and activations are left out."""
         training = recipe.training
-        trained = [each.numel() for each in self.backbone.trained_parameters(recipe.stage).values()]
+        trained = [parameter.numel() for parameter in self.backbone.trained_parameters(recipe.stage).values()]
         count, largest = sum(trained), max(trained, default=0)
         share = launch.share
         buckets = 2 if launch.devices > 1 and not launch.sharded else 1
@@ -135,60 +135,58 @@ class Estimator:
         )
 
     def host(self, recipe: Recipe, launch: Launch, count: int) -> int:
-        """Bytes of what is trained that rest in the memory of the CPU, where the devices are others."""
+        """Bytes of trained weights, moments and averages that GPUs leave in the memory of the CPU."""
         training = recipe.training
         averages = count * FLOAT32 if training.ema else 0
         if launch.offloaded:
-            return self.weights_of(recipe)[1] + round(count * (FLOAT32 + MOMENTS[training.optimizer])) + averages
+            return self.parameter_bytes(recipe)[1] + round(count * (FLOAT32 + MOMENTS[training.optimizer])) + averages
         apart = launch.cuda and training.ema_device == "cpu"
         return averages * (1 if launch.sharded else launch.devices) if apart else 0
 
     def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
-        """What encoding takes in a step of this kind."""
+        """The memory that encoding takes in a step of this kind."""
         kind, training = dataclasses.replace(kind, sharded=False), recipe.training  # what encodes is not sharded
         key = (kind, training.precision, training.frozen_precision, training.vae_slicing)
         if key not in self._encodings:
-            self._encodings[key] = self.twins.encoding(recipe, kind)
+            self._encodings[key] = self.copies.encoding(recipe, kind)
         return self._encodings[key]
 
     def step(self, recipe: Recipe, kind: StepKind) -> Activations:
-        """What forward and backward pass take in a step of this kind."""
+        """The memory that forward and backward pass take in a step of this kind."""
         training = recipe.training
         key = (kind, training.precision, training.gradient_checkpointing, training.frozen_precision)
         if key not in self._steps:
-            self._steps[key] = self.twins.activations(recipe, kind, self.encoding(recipe, kind))
+            self._steps[key] = self.copies.activations(recipe, kind, self.encoding(recipe, kind))
         return self._steps[key]
 
     def weights(self, recipe: Recipe, launch: Launch) -> int:
-        """Bytes of parameters and buffers.
-
-        With FSDP those of this process and what it gathers at once: two blocks, one of them with the gradients that
-        go out in float32, and all that stands in no block.
-        """
-        whole, shared = self.weights_of(recipe)
+        """Bytes of parameters and buffers, with FSDP2 those of this process and what it gathers from others at once."""
+        never_sharded, sharded = self.parameter_bytes(recipe)
         gathered = self.gathered(recipe) if launch.sharded else 0
-        buffers = sum(each.numel() * each.element_size() for each in self.backbone.buffers())
-        return whole + buffers + round(shared * launch.share) + gathered
+        buffers = sum(buffer.numel() * buffer.element_size() for buffer in self.backbone.buffers())
+        return never_sharded + buffers + round(sharded * launch.share) + gathered
 
-    def weights_of(self, recipe: Recipe) -> tuple[int, int]:
-        """Bytes of the parameters that FSDP leaves whole, and of the rest; the frozen ones in their own precision."""
+    def parameter_bytes(self, recipe: Recipe) -> tuple[int, int]:
+        """Bytes of the parameters that FSDP2 never shards, and of all others; frozen ones in their own precision."""
         backbone, frozen = self.backbone, HALF if recipe.training.frozen_precision == "bf16" else FLOAT32
-        trained = {id(each) for each in backbone.trained_parameters(recipe.stage).values()}
+        trained = {id(parameter) for parameter in backbone.trained_parameters(recipe.stage).values()}
 
         def size(parameters: list[nn.Parameter]) -> int:
-            return sum(each.numel() * (FLOAT32 if id(each) in trained else frozen) for each in parameters)
+            return sum(p.numel() * (FLOAT32 if id(p) in trained else frozen) for p in parameters)
 
-        whole = backbone.never_sharded_parameters()
-        kept = {id(each) for each in whole}
-        return size(whole), size([each for each in backbone.parameters() if id(each) not in kept])
+        never_sharded = backbone.never_sharded_parameters()
+        whole = {id(parameter) for parameter in never_sharded}
+        return size(never_sharded), size([p for p in backbone.parameters() if id(p) not in whole])
 
     def gathered(self, recipe: Recipe) -> int:
-        """Bytes that FSDP puts together at once."""
-        kept = {id(each) for each in self.backbone.never_sharded_parameters()}
+        """Bytes that FSDP2 gathers at once.
+
+        These are two blocks, one of them with the gradients that go out in float32, and all that is in no block.
+        """
         width = HALF if recipe.training.precision == "bf16" else FLOAT32
-        blocks = [each for each in self.backbone.modules() if type(each).__name__ in self.backbone.sharded_blocks]
-        sizes = [sum(each.numel() for each in block.parameters()) for block in blocks]
-        inside = {id(each) for block in blocks for each in block.parameters()}
-        rest = sum(each.numel() for each in self.backbone.parameters() if id(each) not in inside | kept)
-        most = max(sizes, default=0)
-        return round(rest * width + most * (2 * width + width + FLOAT32))
+        blocks = [module for module in self.backbone.modules() if type(module).__name__ in self.backbone.sharded_blocks]
+        largest = max((sum(p.numel() for p in block.parameters()) for block in blocks), default=0)
+        apart = {id(p) for p in self.backbone.never_sharded_parameters()}
+        apart |= {id(p) for block in blocks for p in block.parameters()}
+        rest = sum(p.numel() for p in self.backbone.parameters() if id(p) not in apart)
+        return round(rest * width + largest * (2 * width + width + FLOAT32))

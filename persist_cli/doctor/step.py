@@ -1,9 +1,9 @@
-"""What a training step takes in bytes beside weights, gradients and optimizer: its activations, by running it unseen.
+"""The bytes that a training step takes beside weights, gradients and optimizer: its activations.
 
-Two shallow twins of the backbone run forward and backward on tensors without values (see ``tracing``). What either
-pass takes at most, ``a + b·groups``, is a line in the number of groups of like layers. Without gradient checkpointing
-``b`` is all that a group keeps for the backward pass, in bf16 also the copies of its weights. With it ``b`` is the
-hidden states between layers, in the forward pass also those copies, and ``a`` has what one layer keeps.
+Two shallow copies of the backbone run forward and backward on fake tensors (see ``tracing``). The most bytes of either
+pass grow linearly with the number of groups of equal layers: ``a + b·groups``. Without gradient checkpointing ``b`` is
+all that a group keeps for the backward pass, in bf16 also the copies of its weights. With it ``b`` is the hidden states
+between layers, in the forward pass also those copies, and ``a`` holds what one layer keeps.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ import torch
 from persist_cli.api.backbone import Backbone, ClipLatents, Clips
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.doctor.tracing import LiveBytes, imagined, kernels
+from persist_cli.doctor.tracing import LiveBytes, device_kernels, fake_tensors
 from persist_cli.recipe import Recipe
 from persist_cli.train.optimizer import requested_savings
 
-SHALLOW, DEEPER = 2, 4  # groups of layers; one alone is first and last at once
+SHALLOW, DEEPER = 2, 4  # groups of layers; a single group would be first and last at once
 
 
 @dataclass(frozen=True)
 class StepKind:
-    """What a step's bytes depend on besides backbone and recipe.
+    """A kind of step, which decides on its bytes together with backbone and recipe.
 
     Args:
         batch: samples of a micro-batch.
-        cuda: whether precisions are those of CUDA devices.
-        sharded: whether weights come in the precision of the computation, as FSDP gathers them.
+        cuda: whether operations run in the precisions that they have on CUDA devices.
+        sharded: whether weights are in the precision of the computation, as FSDP2 gathers them.
     """
 
     batch: int
@@ -43,11 +43,11 @@ class StepKind:
 
 @dataclass(frozen=True)
 class Encoding:
-    """What encoding a micro-batch takes.
+    """The memory that encoding a micro-batch takes.
 
     Args:
         peak: most bytes at once.
-        latents: on the meta device, ``None`` where the stage encodes nothing before its step.
+        latents: its result, on the meta device, ``None`` where the stage encodes nothing before its step.
     """
 
     peak: int
@@ -56,23 +56,23 @@ class Encoding:
 
 @dataclass(frozen=True)
 class Activations:
-    """What forward and backward pass of a micro-batch take, gradients not counted.
+    """The memory that forward and backward pass of a micro-batch take, without gradients.
 
     Args:
         peak: most bytes at once.
-        shallow: when all gradients are there.
+        shallow: bytes that are still taken when all gradients are there.
     """
 
     peak: int
     shallow: int
 
 
-class Twins:
-    """Shallow copies of a plan, to run unseen.
+class ShallowCopies:
+    """Two copies of a backbone with few layers each, which run on fake tensors.
 
     Args:
-        backbone: a plan, on the meta device.
-        channels: of the memory's features, ``None`` without a memory.
+        backbone: a backbone on the meta device.
+        channels: the number of channels of the memory's features, ``None`` without a memory.
     """
 
     def __init__(self, backbone: Backbone, channels: int | None) -> None:
@@ -82,42 +82,42 @@ class Twins:
         self.shallow.truncate_layers(SHALLOW)
 
     def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
-        """What encoding takes; nothing where the stage encodes nothing before its step."""
+        """The memory that encoding takes; none where the stage encodes nothing before its step."""
         if not self.shallow.encodes(recipe.stage):
             return Encoding(0)
-        with self.imagined(self.shallow, recipe, kind) as (backbone, live), autocast(recipe), torch.no_grad():
-            clips = imagined_clips(backbone, self.channels, kind.batch)
+        with self._traced(self.shallow, recipe, kind) as (backbone, live), _autocast(recipe), torch.no_grad():
+            clips = _fake_clips(backbone, self.channels, kind.batch)
             latents = backbone.encode(clips)
             return Encoding(live.peak, latents.to("meta"))
 
     def activations(self, recipe: Recipe, kind: StepKind, encoding: Encoding) -> Activations:
-        """What forward and backward pass take."""
-        shallow = self.run(self.shallow, recipe, kind, encoding)
-        deeper = self.run(self.deeper, recipe, kind, encoding)
+        """The memory that forward and backward pass take with all layers."""
+        shallow = self._run(self.shallow, recipe, kind, encoding)
+        deeper = self._run(self.deeper, recipe, kind, encoding)
         slopes = [(more - less) / (DEEPER - SHALLOW) for less, more in zip(shallow, deeper, strict=True)]
-        grown = [less + slope * (self.groups - SHALLOW) for less, slope in zip(shallow, slopes, strict=True)]
-        return Activations(round(max(grown)), max(0, round(shallow[1] - slopes[1] * SHALLOW)))
+        peaks = [less + slope * (self.groups - SHALLOW) for less, slope in zip(shallow, slopes, strict=True)]
+        return Activations(round(max(peaks)), max(0, round(shallow[1] - slopes[1] * SHALLOW)))
 
-    def run(self, twin: Backbone, recipe: Recipe, kind: StepKind, encoding: Encoding) -> tuple[int, int]:
-        """Most bytes of a twin's forward and backward pass."""
-        with self.imagined(twin, recipe, kind) as (backbone, live):
-            clips = imagined_clips(backbone, self.channels, kind.batch)
+    def _run(self, model: Backbone, recipe: Recipe, kind: StepKind, encoding: Encoding) -> tuple[int, int]:
+        """The most bytes of the model's forward and of its backward pass."""
+        with self._traced(model, recipe, kind) as (backbone, live):
+            clips = _fake_clips(backbone, self.channels, kind.batch)
             if encoding.latents is not None:
                 video = torch.zeros_like(encoding.latents.video, device="cpu")
                 image = video[:, :1] if backbone.framewise else torch.zeros_like(encoding.latents.image, device="cpu")
                 clips = dataclasses.replace(clips, latents=ClipLatents(video, image))
-            with autocast(recipe):
+            with _autocast(recipe):
                 loss = backbone(clips, recipe.stage)["loss"]
             forward, live.peak = live.peak, live.now
             loss.backward()
             return forward, live.peak
 
     @contextlib.contextmanager
-    def imagined(self, twin: Backbone, recipe: Recipe, kind: StepKind) -> Iterator[tuple[Backbone, LiveBytes]]:
-        """Within the block a copy of the twin, as the recipe trains it, and a count of what lives."""
-        backbone = copy.deepcopy(twin)
+    def _traced(self, model: Backbone, recipe: Recipe, kind: StepKind) -> Iterator[tuple[Backbone, LiveBytes]]:
+        """Within the block there is a fake copy of the model, as the recipe trains it, and a count of its bytes."""
+        backbone = copy.deepcopy(model)
         settings = dataclasses.replace(recipe.training, compile=False)
-        with imagined():
+        with fake_tensors():
             backbone.to_empty(device="cpu")
             parameters = backbone.trained_parameters(recipe.stage)
             backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
@@ -127,24 +127,24 @@ class Twins:
             live = LiveBytes([*backbone.parameters(), *backbone.buffers()], threads)
             for parameter in parameters.values():
                 parameter.register_post_accumulate_grad_hook(live.set_aside)
-            with live, kernels(kind.cuda):
+            with live, device_kernels(kind.cuda):
                 yield backbone, live
 
 
-def autocast(recipe: Recipe) -> torch.autocast:
+def _autocast(recipe: Recipe) -> torch.autocast:
     """Mixed precision as accelerate has it."""
     return torch.autocast("cpu", torch.bfloat16, enabled=recipe.training.precision == "bf16")
 
 
 def _halve(backbone: Backbone) -> None:
-    whole = {id(each) for each in backbone.never_sharded_parameters()}
+    never_sharded = {id(parameter) for parameter in backbone.never_sharded_parameters()}
     for parameter in backbone.parameters():
-        if id(parameter) not in whole:
+        if id(parameter) not in never_sharded:
             parameter.data = parameter.data.to(torch.bfloat16)
 
 
-def imagined_clips(backbone: Backbone, channels: int | None, batch: int) -> Clips:
-    """Clips of the backbone's shape with all memory tokens that its adapter asks for."""
+def _fake_clips(backbone: Backbone, channels: int | None, batch: int) -> Clips:
+    """Clips of the backbone's shape with as many memory tokens as its adapter takes."""
     frames, (height, width) = backbone.frames_per_clip, backbone.image_size
     poses, pinhole = torch.eye(4, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
     cameras = Cameras(poses.expand(batch, frames, 4, 4), pinhole.expand(batch, frames, 3, 3), height, width)

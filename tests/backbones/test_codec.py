@@ -12,7 +12,7 @@ from diffusers import AutoencoderKLCogVideoX
 from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_backbones.cogvideox.codec import batch_to_frames, fold_pixels, frames_to_batch, to_uint8, unfold_pixels
 from persist_cli.api.backbone import Sampling
-from persist_cli.doctor.tracing import imagined
+from persist_cli.doctor.tracing import fake_tensors
 from persist_cli.errors import CheckpointError
 from persist_cli.plugins import make_backbone
 from tests.support.micro_model import micro, random_clips, shaken
@@ -100,7 +100,7 @@ def test_the_papers_clips_are_decoded_whatever_their_number() -> None:
         codec = make_backbone("cogvideox", {"preset": "5b-i2v"} | sizes).codec
     assert codec.samples_at_once(128, (512, 512)) == 2
     assert codec.samples_at_once(256, (512, 512)) == 1
-    with imagined():
+    with fake_tensors():
         codec.to_empty(device="cpu")
         colors, depth = codec.decode_images(torch.zeros(4, 3, 32, 64, 64))
     assert (colors.shape, depth.shape) == ((4, 3, 9, 512, 512), (4, 9, 512, 512))

@@ -1,4 +1,4 @@
-"""The doctor: what fits, the smallest change that makes it fit, and what is said of it."""
+"""The doctor: whether a training fits, the smallest change that makes it fit, and the line that starts it."""
 
 from __future__ import annotations
 
@@ -10,46 +10,52 @@ import pytest
 import torch
 
 from persist_backbones.cogvideox.inputs import _fitted
+from persist_cli.api.backbone import ClipLatents
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
-from persist_cli.doctor.doctor import Doctor, command
+from persist_cli.doctor.doctor import Doctor, launch_command
 from persist_cli.doctor.machine import GIB, Machine
 from persist_cli.doctor.memory_estimate import Estimator, Launch
 from persist_cli.doctor.meta_model import build_meta_model
-from persist_cli.doctor.step import Encoding, StepKind, Twins
-from persist_cli.doctor.tracing import LiveBytes, imagined
+from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
+from persist_cli.doctor.tracing import LiveBytes, fake_tensors
 from persist_cli.train.distributed import check_sharded
 from tests.support.walking import MICRO_SETTINGS
 
 MICRO = [*MICRO_SETTINGS, "base=null"]
 SMALL = ["training.batch=8", "training.precision=bf16"]
 
-
 ONE_GPU = Launch(1, True)
 
 
-def planned(*settings: str, recipe: str = "tiny-stage1"):
+def micro_meta_model(*settings: str, recipe: str = "tiny-stage1"):
     return build_meta_model(recipe, [*MICRO, *SMALL, *settings])
 
 
 @functools.cache
-def estimator(*settings: str, recipe: str = "tiny-stage1"):
-    """One that knows the steps of the tests before."""
-    plan = planned(*settings, recipe=recipe)
-    return Estimator(plan.backbone, plan.channels)
+def estimator(*settings: str):
+    """An estimator that several tests share, because it runs each kind of step only once."""
+    meta_model = micro_meta_model(*settings)
+    return Estimator(meta_model.backbone, meta_model.channels)
 
 
-def need(*settings: str, launch: Launch = ONE_GPU):
-    return estimator().need(planned(*settings).recipe, launch)
+def estimate(*settings: str, launch: Launch = ONE_GPU):
+    return estimator().estimate(micro_meta_model(*settings).recipe, launch)
+
+
+def encoded():
+    """Latents of a micro-batch of one, of which encoding took nothing."""
+    video, image = (torch.zeros(1, frames, 8, 8, 8, device="meta") for frames in (3, 1))
+    return Encoding(0, ClipLatents(video, image))
 
 
 def test_tensors_without_values_are_counted_as_long_as_they_live():
-    with imagined():
+    with fake_tensors():
         known = torch.zeros(100)
         with LiveBytes([known], threads=None) as live:
             views = known[10:], torch.zeros(1000)[:10]
-            other = torch.zeros(500)
+            more = torch.zeros(500)
             assert live.now == 6000
-            del other, views
+            del more, views
     assert (live.now, live.peak) == (0, 6000)
 
 
@@ -59,99 +65,100 @@ def test_tensors_without_values_are_counted_as_long_as_they_live():
      ("training.optimizer=adamw-8bit", "optimizer"), ("training.ema_device=cpu", "average"),
      ("training.accumulation=8", "activations"), ("training.frozen_precision=bf16", "weights")],
 )  # fmt: skip
-def test_each_change_makes_less_of_what_it_is_for(change, less):
-    before, after = need().to_json(), need(change).to_json()
+def test_each_change_lowers_the_bytes_that_it_is_meant_to(change, less):
+    before, after = estimate().to_json(), estimate(change).to_json()
     assert after[less] < before[less]
 
 
 def test_lora_has_fewer_gradients():
     lora = ["lora={rank: 4, targets: [to_q]}"]
-    assert estimator(*lora).need(planned(*lora).recipe, ONE_GPU).gradients < need().gradients
+    with_lora = estimator(*lora).estimate(micro_meta_model(*lora).recipe, ONE_GPU)
+    assert with_lora.gradients < estimate().gradients
 
 
-def test_fsdp_shares_out_what_is_trained():
-    whole, shared = need(), need(launch=Launch(8, True, sharded=True))
+def test_fsdp_divides_what_is_trained_by_the_number_of_processes():
+    whole, shared = estimate(), estimate(launch=Launch(8, True, sharded=True))
     for name in ("optimizer", "gradients", "average"):
         assert shared.to_json()[name] == pytest.approx(whole.to_json()[name] / 8, abs=8)
 
 
-def test_what_is_offloaded_rests_in_the_memory_of_the_cpu_but_what_is_never_sharded():
-    shared, offloaded = (need(launch=Launch(2, True, True, offloaded)) for offloaded in (False, True))
+def test_offloading_moves_all_but_what_is_never_sharded_into_the_memory_of_the_cpu():
+    shared, offloaded = (estimate(launch=Launch(2, True, True, offloaded)) for offloaded in (False, True))
     assert (offloaded.gradients, offloaded.optimizer, offloaded.average, offloaded.update) == (0, 0, 0, 0)
     assert offloaded.activations == shared.activations
-    codec = sum(each.nbytes for each in estimator().backbone.get_submodule("codec").parameters())
+    codec = sum(parameter.nbytes for parameter in estimator().backbone.get_submodule("codec").parameters())
     assert codec < offloaded.weights < shared.weights
-    trained = sum(each.nbytes for each in estimator().backbone.trained_parameters("1").values())
+    trained = sum(parameter.nbytes for parameter in estimator().backbone.trained_parameters("1").values())
     assert offloaded.host == 5 * trained  # weights, gradients, two moments, average
     assert shared.host == 0
 
 
-def test_an_average_on_the_cpu_is_there_once_a_process_or_in_shares():
+def test_an_average_on_the_cpu_is_whole_for_each_process_and_divided_with_fsdp():
     average = "training.ema_device=cpu"
-    trained = sum(each.nbytes for each in estimator().backbone.trained_parameters("1").values())
-    assert need(average, launch=Launch(2, True)).host == 2 * trained
-    assert need(average, launch=Launch(2, True, sharded=True)).host == trained
+    trained = sum(parameter.nbytes for parameter in estimator().backbone.trained_parameters("1").values())
+    assert estimate(average, launch=Launch(2, True)).host == 2 * trained
+    assert estimate(average, launch=Launch(2, True, sharded=True)).host == trained
 
 
 @pytest.mark.parametrize(
     ("recipe", "settings", "sharded"),
     [("tiny-stage1", [], False), ("tiny-stage1", [], True), ("tiny-stage2-voxel", [], False),
-     *[("tiny-stage1", [f"training.{each}"], False) for each in ("frozen_precision=bf16", "optimizer=adamw-8bit")]],
+     ("tiny-stage1", ["training.frozen_precision=bf16"], False),
+     ("tiny-stage1", ["training.optimizer=adamw-8bit"], False)],
 )  # fmt: skip
 def test_no_strategy_is_refused_by_the_training_that_it_is_for(recipe, settings, sharded):
-    plan = planned(*settings, "base=nowhere", recipe=recipe)
-    doctor = Doctor(plan, Machine("cuda", 2, 1), sharded)
-    plan.backbone.trained_parameters(plan.recipe.stage)
-    together = [each for each in strategies(doctor.changes) if doctor.launch(each).sharded]
-    assert bool(together) is (not settings)
-    for strategy in together:
-        check_sharded(doctor.changed(strategy), plan.backbone)
+    meta_model = micro_meta_model(*settings, "base=nowhere", recipe=recipe)
+    doctor = Doctor(meta_model, Machine("cuda", 2, 1), sharded)
+    meta_model.backbone.trained_parameters(meta_model.recipe.stage)
+    with_fsdp = [strategy for strategy in strategies(doctor.changes) if doctor.launch(strategy).sharded]
+    assert bool(with_fsdp) is (not settings)
+    for strategy in with_fsdp:
+        check_sharded(doctor.changed_recipe(strategy), meta_model.backbone)
 
 
 def test_the_smallest_change_that_is_reported_fits_when_it_is_made(persist):
-    plain = need().peak
-    settings = [*MICRO, *SMALL, "--gpu-memory", str(plain * 0.8 / GIB)]
-    found = json.loads(persist("doctor", "tiny-stage1", *settings, "--json").out)
-    assert not found["fits"]
-    assert found["smallest"]["settings"]
-    again = json.loads(persist("doctor", "tiny-stage1", *settings, *found["smallest"]["settings"], "--json").out)
-    assert again["fits"]
-    assert again["smallest"]["settings"] == []
-    assert again["strategies"][0]["need"] == found["smallest"]["need"]
+    settings = [*MICRO, *SMALL, "--gpu-memory", str(estimate().peak * 0.8 / GIB)]
+    before = json.loads(persist("doctor", "tiny-stage1", *settings, "--json").out)
+    assert not before["fits"]
+    assert before["smallest"]["settings"]
+    after = json.loads(persist("doctor", "tiny-stage1", *settings, *before["smallest"]["settings"], "--json").out)
+    assert after["fits"]
+    assert after["smallest"]["settings"] == []
+    assert after["strategies"][0]["need"] == before["smallest"]["need"]
 
 
 def test_no_smaller_set_of_changes_would_have_fitted():
-    doctor = Doctor(planned(), Machine("cuda", 1, round(need().peak * 0.7)), sharded=False)
+    doctor = Doctor(micro_meta_model(), Machine("cuda", 1, round(estimate().peak * 0.7)), sharded=False)
     best = doctor.smallest()
-    cheaper = [each for each in doctor.each() if each.strategy.cost < best.strategy.cost]
-    assert not any(each.fits for each in cheaper)
+    cheaper = [finding for finding in doctor.findings() if finding.strategy.cost < best.strategy.cost]
+    assert not any(finding.fits for finding in cheaper)
 
 
-def test_what_is_said_can_be_run():
-    doctor = Doctor(planned(), Machine("cuda", 2, 1), sharded=False)
+def test_the_launch_command_runs_the_recipe_with_the_strategy():
+    doctor = Doctor(micro_meta_model(), Machine("cuda", 2, 1), sharded=False)
     strategy = Strategy((FROZEN, CHECKPOINTING, EIGHT_BIT))
-    line = command(doctor, [*MICRO, *SMALL], strategy)
+    line = launch_command(doctor, [*MICRO, *SMALL], strategy)
     assert line.startswith("accelerate launch --num_processes 2 --multi_gpu --module persist_cli finetune tiny-stage1 ")
     settings = [word for word in shlex.split(line) if "=" in word and not word.endswith("=DIR")]
-    assert build_meta_model("tiny-stage1", settings).recipe == doctor.changed(strategy)
+    assert build_meta_model("tiny-stage1", settings).recipe == doctor.changed_recipe(strategy)
     for sharded, machine in ((True, Machine("cuda", 2, 1)), (False, Machine("cuda", 1, 1))):
-        line = command(Doctor(planned(), machine, sharded), [], Strategy((OFFLOAD,)))
+        line = launch_command(Doctor(micro_meta_model(), machine, sharded), [], Strategy((OFFLOAD,)))
         flags = "--use_fsdp --fsdp_version 2 --fsdp_offload_params true"
         assert f"--num_processes {machine.devices} {flags} --module" in line
-    line = command(Doctor(planned(), Machine("cuda", 64, 1), False), [], Strategy())
+    line = launch_command(Doctor(micro_meta_model(), Machine("cuda", 64, 1), False), [], Strategy())
     assert line.startswith("accelerate launch --num_machines 8 --machine_rank R --main_process_ip HOST ")
 
 
-def test_a_plan_of_stage_1_is_beside_that_of_the_stage_2_that_stands_on_it(persist):
+def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
     settings = [*MICRO, *SMALL, "base=nowhere", "--gpus", "1", "--gpu-memory", "1", "--json"]
-    found = {name: json.loads(persist("doctor", name, *settings).out) for name in ("tiny-stage1", "tiny-stage2-voxel")}
-    last = found["tiny-stage1"]["strategies"][-1]
-    assert (last["name"], last["recipe"]) == ("stage 2 only", "tiny-stage2-voxel")
-    assert last["need"] == found["tiny-stage2-voxel"]["strategies"][0]["need"]
-    assert not any(each["name"] == "stage 2 only" for each in found["tiny-stage2-voxel"]["strategies"])
+    recipes = ("tiny-stage1", "tiny-stage2-voxel")
+    stage1, stage2 = (json.loads(persist("doctor", name, *settings).out)["strategies"] for name in recipes)
+    assert (stage1[-1]["name"], stage1[-1]["recipe"]) == ("stage 2 only", "tiny-stage2-voxel")
+    assert stage1[-1]["need"] == stage2[0]["need"]
+    assert not any(strategy["name"] == "stage 2 only" for strategy in stage2)
 
 
-def test_the_line_for_a_shell_has_what_was_asked_for_and_the_weights_to_begin_with(persist):
+def test_the_launch_command_has_the_users_options_and_the_pretrained_weights_to_begin_with(persist):
     machine = ["--gpus", "2", "--gpu-memory", "80", "--fsdp"]
     changes = [*MICRO, "training.batch=8", "lora={rank: 2}"]
     words = shlex.split(persist("doctor", "tiny-stage1", *machine, *changes).out.splitlines()[-1])
@@ -160,23 +167,22 @@ def test_the_line_for_a_shell_has_what_was_asked_for_and_the_weights_to_begin_wi
 
 
 def test_every_form_of_memory_can_be_estimated():
-    found = {}
+    peaks = {}
     for form in ("cross", "projected", "canvas"):
         changes = ["base=nowhere", f"adapter={{form: {form}, width: 16, token_budget: 64}}"]
-        plan = planned(*changes, recipe="tiny-stage2-voxel")
-        twins = Twins(plan.backbone, plan.channels)
-        found[form] = twins.activations(plan.recipe, StepKind(1, True), Encoding(0, (1, 4, 8, 8, 8))).peak
-    assert found["projected"] > found["cross"] > 0  # tokens for each latent frame
-    assert found["canvas"] > 0
+        meta_model = micro_meta_model(*changes, recipe="tiny-stage2-voxel")
+        copies = ShallowCopies(meta_model.backbone, meta_model.channels)
+        peaks[form] = copies.activations(meta_model.recipe, StepKind(1, True), encoded()).peak
+    assert peaks["projected"] > peaks["cross"] > 0  # tokens for each latent frame
+    assert peaks["canvas"] > 0
 
 
 def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
     rotary = ["use_rotary_positional_embeddings: true", "num_layers: 4", "in_channels: 8", "out_channels: 4"]
     settings = f"backbone.settings.transformer={{{', '.join(rotary)}, num_attention_heads: 1, attention_head_dim: 32}}"
-    plan = planned(settings)
+    meta_model = micro_meta_model(settings)
     _fitted.cache_clear()
-    Twins(plan.backbone, None).run(plan.backbone, plan.recipe, StepKind(1, True), Encoding(0, (1, 4, 8, 8, 8)))
-
+    ShallowCopies(meta_model.backbone, None).activations(meta_model.recipe, StepKind(1, True), encoded())
     region = ((0, 0), (2, 2))
     assert type(_fitted(32, (1, 2, 2), region, "cpu")[0]) is torch.Tensor
     assert _fitted.cache_info().currsize == 1
@@ -196,7 +202,7 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
      (["backbone.settings.vae={temporal_compression_ratio: 0}"], "temporal_compression_ratio 0: at least 1"),
      (["backbone.settings.pretrained=nowhere"], "nowhere: no such directory, and not the name of a repository")],
 )  # fmt: skip
-def test_what_cannot_be_planned_is_one_line(persist, options, cause):
+def test_an_impossible_recipe_or_machine_is_reported_in_one_line(persist, options, cause):
     if torch.cuda.is_available() and "--gpu-memory" not in options and "--gpus" in options:
         pytest.skip("there is a GPU to know the memory of")
     ended = persist("doctor", "tiny-stage1", *MICRO, *options)

@@ -1,4 +1,4 @@
-"""A recipe's plan: every parameter counted on the meta device, without data, download or weights."""
+"""A dry run counts every parameter on the meta device, without data, download or weights."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ import shutil
 import pytest
 from diffusers import CogVideoXTransformer3DModel
 
-from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.doctor.meta_model import build_meta_model
 from tests.support.export_runs import write_base
 from tests.support.micro_model import micro
 from tests.support.walking import MICRO_SETTINGS
 
 
-def test_a_plan_counts_what_the_trained_model_has(tmp_path):
+def test_a_meta_model_has_the_parameters_of_the_trained_model(tmp_path):
     write_base(tmp_path / "stage1")
-    planned = build_meta_model("tiny-stage2-voxel", [f"base={tmp_path / 'stage1'}"])
+    meta_model = build_meta_model("tiny-stage2-voxel", [f"base={tmp_path / 'stage1'}"])
     backbone = load_backbone(find_checkpoint(tmp_path / "stage1"))
-    backbone.add_adapter("voxel", planned.channels, {"form": "cross", "width": 128})
-    shapes = {name: each.shape for name, each in backbone.named_parameters()}
-    assert {name: each.shape for name, each in planned.backbone.named_parameters()} == shapes
-    assert all(each.is_meta for each in [*planned.backbone.parameters(), *planned.backbone.buffers()])
+    backbone.add_adapter("voxel", meta_model.channels, {"form": "cross", "width": 128})
+    shapes = {name: parameter.shape for name, parameter in backbone.named_parameters()}
+    assert {name: parameter.shape for name, parameter in meta_model.backbone.named_parameters()} == shapes
+    assert all(tensor.is_meta for tensor in [*meta_model.backbone.parameters(), *meta_model.backbone.buffers()])
 
 
 def test_every_parameter_is_in_one_part_and_stages_train_different_ones(persist):
@@ -36,14 +37,14 @@ def test_every_parameter_is_in_one_part_and_stages_train_different_ones(persist)
     assert record["total"]["bytes"] == 4 * record["total"]["parameters"]
 
 
-def test_a_base_that_is_not_there_yet_is_said_and_planned_from_the_recipe(persist):
+def test_a_base_that_does_not_exist_yet_is_replaced_by_the_recipes_backbone_and_a_line_says_so(persist):
     ended = persist("finetune", "tiny-stage2-voxel", "--dry-run", "base=runs/nowhere", "backbone.settings.preset=2b")
     assert ended.code == 0
     assert ended.err.startswith("runs/nowhere: no base there yet; planned with the backbone settings of tiny-stage2")
     assert "1,693,783,872" in ended.out
 
 
-def test_a_pretrained_folder_is_planned_from_its_configurations_alone(persist, tmp_path):
+def test_a_pretrained_folder_needs_only_its_configurations(persist, tmp_path):
     micro().save_base(tmp_path)
     for weights in tmp_path.rglob("*.safetensors"):
         weights.unlink()
@@ -52,10 +53,10 @@ def test_a_pretrained_folder_is_planned_from_its_configurations_alone(persist, t
     transformer = next(part for part in record["parts"] if part["name"] == "transformer")
     config = CogVideoXTransformer3DModel.load_config(tmp_path, subfolder="transformer")
     plain = CogVideoXTransformer3DModel.from_config(config)
-    assert transformer["parameters"] == sum(each.numel() for each in plain.parameters())
+    assert transformer["parameters"] == sum(parameter.numel() for parameter in plain.parameters())
 
 
-def test_weights_known_by_name_need_not_be_here_for_a_plan():
+def test_the_channels_of_an_encoder_are_known_by_the_name_of_its_weights():
     changes = ["memory.encoder=dinov2", "memory.encoder_settings={weights: dinov2-base}", *MICRO_SETTINGS]
     assert build_meta_model("tiny-stage2-voxel", changes).channels == 768
 
@@ -67,14 +68,14 @@ def test_weights_known_by_name_need_not_be_here_for_a_plan():
      (["tiny-stage1", "--dry-run", "backbone.settings.height=65"], "must be a multiple of"),
      (["tiny-stage2-voxel", "--dry-run", "memory.encoder_settings={weights: x}", "memory.encoder=dinov2"], "'x'")],
 )  # fmt: skip
-def test_a_plan_that_cannot_be_is_one_line(persist, arguments, cause):
+def test_a_dry_run_that_is_impossible_ends_in_one_line(persist, arguments, cause):
     ended = persist("finetune", *arguments)
     assert ended.code == 1
     assert cause in ended.err
     assert ended.err.strip().splitlines()[-1].startswith("error: ")
 
 
-def test_a_base_that_is_broken_is_not_taken_for_one_that_is_missing(persist, tmp_path):
+def test_a_broken_base_is_not_taken_for_a_missing_one(persist, tmp_path):
     write_base(tmp_path / "stage1")
     shutil.rmtree(tmp_path / "stage1/vae")
     ended = persist("finetune", "tiny-stage2-voxel", "--dry-run", f"base={tmp_path / 'stage1'}")

@@ -1,4 +1,4 @@
-"""The doctor's estimates beside what runs take: within 15 %, at three sizes and in both precisions."""
+"""The doctor's estimates are within 15 % of what runs take, at three sizes and in both precisions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TWIN_OF_5B = (
     "use_rotary_positional_embeddings: true}"
 )
 
-pytestmark = pytest.mark.skipif(not resident.KNOWN, reason="peak memory is asked of Linux")
+pytestmark = pytest.mark.skipif(not resident.KNOWN, reason="only Linux tells the peak memory")
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +43,8 @@ def walks_of(tmp_path_factory: pytest.TempPathFactory):
 
 def estimate(run: Run, cuda: bool = False) -> int:
     recipe, _, settings = run
-    planned = build_meta_model(recipe, [*SHORT, *settings])
-    return Estimator(planned.backbone, planned.channels).need(planned.recipe, Launch(1, cuda)).peak
+    meta_model = build_meta_model(recipe, [*SHORT, *settings])
+    return Estimator(meta_model.backbone, meta_model.channels).estimate(meta_model.recipe, Launch(1, cuda)).peak
 
 
 def trained_stage1(data: str, settings: list[str]) -> Path:
@@ -60,7 +60,7 @@ def check(runs: Sequence[Run]) -> None:
 
 def test_estimates_hold_for_a_tiny_model_with_and_without_gradient_checkpointing(walks_of):
     data, settings = walks_of(64)
-    changes = ["training.batch=4", CHECKPOINTING], ["training.batch=8"]  # so many that activations are most of it
+    changes = ["training.batch=4", CHECKPOINTING], ["training.batch=8"]  # activations then take most of the memory
     check([("tiny-stage1", data, [*settings, *PLAIN, *change]) for change in changes])
 
 
@@ -101,7 +101,7 @@ def test_estimates_hold_for_a_memory_adapter_and_for_lora(walks_of):
     data, settings = walks_of(64)
     run = [*settings, *PLAIN, "training.batch=8", TWIN_OF_5B]
     stage1 = trained_stage1(data, run)
-    run = [each for each in run if each != TWIN_OF_5B]
+    run.remove(TWIN_OF_5B)
     check([("tiny-stage2-voxel", data, [*run, f"base={stage1}", "adapter={form: cross, width: 128, dropout: 0}"]),
            ("tiny-stage1", data, [*run, f"base={stage1}", "lora={rank: 16}"])])  # fmt: skip
 
