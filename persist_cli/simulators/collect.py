@@ -1,4 +1,7 @@
-"""What a worker process of ``persist collect`` does: one simulator, one trajectory after another."""
+"""``persist collect``: trajectories of a simulator's scenes, walked and written by several processes.
+
+Each worker process has one simulator and collects one scene after another, see ``collect_scene``.
+"""
 
 from __future__ import annotations
 
@@ -27,110 +30,30 @@ from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
 from persist_cli.plugins import load_plugin, make_simulator
-from persist_cli.simulators import collect as work
 from persist_cli.simulators.policies import POLICIES, clear_distance, walk
 from persist_cli.viewing.console import add_task, print_json, progress, say
 
-START_TRIES = 100
-
-OPEN_WAY = 1.0  # metres
-
-
-@dataclass(frozen=True)
-class Tour:
-    """How to walk through scenes.
-
-    Args:
-        simulator: name of the plugin.
-        settings: of the simulator, plain values.
-        policy: a name in ``POLICIES``.
-        frames: of each trajectory.
-        seed: of the paths.
-        split: noted in the trajectories.
-    """
-
-    simulator: str
-    settings: dict[str, Any]
-    policy: str
-    frames: int
-    seed: int
-    split: str
-
-
-_running: dict[str, Any] = {}  # this worker's tour, and its simulator once it is needed
-
-
-def start(tour: Tour) -> None:
-    """Prepare this process for a tour, and end it when its parent ends, killed or not."""
-    _running["tour"] = tour
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def collect_scene(scene: int, path: Path) -> int:
-    """Walk through the scene of a generator seed and write what is seen; the number of frames."""
-    tour: Tour = _running["tour"]
-    if "simulator" not in _running:
-        _running["simulator"] = make_simulator(tour.simulator, tour.settings)
-    simulator: Simulator = _running["simulator"]
-    frames = tour_frames(simulator, tour, scene)
-    note = {"split": tour.split, "policy": tour.policy, "seed": tour.seed}
-    info = replace(simulator.info, source={**simulator.info.source, **note})
-    return write_trajectory(path, info, frames)
-
-
-def tour_frames(simulator: Simulator, tour: Tour, scene: int) -> Iterator[Frame]:
-    """The frames of a scene's trajectory, the same each time; the scene is open when this returns.
-
-    Raises:
-        DataError: when the scene has no free place for the agent.
-    """
-    random = np.random.default_rng([tour.seed, scene])
-    simulator.open_scene(scene)
-    simulator.place(_start(simulator, random), float(random.uniform(-math.pi, math.pi)))
-    return walk(simulator, POLICIES[tour.policy], random, tour.frames)
-
-
-def _start(simulator: Simulator, random: np.random.Generator) -> tuple[float, float]:
-    """A free place from which some way is open for a metre: not a nook behind a thing."""
-    ground = random_ground(simulator, random)
-    for _ in range(START_TRIES):
-        if ground is None:
-            break
-        ways = [2 * math.pi * way / 8 for way in range(8)]
-        if any(clear_distance(simulator, ground, way, OPEN_WAY, OPEN_WAY) for way in ways):
-            return ground
-        ground = random_ground(simulator, random)
-    raise DataError(f"{simulator.info.scene}: no free place for the agent was found")
-
-
-def _end_with(parent: Any) -> None:
-    parent.join()
-    os._exit(1)
-
-
 PLAN_FILE = "collect.json"
-
 VERSION = 1
-
 TEST_SEEDS = 1_000_000  # generator seeds of test scenes begin here; those of training scenes stay below
-
 FIRST_SEED = {"train": 0, "test": TEST_SEEDS}
-
 LARGEST_SIDE = 4096  # pixels
+START_TRIES = 100
+OPEN_WAY = 1.0  # metres that must be free in front of a start
+
+_worker: dict[str, Any] = {}  # this worker process's plan, and its simulator once it is needed
 
 
 @dataclass(frozen=True)
 class CollectPlan:
-    """What to collect, as the user wrote it.
+    """Options of ``persist collect`` as the user wrote them.
 
     Args:
         simulator: name of the plugin.
         scenes: ``A:B``, B not included.
-        frames: of each trajectory.
+        frames: number of frames of each trajectory.
         size: ``HxW`` in pixels.
-        seed: of the paths through the scenes.
+        seed: seed of the paths through the scenes.
         split: train or test.
         policy: a name in ``POLICIES``.
         step: metres.
@@ -148,7 +71,7 @@ class CollectPlan:
     turn: float = 15.0
 
     def check(self) -> None:
-        """Raise ``DataError`` with one line for the first setting that cannot be used."""
+        """Raise ``DataError`` with one line for the first option that cannot be used."""
         for name, value, known in (("policy", self.policy, POLICIES), ("split", self.split, FIRST_SEED)):
             if value not in known:
                 raise DataError(f"unknown {name} {value!r}; known: {', '.join(known)}")
@@ -160,7 +83,7 @@ class CollectPlan:
 
     @property
     def generator_seeds(self) -> list[int]:
-        """The seeds that the simulator makes the scenes from; no two splits share one."""
+        """The seeds that the simulator generates the scenes from; no two splits share one."""
         match = re.fullmatch(r"(\d+):(\d+)", self.scenes)
         low, high = (int(number) for number in match.groups()) if match else (0, 0)
         if low >= high:
@@ -178,22 +101,15 @@ class CollectPlan:
             raise DataError(f"size {self.size!r}: write HxW in pixels, each 1 to {LARGEST_SIDE}, as in 64x64")
         return height, width
 
-    @property
-    def tour(self) -> work.Tour:
-        """What a worker needs to know."""
-        height, width = self.image_size
-        settings = {"height": height, "width": width, "step": self.step, "turn": self.turn}
-        return work.Tour(self.simulator, settings, self.policy, self.frames, self.seed, self.split)
-
 
 def run_collect(plan: CollectPlan, out: Path, workers: int, json: bool) -> None:
-    """Collect what is missing of a plan's trajectories into ``out`` and say what is there.
+    """Collect the trajectories of a plan that are missing in ``out``, and print what there is.
 
     Args:
         plan: what to collect.
         out: data set folder; whole trajectories in it are kept.
-        workers: processes, 0 for one a core.
-        json: print JSON rather than a line.
+        workers: number of processes, 0 for one a core.
+        json: print JSON instead of a line.
 
     Raises:
         PersistError: for a plan that cannot be used, a folder of another plan, or a worker that died.
@@ -203,15 +119,15 @@ def run_collect(plan: CollectPlan, out: Path, workers: int, json: bool) -> None:
     claim_folder(plan, out)
     paths = {seed: out / f"house-{seed:06d}.parquet" for seed in plan.generator_seeds}
     missing = {seed: path for seed, path in paths.items() if not path.exists()}
-    began = time.perf_counter()
+    started = time.perf_counter()
     if missing:
         _collect_all(plan, missing, workers or os.cpu_count() or 1)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - started
     _report(plan, out, len(paths), len(missing), seconds, json)
 
 
 def claim_folder(plan: CollectPlan, out: Path) -> None:
-    """Make ``out`` this plan's folder and remove what a killed run left half-written in it.
+    """Make ``out`` this plan's folder and remove files that a killed run left half-written in it.
 
     Raises:
         DataError: when it holds trajectories of another split, of other settings, or not collected ones.
@@ -233,25 +149,64 @@ def claim_folder(plan: CollectPlan, out: Path) -> None:
     remove_leftovers(out)
 
 
-def _compare(wanted: dict[str, Any], found: Any, file: Path) -> None:
-    if not isinstance(found, dict):
+def collect_scene(seed: int, path: Path) -> int:
+    """Walk through the scene of a generator seed and write the trajectory, in a worker process.
+
+    Args:
+        seed: generator seed of the scene.
+        path: file of the trajectory.
+
+    Returns:
+        The number of frames.
+    """
+    plan: CollectPlan = _worker["plan"]
+    if "simulator" not in _worker:
+        height, width = plan.image_size
+        settings = {"height": height, "width": width, "step": plan.step, "turn": plan.turn}
+        _worker["simulator"] = make_simulator(plan.simulator, settings)
+    simulator: Simulator = _worker["simulator"]
+    frames = collect_frames(simulator, plan, seed)
+    source = {**simulator.info.source, "split": plan.split, "policy": plan.policy, "seed": plan.seed}
+    return write_trajectory(path, replace(simulator.info, source=source), frames)
+
+
+def collect_frames(simulator: Simulator, plan: CollectPlan, seed: int) -> Iterator[Frame]:
+    """The frames of a walk through a scene, the same each time; the scene is open when this returns.
+
+    Args:
+        simulator: opens the scene.
+        plan: gives policy, number of frames and the seed of the path.
+        seed: generator seed of the scene.
+
+    Raises:
+        DataError: when the scene has no free place for the agent.
+    """
+    random = np.random.default_rng([plan.seed, seed])
+    simulator.open_scene(seed)
+    simulator.place(_random_start(simulator, random), float(random.uniform(-math.pi, math.pi)))
+    return walk(simulator, POLICIES[plan.policy], random, plan.frames)
+
+
+def _compare(settings: dict[str, Any], stored: Any, file: Path) -> None:
+    """Raise ``DataError`` unless the settings stored in the file are these."""
+    if not isinstance(stored, dict):
         raise DataError(f"{file}: holds no plan of `persist collect`")
-    for name, value in wanted.items():
-        if found.get(name) != value:
+    for name, value in settings.items():
+        if stored.get(name) != value:
             raise DataError(
-                f"{file.parent}: was collected with {name} {found.get(name)!r}, not {value!r}; choose another folder"
+                f"{file.parent}: was collected with {name} {stored.get(name)!r}, not {value!r}; choose another folder"
             )
 
 
 def _collect_all(plan: CollectPlan, missing: dict[int, Path], workers: int) -> None:
     """Collect each missing trajectory in one of the worker processes, with a progress bar."""
     executor = ProcessPoolExecutor(
-        min(workers, len(missing)), get_context("spawn"), initializer=work.start, initargs=(plan.tour,)
+        min(workers, len(missing)), get_context("spawn"), initializer=_start_worker, initargs=(plan,)
     )
     futures: list[Future[int]] = []
     try:
         with _interrupts_ignored():  # the workers inherit this: Ctrl-C is the parent's matter
-            futures = [executor.submit(work.collect_scene, seed, path) for seed, path in missing.items()]
+            futures = [executor.submit(collect_scene, seed, path) for seed, path in missing.items()]
         with progress() as bar:
             task = add_task(bar, "collect", len(missing) * plan.frames, "frames", note="starting the simulator")
             for future in as_completed(futures):
@@ -266,11 +221,37 @@ def _collect_all(plan: CollectPlan, missing: dict[int, Path], workers: int) -> N
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
+
+
+def _start_worker(plan: CollectPlan) -> None:
+    """Prepare a worker process for a plan, and end it when its parent ends, killed or not."""
+    _worker["plan"] = plan
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_exit_with, args=(parent,), daemon=True).start()
+
+
+def _exit_with(parent: Any) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _random_start(simulator: Simulator, random: np.random.Generator) -> tuple[float, float]:
+    """A free place from which a metre straight ahead is free in some direction: not a nook behind a thing."""
+    ground = random_ground(simulator, random)
+    for _ in range(START_TRIES):
+        if ground is None:
+            break
+        headings = [2 * math.pi * direction / 8 for direction in range(8)]
+        if any(clear_distance(simulator, ground, heading, OPEN_WAY, OPEN_WAY) for heading in headings):
+            return ground
+        ground = random_ground(simulator, random)
+    raise DataError(f"{simulator.info.scene}: no free place for the agent was found")
 
 
 def _report(plan: CollectPlan, out: Path, trajectories: int, new: int, seconds: float, json: bool) -> None:
@@ -280,5 +261,5 @@ def _report(plan: CollectPlan, out: Path, trajectories: int, new: int, seconds: 
         figures |= {"frames": trajectories * plan.frames, "new_frames": new * plan.frames}
         print_json(figures | {"seconds": round(seconds, 3), "frames_per_second": round(rate, 1)})
         return
-    made = f"{new} new in {seconds:.1f} s, {rate:.0f} frames/s" if new else "all there already"
-    say(f"{out}: {trajectories} {plan.split} trajectories, {trajectories * plan.frames} frames ({made})")
+    news = f"{new} new in {seconds:.1f} s, {rate:.0f} frames/s" if new else "all there already"
+    say(f"{out}: {trajectories} {plan.split} trajectories, {trajectories * plan.frames} frames ({news})")

@@ -1,6 +1,6 @@
 """Decoration: paint and pictures for rooms and doors, drawn from the house's seed.
 
-Every wall, floor and ceiling has its own texture and colour, so that what is out of view cannot be guessed.
+Every wall, floor and ceiling has its own texture and colour, so that a place out of view cannot be guessed.
 """
 
 from __future__ import annotations
@@ -25,16 +25,8 @@ FLOOR_TEXTURES = (
 )  # fmt: skip
 CEILING_TEXTURES = ("ceiling_tiles_1", "ceiling_tile_noborder_1", "drywall_1", "stucco_1", "wood_2", "concrete_3")
 POSTERS = (
-    "lava_1",
-    "lava_2",
-    "slime_1",
-    "water_1",
-    "water_3",
-    "logo_mila_1",
-    "floor_tiles_bw_1",
-    "marble_1",
-    "grass_2",
-)
+    "lava_1", "lava_2", "slime_1", "water_1", "water_3", "logo_mila_1", "floor_tiles_bw_1", "marble_1", "grass_2",
+)  # fmt: skip
 CLOSED_DOORS = ("door_steel_brown", "door_steel_grey", "door_steel_red", "door_doom_1", "door_garage_white")
 
 
@@ -64,13 +56,13 @@ def paint(textures: tuple[str, ...], random: np.random.Generator) -> Paint:
 
 
 def tint(random: np.random.Generator, saturation: float) -> Colour:
-    """A bright colour, at most this saturated."""
+    """A random bright colour of at most this saturation, 0 to 1."""
     hue, value = float(random.random()), float(random.uniform(0.8, 1.0))
     return colorsys.hsv_to_rgb(hue, float(random.uniform(0.0, saturation)), value)
 
 
 def pick(names: tuple[str, ...], random: np.random.Generator) -> str:
-    """One of the names."""
+    """One of the names, drawn at random."""
     return names[int(random.integers(len(names)))]
 
 
@@ -83,7 +75,7 @@ def _pictures(ground: Rectangle, wall: int, doors: tuple[Door, ...], random: np.
     for _ in range(int(random.integers(*PICTURES))):
         picture = _picture(wall, length, random)
         low, high = picture.along - picture.width / 2 - BESIDE, picture.along + picture.width / 2 + BESIDE
-        if low > 0 and high < length and all(high < other[0] or low > other[1] for other in taken):
+        if low > 0 and high < length and all(high < start or low > end for start, end in taken):
             pictures.append(picture)
             taken.append((low, high))
     return pictures

@@ -21,7 +21,15 @@ BOX_TEXTURES = (
 
 
 class MeshKind(NamedTuple):
-    """One of MiniWorld's meshes: lowest and highest height in metres, radius over height, can it be carried."""
+    """One of MiniWorld's meshes.
+
+    Args:
+        name: file name without its ending.
+        low: smallest height in metres.
+        high: largest height in metres.
+        aspect: radius over height.
+        movable: whether it can be picked up.
+    """
 
     name: str
     low: float
@@ -49,15 +57,21 @@ MESH_WEIGHTS = np.array([1.0] * (len(MESHES) - 1) + [0.3])  # a ball has 15,000 
 
 
 def furnish(ground: Rectangle, doors: tuple[Door, ...], random: np.random.Generator) -> list[Thing]:
-    """Three or more things between which an agent can walk everywhere."""
-    near = [door.passage.center for door in doors if door.passage.grown(0.1, 0.1).overlaps(ground)]
+    """Three or more things for a room, between which an agent can walk everywhere.
+
+    Args:
+        ground: the room's floor.
+        doors: doors of the house; things keep away from those of the room.
+        random: source of all random choices.
+    """
+    doorways = [door.passage.center for door in doors if door.passage.grown(0.1, 0.1).overlaps(ground)]
     wanted = FEWEST_THINGS + int(random.integers(0, 2 + int(ground.width * ground.depth / 6)))
     things: list[Thing] = []
     for attempt in range(10 * TRIES):
         if len(things) >= (wanted if attempt < TRIES else FEWEST_THINGS):
             break
         thing = _thing(ground, random, small=attempt > TRIES // 3)
-        if _fits(thing, ground, things, near):
+        if _fits(thing, ground, things, doorways):
             things.append(thing)
     return things + [_on_top(thing, random) for thing in things if _is_low_box(thing) and random.random() < 0.5]
 
@@ -65,7 +79,7 @@ def furnish(ground: Rectangle, doors: tuple[Door, ...], random: np.random.Genera
 def _fits(thing: Thing, ground: Rectangle, things: list[Thing], doorways: list[Ground]) -> bool:
     """Whether an agent can still reach every free place of the room with this thing in it.
 
-    Things are kept apart by a gap, so each bites at most one piece off the room's border; the one way to cut
+    Things are kept apart by a gap, so each blocks at most one piece of the room's border; the only way to cut
     off a pocket is to stand near two walls but not in their corner.
     """
     x, z = thing.ground

@@ -55,7 +55,7 @@ class Rectangle:
 
     @property
     def center(self) -> Ground:
-        """The middle."""
+        """The point in the middle."""
         return (self.low_x + self.high_x) / 2, (self.low_z + self.high_z) / 2
 
     def grown(self, by_x: float, by_z: float) -> Rectangle:
@@ -71,7 +71,7 @@ class Rectangle:
         )
 
     def overlaps(self, other: Rectangle) -> bool:
-        """Whether the two share more than a border."""
+        """Whether both rectangles share more than a border."""
         return (
             self.low_x < other.high_x - ROUNDING
             and other.low_x < self.high_x - ROUNDING
@@ -95,7 +95,7 @@ class Door:
         passage: the ground between the two wall faces.
         along_x: whether one walks through it along x.
         height: metres.
-        paint: of its frame.
+        paint: paint of its frame.
         rooms: numbers of the two rooms.
     """
 
@@ -106,7 +106,7 @@ class Door:
     rooms: tuple[int, int]
 
     def walkway(self, radius: float) -> Rectangle:
-        """Where the centre of an agent of this radius may be while it walks through."""
+        """The ground where the centre of an agent of this radius may be while it walks through."""
         return self.passage.grown(radius, -radius) if self.along_x else self.passage.grown(-radius, radius)
 
 
@@ -120,7 +120,7 @@ class Picture:
         bottom: metres above the floor.
         width: metres.
         height: metres.
-        paint: what it shows, over its full size.
+        paint: the texture that it shows, over its full size.
         frame: colour of its border.
     """
 
@@ -139,10 +139,10 @@ class Thing:
 
     Args:
         shape: ``box``, ``table`` or the name of one of MiniWorld's meshes.
-        ground: its middle.
+        ground: position of its middle in metres.
         heading: radians, left turns positive.
         size: metres along its own x, up and along its own z; meshes are round, of diameter ``size[0]``.
-        paint: of boxes and tables.
+        paint: paint of boxes and tables; meshes bring their own.
         elevation: metres above the floor.
         movable: whether it can be picked up.
     """
@@ -178,7 +178,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Room:
-    """A rectangular room and what is in it; a room without a ceiling paint is open to the sky."""
+    """A rectangular room with its pictures and things; a room without a ceiling paint is open to the sky."""
 
     ground: Rectangle
     walls: tuple[Paint, ...]
@@ -193,9 +193,9 @@ class House:
     """A whole house, the same for the same seed.
 
     Args:
-        seed: what it was made from.
-        rooms: they do not overlap, and each can be reached.
-        doors: the ways between them.
+        seed: seed that it was generated from.
+        rooms: rooms that do not overlap, and of which each can be reached.
+        doors: doorways between the rooms.
         light: direction towards the light, of any length.
     """
 
@@ -206,12 +206,12 @@ class House:
 
     @property
     def things(self) -> list[Thing]:
-        """The things of all rooms."""
+        """The things in all rooms."""
         return [thing for room in self.rooms for thing in room.things]
 
     @property
     def bounds(self) -> tuple[Ground, Ground]:
-        """Lowest and highest ground corner."""
+        """Lowest and highest ground corner in metres."""
         grounds = [room.ground for room in self.rooms]
         low = min(ground.low_x for ground in grounds), min(ground.low_z for ground in grounds)
         return low, (max(ground.high_x for ground in grounds), max(ground.high_z for ground in grounds))
@@ -221,7 +221,7 @@ class House:
         return next((number for number, room in enumerate(self.rooms) if room.ground.contains(ground)), None)
 
     def walkable(self, radius: float) -> list[Rectangle]:
-        """Where the centre of a circle on the ground may be without touching a wall."""
+        """The ground where the centre of a circle may be without touching a wall."""
         rooms = [room.ground.grown(-radius, -radius) for room in self.rooms]
         return rooms + [door.walkway(radius) for door in self.doors]
 

@@ -24,7 +24,7 @@ class MeshPart:
         normals: ``[vertex, 3]`` float32.
         tiles: ``[vertex, 2]`` float32 texture coordinates.
         colour: red, green, blue in 0 to 1.
-        image: texture file, if it has one.
+        image: texture file; ``None`` for plain colour.
     """
 
     vertices: Array
@@ -36,7 +36,13 @@ class MeshPart:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh in parts, with its height and the radius of the circle around it in the file's units."""
+    """A mesh in parts of one material each.
+
+    Args:
+        parts: triangles by material.
+        height: height in the file's units.
+        radius: radius of the circle around it on the ground, in the file's units.
+    """
 
     parts: tuple[MeshPart, ...]
     height: float
@@ -44,7 +50,7 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """The mesh of an OBJ file of triangles, with the materials beside it."""
+    """Read an OBJ file of triangles, with the materials in the MTL file beside it."""
     vectors: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     faces: dict[str, list[list[int]]] = {}
     material = ""

@@ -63,7 +63,7 @@ class MiniWorld(Simulator):
         self._walkable: list[Rectangle] = []
         self._things: list[Thing] = []
         self._carried: Thing | None = None
-        self._stale = True  # whether the renderer has yet to hear of a change
+        self._stale = True  # whether the renderer draws an earlier state of the house
         self._ground: Ground = (0.0, 0.0)
         self._start_heading, self._turned = 0.0, 0.0  # radians and degrees to the left
 
@@ -79,7 +79,7 @@ class MiniWorld(Simulator):
         return self._house
 
     def open_scene(self, scene: int) -> None:
-        """Build the house of this seed, its things in their places and the agent not yet in it."""
+        """Build the house of this seed with its things in their places; ``place`` puts the agent into it."""
         if scene < 0:
             raise DataError(f"scene {scene}: seeds of houses are not negative")
         self._house = build_house(scene)
@@ -100,7 +100,7 @@ class MiniWorld(Simulator):
         self._ground, self._start_heading, self._turned = exact, heading, 0.0
 
     def observe(self) -> Frame:
-        """What the agent sees now."""
+        """The image, depth and pose of the agent's camera now."""
         if self._stale:
             carried = [self._carried_thing(self._ground, self._heading)] if self._carried is not None else []
             self._renderer.load(self.house, [*self._things, *carried])
@@ -110,19 +110,19 @@ class MiniWorld(Simulator):
         return Frame(rgb, depth, pose)
 
     def act(self, action: str) -> bool:
-        """Do an action; false, and nothing changed, where something is in the way or there is nothing to do it to.
+        """Do an action; returns false and changes nothing where something is in the way or out of reach.
 
         Raises:
             DataError: for an unknown action.
         """
-        known = self.vocabulary[action]
-        if known.interaction:
+        motion = self.vocabulary[action]
+        if motion.interaction:
             return {"pick_up": self._pick_up, "drop": self._drop, "toggle": self._toggle}[action]()
-        turned = self._turned + known.turn
+        turned = self._turned + motion.turn
         ahead_x, ahead_z = self.ahead(self._heading)
         ground = (
-            self._ground[0] + _exact(known.forward * ahead_x),
-            self._ground[1] + _exact(known.forward * ahead_z),
+            self._ground[0] + _exact(motion.forward * ahead_x),
+            self._ground[1] + _exact(motion.forward * ahead_z),
         )
         if not self._can_go(ground, turned):
             return False
@@ -169,7 +169,7 @@ class MiniWorld(Simulator):
         return self._start_heading + math.radians(self._turned)
 
     def _world_from_camera(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        """OpenCV axes: right, down, forward."""
+        """The camera's pose ``[4, 4]`` in OpenCV axes: right, down, forward."""
         (forward_x, forward_z), pose = self.ahead(self._heading), np.eye(4)
         pose[:3, 0] = -forward_z, 0.0, forward_x
         pose[:3, 1] = 0.0, -1.0, 0.0
@@ -178,7 +178,7 @@ class MiniWorld(Simulator):
         return pose
 
     def _can_go(self, ground: Ground, turned: float) -> bool:
-        """Whether the agent, with what it carries, passes nothing on the straight way there."""
+        """Whether nothing blocks the agent, with the thing that it carries, on the straight way there."""
         if not all(self.is_free(place) for place in self._way(ground)):
             return False
         if self._carried is None:
@@ -191,13 +191,13 @@ class MiniWorld(Simulator):
         (x, z), (to_x, to_z) = self._ground, ground
         return [(x + n / strides * (to_x - x), z + n / strides * (to_z - z)) for n in range(1, strides + 1)]
 
-    def _has_room(self, carried: Thing, others: list[Thing]) -> bool:
-        """Whether what is carried touches neither walls nor other things."""
+    def _has_room(self, carried: Thing, things: list[Thing]) -> bool:
+        """Whether a carried thing touches neither walls nor other things."""
         between_walls = any(area.contains(carried.ground) for area in self.house.walkable(carried.radius))
-        return between_walls and is_clear(carried.ground, carried.radius, others)
+        return between_walls and is_clear(carried.ground, carried.radius, things)
 
     def _carried_thing(self, ground: Ground, heading: float) -> Thing:
-        """What the agent carries, as it hangs before an agent at this place."""
+        """The carried thing in front of an agent at this place."""
         if self._carried is None:
             raise DataError("nothing is carried")
         distance = self.settings.radius + self._carried.radius + 0.3
@@ -225,12 +225,12 @@ class MiniWorld(Simulator):
         thing = self._within_reach()
         if self._carried is not None or thing is None:
             return False
-        others = [other for other in self._things if other is not thing]
+        remaining = [other for other in self._things if other is not thing]
         self._carried = thing
-        if not self._has_room(self._carried_thing(self._ground, self._heading), others):
+        if not self._has_room(self._carried_thing(self._ground, self._heading), remaining):
             self._carried = None
             return False
-        self._things, self._stale = others, True
+        self._things, self._stale = remaining, True
         return True
 
     def _drop(self) -> bool:

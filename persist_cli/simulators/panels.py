@@ -1,4 +1,4 @@
-"""Panels: the flat surfaces of a house as textured quadrilaterals, ready to be drawn by whatever draws."""
+"""Panels: the flat surfaces of a house as textured quadrilaterals, for any renderer."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Panel:
 
     Args:
         texture: file name in MiniWorld's textures, without its ending.
-        tint: colour to multiply with.
+        tint: colour that the texture is multiplied with.
         corners: ``[4, 3]`` world metres, counter-clockwise as seen from its front.
         tiles: ``[4, 2]`` texture coordinates of the corners; one unit is one tile.
     """
@@ -50,7 +50,7 @@ class Panel:
 
     @property
     def normal(self) -> Points:
-        """Unit vector out of its front."""
+        """The unit vector that points out of its front."""
         normal: Points = np.cross(self.corners[1] - self.corners[0], self.corners[3] - self.corners[0])
         normal /= np.linalg.norm(normal)
         return normal
@@ -193,7 +193,7 @@ def _level(ground: Rectangle, height: float, paint: Paint, down: bool = False) -
 
 
 def _moved(start: Ground, end: Ground, inwards: float) -> tuple[Ground, Ground]:
-    """A wall's ends moved into the room."""
+    """The ends of a wall, moved into the room by so many metres."""
     length = math.dist(start, end)
     by_x, by_z = -inwards * (end[1] - start[1]) / length, inwards * (end[0] - start[0]) / length
     return (start[0] + by_x, start[1] + by_z), (end[0] + by_x, end[1] + by_z)

@@ -1,4 +1,4 @@
-"""Routes: how far every free place of a scene is from a goal, and which way leads nearer to it."""
+"""Policies: how an agent walks through a scene, at random, to random goals, or there and back."""
 
 from __future__ import annotations
 
@@ -15,22 +15,94 @@ from persist_cli.api.observations import Frame
 from persist_cli.api.simulator import Simulator
 from persist_cli.errors import DataError
 
-Ground = tuple[float, float]
+MOST_REFUSALS = 200  # in a row
 
-Cell = tuple[int, int]
+# of explore
+SIGHT = 4.0  # metres that it looks ahead
+OPEN_VIEW = 0.75  # metres ahead that it likes to see: a wall before the nose shows nothing
+EFFORT = 3.0  # metres of new ground that it gives for not turning right round
+PATCH = 0.5  # metres of the squares in which it counts its visits
 
-SPACING = 0.2  # metres between grid places
+# of path
+NEAR_GOAL = 0.4  # metres at which a goal counts as reached
+LOOK_AROUND = 0.3  # how often it looks around before it sets out
+PATIENCE = 4  # steps without getting nearer, after which it gives up a goal
 
-FINE = 0.1  # metres between the places looked at along a straight way
-
+SPACING = 0.2  # metres between places of the grid
+FINE = 0.1  # metres between the places that are checked along a straight way
 NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+
+Ground = tuple[float, float]
+Cell = tuple[int, int]
+ActionStream = Generator[str, bool, None]  # yields the next action, and is sent whether the world allowed it
+Policy = Callable[[Simulator, np.random.Generator, int], ActionStream]
+
+
+def walk(simulator: Simulator, policy: Policy, random: np.random.Generator, frames: int) -> Iterator[Frame]:
+    """Let a policy walk from where the agent stands, and yield exactly ``frames`` observations.
+
+    Each frame holds the action taken at it, the last none; timestamps count one second an action.
+
+    Raises:
+        DataError: when the world refuses every action of the policy.
+    """
+    actions = policy(simulator, random, frames - 1)
+    for number in range(frames - 1):
+        frame = simulator.observe()
+        yield replace(frame, action=_next_allowed(simulator, actions, first=number == 0), timestamp=float(number))
+    yield replace(simulator.observe(), action=None, timestamp=float(frames - 1))
+
+
+def explore(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
+    """A random walk in straight runs, towards open and rarely visited ground; it turns away from obstacles."""
+    visits: Counter[tuple[int, int]] = Counter()
+    _, turn = _gait(simulator)
+    while True:
+        turns = _inviting_turn(simulator, random, visits)
+        yield from _turned(turns)
+        steps = yield from _step_ahead(simulator, int(random.integers(3, 13)), visits)
+        if turns == 0 and steps == 0:  # the way looked free, but is blocked
+            yield from _turned(int(random.choice([-1, 1])) * max(1, round(90 / turn)))
+
+
+def path(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
+    """Shortest paths between random places, one after another, sometimes with a look around before setting out."""
+    grid = FreeGrid(simulator)
+    reachable = sorted(grid.distances(simulator.agent[0]))
+    _, turn = _gait(simulator)
+    while True:
+        if random.random() < LOOK_AROUND:
+            yield from _turned(round(360 / turn))
+        goal = grid.place(reachable[int(random.integers(len(reachable)))]) if reachable else simulator.agent[0]
+        steps = yield from _go_to(simulator, grid, goal)
+        if steps == 0:
+            yield from _turned(int(random.choice([-1, 1])) * int(random.integers(1, max(2, round(90 / turn)))))
+
+
+def there_and_back(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
+    """Out along a path or a random walk for half of ``count`` actions, then the reversed actions back."""
+    out = path if random.random() < 0.5 else explore
+    outward = out(simulator, random, count // 2)
+    vocabulary = simulator.info.vocabulary
+    taken: list[str] = []
+    action = next(outward) if count >= 2 else STAY
+    while len(taken) < count // 2:
+        allowed = yield action
+        if allowed:
+            taken.append(action)
+        action = outward.send(allowed)
+    for action in [STAY] * (count % 2) + list(vocabulary.reversed(taken)):
+        yield action
+
+
+POLICIES: dict[str, Policy] = {"explore": explore, "path": path, "there-and-back": there_and_back}
 
 
 class FreeGrid:
     """The free places of the open scene on a square grid.
 
     Args:
-        simulator: with an open scene; what it says is free now counts.
+        simulator: has an open scene, of which the places that are free now count.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -51,22 +123,22 @@ class FreeGrid:
         return math.floor(x), math.floor(z)
 
     def distances(self, goal: Ground) -> dict[Cell, float]:
-        """Metres of the shortest way from each cell to the goal; cells without a way are missing (Dijkstra)."""
-        found: dict[Cell, float] = {}
+        """Metres of the shortest way from each cell to the goal (Dijkstra); cells without a way are missing."""
+        distances: dict[Cell, float] = {}
         queue = [(offset, cell) for cell, offset in self.around(goal)]
         heapq.heapify(queue)
         while queue:
             distance, cell = heapq.heappop(queue)
-            if cell in found:
+            if cell in distances:
                 continue
-            found[cell] = distance
+            distances[cell] = distance
             for neighbour, length in self._beside[cell]:
-                if neighbour not in found:
+                if neighbour not in distances:
                     heapq.heappush(queue, (distance + length, neighbour))
-        return found
+        return distances
 
     def around(self, ground: Ground) -> list[tuple[Cell, float]]:
-        """The free cells next to a place, nearest first, with the metres to their middles.
+        """The free cells at and beside a place, nearest first, with the metres to their middles.
 
         A free place may lie in a cell whose middle is not free.
         """
@@ -76,11 +148,11 @@ class FreeGrid:
         return sorted(near, key=lambda item: item[1])
 
     def remaining(self, ground: Ground, distances: dict[Cell, float]) -> float:
-        """Metres from a place to where ``distances`` lead, infinite without a way."""
+        """Metres from a place to the goal of ``distances``, infinite without a way."""
         return min((distances.get(cell, math.inf) + offset for cell, offset in self.around(ground)), default=math.inf)
 
     def _neighbours(self, cell: Cell) -> Iterator[tuple[Cell, float]]:
-        """Free cells beside a cell, and diagonal ones past which no corner stands."""
+        """Free cells beside a cell, and diagonal ones when no corner stands in between."""
         i, j = cell
         for by_i, by_j in NEIGHBOURS:
             beside = (i + by_i, j) in self.free and (i, j + by_j) in self.free
@@ -99,44 +171,8 @@ def clear_distance(simulator: Simulator, start: Ground, heading: float, longest:
     return math.floor(longest / stride + 1e-9) * stride
 
 
-CameraPath = Generator[str, bool, None]
-
-Policy = Callable[[Simulator, np.random.Generator, int], CameraPath]
-
-SIGHT = 4.0  # metres that explore looks ahead
-
-OPEN_VIEW = 0.75  # metres ahead that explore likes to see: a wall before the nose shows nothing
-
-EFFORT = 3.0  # metres of new ground that explore gives for not turning right round
-
-PATCH = 0.5  # metres of the squares in which explore counts its visits
-
-NEAR_GOAL = 0.4  # metres at which a goal counts as reached
-
-LOOK_AROUND = 0.3  # how often path looks around before it sets out
-
-PATIENCE = 4  # steps without getting nearer, after which path gives up a goal
-
-MOST_REFUSALS = 200  # in a row
-
-
-def walk(simulator: Simulator, policy: Policy, random: np.random.Generator, frames: int) -> Iterator[Frame]:
-    """Exactly ``frames`` observations along a policy's path from where the agent stands.
-
-    Each frame holds the action taken at it, the last none; timestamps count one second an action.
-
-    Raises:
-        DataError: when the world refuses whatever the policy wants.
-    """
-    actions = policy(simulator, random, frames - 1)
-    for number in range(frames - 1):
-        frame = simulator.observe()
-        yield replace(frame, action=_next_allowed(simulator, actions, first=number == 0), timestamp=float(number))
-    yield replace(simulator.observe(), action=None, timestamp=float(frames - 1))
-
-
-def _next_allowed(simulator: Simulator, actions: CameraPath, first: bool) -> str:
-    """Do what the policy wants next that the world allows; its name."""
+def _next_allowed(simulator: Simulator, actions: ActionStream, first: bool) -> str:
+    """Do the policy's next action that the world allows, and return its name."""
     action = next(actions) if first else actions.send(True)
     for _ in range(MOST_REFUSALS):
         if simulator.act(action):
@@ -145,80 +181,20 @@ def _next_allowed(simulator: Simulator, actions: CameraPath, first: bool) -> str
     raise DataError(f"{simulator.info.scene}: the agent cannot move; the last {MOST_REFUSALS} actions were refused")
 
 
-def explore(simulator: Simulator, random: np.random.Generator, count: int) -> CameraPath:
-    """A random walk in straight runs, towards open and rarely visited ground; it turns away from what blocks it."""
-    visits: Counter[tuple[int, int]] = Counter()
-    _, turn = _gait(simulator)
-    while True:
-        turns = _inviting_turn(simulator, random, visits)
-        yield from _turned(turns)
-        steps = yield from _run(simulator, int(random.integers(3, 13)), visits)
-        if turns == 0 and steps == 0:  # whatever the way looked like, it is blocked
-            yield from _turned(int(random.choice([-1, 1])) * max(1, round(90 / turn)))
-
-
-def _run(simulator: Simulator, most: int, visits: Counter[tuple[int, int]]) -> Generator[str, bool, int]:
-    """Steps straight ahead until something is in the way; how many they were."""
+def _step_ahead(simulator: Simulator, most: int, visits: Counter[tuple[int, int]]) -> Generator[str, bool, int]:
+    """Step straight ahead until something is in the way, and return the number of steps."""
     step, _ = _gait(simulator)
-    for done in range(most):
+    for steps in range(most):
         ground, heading = simulator.agent
         visits[_patch(ground)] += 1
-        view = step if done == 0 else step * math.ceil(OPEN_VIEW / step)
+        view = step if steps == 0 else step * math.ceil(OPEN_VIEW / step)
         if clear_distance(simulator, ground, heading, view, step) < view or not (yield "forward"):
-            return done
+            return steps
     return most
 
 
-def path(simulator: Simulator, random: np.random.Generator, count: int) -> CameraPath:
-    """Shortest ways between random places, one after another, sometimes with a look around before setting out."""
-    grid = FreeGrid(simulator)
-    reachable = sorted(grid.distances(simulator.agent[0]))
-    _, turn = _gait(simulator)
-    while True:
-        if random.random() < LOOK_AROUND:
-            yield from _turned(round(360 / turn))
-        goal = grid.place(reachable[int(random.integers(len(reachable)))]) if reachable else simulator.agent[0]
-        steps = yield from _go_to(simulator, grid, goal)
-        if steps == 0:
-            yield from _turned(int(random.choice([-1, 1])) * int(random.integers(1, max(2, round(90 / turn)))))
-
-
-def there_and_back(simulator: Simulator, random: np.random.Generator, count: int) -> CameraPath:
-    """Out along a path or a random walk for half of ``count`` actions, then the reversed actions back."""
-    out = path if random.random() < 0.5 else explore
-    outward = out(simulator, random, count // 2)
-    vocabulary = simulator.info.vocabulary
-    done: list[str] = []
-    action = next(outward) if count >= 2 else STAY
-    while len(done) < count // 2:
-        allowed = yield action
-        done += [action] if allowed else []
-        action = outward.send(allowed)
-    for action in [STAY] * (count % 2) + list(vocabulary.reversed(done)):
-        yield action
-
-
-POLICIES: dict[str, Policy] = {"explore": explore, "path": path, "there-and-back": there_and_back}
-
-
-def _gait(simulator: Simulator) -> tuple[float, float]:
-    """Metres of a step forward and degrees of a turn to the left."""
-    vocabulary = simulator.info.vocabulary
-    return vocabulary["forward"].forward, vocabulary["left"].turn
-
-
-def _turned(turns: int) -> CameraPath:
-    """Turns to the left, or to the right where negative."""
-    for _ in range(abs(turns)):
-        yield "left" if turns > 0 else "right"
-
-
-def _patch(ground: Ground) -> tuple[int, int]:
-    return math.floor(ground[0] / PATCH), math.floor(ground[1] / PATCH)
-
-
 def _inviting_turn(simulator: Simulator, random: np.random.Generator, visits: Counter[tuple[int, int]]) -> int:
-    """How many turns to the left (negative: right) face the way that is longest and least visited, by chance."""
+    """Number of turns to the left (negative: right) towards long and rarely visited ways, by chance."""
     step, turn = _gait(simulator)
     ground, heading = simulator.agent
     most = int(180 // turn)
@@ -237,7 +213,7 @@ def _inviting_turn(simulator: Simulator, random: np.random.Generator, visits: Co
 
 
 def _go_to(simulator: Simulator, grid: FreeGrid, goal: Ground) -> Generator[str, bool, int]:
-    """Turn and step along the shortest way until near the goal, or until it gets no nearer; how many steps."""
+    """Turn and step along the shortest way to the goal until near it or no nearer, and return the number of steps."""
     distances = grid.distances(goal)
     step, _ = _gait(simulator)
     best, patience, steps = math.inf, 0, 0
@@ -256,7 +232,7 @@ def _go_to(simulator: Simulator, grid: FreeGrid, goal: Ground) -> Generator[str,
 
 
 def _nearer_turn(simulator: Simulator, grid: FreeGrid, distances: dict[tuple[int, int], float]) -> int | None:
-    """How many turns face the way whose first steps lead nearest to the goal; ``None`` where all are blocked."""
+    """Number of turns towards the way whose first steps lead nearest to the goal; ``None`` where all are blocked."""
     step, turn = _gait(simulator)
     ground, heading = simulator.agent
     most = int(180 // turn)
@@ -267,10 +243,26 @@ def _nearer_turn(simulator: Simulator, grid: FreeGrid, distances: dict[tuple[int
             continue
         x, z = simulator.ahead(way)
         for walked in (step, 2 * step, 3 * step):
-            there = ground[0] + walked * x, ground[1] + walked * z
-            cost = grid.remaining(there, distances) + walked + 0.02 * abs(turns)
+            place = ground[0] + walked * x, ground[1] + walked * z
+            cost = grid.remaining(place, distances) + walked + 0.02 * abs(turns)
             if math.isinf(cost):
                 break
             if best is None or cost < best[0] - 1e-9:
                 best = cost, turns
     return None if best is None else best[1]
+
+
+def _turned(turns: int) -> ActionStream:
+    """Turn to the left, or to the right where negative."""
+    for _ in range(abs(turns)):
+        yield "left" if turns > 0 else "right"
+
+
+def _gait(simulator: Simulator) -> tuple[float, float]:
+    """Metres of a step forward and degrees of a turn to the left."""
+    vocabulary = simulator.info.vocabulary
+    return vocabulary["forward"].forward, vocabulary["left"].turn
+
+
+def _patch(ground: Ground) -> tuple[int, int]:
+    return math.floor(ground[0] / PATCH), math.floor(ground[1] / PATCH)

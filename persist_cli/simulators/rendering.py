@@ -26,7 +26,7 @@ from persist_cli.simulators.meshes import Mesh, MeshPart, read_mesh
 from persist_cli.simulators.panels import Panel, house_panels
 
 NEAR, FAR = 0.04, 100.0  # metres
-SKY = 99.0  # what seems farther away is missing
+SKY = 99.0  # metres; depth beyond is stored as missing
 SKY_COLOUR = (0.25, 0.82, 1.0)
 SAMPLES = 4
 LARGEST_TEXTURE = 256  # pixels of a side
@@ -38,17 +38,17 @@ Array = np.ndarray[Any, Any]
 
 @functools.cache
 def assets() -> Path:
-    """MiniWorld's folder, with its ``textures`` and ``meshes``.
+    """The folder of MiniWorld that holds ``textures`` and ``meshes``.
 
     Raises:
         PluginError: when the package is not installed.
     """
-    found = importlib.util.find_spec("miniworld")
-    if found is None or not found.submodule_search_locations or importlib.util.find_spec("pyglet") is None:
+    spec = importlib.util.find_spec("miniworld")
+    if spec is None or not spec.submodule_search_locations or importlib.util.find_spec("pyglet") is None:
         raise PluginError(
             "simulator 'miniworld' needs the package miniworld; install it with `pip install 'persist-cli[miniworld]'`"
         )
-    return Path(found.submodule_search_locations[0])
+    return Path(spec.submodule_search_locations[0])
 
 
 @functools.cache
@@ -56,7 +56,7 @@ def _context() -> tuple[Any, Any]:
     """OpenGL's functions, and the one invisible window of this process that they draw for.
 
     Raises:
-        PluginError: when OpenGL cannot be had without a screen.
+        PluginError: when OpenGL is not available without a screen.
     """
     assets()
     os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's threads only get in each other's way on small images
@@ -72,14 +72,14 @@ def _context() -> tuple[Any, Any]:
         raise PluginError(_no_egl(error)) from error
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what pyglet tries instead fails, too, and that is told below
+            warnings.simplefilter("ignore")  # pyglet then tries a screen; its failure is reported below
             return gl, Window(width=1, height=1, visible=False)
     except (NoSuchConfigException, NoSuchDisplayException, gl.ContextException, gl.lib.GLException) as error:
         raise PluginError(_no_egl(error)) from error
 
 
 def _graphics() -> Any:
-    """OpenGL's functions, drawing for persist whatever else this process draws."""
+    """OpenGL's functions, switched to the window of persist whatever else this process draws."""
     gl, window = _context()
     window.switch_to()
     return gl
@@ -94,8 +94,11 @@ class Renderer:
     """Draws one house at a time into images of one size.
 
     Args:
-        height: pixels.
-        width: pixels.
+        height: image height in pixels.
+        width: image width in pixels.
+
+    Raises:
+        PluginError: when OpenGL is not available, or has no frame buffer of this size.
     """
 
     def __init__(self, height: int, width: int) -> None:
@@ -106,7 +109,7 @@ class Renderer:
         self._set_up()
 
     def load(self, house: House, things: Sequence[Thing]) -> None:
-        """Take a house, with its things as they are now, for the images to come."""
+        """Draw this house, with its things as they are now, in all images until the next call."""
         gl = _graphics()
         panels = sorted(house_panels(house, things), key=lambda panel: panel.texture)
         painted = [(texture(name), list(group)) for name, group in groupby(panels, key=lambda panel: panel.texture)]
@@ -120,7 +123,12 @@ class Renderer:
         gl.glEndList()
 
     def render(self, eye: Sequence[float], forward: Sequence[float], fov: float) -> tuple[Array, Array]:
-        """The view from ``eye`` towards ``forward`` (world, metres), +y up, ``fov`` degrees from top to bottom.
+        """Render the view from a point, with +y up.
+
+        Args:
+            eye: position in world metres.
+            forward: direction of the view.
+            fov: degrees from the top of the image to its bottom.
 
         Returns:
             rgb uint8 ``[height, width, 3]``, and planar depth float32 metres ``[height, width]``, 0 for the sky.
@@ -133,9 +141,9 @@ class Renderer:
         gl.glBlitFramebuffer(*whole, *whole, gl.GL_COLOR_BUFFER_BIT, gl.GL_NEAREST)
         rgb = np.empty((self.height, self.width, 3), np.uint8)
         self._read(self._resolved, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, rgb)
-        self._paint(False)
+        self._write_colors(False)
         self._draw(self._single, eye, forward, fov)
-        self._paint(True)
+        self._write_colors(True)
         buffer = np.empty((self.height, self.width), np.float32)
         self._read(self._single, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, buffer)
         depth = NEAR * FAR / (FAR - buffer.astype(np.float64) * (FAR - NEAR))
@@ -163,12 +171,12 @@ class Renderer:
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
         gl.glReadPixels(0, 0, self.width, self.height, channels, kind, into.ctypes.data_as(ctypes.c_void_p))
 
-    def _paint(self, wanted: bool) -> None:
-        """Whether what is drawn has colours, or depth alone."""
+    def _write_colors(self, enabled: bool) -> None:
+        """Draw colours and depth from now on, or depth alone."""
         gl = self._gl
-        gl.glColorMask(*(4 * [wanted]))
+        gl.glColorMask(*(4 * [enabled]))
         for switch in (gl.GL_TEXTURE_2D, gl.GL_LIGHTING):
-            (gl.glEnable if wanted else gl.glDisable)(switch)
+            (gl.glEnable if enabled else gl.glDisable)(switch)
 
     def _frame_buffer(self, samples: int) -> Any:
         """A frame buffer with eight bits a colour and 32 bits of depth; 0 samples for a plain one."""
@@ -226,7 +234,7 @@ class Renderer:
 
 @functools.cache
 def texture(name: str) -> Any:
-    """OpenGL's number of one of MiniWorld's textures; ``portraits/7`` is the eighth portrait by name."""
+    """The OpenGL number of one of MiniWorld's textures; ``portraits/7`` is the eighth portrait by name."""
     folder = assets() / "textures"
     if name.startswith("portraits/"):
         portraits = sorted((folder / "portraits").glob("*.png"))
@@ -236,7 +244,7 @@ def texture(name: str) -> Any:
 
 @functools.cache
 def _upload(path: Path) -> Any:
-    """OpenGL's number of an image file, with smaller copies for the distance."""
+    """The OpenGL number of an image file, uploaded with smaller copies for the distance."""
     gl = _graphics()
     with Image.open(path) as file:
         image = file.convert("RGB")
@@ -257,7 +265,7 @@ def _upload(path: Path) -> Any:
 
 @functools.cache
 def mesh(name: str) -> tuple[int, Mesh]:
-    """OpenGL's display list of one of MiniWorld's meshes, in the file's units, and the mesh."""
+    """The OpenGL display list of one of MiniWorld's meshes, in the file's units, and the mesh."""
     gl = _graphics()
     shape = read_mesh(assets() / "meshes" / f"{name}.obj")
     textures = [_upload(part.image) if part.image else texture("white_1") for part in shape.parts]

@@ -1,3 +1,5 @@
+"""Collecting is repeatable, can be stopped at any time, and keeps splits apart."""
+
 from __future__ import annotations
 
 import json
@@ -14,8 +16,7 @@ import pytest
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.simulators.collect import TEST_SEEDS, CollectPlan, claim_folder, run_collect
-
-from .conftest import make_world
+from tests.support.miniworlds import make_world
 
 SMALL = CollectPlan("miniworld", "0:3", frames=6, size="16x24")
 EIGHT = CollectPlan("miniworld", "0:8", frames=12, size="32x32")
@@ -28,7 +29,7 @@ def persist(arguments: str, out: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, text=True, start_new_session=True, **pipes)  # type: ignore[call-overload,no-any-return]
 
 
-def persist_at_work(out: Path) -> subprocess.Popen[str]:
+def start_and_wait_for_a_scene(out: Path) -> subprocess.Popen[str]:
     """A run of sixty scenes that has finished its first."""
     process = persist(COMMAND.replace("0:8", "0:60") + " 1", out)
     while process.poll() is None and not list(out.glob("house-*.parquet")):
@@ -49,7 +50,7 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_collected_trajectory_reads_back_as_planned(collected: Path) -> None:
+def test_a_collected_trajectory_reads_back_with_the_options_of_its_plan(collected: Path) -> None:
     store = Store(collected)
     trajectory = store[2].read()
     assert store.names == ["house-000000", "house-000001", "house-000002"]
@@ -65,7 +66,7 @@ def test_collecting_again_changes_nothing(collected: Path, capsys: pytest.Captur
     assert json.loads(capsys.readouterr().out)["new_trajectories"] == 0
 
 
-def test_more_scenes_may_be_added_later(collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scenes_can_be_added_to_a_folder_later(collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_collect(replace(SMALL, scenes="1:4"), collected, 1, json=True)
     figures = json.loads(capsys.readouterr().out)
     assert (figures["trajectories"], figures["new_trajectories"], figures["frames"]) == (3, 1, 18)
@@ -89,13 +90,15 @@ def test_test_scenes_never_share_a_seed_with_training_scenes() -> None:
         ({"policy": "path"}, "was collected with policy 'explore', not 'path'"),
     ],
 )
-def test_a_folder_keeps_to_one_plan(tmp_path: Path, change: dict[str, object], message: str) -> None:
+def test_a_folder_collected_with_other_options_is_refused(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
     claim_folder(SMALL, tmp_path)
     with pytest.raises(DataError, match=message):
         claim_folder(replace(SMALL, **change), tmp_path)  # type: ignore[arg-type]
 
 
-def test_a_folder_of_other_trajectories_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_of_trajectories_that_were_not_collected_is_refused(tmp_path: Path) -> None:
     (tmp_path / "kitchen.parquet").touch()
     with pytest.raises(DataError, match="did not write"):
         claim_folder(SMALL, tmp_path)
@@ -115,7 +118,7 @@ def test_a_folder_of_other_trajectories_is_left_alone(tmp_path: Path) -> None:
         {"simulator": "minworld"},
     ],
 )
-def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, change: dict[str, object]) -> None:
+def test_bad_options_are_reported_in_one_line_and_write_nothing(tmp_path: Path, change: dict[str, object]) -> None:
     out = tmp_path / "out"
     with pytest.raises(PersistError) as caught:
         run_collect(replace(SMALL, **change), out, 1, json=False)  # type: ignore[arg-type]
@@ -124,7 +127,7 @@ def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, change: dict[s
     assert not out.exists()
 
 
-def test_a_killed_run_goes_on_and_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
+def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
     make_world()
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     run_collect(EIGHT, whole, 1, json=True)
@@ -144,23 +147,23 @@ def children(pid: int) -> list[int]:
     return [int(worker) for worker in workers]
 
 
-def test_a_worker_that_dies_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_worker_that_dies_is_reported_in_one_line(tmp_path: Path) -> None:
     make_world()
-    process = persist_at_work(tmp_path)
+    process = start_and_wait_for_a_scene(tmp_path)
     os.kill(children(process.pid)[0], signal.SIGKILL)
-    _, told = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert told.strip().splitlines()[-1].startswith("error: a worker process died")
-    assert "Traceback" not in told
+    assert err.strip().splitlines()[-1].startswith("error: a worker process died")
+    assert "Traceback" not in err
 
 
 def test_an_interrupt_ends_quietly_and_leaves_whole_files(tmp_path: Path) -> None:
     make_world()
-    process = persist_at_work(tmp_path)
+    process = start_and_wait_for_a_scene(tmp_path)
     os.killpg(process.pid, signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert told.strip().splitlines()[-1].startswith("stopped; what is written is whole")
-    assert "Traceback" not in told
+    assert err.strip().splitlines()[-1].startswith("stopped; what is written is whole")
+    assert "Traceback" not in err
     assert all(trajectory.length == 12 for trajectory in Store(tmp_path))
     assert not list(tmp_path.glob(".partial-*"))

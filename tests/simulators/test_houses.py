@@ -1,3 +1,5 @@
+"""Houses are repeatable, differ from each other, and can be walked through everywhere."""
+
 from __future__ import annotations
 
 import math
@@ -33,8 +35,8 @@ def free_cells(house: House, spacing: float = 0.1) -> set[tuple[int, int]]:
     return cells
 
 
-def reached(cells: set[tuple[int, int]]) -> int:
-    """Cells in the largest connected piece."""
+def largest_piece(cells: set[tuple[int, int]]) -> int:
+    """Number of cells in the largest connected piece."""
     left, largest = set(cells), 0
     while left:
         piece, queue = 0, [left.pop()]
@@ -49,7 +51,7 @@ def reached(cells: set[tuple[int, int]]) -> int:
     return largest
 
 
-def test_the_same_seed_gives_the_same_house() -> None:
+def test_equal_seeds_give_equal_houses() -> None:
     assert build_house(7) == build_house(7)
 
 
@@ -58,7 +60,7 @@ def test_every_seed_gives_another_house(houses: list[House]) -> None:
     assert len(looks) == len(houses)
 
 
-def test_houses_have_one_to_six_rooms_and_all_of_these_occur(houses: list[House]) -> None:
+def test_houses_have_every_number_of_rooms_from_one_to_six(houses: list[House]) -> None:
     assert {len(house.rooms) for house in houses} == {1, 2, 3, 4, 5, 6}
 
 
@@ -75,7 +77,7 @@ def test_rooms_do_not_overlap(houses: list[House]) -> None:
 def test_an_agent_can_walk_to_nearly_all_free_ground(houses: list[House]) -> None:
     for house in houses[:20]:
         cells = free_cells(house)
-        assert reached(cells) > 0.99 * len(cells)  # a nook behind a cabinet may be cut off
+        assert largest_piece(cells) > 0.99 * len(cells)  # a nook behind a cabinet may be cut off
 
 
 def test_doors_join_all_rooms(houses: list[House]) -> None:
@@ -86,11 +88,11 @@ def test_doors_join_all_rooms(houses: list[House]) -> None:
         assert joined == set(range(len(house.rooms)))
 
 
-def test_some_houses_have_ways_round(houses: list[House]) -> None:
+def test_some_houses_have_loops(houses: list[House]) -> None:
     assert sum(len(house.doors) >= len(house.rooms) for house in houses) >= 3
 
 
-def test_the_walls_of_a_room_differ(houses: list[House]) -> None:
+def test_the_four_walls_of_a_room_have_different_paint(houses: list[House]) -> None:
     assert all(len(set(room.walls)) == 4 for house in houses for room in house.rooms)
 
 
@@ -104,7 +106,7 @@ def test_things_stand_inside_their_room(houses: list[House]) -> None:
         assert all(room.ground.contains(thing.ground) for thing in room.things)
 
 
-def test_the_distance_to_a_turned_box_is_that_to_its_side() -> None:
+def test_the_distance_to_a_turned_box_is_measured_to_its_side() -> None:
     box = Thing("box", (1.0, 2.0), math.pi / 2, (2.0, 1.0, 0.4))
     assert box.distance((1.0, 2.9)) == pytest.approx(0.0)
     assert box.distance((1.5, 2.0)) == pytest.approx(0.3)
@@ -127,7 +129,7 @@ def test_walls_are_numbered_left_to_right_as_seen_from_inside() -> None:
 
 
 @pytest.mark.parametrize("kind", MESHES, ids=lambda kind: kind.name)
-def test_meshes_stand_on_the_ground_within_the_circle_kept_for_them(kind: MeshKind) -> None:
+def test_meshes_stand_on_the_ground_within_their_circle(kind: MeshKind) -> None:
     mesh = read_mesh(assets() / "meshes" / f"{kind.name}.obj")
     lowest = min(float(part.vertices[:, 1].min()) for part in mesh.parts)
     assert lowest == pytest.approx(0.0, abs=1e-3 * mesh.height)

@@ -1,3 +1,5 @@
+"""MiniWorld's images are repeatable, its depth is exact, and its agent moves by the nominal motion."""
+
 from __future__ import annotations
 
 import hashlib
@@ -15,9 +17,9 @@ from persist_cli.api.geometry import camera_rays, project, unproject
 from persist_cli.api.observations import Frame
 from persist_cli.errors import DataError, RecipeError
 from persist_cli.plugins import make_simulator
+from persist_cli.simulators.building import build_house
 from persist_cli.simulators.miniworld import MiniWorld
-
-from .conftest import make_world, put_somewhere
+from tests.support.miniworlds import make_world, put_somewhere
 
 FINGERPRINT = """
 import hashlib, sys
@@ -44,8 +46,8 @@ for missing in sys.argv[1:] or [""]:
 
 def run_python(code: str, *arguments: str, **environment: str) -> str:
     command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
+    completed = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
+    return completed.stdout.strip()
 
 
 def camera(world: MiniWorld, frame: Frame) -> Cameras:
@@ -61,20 +63,20 @@ def depth_at(depth: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     return 1 / sampled[0, 0, 0]
 
 
-def test_the_same_house_gives_the_same_pixels_in_another_process(world: MiniWorld) -> None:
+def test_another_process_gives_equal_pixels_for_a_house(world: MiniWorld) -> None:
     frame, ((x, z), _) = world.observe(), world.agent
     here = hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()
     assert run_python(FINGERPRINT, repr(x), repr(z)) == here
 
 
-def test_another_house_gives_other_pixels(world: MiniWorld) -> None:
+def test_another_house_gives_different_pixels(world: MiniWorld) -> None:
     before = world.observe().rgb
     world.open_scene(4)
     put_somewhere(world)
     assert np.abs(world.observe().rgb.astype(int) - before).mean() > 5
 
 
-def test_depth_of_the_floor_is_exact_to_a_tenth_of_a_millimetre(world: MiniWorld) -> None:
+def test_the_depth_of_the_floor_is_exact_to_a_tenth_of_a_millimetre(world: MiniWorld) -> None:
     frame = world.observe()
     points = unproject(torch.from_numpy(frame.depth)[None], camera(world, frame))[0]
     floor = points[-12:, :, 1][points[-12:, :, 1] < 0.1]
@@ -82,7 +84,7 @@ def test_depth_of_the_floor_is_exact_to_a_tenth_of_a_millimetre(world: MiniWorld
     assert float(floor.abs().median()) < 1e-4
 
 
-def test_depth_of_a_far_wall_is_exact_to_a_millimetre(world: MiniWorld) -> None:
+def test_the_depth_of_a_far_wall_is_exact_to_a_millimetre(world: MiniWorld) -> None:
     room = max((room.ground for room in world.house.rooms), key=lambda ground: ground.width)
     eye, forward = (room.low_x + 0.1, 2.6, room.center[1]), (1.0, 0.0, 0.0)
     _, depth = world._renderer.render(eye, forward, 30.0)
@@ -123,19 +125,14 @@ def test_the_field_of_view_is_that_of_the_intrinsics() -> None:
     assert float(rays[0, -1, 0]) == pytest.approx(79 / 40)
 
 
-def test_the_sky_is_missing_depth(world: MiniWorld) -> None:
-    roofless = next(seed for seed in range(200) if any(not room.ceiling for room in make_house(world, seed)))
+def test_the_sky_has_no_depth(world: MiniWorld) -> None:
+    roofless = next(seed for seed in range(200) if any(not room.ceiling for room in build_house(seed).rooms))
     world.open_scene(roofless)
     room = next(room for room in world.house.rooms if room.ceiling is None)
     world._renderer.load(world.house, [])
     (x, z), sky = room.ground.center, 25.0
     _, depth = world._renderer.render((x, 1.2, z), (0.01, 1.0, 0.0), sky)
     assert not depth.any()
-
-
-def make_house(world: MiniWorld, seed: int) -> tuple:  # type: ignore[type-arg]
-    world.open_scene(seed)
-    return world.house.rooms
 
 
 def test_recorded_poses_are_the_nominal_motion(world: MiniWorld) -> None:
@@ -203,7 +200,7 @@ def test_pick_up_and_drop_move_a_thing(world: MiniWorld) -> None:
     assert not np.array_equal(carried, world.observe().rgb)
 
 
-def test_toggle_changes_a_thing_and_toggling_again_undoes_it(world: MiniWorld) -> None:
+def test_toggle_changes_a_thing_and_a_second_toggle_undoes_it(world: MiniWorld) -> None:
     face_a_movable_thing(world)
     before = world.observe().rgb
     assert world.act("toggle")
@@ -218,21 +215,21 @@ def test_a_place_inside_a_wall_is_refused(world: MiniWorld) -> None:
         world.place((-9.0, -9.0), 0.0)
 
 
-def test_wrong_settings_are_told_in_one_line() -> None:
+def test_wrong_settings_are_refused_with_a_hint() -> None:
     with pytest.raises(RecipeError, match="did you mean 'fov'"):
         make_simulator("miniworld", {"fow": 75})
     with pytest.raises(RecipeError, match="fov 200"):
         make_simulator("miniworld", {"fov": 200.0})
 
 
-def test_a_missing_driver_is_told_with_the_packages_to_install() -> None:
+def test_a_missing_driver_is_reported_with_the_packages_to_install() -> None:
     line = run_python(OPEN, __EGL_VENDOR_LIBRARY_DIRS="/nonexistent")
     assert "EGL" in line
     assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in line
     assert len(line.splitlines()) == 1
 
 
-def test_a_missing_library_or_package_is_told_with_what_to_install() -> None:
+def test_a_missing_library_or_package_is_reported_with_how_to_install_it() -> None:
     package, library = run_python(OPEN, "miniworld", "pyglet.libs.egl").splitlines()
     assert "pip install 'persist-cli[miniworld]'" in package
     assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in library
