@@ -87,7 +87,7 @@ def common_sampling(checkpoints: Sequence[Checkpoint], overrides: SamplingOverri
     Raises:
         CheckpointError: when the cards give different ones, because rows of one table are sampled alike.
     """
-    checkpoints_by_sampling = {overrides.over(checkpoint.sampling): checkpoint for checkpoint in checkpoints}
+    checkpoints_by_sampling = {checkpoint.sampling_with(overrides): checkpoint for checkpoint in checkpoints}
     if len(checkpoints_by_sampling) > 1:
         samplings = " and ".join(
             f"{checkpoint.folder} means {sampling.steps} steps of {sampling.sampler} with guidance "

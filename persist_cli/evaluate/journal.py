@@ -16,14 +16,7 @@ from torch import Tensor
 from persist_cli.data.store import SUFFIX
 from persist_cli.errors import DataError, PersistError
 from persist_cli.evaluate.cases import Case, hash_trajectories
-from persist_cli.io.files import (
-    file_sha256,
-    read_json,
-    read_tensors,
-    remove_leftovers,
-    write_json,
-    write_tensors,
-)
+from persist_cli.io.files import file_sha256, read_json, read_tensors, remove_leftovers, write_json, write_tensors
 
 FOLDER = "parts"
 
@@ -93,8 +86,8 @@ class Journal:
         earlier_plan = read_json(self.folder / PLAN) if self.begun else plan
         if earlier_plan != plan:
             raise PersistError(
-                f"{self.folder.parent}: holds another evaluation ({first_difference(earlier_plan, plan)}); choose another "
-                "--out or delete it"
+                f"{self.folder.parent}: holds another evaluation ({first_difference(earlier_plan, plan)}); "
+                "choose another --out or delete it"
             )
         remove_leftovers(self.folder)
 

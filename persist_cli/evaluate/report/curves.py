@@ -138,35 +138,27 @@ def _share_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]]) ->
     series = []
     for style, curve in curves:
         bins = _fill_gaps(curve.by_seen_before)
-        names = [
-            f"{share_bin.low:.0%} to {share_bin.high:.0%} seen before, n = {share_bin.count}" for share_bin in bins
-        ]
-        series.append(
-            Series(style, [_middle(share_bin) for share_bin in bins], [share_bin.mean for share_bin in bins], names)
-        )
+        names = [f"{share.low:.0%} to {share.high:.0%} seen before, n = {share.count}" for share in bins]
+        series.append(Series(style, [share.middle for share in bins], [share.mean for share in bins], names))
     if not _known(series):
         return None
     bins_by_low: dict[float, Bin] = {}
     for _, curve in curves:
-        for share_bin in curve.by_seen_before:
-            bins_by_low.setdefault(share_bin.low, share_bin)
+        for share in curve.by_seen_before:
+            bins_by_low.setdefault(share.low, share)
     across = "share of the view seen before the clip"
     ticks = [(edge / 5, f"{edge / 5:.0%}") for edge in range(6)]
-    counts = [(_middle(share_bin), f"{share_bin.count}") for share_bin in bins_by_low.values()]
+    counts = [(share.middle, f"{share.count}") for share in bins_by_low.values()]
     return _lay_out(f"{name}-seen-before", title, across, series, (0.0, 1.0), ticks, counts)
-
-
-def _middle(share_bin: Bin) -> float:
-    return (share_bin.low + share_bin.high) / 2
 
 
 def _fill_gaps(bins: Sequence[Bin]) -> list[Bin]:
     """The bins with an empty one in each gap between them, so that lines break there."""
     filled: list[Bin] = []
-    for share_bin in bins:
-        if filled and share_bin.low > filled[-1].high + 1e-6:
-            filled.append(Bin(low=filled[-1].high, high=share_bin.low, mean=None, count=0))
-        filled.append(share_bin)
+    for share in bins:
+        if filled and share.low > filled[-1].high + 1e-6:
+            filled.append(Bin(low=filled[-1].high, high=share.low, mean=None, count=0))
+        filled.append(share)
     return filled
 
 

@@ -128,6 +128,11 @@ class Bin(ResultModel):
     mean: FiniteOrNone
     count: int
 
+    @property
+    def middle(self) -> float:
+        """The share in the middle between ``low`` and ``high``."""
+        return (self.low + self.high) / 2
+
 
 class Curve(ResultModel):
     """A metric frame by frame, the last value at the clip's last frame, and by the seen-before share of the view."""

@@ -5,14 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from persist_cli.evaluate.report.result_file import (
-    Cell,
-    ColumnRecord,
-    Difference,
-    EvalResults,
-    RowRecord,
-    TableRecord,
-)
+from persist_cli.evaluate.report.result_file import Cell, ColumnRecord, Difference, EvalResults, RowRecord, TableRecord
 
 KINDS = {
     "model": "models",

@@ -42,7 +42,12 @@ TITLES = {
     "truth": "ground truth",
 }
 
-INTERVENTIONS = ("shuffled", "emptied", "oracle", "noisy")
+INTERVENTIONS: dict[str, Callable[[RowConfig, Sequence[Case]], MemoryIntervention]] = {
+    "shuffled": lambda config, cases: Shuffled(cases),
+    "emptied": lambda config, cases: Emptied(),
+    "oracle": lambda config, cases: Oracle(),
+    "noisy": lambda config, cases: NoisyPoses(*config.noise),
+}
 
 
 @dataclass(frozen=True)
@@ -103,15 +108,16 @@ def build_control_rows(
     Raises:
         DataError: when the clips do not allow a control.
     """
-    rows: list[Row] = [
-        ModelRow(
-            f"{row.name}, {intervention.name}", row.checkpoint, row.adapter, row.sampling,
-            replace(row.row_memory, recall=intervention),
-        )
-        for row in models
-        if row.adapter not in (None, NO_MEMORY)
-        for intervention in make_interventions(config, cases)
-    ]  # fmt: skip
+    rows: list[Row] = []
+    for row in models:
+        if row.adapter in (None, NO_MEMORY):
+            continue
+        for name, make_intervention in INTERVENTIONS.items():
+            if name in config.controls:
+                intervention = make_intervention(config, cases)
+                row_memory = replace(row.row_memory, recall=intervention)
+                row_name = f"{row.name}, {intervention.name}"
+                rows.append(ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory))
     if "warp" in config.controls and all(share is None for case in cases for share in case.seen_before):
         raise DataError("the control 'warp' needs depth, which the data does not have; leave it out of --controls")
     bases = unique_bases(checkpoints)
@@ -146,17 +152,5 @@ def checkpoints_with(memory: str, checkpoints: Sequence[Checkpoint]) -> list[Che
 def labels(checkpoints: Sequence[Checkpoint]) -> list[str]:
     """The checkpoints' names, or their folders where two share a name."""
     names = [checkpoint.name for checkpoint in checkpoints]
-    return [
-        checkpoint.name if names.count(checkpoint.name) == 1 else str(checkpoint.folder) for checkpoint in checkpoints
-    ]
-
-
-def make_interventions(config: RowConfig, cases: Sequence[Case]) -> list[MemoryIntervention]:
-    """Make the memory interventions that are named, in a fixed order."""
-    makers: dict[str, Callable[[], MemoryIntervention]] = {
-        "shuffled": lambda: Shuffled(cases),
-        "emptied": Emptied,
-        "oracle": Oracle,
-        "noisy": lambda: NoisyPoses(*config.noise),
-    }
-    return [makers[name]() for name in INTERVENTIONS if name in config.controls]
+    pairs = zip(names, checkpoints, strict=True)
+    return [name if names.count(name) == 1 else str(checkpoint.folder) for name, checkpoint in pairs]
