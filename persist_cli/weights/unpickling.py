@@ -1,7 +1,7 @@
 """Trees of numpy arrays out of a pickle that nobody has to trust.
 
-No name that the pickle asks for is ever imported: the three that numpy writes for an array are answered by stand-ins
-of this module, which check shape, type and length and then read the bytes as numbers; every other name is refused.
+No name in the pickle is ever imported: the three that numpy writes for an array are replaced by stand-ins of this
+module, which check shape, type and length and then read the bytes as numbers; every other name is refused.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from persist_cli.errors import CheckpointError
 
 DEEPEST: Final = 16  # levels of a tree: far more than a network's, and an end to one that holds itself
-MOST: Final = 10_000  # arrays of a tree, so that one branch shared by many does not grow without end
-PLAIN: Final = frozenset({"f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1"})
+MOST_ARRAYS: Final = 10_000  # of a tree, so that one branch shared by many does not grow without end
+NUMBER_TYPES: Final = frozenset({"f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1"})
 
-BROKEN: Final = (
+UNPICKLING_ERRORS: Final = (
     pickle.UnpicklingError, EOFError, LookupError, TypeError, ValueError, AttributeError, ImportError, OverflowError,
     MemoryError, RecursionError,
 )  # fmt: skip
@@ -35,17 +35,17 @@ def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         with path.open("rb") as file:
-            leaves = list(itertools.islice(_leaves(_ArrayUnpickler(file).load(), "", 0), MOST + 1))
-        if not 0 < len(leaves) <= MOST:
-            raise pickle.UnpicklingError(f"no arrays, or more than {MOST}")
+            leaves = list(itertools.islice(_leaves(_ArrayUnpickler(file).load(), "", 0), MOST_ARRAYS + 1))
+        if not 0 < len(leaves) <= MOST_ARRAYS:
+            raise pickle.UnpicklingError(f"no arrays, or more than {MOST_ARRAYS}")
         return dict(leaves)
-    except BROKEN as error:
+    except UNPICKLING_ERRORS as error:
         cause = (str(error) or type(error).__name__).splitlines()[0]
         raise CheckpointError(f"{path}: refused, not a pickle of plain arrays only ({cause})") from error
 
 
 class _StandIn:
-    """What a pickle may hold of numpy before it is an array; takes no attributes from it."""
+    """A replacement for an object of numpy in a pickle, which takes no attributes from the pickle."""
 
     __slots__ = ()
 
@@ -76,7 +76,7 @@ class _TypeMaker(_StandIn):
     __slots__ = ()
 
     def __call__(self, code: object, *_: object) -> _Type:
-        if code not in PLAIN:
+        if code not in NUMBER_TYPES:
             raise pickle.UnpicklingError(f"an array of type {code!r}")
         return _Type(str(code))
 

@@ -1,4 +1,4 @@
-"""Weights of a few bytes in every form that the real ones come in."""
+"""Weights of a few bytes in every form that the real ones have."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SETUP = "import pathlib\npathlib.Path({marker!r}).write_text('ran')\nimport setu
 
 
 def alex_tree() -> dict:
-    """A tree as that of the AlexNet pickle, its kernels 2×1."""
+    """A tree with the names of the AlexNet pickle, and kernels of 2×1."""
     numbers = np.random.default_rng(0)
 
     def draw(*shape: int) -> np.ndarray:

