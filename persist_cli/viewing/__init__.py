@@ -1,1 +1,1 @@
-"""Pictures for people: videos, contact sheets, maps, curves, tables."""
+"""Output for people: the console, listings, videos, contact sheets and maps."""

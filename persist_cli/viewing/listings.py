@@ -1,8 +1,9 @@
-"""``persist plugins`` and ``persist recipes``: what is installed."""
+"""Listings of what is installed: ``persist plugins`` and ``persist recipes``."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 from persist_cli.errors import PluginError
 from persist_cli.plugins import KINDS, Plugin, import_plugin, list_plugins
@@ -11,12 +12,18 @@ from persist_cli.viewing.console import print_json, print_table
 
 
 def show_plugins(json: bool) -> None:
-    """Import every plugin on its own and show what came of it."""
+    """Import every plugin on its own, and print whether each can be used."""
     rows = [row for kind in KINDS for row in plugin_rows(list_plugins(kind))]
-    if json:
-        print_json([dict(zip(("kind", "name", "package", "version", "state"), row, strict=True)) for row in rows])
-    else:
-        print_table("Plugins", ("kind", "name", "package", "version", "state"), rows)
+    _show("Plugins", ("kind", "name", "package", "version", "state"), rows, json)
+
+
+def show_recipes(json: bool) -> None:
+    """Print name, stage, memory and description of every recipe of the package."""
+    rows = []
+    for name in recipe_names():
+        recipe = make_recipe(read_recipe(name), name)
+        rows.append([name, recipe.stage, recipe.memory.name if recipe.memory else "", recipe.description])
+    _show("Recipes", ("name", "stage", "memory", "description"), rows, json)
 
 
 def plugin_rows(plugins: list[Plugin]) -> list[list[str]]:
@@ -29,7 +36,12 @@ def plugin_rows(plugins: list[Plugin]) -> list[list[str]]:
 
 
 def plugin_state(plugin: Plugin, claims: int) -> str:
-    """``ok``, or the cause why it cannot be used."""
+    """``ok``, or the cause why the plugin cannot be used.
+
+    Args:
+        plugin: the plugin, which is imported.
+        claims: number of packages that have a plugin of this kind and name.
+    """
     if claims > 1:
         return f"name claimed by {claims} packages"
     try:
@@ -39,11 +51,8 @@ def plugin_state(plugin: Plugin, claims: int) -> str:
     return "ok"
 
 
-def show_recipes(json: bool) -> None:
-    """Name, stage, memory and description of each."""
-    recipes = [(name, make_recipe(read_recipe(name), name)) for name in recipe_names()]
-    rows = [[name, each.stage, each.memory.name if each.memory else "", each.description] for name, each in recipes]
+def _show(title: str, columns: Sequence[str], rows: list[list[str]], json: bool) -> None:
     if json:
-        print_json([dict(zip(("name", "stage", "memory", "description"), row, strict=True)) for row in rows])
+        print_json([dict(zip(columns, row, strict=True)) for row in rows])
     else:
-        print_table("Recipes", ("name", "stage", "memory", "description"), rows)
+        print_table(title, columns, rows)

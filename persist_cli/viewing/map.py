@@ -31,13 +31,13 @@ def draw_map(
     paths: Mapping[str, Float[Tensor, "frame 4 4"]] | Sequence[Float[Tensor, "frame 4 4"]],
     out: Path,
 ) -> None:
-    """Write a PNG of the map from above, true to scale, without what lies over the cameras' heads.
+    """Write a PNG of the map from above, true to scale, without the points higher than the cameras.
 
     Args:
-        points: of a memory; none gives a picture of the paths alone.
-        world_up: unit vector.
+        points: points of a memory; without any the picture shows the paths alone.
+        world_up: unit vector that points up in the world.
         paths: world_from_camera of each path, by the name that the legend shows, or in order without names.
-        out: PNG file.
+        out: path of the PNG file.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -66,9 +66,9 @@ def draw_map(
 
 
 def ground_axes(world_up: Sequence[float]) -> Float[Tensor, "3 3"]:
-    """Rows: right and up in the picture, and the height; as seen from above, never mirrored. Float64.
+    """A float64 rotation with the rows right and up in the picture, and height: seen from above, never mirrored.
 
-    Right is the world axis farthest from up, laid onto the ground.
+    Right is the world axis farthest from up, projected onto the ground.
     """
     up = torch.nn.functional.normalize(torch.tensor(list(world_up), dtype=torch.float64), dim=0)
     right = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
@@ -82,7 +82,7 @@ def paint(
     """The picture of some points, each square in the colour of the highest point under the ceiling.
 
     Args:
-        points: what to draw.
+        points: points to draw.
         ground: rows as ``ground_axes`` gives them.
         ceiling: height in metres; ``None`` for 60 % of the points' own height.
 
@@ -96,12 +96,12 @@ def paint(
     heights = places[:, 2]
     if ceiling is None:
         ceiling = heights.min() + 0.6 * np.ptp(heights)
-    kept = heights <= ceiling
-    if not kept.any():
-        kept[:] = True
-    order = np.argsort(heights[kept], kind="stable")
-    colors = points.colors.cpu().numpy()[kept][order] / 255.0
-    return _stamp(places[kept][order, :2], colors, points.spread)
+    visible = heights <= ceiling
+    if not visible.any():
+        visible[:] = True
+    order = np.argsort(heights[visible], kind="stable")
+    colors = points.colors.cpu().numpy()[visible][order] / 255.0
+    return _stamp(places[visible][order, :2], colors, points.spread)
 
 
 def _stamp(places: Array, colors: Array, spread: float) -> tuple[Array, tuple[float, float, float, float]]:

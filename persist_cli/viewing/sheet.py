@@ -1,4 +1,4 @@
-"""Contact sheets: rows of frames with a label, one picture to see a whole video or a comparison."""
+"""Contact sheets: pictures with a labelled row of frames for each video."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ def write_sheet(
     columns: Sequence[str] = (),
     most: int = 16,
 ) -> None:
-    """A PNG with a labelled row of frames for each video, at most ``most`` of each, evenly chosen.
+    """Write a PNG with a labelled row of frames for each video, chosen evenly.
 
     Args:
-        path: of the PNG.
-        rows: label and frames.
+        path: path of the PNG.
+        rows: label and frames of each row.
         columns: labels above the frames.
-        most: frames a row.
+        most: largest number of frames of a row.
     """
     font = label_font()
     margin = GAP + max(int(font.getlength(label)) for label, _ in rows) + GAP
-    widths = [_cells(video, most) for _, video in rows]
-    across = max(len(cells) * (cells[0].width + GAP) for cells in widths)
+    images = [_cells(video, most) for _, video in rows]
+    across = max(len(cells) * (cells[0].width + GAP) for cells in images)
     header = 20 if columns else GAP
     sheet = Image.new("RGB", (margin + across, header + len(rows) * (CELL + GAP)), "white")
     draw = ImageDraw.Draw(sheet)
-    for row, ((label, _), cells) in enumerate(zip(rows, widths, strict=True)):
+    for row, ((label, _), cells) in enumerate(zip(rows, images, strict=True)):
         top = header + row * (CELL + GAP)
         draw.text((GAP, top + CELL // 2 - 8), label, fill="black", font=font)
         for column, cell in enumerate(cells):
@@ -50,7 +50,7 @@ def write_sheet(
 
 
 def label_font() -> ImageFont.FreeTypeFont:
-    """The font of labels in pictures; it has Greek letters and signs, which Pillow's own lacks."""
+    """The font of labels in pictures, with Greek letters and signs, which Pillow's own font lacks."""
     import matplotlib
 
     return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", 12)

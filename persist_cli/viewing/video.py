@@ -1,4 +1,4 @@
-"""Videos: H.264 in MP4, images enlarged to be seen, depth in colours."""
+"""Videos: written as MP4 or GIF and read back, side by side, with labels, and depth in colours."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from persist_cli.errors import DataError
 from persist_cli.io.files import written_aside
 
 SMALLEST = 256  # pixels of the shorter side of a written image
-STRIP = 20  # pixels of the strip with a video's name
+STRIP = 20  # pixels of the height of the strip with a label
 
 
 def color_depth(
@@ -39,7 +39,7 @@ def color_depth(
 def beside(
     videos: Sequence[UInt8[Tensor, "frame height width 3"]], gap: int = 2
 ) -> UInt8[Tensor, "frame height all 3"]:
-    """Videos of one length side by side with a white gap."""
+    """Videos of equal length and height side by side, with a white gap of ``gap`` pixels."""
     parts: list[Tensor] = []
     for number, video in enumerate(videos):
         if number:
@@ -49,13 +49,13 @@ def beside(
 
 
 def below(videos: Sequence[UInt8[Tensor, "frame height width 3"]], gap: int = 2) -> UInt8[Tensor, "frame all width 3"]:
-    """Videos of one length and width one below the other with a white gap."""
-    turned = beside([video.transpose(1, 2) for video in videos], gap)
-    return turned.transpose(1, 2).contiguous()
+    """Videos of equal length and width one below the other, with a white gap of ``gap`` pixels."""
+    transposed = beside([video.transpose(1, 2) for video in videos], gap)
+    return transposed.transpose(1, 2).contiguous()
 
 
 def labelled(video: UInt8[Tensor, "frame height width 3"], label: str) -> UInt8[Tensor, "frame taller width 3"]:
-    """A video under a white strip with its name."""
+    """The video under a white strip with a label."""
     from PIL import Image, ImageDraw
 
     from persist_cli.viewing.sheet import label_font
@@ -67,13 +67,13 @@ def labelled(video: UInt8[Tensor, "frame height width 3"], label: str) -> UInt8[
 
 
 def enlarge(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame height width 3"]:
-    """Pixels repeated until the shorter side is at least 256 pixels."""
+    """The video with its pixels repeated until the shorter side has at least 256."""
     factor = max(1, -(-SMALLEST // min(video.shape[1:3])))
     return video.repeat_interleave(factor, dim=1).repeat_interleave(factor, dim=2)
 
 
 def write_video(path: Path, video: UInt8[Tensor, "frame height width 3"], frames_per_second: int = 8) -> None:
-    """An MP4 (H.264) of the frames, whole or not at all."""
+    """Write the frames, enlarged to be seen, as an MP4 (H.264), whole or not at all."""
     import av
 
     frames = enlarge(video)
@@ -87,17 +87,17 @@ def write_video(path: Path, video: UInt8[Tensor, "frame height width 3"], frames
 
 
 def write_gif(path: Path, video: UInt8[Tensor, "frame height width 3"], frames_per_second: int = 8) -> None:
-    """An endless GIF of the frames in their own size, whole or not at all: for pages that do not play videos."""
+    """Write the frames in their own size as an endless GIF, whole or not at all, for pages that do not play videos."""
     from PIL import Image
 
-    first, *others = (Image.fromarray(frame.numpy()).quantize(256) for frame in video)
+    first, *rest = (Image.fromarray(frame.numpy()).quantize(256) for frame in video)
     milliseconds = 1000 // frames_per_second
     with written_aside(path) as aside:
-        first.save(aside, format="GIF", save_all=True, append_images=others, duration=milliseconds, loop=0)
+        first.save(aside, format="GIF", save_all=True, append_images=rest, duration=milliseconds, loop=0)
 
 
 def read_video(path: Path, height: int, width: int) -> UInt8[Tensor, "frame height width 3"]:
-    """Frames of a video file, reduced to a size by averaging.
+    """The frames of a video file, scaled to this height and width in pixels.
 
     Raises:
         DataError: when it is missing or no video.

@@ -1,4 +1,4 @@
-"""What machines read of the console and of files."""
+"""The console prints JSON that machines can read, and tables that cut no word."""
 
 import json
 import math
@@ -21,18 +21,18 @@ def test_json_has_null_where_a_figure_is_not_defined(tmp_path, capsys):
         assert json.loads(text, parse_constant=pytest.fail) == PLAIN
 
 
-@pytest.mark.parametrize("room", [60, 80, 100, 160])
-def test_no_table_cuts_a_number_or_a_name_whatever_the_terminal(room, capsys, monkeypatch):
-    monkeypatch.setattr(console, "OUT", Console(width=room))
+@pytest.mark.parametrize("width", [60, 80, 100, 160])
+def test_no_table_cuts_a_number_or_a_name_whatever_the_terminal(width, capsys, monkeypatch):
+    monkeypatch.setattr(console, "OUT", Console(width=width))
     columns = ["strategy", *(f"column {number}" for number in range(9)), "what it is"]
     rows = [["gradient checkpointing", *(f"{number}570479680" for number in range(9)), "some words that may wrap"]]
     print_table("title", columns, rows)
     printed = capsys.readouterr().out
-    assert max(map(len, printed.splitlines())) <= room
+    assert max(map(len, printed.splitlines())) <= width
     assert all(f" {cell} " in printed for cell in rows[0][:-1])
     assert all(word in printed for word in rows[0][-1].split())
 
 
-def test_one_table_is_enough_where_there_is_room(capsys):
+def test_columns_that_fit_the_terminal_stand_in_one_table(capsys):
     print_table("title", ["a", "b", "c"], [["x", "1", "2"]])
     assert [line.split() for line in capsys.readouterr().out.splitlines() if "x" in line] == [list("│x│1│2│")]

@@ -1,3 +1,5 @@
+"""The map is seen from above, true to scale, and repeatable."""
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,8 @@ from tests.support.rooms import UP
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 
 
-def points(*placed) -> MapPoints:
-    positions, colors = zip(*placed, strict=True)
+def points(*colored_positions) -> MapPoints:
+    positions, colors = zip(*colored_positions, strict=True)
     return MapPoints(torch.tensor(positions, dtype=torch.float64), torch.tensor(colors, dtype=torch.uint8), 0.5)
 
 
@@ -25,12 +27,12 @@ def test_the_map_is_seen_from_above_and_never_mirrored(up):
 
 
 def test_the_highest_point_under_the_ceiling_is_drawn():
-    seen = points(((0, 0.0, 0), RED), ((0, 1.0, 0), GREEN), ((0, 2.5, 0), BLUE))
-    image, _ = paint(seen, ground_axes(UP), 1.5)
+    tower = points(((0, 0.0, 0), RED), ((0, 1.0, 0), GREEN), ((0, 2.5, 0), BLUE))
+    image, _ = paint(tower, ground_axes(UP), 1.5)
     assert {tuple(color) for color in image[image[..., 3] > 0][:, :3]} == {(0.0, 1.0, 0.0)}
 
 
-def test_a_place_without_a_point_is_left_open():
+def test_a_place_without_a_point_is_transparent():
     image, extent = paint(points(((0, 0, 0), RED), ((3, 0, 0), BLUE)), ground_axes(UP), None)
     assert np.isclose(extent[0], -0.25)
     assert (image[..., 3] == 0).mean() > 0.5
@@ -38,12 +40,12 @@ def test_a_place_without_a_point_is_left_open():
     assert image[1, -3, 2] == 1.0
 
 
-def test_when_everything_is_over_the_cameras_all_of_it_is_drawn():
+def test_points_are_drawn_even_when_all_are_above_the_cameras():
     image, _ = paint(points(((0, 5.0, 0), RED)), ground_axes(UP), 1.0)
     assert (image[..., 3] > 0).any()
 
 
-def test_a_map_with_several_paths_is_a_picture_in_true_scale(tmp_path):
+def test_a_map_shows_several_paths_in_their_colours(tmp_path):
     observations = room_walk()
     poses = observations.cameras.world_from_camera
     memory = written_memory("voxel", observations)
@@ -62,7 +64,7 @@ def test_an_empty_memory_and_a_short_path_still_give_a_picture(tmp_path, paths):
     assert Image.open(tmp_path / "map.png").size[0] > 100
 
 
-def test_the_same_map_is_the_same_picture(tmp_path):
+def test_drawing_a_map_twice_gives_equal_files(tmp_path):
     memory = written_memory("voxel", room_walk(2))
     for name in ("a.png", "b.png"):
         draw_map(memory.points(), UP, {}, tmp_path / name)

@@ -1,3 +1,5 @@
+"""Videos and GIFs come back as they were written."""
+
 import torch
 from PIL import Image
 
@@ -9,14 +11,14 @@ RAMP = (torch.linspace(0, 255, 64)[None, None, :, None] * torch.linspace(0.5, 1,
 VIDEO = RAMP.round().to(torch.uint8)
 
 
-def test_a_video_comes_back_as_it_was_but_for_the_codec(tmp_path):
+def test_a_video_comes_back_as_it_was_but_for_losses_of_the_codec(tmp_path):
     write_video(tmp_path / "a.mp4", VIDEO)
     back = read_video(tmp_path / "a.mp4", 64, 64)
     assert back.shape == VIDEO.shape
     assert (back.int() - VIDEO.int()).abs().float().mean() < 4
 
 
-def test_a_gif_holds_every_frame_in_nearly_its_colours_and_never_ends(tmp_path):
+def test_a_gif_is_endless_and_has_every_frame_in_nearly_its_colours(tmp_path):
     write_gif(tmp_path / "a.gif", VIDEO, frames_per_second=10)
     with Image.open(tmp_path / "a.gif") as image:
         assert (image.n_frames, image.info["duration"], image.info["loop"]) == (5, 100, 0)
@@ -26,7 +28,7 @@ def test_a_gif_holds_every_frame_in_nearly_its_colours_and_never_ends(tmp_path):
             assert (frame.int() - VIDEO[number].int()).abs().float().mean() < 4
 
 
-def test_videos_under_their_names_stand_side_by_side():
+def test_labelled_videos_stand_side_by_side():
     both = beside([labelled(enlarge(VIDEO), name) for name in ("one", "two")])
     assert both.shape == (5, 276, 2 * 256 + 2, 3)
     assert torch.equal(both[:, 20:, :256], both[:, 20:, 258:])
