@@ -25,7 +25,7 @@ def load(folder: Path | str, adapter: str | None = None, dtype: Precision | None
     Raises:
         PersistError: one line when there is no such checkpoint or adapter, or it is damaged.
     """
-    from persist_backbones.pipeline.load import load_pipeline  # diffusers takes seconds to import
+    from persist_backbones.pipeline.pipeline import load_pipeline  # diffusers takes seconds to import
 
     return load_pipeline(Path(folder), adapter, dtype)
 

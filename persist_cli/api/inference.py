@@ -1,7 +1,8 @@
-"""Where a backbone samples, how precisely, and what it does to need less memory there."""
+"""How clips are sampled: where and how precisely, and which steps, sampler and guidance a command wants."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
@@ -9,7 +10,6 @@ from persist_cli.errors import PersistError, hint
 
 if TYPE_CHECKING:
     import torch
-
 
 Precision = Literal["float32", "bfloat16", "float16"]
 
@@ -79,3 +79,22 @@ class InferenceOptions:
                 "leave it out"
             )
         return torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class SamplingOverrides:
+    """The options of a command that say how to sample; ``None`` leaves a choice to the checkpoint.
+
+    Args:
+        steps: denoising steps.
+        sampler: the name of one of the backbone's samplers.
+        memory_guidance: weight of classifier-free guidance over memory; 1 means none.
+    """
+
+    steps: int | None = None
+    sampler: str | None = None
+    memory_guidance: float | None = None
+
+    def requested(self) -> dict[str, Any]:
+        """The options that are not left to the checkpoint, by name."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}

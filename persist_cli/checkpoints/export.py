@@ -14,19 +14,12 @@ import torch
 import yaml
 
 from persist_cli import __version__
-from persist_cli.checkpoints.checkpoint import (
-    Checkpoint,
-    base_files,
-    empty_backbone,
-    find_checkpoint,
-    fingerprint,
-    load_backbone,
-    write_card,
-)
+from persist_cli.api.checkpoint import CARD, PLAIN, Checkpoint, find_checkpoint, lora_base
+from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.lineage import RECIPE, RECIPES, save_stage_recipes, stage_recipes, training_scenes
-from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.checkpoints.load import empty_backbone, load_backbone
+from persist_cli.checkpoints.save import base_files, fingerprint, write_card
 from persist_cli.errors import CheckpointError, PersistError, hint
-from persist_cli.io.checkpoint_folder import CARD, PLAIN, lora_base
 from persist_cli.io.files import (
     check_folder,
     empty_folder_aside,
@@ -167,7 +160,7 @@ def _default_sampling(base: Checkpoint, requested: SamplingOverrides) -> dict[st
     """
     if base.sampling is None and not requested.requested():
         return None
-    sampling = requested.over(base.sampling)
+    sampling = base.sampling_with(requested)
     empty_backbone(base).check_sampling(sampling)
     return asdict(sampling)
 

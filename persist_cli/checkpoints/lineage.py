@@ -6,9 +6,8 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.checkpoints.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, find_checkpoint
 from persist_cli.data.reference import data_folder
-from persist_cli.data.scenes import TrainingScenes
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import write_text

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from persist_cli.api.inference import InferenceOptions
-from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
     ActionsOption,
     Commands,

@@ -14,7 +14,7 @@ from persist_cli.evaluate.cases import cases_json
 from persist_cli.evaluate.columns import column_json, make_columns
 from persist_cli.evaluate.example_clips import make_pictures
 from persist_cli.evaluate.journal import Processes
-from persist_cli.evaluate.measure_rows import measure_rows
+from persist_cli.evaluate.measure import measure_rows
 from persist_cli.evaluate.plan import EvalPlan, Evaluation, prepare
 from persist_cli.evaluate.provenance import checkpoint_json, command, environment, metric_json, scenes_json
 from persist_cli.evaluate.report.page import write_report

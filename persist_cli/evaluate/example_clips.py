@@ -10,7 +10,7 @@ from torch import Tensor
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.journal import ExampleClip, Unit
-from persist_cli.evaluate.measure_rows import SHOWN, predict
+from persist_cli.evaluate.measure import SHEET_CLIPS, predict
 from persist_cli.evaluate.metric_suite import FIGURES, VIDEO
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.report.pictures import ClipPicture, Pictures, RowPictures, Sheet
@@ -32,7 +32,7 @@ def make_pictures(run: Evaluation, domains: dict[str, list[int]], loader: Backbo
 def make_sheets(run: Evaluation) -> list[Sheet]:
     """A contact sheet for each of the first clips, with every row."""
     sheets = []
-    for number, case in enumerate(run.cases[:SHOWN]):
+    for number, case in enumerate(run.cases[:SHEET_CLIPS]):
         batch, place = divmod(number, run.plan.batch)
         rows = [("truth", read_case(case).observations.rgb)]
         for row_number, row in enumerate(run.rows):

@@ -9,7 +9,8 @@ from typing import Any
 
 import yaml
 
-from persist_cli.checkpoints.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.checkpoints.load import adapter_memory, reference_checkpoint
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from persist_cli.recipe import MemoryConfig
 
@@ -73,12 +74,12 @@ def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig
         asked = "a memory" if memory is None else f"a memory {memory!r}"
         raise CheckpointError(f"{checkpoint.folder}: no adapter reads {asked}; it has {', '.join(memories) or 'none'}")
     name = str([*first, *wanted][0])
-    return checkpoint.memory_config(name), f"adapter {name!r} of {checkpoint.folder}"
+    return adapter_memory(checkpoint, name), f"adapter {name!r} of {checkpoint.folder}"
 
 
 def _memories(checkpoint: Checkpoint) -> dict[str, str]:
     """The memory that each adapter reads."""
-    return {name: checkpoint.memory_config(name).name for name in checkpoint.adapters}
+    return {name: adapter_memory(checkpoint, name).name for name in checkpoint.adapters}
 
 
 def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:

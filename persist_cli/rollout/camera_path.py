@@ -8,10 +8,9 @@ from pathlib import Path
 from persist_cli.api.actions import format_actions
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras
-from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
-from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import TrajectoryFile

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
 from persist_cli.io.files import write_json, write_text
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
-from persist_cli.rollout.camera_path import Rollout
+from persist_cli.rollout.camera_path import Rollout, RolloutPlan
 from persist_cli.viewing.map import draw_map
 from persist_cli.viewing.sheet import write_sheet
 from persist_cli.viewing.video import beside, color_depth, write_video
@@ -47,6 +49,22 @@ def write_poses(path: Path, timestamps: Sequence[float], poses: Float[Tensor, "f
 
 
 SOMETIMES = ("compare.mp4", "map-before.png", "map-after.png", "memory.safetensors")  # what not every rollout leaves
+
+
+def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
+    """What is needed to roll out again, JSON values."""
+    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
+    options |= {"sampling": plan.sampling.requested(), "placement": dataclasses.asdict(plan.placement)}
+    memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
+    together = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
+    return {
+        "checkpoint": str(checkpoint.folder),
+        "fingerprint": checkpoint.fingerprint,
+        "plan": options | {"adapter": adapter, "actions": rollout.path.actions},
+        "frames": len(rollout.seen),
+        "seconds": rollout.seconds,
+        "memory": memory,
+    } | together
 
 
 def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[str, Any]:

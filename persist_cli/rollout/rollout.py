@@ -6,25 +6,19 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, TrajectoryInfo
-from persist_cli.checkpoints.checkpoint import (
-    Checkpoint,
-    find_checkpoint,
-    load_adapter,
-    load_backbone,
-    reference_checkpoint,
-)
-from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.checkpoints.load import adapter_memory, load_backbone, reference_checkpoint
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
-from persist_cli.rollout.outputs import write_outputs
+from persist_cli.rollout.outputs import describe, write_outputs
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import add_task, print_json, progress, say
 
@@ -39,19 +33,20 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     paths = plan_camera_paths(plan)
     folders = check_folders(out, len(paths))
     info = paths[0].info
-    backbone = load_backbone(checkpoint)
+    backbone = load_backbone(checkpoint, adapter=adapter)
     check_size(info, backbone.image_size, plan.start)
-    sampling = plan.sampling.over(checkpoint.sampling)
+    sampling = checkpoint.sampling_with(plan.sampling)
     backbone.check_sampling(sampling)
     plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(sampling)))
-    load_adapter(backbone, checkpoint, adapter)
     backbone.prepare_inference(plan.placement)
     memory = open_memory(checkpoint, adapter, plan, info)
     agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write)
     model = WorldModel(backbone, [agent], sampling)
     rollouts = roll(model, paths)
     pairs = list(zip(rollouts, folders, strict=True))
-    figures = [write_outputs(each, folder, describe(checkpoint, adapter, plan, each)) for each, folder in pairs]
+    figures = [
+        write_outputs(rollout, folder, describe(checkpoint, adapter, plan, rollout)) for rollout, folder in pairs
+    ]
     if json:
         print_json(figures if len(figures) > 1 else figures[0])
         return
@@ -84,7 +79,7 @@ def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, 
         if plan.memory is not None:
             raise CheckpointError(f"{checkpoint.folder}: has no memory adapter that could read {plan.memory}")
         return None
-    maker = MemoryFactory.of(checkpoint.memory_config(adapter))
+    maker = MemoryFactory.of(adapter_memory(checkpoint, adapter))
     empty = maker.empty(info)
     if plan.memory is None:
         return empty
@@ -119,19 +114,3 @@ def roll(model: WorldModel, paths: Sequence[CameraPath]) -> list[Rollout]:
         Rollout(path, video, before, agent.memory, seconds, depth)
         for path, video, agent in zip(paths, videos, branches.agents, strict=True)
     ]
-
-
-def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
-    """What is needed to roll out again, JSON values."""
-    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
-    options |= {"sampling": plan.sampling.requested(), "placement": dataclasses.asdict(plan.placement)}
-    memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
-    together = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
-    return {
-        "checkpoint": str(checkpoint.folder),
-        "fingerprint": checkpoint.fingerprint,
-        "plan": options | {"adapter": adapter, "actions": rollout.path.actions},
-        "frames": len(rollout.seen),
-        "seconds": rollout.seconds,
-        "memory": memory,
-    } | together

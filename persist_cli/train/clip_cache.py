@@ -1,9 +1,9 @@
-"""What training keeps of clips between steps and runs: latents and memory tokens in a folder that processes share.
+"""A cache of the latents and memory tokens of clips, in a folder that processes and runs share.
 
-An entry is a safetensors file named by its key, a hash of what its content depends on as far as that can be named:
-data, weights, settings, versions of packages. Code that changed and kept its version is not told apart; then the folder
-must be removed. Entries are written aside and renamed: two writers of one key write the same. What does not fit any
-more is not stored; nothing is ever pushed out.
+An entry is a safetensors file. Its name is its key: a hash of data, weights, settings and versions of packages, on
+which its content depends. When code changes and its version does not, the folder must be removed by hand. Two processes
+may write an entry at once, because both write the same, aside, and then rename it. Once the folder is full nothing more
+is stored; entries are never replaced.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import shutil
 import time
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from accelerate import Accelerator
@@ -37,43 +37,37 @@ from persist_cli.plugins import find_plugin
 from persist_cli.recipe import MemoryConfig, Recipe
 from persist_cli.viewing.console import say
 
-FORMAT = 2  # of the entries; another number makes every older one unknown
+FORMAT: Final = 2  # of the entries; those of another format are not found
 
-SCANS = 64  # how often at most the folder is measured while it fills up
+SCANS: Final = 64  # how often at most the folder is measured while it fills up
 
-STALE = 3600.0  # seconds after which what lies aside was left by a killed writer
+STALE: Final = 3600.0  # seconds after which a file aside must be that of a killed writer
 
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """Where and how much.
+    """The place and size of a cache.
 
     Args:
-        folder: made when missing.
-        gigabytes: 10⁹ bytes that its entries may fill.
+        folder: the folder of the entries; it is made when missing.
+        gigabytes: the size that all entries together may have, in 10⁹ bytes.
     """
 
     folder: Path
     gigabytes: float
 
 
-def cache_key(values: Mapping[str, Any]) -> str:
-    """The key of an entry: a hash of what it depends on, JSON values."""
-    text = json.dumps(dict(values) | {"format": FORMAT}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:40]
+class TensorCache:
+    """Keeps tensors by key in a folder, up to a number of bytes.
 
-
-class Cache:
-    """Tensors by key in a folder, bounded in bytes.
-
-    Its size is measured when it is opened and whenever this process has added a 64th of the bound since: other
-    writers can pass the bound by as much each.
+    The folder is measured at the beginning and whenever this process has added a 64th of the limit. Each of several
+    processes can therefore exceed the limit by as much.
 
     Args:
-        settings: folder and bound.
+        settings: the folder and its limit.
 
     Raises:
-        PersistError: when the folder cannot be made or the bound is no number.
+        PersistError: when the folder cannot be made or the limit is not a number of at least 0.
     """
 
     def __init__(self, settings: CacheSettings) -> None:
@@ -95,26 +89,26 @@ class Cache:
         self.added = 0
 
     def path(self, key: str) -> Path:
-        """Where the entry is or would be; 256 folders share them."""
+        """The file of an entry, which need not exist; entries are spread over 256 folders."""
         return self.folder / key[:2] / f"{key}.safetensors"
 
     def get(self, key: str) -> dict[str, Tensor] | None:
-        """The entry, ``None`` when there is none; a damaged one is removed with one line."""
+        """The tensors of an entry, ``None`` when there is none; a damaged one is removed, and a line says so."""
         path = self.path(key)
         if not path.is_file():
             return None
         try:
             tensors, metadata = read_tensors(path)
         except CheckpointError as error:
-            self._throw_away(path, str(error))
+            self._remove(path, str(error))
             return None
         if metadata.get("crc32") != _checksum(tensors):
-            self._throw_away(path, f"{path}: its checksum is wrong")
+            self._remove(path, f"{path}: its checksum is wrong")
             return None
         return tensors
 
     def put(self, key: str, tensors: Mapping[str, Tensor]) -> None:
-        """Store an entry while there is room; a folder that cannot be written ends the storing, not the run."""
+        """Store an entry while there is room; once the folder cannot be written, nothing more is stored."""
         if self.full:
             return
         path = self.path(key)
@@ -123,7 +117,7 @@ class Cache:
             self.measure()
         if self.used + size > self.limit:
             return self._stop(f"full ({self.used / 1e9:.3g} GB)")
-        before = _size(path)  # of the same entry, when another process was faster
+        before = _size(path)  # another process may have written the same entry already
         try:
             path.parent.mkdir(exist_ok=True)
             write_tensors(path, tensors, {"crc32": _checksum(tensors)})
@@ -136,166 +130,132 @@ class Cache:
         self.full = True
         say(f"{self.folder}: {cause}; what is not in it is made anew each time")
 
-    def _throw_away(self, path: Path, cause: str) -> None:
-        if path.is_file():  # another process may have been faster
+    def _remove(self, path: Path, cause: str) -> None:
+        if path.is_file():  # another process may have removed it
             path.unlink(missing_ok=True)
             say(f"{cause}; removed, made anew")
 
 
-def _checksum(tensors: Mapping[str, Tensor]) -> str:
-    """CRC-32 of the tensors' bytes, in order of their names."""
-    code = 0
-    for _, tensor in sorted(tensors.items()):
-        code = zlib.crc32(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().data, code)
-    return f"{code:08x}"
+def cache_key(values: Mapping[str, Any]) -> str:
+    """The key of an entry: a hash of the JSON values that it depends on."""
+    text = json.dumps(dict(values) | {"format": FORMAT}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:40]
 
 
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:  # removed in between by another process
-        return 0
-
-
-def _remove_stale(aside: Path) -> None:
-    try:
-        if time.time() - aside.stat().st_mtime > STALE:
-            shutil.rmtree(aside, ignore_errors=True)
-    except FileNotFoundError:  # a writer that lives has renamed it
-        return
-
-
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class ClipKeys:
-    """The keys of one clip.
+    """The keys of the entries of one clip.
 
     Args:
-        latents: of its latents, or of those of its whole trajectory.
-        tokens: of its memory tokens, ``None`` without a memory.
+        latents: the key of its latents, or of those of its whole trajectory.
+        tokens: the key of its memory tokens, ``None`` without a memory.
     """
 
     latents: str
     tokens: str | None
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class CacheKeys:
-    """The keys of all clips of a run.
+    """Makes the keys of all clips of a run.
 
     Args:
-        latents: what latents depend on besides the clip, JSON values.
-        tokens: what memory tokens depend on besides the clip, ``None`` without a memory.
-        whole: whether latents are those of whole trajectories.
+        latents: the JSON values that latents depend on besides the clip.
+        tokens: the JSON values that memory tokens depend on besides the clip, ``None`` without a memory.
+        whole: whether an entry has the latents of a whole trajectory instead of a clip.
     """
 
     latents: dict[str, Any]
     tokens: dict[str, Any] | None
     whole: bool
-    hashes: dict[Path, str] = dataclasses.field(default_factory=dict)  # of trajectories, each computed once
+    hashes: dict[Path, str] = field(default_factory=dict)  # of the trajectories' files, each computed once
 
     @staticmethod
-    def of(recipe: Recipe, backbone: Backbone, maker: MemoryFactory | None, device: str) -> CacheKeys:
-        """Those of a run.
+    def of(recipe: Recipe, backbone: Backbone, factory: MemoryFactory | None, device: str) -> CacheKeys:
+        """The keys of a run.
 
         Args:
-            recipe: of the run.
-            backbone: which encodes, and on which the budget of tokens and the size of images depend.
-            maker: of memories, ``None`` without one.
-            device: the kind of device that encodes.
+            recipe: the recipe of the run.
+            backbone: the backbone, which encodes clips and decides on the number of tokens and the size of images.
+            factory: makes the memories, ``None`` without one.
+            device: the type of the device that encodes.
         """
-        made_by = {"persist": __version__, "torch": torch.__version__, "device": device}
-        latents = made_by | {"encoding": backbone.encoding(), "precision": recipe.training.precision}
+        encoded_by = {"persist": __version__, "torch": torch.__version__, "device": device}
+        latents = encoded_by | {"encoding": backbone.encoding(), "precision": recipe.training.precision}
         tokens = None
-        if maker is not None and recipe.memory is not None:
-            tokens = made_by | _of_memory(recipe.memory, maker, backbone)
+        if factory is not None and recipe.memory is not None:
+            tokens = encoded_by | _token_dependencies(recipe.memory, factory, backbone)
         return CacheKeys(latents, tokens, backbone.framewise)
 
-    def of_clip(self, choice: ClipFrames) -> ClipKeys:
+    def of_clip(self, frames: ClipFrames) -> ClipKeys:
         """The keys of a clip."""
-        clip = {"trajectory": self._trajectory(choice.file.path), "frames": list(choice.frames)}
+        clip = {"trajectory": self._file_hash(frames.file.path), "frames": list(frames.frames)}
         latents = cache_key((clip | {"frames": "all"} if self.whole else clip) | self.latents)
         if self.tokens is None:
             return ClipKeys(latents, None)
-        return ClipKeys(latents, cache_key(clip | {"context": list(choice.context)} | self.tokens))
+        return ClipKeys(latents, cache_key(clip | {"context": list(frames.context)} | self.tokens))
 
-    def _trajectory(self, path: Path) -> str:
+    def _file_hash(self, path: Path) -> str:
         if path not in self.hashes:
             self.hashes[path] = file_sha256(path)
         return self.hashes[path]
 
 
-def _of_memory(choice: MemoryConfig, maker: MemoryFactory, backbone: Backbone) -> dict[str, Any]:
-    """What tokens depend on; an encoder's weights are told by the features that they give of a fixed picture."""
-    height, width = backbone.image_size
-    picture = torch.arange(height * width * 3).reshape(1, height, width, 3) * 37 % 256
-    features = maker.encoder.encode(picture.to(torch.uint8)).float().cpu().contiguous().numpy().data
-    plugins = [find_plugin("memory", choice.name), find_plugin("encoder", choice.encoder)]
-    return {
-        "memory": choice.name,
-        "settings": dataclasses.asdict(maker.settings),
-        "encoder": choice.encoder,
-        "encoder_settings": dataclasses.asdict(maker.encoder.settings),
-        "features": hashlib.sha256(features).hexdigest(),
-        "budget": backbone.token_budget,
-        "packages": [[plugin.package, plugin.version] for plugin in plugins],
-    }
-
-
 @dataclass(frozen=True)
 class ClipCache:
-    """A cache of what is made of clips.
+    """A cache of the latents and memory tokens of a run's clips.
 
     Args:
-        cache: tensors by key.
-        keys: of the clips.
+        cache: the tensors by key.
+        keys: makes the keys of the clips.
     """
 
-    cache: Cache
+    cache: TensorCache
     keys: CacheKeys
 
     @property
     def whole(self) -> bool:
-        """Whether it takes latents of whole trajectories."""
+        """Whether an entry has the latents of a whole trajectory instead of a clip."""
         return self.keys.whole
 
-    def latents(self, choice: ClipFrames) -> ClipLatents | None:
-        """Latents of the clip, ``None`` where there are none."""
-        tensors = self.cache.get(self.keys.of_clip(choice).latents)
+    def latents(self, frames: ClipFrames) -> ClipLatents | None:
+        """The latents of a clip, ``None`` where the cache has none."""
+        tensors = self.cache.get(self.keys.of_clip(frames).latents)
         if tensors is None:
             return None
-        return self.cut(tensors["video"], choice) if self.whole else ClipLatents(**tensors)
+        return self.cut(tensors["video"], frames) if self.whole else ClipLatents(**tensors)
 
-    def cut(self, video: Tensor, choice: ClipFrames) -> ClipLatents:
-        """The clip's latents out of those of its whole trajectory, every frame of which was encoded alone."""
-        frames = video[list(choice.frames)]
-        return ClipLatents(frames, frames[:1])
+    def cut(self, trajectory: Tensor, frames: ClipFrames) -> ClipLatents:
+        """The latents of a clip out of those of its whole trajectory, in which every frame was encoded alone."""
+        video = trajectory[list(frames.frames)]
+        return ClipLatents(video, video[:1])
 
-    def tokens(self, choice: ClipFrames) -> MemoryTokens | None:
-        """Memory tokens of the clip, ``None`` where there are none."""
-        key = self.keys.of_clip(choice).tokens
-        found = None if key is None else self.cache.get(key)
-        return None if found is None else MemoryTokens(**found)
+    def tokens(self, frames: ClipFrames) -> MemoryTokens | None:
+        """The memory tokens of a clip, ``None`` where the cache has none."""
+        key = self.keys.of_clip(frames).tokens
+        tensors = None if key is None else self.cache.get(key)
+        return None if tensors is None else MemoryTokens(**tensors)
 
-    def put_latents(self, choice: ClipFrames, latents: ClipLatents) -> None:
-        """Store the clip's latents, or those of its whole trajectory, while there is room."""
+    def put_latents(self, frames: ClipFrames, latents: ClipLatents) -> None:
+        """Store the latents of a clip, or of its whole trajectory, while there is room."""
         tensors = {"video": latents.video} | ({} if self.whole else {"image": latents.image})
-        self.cache.put(self.keys.of_clip(choice).latents, tensors)
+        self.cache.put(self.keys.of_clip(frames).latents, tensors)
 
-    def put_tokens(self, choice: ClipFrames, tokens: MemoryTokens) -> None:
-        """Store the clip's memory tokens while there is room."""
-        key = self.keys.of_clip(choice).tokens
+    def put_tokens(self, frames: ClipFrames, tokens: MemoryTokens) -> None:
+        """Store the memory tokens of a clip while there is room."""
+        key = self.keys.of_clip(frames).tokens
         if key is not None:
-            fields = {"features": tokens.features, "positions": tokens.positions, "mask": tokens.mask}
-            self.cache.put(key, fields)
+            tensors = {"features": tokens.features, "positions": tokens.positions, "mask": tokens.mask}
+            self.cache.put(key, tensors)
 
 
 @dataclass(frozen=True)
 class CachedSample:
-    """A training clip, with the latents and tokens that a cache has of it.
+    """A training clip with the latents and tokens that a cache has of it.
 
     Args:
-        sample: the clip, without the images and the context that nothing has to be made of any more.
-        frames: which frames of which trajectory it is made of.
+        sample: the clip, without images where it has latents and without context where it has tokens.
+        frames: its frames and their trajectory.
     """
 
     sample: ClipSample
@@ -303,11 +263,11 @@ class CachedSample:
 
 
 class CachedClips(Dataset[CachedSample]):
-    """Clips with the latents and tokens that a cache has of them; of those, no image is read.
+    """Reads clips with the latents and tokens that a cache has of them; images that these stand for are not read.
 
     Args:
         clips: the clips.
-        cache: ``None`` has nothing.
+        cache: the cache, ``None`` for none.
     """
 
     def __init__(self, clips: ClipDataset, cache: ClipCache | None) -> None:
@@ -376,3 +336,43 @@ class ClipEncoder:
         """Latents of these frames, on the CPU."""
         with torch.no_grad(), self.accelerator.autocast():
             return self.backbone.encode(Clips.stack([clip]))[0].to("cpu")
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> str:
+    """CRC-32 of the bytes of all tensors, in order of their names."""
+    code = 0
+    for _, tensor in sorted(tensors.items()):
+        code = zlib.crc32(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().data, code)
+    return f"{code:08x}"
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:  # another process may have removed it
+        return 0
+
+
+def _remove_stale(aside: Path) -> None:
+    try:
+        if time.time() - aside.stat().st_mtime > STALE:
+            shutil.rmtree(aside, ignore_errors=True)
+    except FileNotFoundError:  # its writer may have renamed it
+        return
+
+
+def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: Backbone) -> dict[str, Any]:
+    """The JSON values that memory tokens depend on; the features of a fixed picture stand for the encoder's weights."""
+    height, width = backbone.image_size
+    picture = torch.arange(height * width * 3).reshape(1, height, width, 3) * 37 % 256
+    features = factory.encoder.encode(picture.to(torch.uint8)).float().cpu().contiguous().numpy().data
+    plugins = [find_plugin("memory", memory.name), find_plugin("encoder", memory.encoder)]
+    return {
+        "memory": memory.name,
+        "settings": dataclasses.asdict(factory.settings),
+        "encoder": memory.encoder,
+        "encoder_settings": dataclasses.asdict(factory.encoder.settings),
+        "features": hashlib.sha256(features).hexdigest(),
+        "budget": backbone.token_budget,
+        "packages": [[plugin.package, plugin.version] for plugin in plugins],
+    }

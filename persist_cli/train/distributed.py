@@ -17,8 +17,8 @@ from accelerate.utils import DeepSpeedPlugin, FullyShardedDataParallelPlugin
 from torch import Tensor, distributed, nn
 
 from persist_cli.api.backbone import Backbone
+from persist_cli.api.checkpoint import step_folders
 from persist_cli.errors import PersistError
-from persist_cli.io.checkpoint_folder import step_folders
 from persist_cli.recipe import Recipe, TrainingSettings
 
 CHECKPOINT_WRAPPER: Final = "_checkpoint_wrapped_module."  # accelerate's activation checkpointing adds it to names

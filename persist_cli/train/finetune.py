@@ -19,9 +19,9 @@ from accelerate import Accelerator
 from accelerate.utils import InitProcessGroupKwargs, set_seed
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.checkpoints.checkpoint import Checkpoint, find_checkpoint, start_backbone, starts_from_random_codec
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, step_folders
+from persist_cli.checkpoints.load import start_backbone, starts_from_random_codec
 from persist_cli.errors import INTERRUPTED, PersistError, RecipeError
-from persist_cli.io.checkpoint_folder import step_folders
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import (
@@ -128,11 +128,11 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
     """
     accelerator = make_accelerator(recipe, run)
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
-    maker = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
-    backbone = prepare_backbone(recipe, base, maker)
+    factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
+    backbone = prepare_backbone(recipe, base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
         warn(f"{run}: {RANDOM_CODEC}")
-    trainer = Trainer(recipe, backbone, maker, accelerator, plan.cache)
+    trainer = Trainer(recipe, backbone, factory, accelerator, plan.cache)
     if plan.profile:
         trainer.times = StepTimes(accelerator.device, recipe.training.batch)
     load_state(run, trainer.state)
@@ -178,7 +178,7 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
     return accelerator
 
 
-def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryFactory | None) -> Backbone:
+def prepare_backbone(recipe: Recipe, base: Checkpoint | None, factory: MemoryFactory | None) -> Backbone:
     """The backbone to train: fresh or that of the base, with a fresh LoRA or memory adapter where the recipe has one.
 
     Raises:
@@ -189,8 +189,8 @@ def prepare_backbone(recipe: Recipe, base: Checkpoint | None, maker: MemoryFacto
         if base is None and not backbone.origin():
             raise RecipeError("lora changes weights that are there; give base=RUN, or pretrained backbone.settings")
         backbone.add_lora(recipe.lora)
-    if recipe.memory is not None and maker is not None:
-        backbone.add_adapter(recipe.memory.name, maker.encoder.channels, recipe.adapter)
+    if recipe.memory is not None and factory is not None:
+        backbone.add_adapter(recipe.memory.name, factory.encoder.channels, recipe.adapter)
     return backbone
 
 

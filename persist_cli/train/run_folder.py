@@ -8,9 +8,9 @@ from typing import Final
 from safetensors import SafetensorError
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.checkpoints.checkpoint import Checkpoint, save_adapter, save_base, save_lora
+from persist_cli.api.checkpoint import Checkpoint, TrainingScenes
 from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
-from persist_cli.data.scenes import TrainingScenes
+from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
 from persist_cli.recipe import to_yaml

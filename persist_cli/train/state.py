@@ -26,8 +26,8 @@ from torch.distributed.checkpoint.metadata import TensorStorageMetadata
 from torch.distributed.checkpoint.state_dict_loader import load
 from torch.distributed.checkpoint.state_dict_saver import save
 
+from persist_cli.api.checkpoint import STEP, step_folders
 from persist_cli.errors import CheckpointError
-from persist_cli.io.checkpoint_folder import STEP, step_folders
 from persist_cli.io.files import folder_aside, read_json, read_tensors, write_json, write_tensors
 from persist_cli.train.distributed import is_sharded
 

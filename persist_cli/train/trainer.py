@@ -22,7 +22,7 @@ from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import Recipe, TrainingSettings
-from persist_cli.train.clip_cache import Cache, CachedClips, CacheKeys, CacheSettings, ClipCache, ClipEncoder
+from persist_cli.train.clip_cache import CachedClips, CacheKeys, CacheSettings, ClipCache, ClipEncoder, TensorCache
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes, timed
 from persist_cli.train.optimizer import make_average, make_optimizer, requested_savings, update_average
@@ -127,7 +127,7 @@ class Trainer:
                 "data.clips_per_trajectory=32, or leave --cache out"
             )
         keys = CacheKeys.of(recipe, backbone, self.factory, self.accelerator.device.type)
-        return ClipEncoder(backbone, self.factory, self.accelerator, ClipCache(Cache(settings), keys))
+        return ClipEncoder(backbone, self.factory, self.accelerator, ClipCache(TensorCache(settings), keys))
 
     def loader(self) -> Iterator[Clips]:
         """Batches of this process from the state's step to the last."""

@@ -21,8 +21,9 @@ from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_backbones.extensions.offload import enable_tiling
 from persist_backbones.pipeline.pipeline import WorldPipeline, WorldPipelineOutput
 from persist_cli.api.backbone import Sampling
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.checkpoints.checkpoint import find_checkpoint, save_adapter, save_base
+from persist_cli.checkpoints.save import save_adapter, save_base
 from persist_cli.errors import PersistError
 from persist_cli.recipe import MemoryConfig
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, trained

@@ -5,7 +5,7 @@ import shutil
 import pytest
 import torch
 
-from persist_backbones.cogvideox.pretrained import folder_here, pretrained_folder, published_preset
+from persist_backbones.cogvideox.parts import folder_here, pretrained_folder, published_preset
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, read_tensors, write_json, write_tensors
 from persist_cli.plugins import make_backbone

@@ -4,7 +4,7 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
 
-from persist_backbones.cogvideox.pretrained import load_parts
+from persist_backbones.cogvideox.parts import load_parts
 from persist_cli.errors import CheckpointError
 from persist_cli.plugins import make_backbone
 from tests.support.walking import MICRO, SIZE

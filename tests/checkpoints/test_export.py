@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.checkpoints.checkpoint import find_checkpoint, load_adapter, load_backbone
-from persist_cli.checkpoints.sampling_defaults import SamplingOverrides
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.inference import SamplingOverrides
+from persist_cli.checkpoints.load import load_adapter, load_backbone
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
 from tests.support.disk import file_limit
@@ -104,10 +105,10 @@ def test_a_stage_2_run_stands_for_its_base_and_adapter(persist, export, runs, tm
 def test_the_sampling_of_the_card_is_meant_where_nothing_is_asked_for(export, runs, tmp_path):
     export(tmp_path / "m", "--steps", "7", "--sampler", "unipc", "--guidance", "1.5")
     exported, run = find_checkpoint(tmp_path / "m"), find_checkpoint(runs / "stage1")
-    assert SamplingOverrides().over(exported.sampling) == Sampling(7, "unipc", 1.5)
-    assert SamplingOverrides(3, "ddim").over(exported.sampling) == Sampling(3, "ddim", 1.5)
-    assert SamplingOverrides(memory_guidance=1.0).over(exported.sampling) == Sampling(7, "unipc", 1.0)
-    assert (run.sampling, SamplingOverrides().over(run.sampling)) == (None, Sampling(50, "ddim", 1.0))
+    assert exported.sampling_with(SamplingOverrides()) == Sampling(7, "unipc", 1.5)
+    assert exported.sampling_with(SamplingOverrides(3, "ddim")) == Sampling(3, "ddim", 1.5)
+    assert exported.sampling_with(SamplingOverrides(memory_guidance=1.0)) == Sampling(7, "unipc", 1.0)
+    assert (run.sampling, run.sampling_with(SamplingOverrides())) == (None, Sampling(50, "ddim", 1.0))
 
 
 @pytest.mark.parametrize(

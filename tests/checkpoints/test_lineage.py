@@ -7,9 +7,8 @@ import shutil
 
 import pytest
 
-from persist_cli.checkpoints.checkpoint import find_checkpoint
+from persist_cli.api.checkpoint import TrainingScenes, find_checkpoint
 from persist_cli.checkpoints.lineage import stage_recipes, training_scenes
-from persist_cli.data.scenes import TrainingScenes
 from persist_cli.evaluate.provenance import checkpoint_json, scenes_json
 from persist_cli.evaluate.provenance import training_scenes as scenes_to_avoid
 from tests.support.walking import stage

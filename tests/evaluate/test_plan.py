@@ -105,7 +105,7 @@ def test_memories_and_data_named_twice_are_measured_once(persist, walks, tmp_pat
 def test_a_second_report_of_a_finished_evaluation_predicts_nothing(persist, walks, tmp_path, monkeypatch):
     command = ["eval", write_model(tmp_path), "--data", walks, *ONE, "--steps", 1, "--out", tmp_path / "o"]
     assert persist(*command, "--report", tmp_path / "a").code == 0
-    for module in ("measure_rows", "example_clips"):
+    for module in ("measure", "example_clips"):
         monkeypatch.setattr(f"persist_cli.evaluate.{module}.predict", lambda *_: pytest.fail("predicts again"))
     assert persist(*command, "--report", tmp_path / "b").code == 0
     first, again = ({path.name: path.read_bytes() for path in (tmp_path / name / "sheets").iterdir()} for name in "ab")

@@ -1,4 +1,4 @@
-"""A disk that is full."""
+"""A full disk, as a limit on the size of files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def file_limit(size: int) -> Iterator[None]:
-    """No file may grow beyond so many bytes."""
+    """Within the block no file can grow beyond so many bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

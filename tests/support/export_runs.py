@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.checkpoints.checkpoint import find_checkpoint, save_adapter, save_base
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.checkpoints.save import save_adapter, save_base
 from persist_cli.recipe import MemoryConfig
 from tests.support.micro_model import CHANNELS, micro, shaken
 
@@ -16,7 +17,7 @@ SMALL = {"width": 16, "dropout": 0.0}
 
 
 def write_base(folder: Path, scale: float = 0.1, **settings: Any) -> Backbone:
-    """A base with weights that ``scale`` tells apart from another."""
+    """Write a base with random weights of this scale; another scale makes it another base."""
     backbone = micro(**settings)
     shaken(backbone, scale)
     folder.mkdir(parents=True)
@@ -25,17 +26,20 @@ def write_base(folder: Path, scale: float = 0.1, **settings: Any) -> Backbone:
 
 
 def write_adapter(backbone: Backbone, base: Path, folder: Path, memory: str, form: str = "cross") -> Path:
-    """A stage-2 run on the base."""
+    """Write a stage-2 run on a base; returns its folder."""
     backbone.add_adapter(memory, CHANNELS, SMALL | {"form": form})
     shaken(backbone.adapters[memory])  # type: ignore[index]
     folder.mkdir()
-    choice = MemoryConfig(memory, {"cell": (0.5, 1.0, 0.5)} if memory == "voxel" else {}, "patches", ENCODER)
-    save_adapter(backbone, find_checkpoint(base), choice, folder, folder)
+    config = MemoryConfig(memory, {"cell": (0.5, 1.0, 0.5)} if memory == "voxel" else {}, "patches", ENCODER)
+    save_adapter(backbone, find_checkpoint(base), config, folder, folder)
     return folder
 
 
 def write_runs(folder: Path) -> Path:
-    """``stage1`` with the stage-2 runs ``voxel``, ``canvas`` (voxel in that form) and ``none``, and ``other``."""
+    """Write ``stage1`` with its stage-2 runs ``voxel``, ``canvas`` and ``none``, and ``other`` on another base.
+
+    ``canvas`` also has a voxel memory, read by an adapter of that form.
+    """
     backbone = write_base(folder / "stage1")
     write_adapter(backbone, folder / "stage1", folder / "voxel", "voxel")
     write_adapter(backbone, folder / "stage1", folder / "canvas", "voxel", "canvas")

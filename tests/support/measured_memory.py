@@ -1,7 +1,8 @@
-"""Run as a program: train by each list of settings in turn and print the most bytes that each run took.
+"""Measures the most bytes of memory that short trainings take; a program for a process of its own.
 
-Of a process's resident memory, less what it had before the run; a small run comes first, which loads what libraries
-load late. The environment of ``MEASURED`` keeps freed memory from staying with the process.
+A run takes the peak of the process's resident memory less what the process held before. A first run is not counted,
+because libraries load parts of themselves late. With the environment of ``MEASURED`` the process gives freed memory
+back at once.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ SHORT = ["base=null", "training.steps=2", "training.workers=0", "training.thread
 
 
 def measured_peaks(runs: Sequence[Run]) -> list[int]:
-    """Bytes of each run, all in one fresh process."""
+    """The most bytes of each run, all of which are measured in one fresh process."""
     command = [sys.executable, "-m", "tests.support.measured_memory", json.dumps(runs)]
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | MEASURED)
-    assert done.returncode == 0, done.stderr
-    found: list[int] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    process = subprocess.run(command, capture_output=True, text=True, env=os.environ | MEASURED)
+    assert process.returncode == 0, process.stderr
+    peaks: list[int] = json.loads(process.stdout.splitlines()[-1])
+    return peaks
 
 
 def trained_bytes(run: Run, peak: Callable[[], int]) -> int:
-    """What ``peak`` says at the end of a short run, before it saves anything."""
+    """The result of ``peak`` at the end of a short run, before it saves anything."""
     recipe, data, settings = run
     peaks: list[int] = []
     with (
@@ -51,7 +52,7 @@ def trained_bytes(run: Run, peak: Callable[[], int]) -> int:
 
 
 def resident_bytes(run: Run) -> int:
-    """Resident bytes that a short run took at most."""
+    """The most resident bytes that a short run takes."""
     gc.collect()
     before = resident_now()
     forget_peak()
@@ -59,6 +60,6 @@ def resident_bytes(run: Run) -> int:
 
 
 if __name__ == "__main__":
-    asked: list[Run] = json.loads(sys.argv[1])
-    resident_bytes(asked[0])
-    print(json.dumps([resident_bytes(run) for run in asked]))  # noqa: T201
+    runs: list[Run] = json.loads(sys.argv[1])
+    resident_bytes(runs[0])
+    print(json.dumps([resident_bytes(run) for run in runs]))  # noqa: T201

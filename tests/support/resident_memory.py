@@ -1,4 +1,4 @@
-"""Resident memory of this process, as Linux counts it."""
+"""The resident memory of this process, as Linux counts it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from pathlib import Path
 
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
-RESET_PEAK = "5"  # what Linux takes as: forget the greatest resident size so far
+RESET_PEAK = "5"  # written to clear_refs, it resets the peak of the resident memory
 
 KNOWN = STATUS.exists() and CLEAR.exists()
 
 
 def resident_now() -> int:
-    """Bytes."""
+    """Bytes of resident memory."""
     return _status("VmRSS")
 
 
@@ -22,7 +22,7 @@ def peak_resident() -> int:
 
 
 def forget_peak() -> None:
-    """Begin to look for the most bytes anew."""
+    """Reset the peak of the resident memory."""
     CLEAR.write_text(RESET_PEAK)
 
 

@@ -40,6 +40,15 @@ def room_walk(frames: int = 8) -> Observations:
     return observe(walk(frames))
 
 
+def write_room_walks(folder: Path, size: int, trajectories: int = 3, frames: int = 64) -> Path:
+    """A data set of walks through the room in square images; each walk starts at another place of the round."""
+    poses = walk(frames)
+    for number in range(trajectories):
+        turned = np.roll(poses, number * frames // trajectories, axis=0)
+        Room(size, size).write(folder / f"walk-{number}.parquet", turned)
+    return folder
+
+
 def empty_memory(
     name: str, encoder: dict[str, Any] | None = None, up: tuple[float, float, float] = UP, **settings: Any
 ) -> Memory:

@@ -1,7 +1,7 @@
-"""Several runs of ``persist`` in the same two processes, which are slow to start.
+"""Several commands of ``persist`` in the same two processes, because processes are slow to start.
 
-``python -m tests.training.pair JOBS.json`` is for a launcher. A job is its environment and its arguments; the main
-process writes beside the jobs with which code each ended, and what it said of an error.
+A launcher runs ``python -m tests.support.two_processes JOBS.json``. A job is the environment and the arguments of a
+command. The main process writes the exit code and the error output of each into a file beside the jobs.
 """
 
 from __future__ import annotations
@@ -24,39 +24,39 @@ Job = dict[str, Any]
 
 
 def job(*arguments: str, **environment: str) -> Job:
-    """A command to run."""
+    """A command with its environment."""
     return {"arguments": [*arguments], "environment": environment}
 
 
-def run_pair(folder: Path, *jobs: Job) -> list[tuple[int, str]]:
-    """Run jobs in two processes with gloo; how each ended."""
+def run_in_two(folder: Path, *jobs: Job) -> list[tuple[int, str]]:
+    """Run jobs in two processes with gloo; returns the exit code and the error output of each."""
     (folder / "jobs.json").write_text(json.dumps(jobs))
-    ended = subprocess.run(
+    process = subprocess.run(
         **launched("tests.support.two_processes", str(folder / "jobs.json")), capture_output=True, text=True
     )
-    assert ended.returncode == 0, ended.stderr
-    return [(code, said) for code, said in json.loads((folder / "ended.json").read_text())]
+    assert process.returncode == 0, process.stderr
+    return [(code, errors) for code, errors in json.loads((folder / "ended.json").read_text())]
 
 
-def run(given: Job) -> tuple[int, str]:
-    """One command, with its environment, as if the process were new."""
-    os.environ.update(given["environment"])
-    said = io.StringIO()
+def run(job: Job) -> tuple[int, str]:
+    """Run a command with its environment, as if the process were new."""
+    os.environ.update(job["environment"])
+    errors = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
-            main(given["arguments"])
+        with contextlib.redirect_stderr(errors):
+            main(job["arguments"])
     except SystemExit as ended:
-        return int(ended.code or 0), said.getvalue()
+        return int(ended.code or 0), errors.getvalue()
     finally:
         AcceleratorState._reset_state(reset_partial_state=True)
-        for name in given["environment"]:
+        for name in job["environment"]:
             del os.environ[name]
-    return 0, said.getvalue()
+    return 0, errors.getvalue()
 
 
 if __name__ == "__main__":
-    os.environ["FORK_LAUNCHED"] = "1"  # accelerate then leaves the processes' connection to the next run
+    os.environ["FORK_LAUNCHED"] = "1"  # so that accelerate keeps the connection of the processes for the next job
     path = Path(sys.argv[1])
-    results = [run(each) for each in json.loads(path.read_text())]
+    results = [run(job) for job in json.loads(path.read_text())]
     if os.environ["RANK"] == "0":
         (path.parent / "ended.json").write_text(json.dumps(results))

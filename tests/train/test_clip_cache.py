@@ -1,4 +1,4 @@
-"""tests.train.test_clip_cache."""
+"""A cache of clips: cached training is training to the bit, and keys say all that entries depend on."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ import torch
 from accelerate import Accelerator
 
 from persist_cli.api.backbone import ClipLatents
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.errors import PersistError
 from persist_cli.io.files import ASIDE, read_tensors
 from persist_cli.memorize import sources
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.plugins import make_backbone
+from persist_cli.plugins import find_plugin, make_backbone
 from persist_cli.recipe import Recipe, TrainingSettings
-from persist_cli.train import clip_cache as keys
+from persist_cli.train import clip_cache
 from persist_cli.train.clip_cache import (
     STALE,
-    Cache,
     CachedClips,
     CacheKeys,
     CacheSettings,
     ClipCache,
     ClipEncoder,
+    TensorCache,
     cache_key,
 )
 from tests.support.disk import file_limit
@@ -37,13 +38,19 @@ from tests.support.walking import MICRO, MICRO_SETTINGS, SIZE, ended_alike, loss
 
 FEW = "data.clips_per_trajectory=3"
 
+STILL = "backbone.settings.vae={block_out_channels: [8, 8, 8], norm_num_groups: 4, latent_channels: 4, "
+
+FRAMEWISE = ["base=null", *MICRO_SETTINGS, STILL + "temporal_compression_ratio: 1}"]
+
+TOKENS = {"features": torch.ones(2, 3), "positions": torch.ones(2, 3).double(), "mask": torch.ones(2).bool()}
+
 
 def entries(folder: Path) -> list[Path]:
     return sorted(folder.glob("*/*.safetensors"))
 
 
-def found(run: Path) -> float:
-    """Share of a run's clips that came with latents."""
+def share_cached(run: Path) -> float:
+    """The share of a run's clips whose latents were in the cache."""
     return json.loads((run / "speed.jsonl").read_text().splitlines()[-1])["latents_found"]
 
 
@@ -54,43 +61,37 @@ def test_cached_steps_equal_uncached_ones_to_the_bit(persist, walks, stage1, tmp
     for name in ("cold", "warm"):
         assert persist(*stage(number, walks, tmp_path / name, *changes, "--cache", tmp_path / "cache")).code == 0
         assert ended_alike(tmp_path / "without", tmp_path / name)
-    assert found(tmp_path / "without") == 0
-    assert found(tmp_path / "cold") < found(tmp_path / "warm") == 1
-
-
-STILL = "backbone.settings.vae={block_out_channels: [8, 8, 8], norm_num_groups: 4, latent_channels: 4, "
-
-ALONE = ["base=null", *MICRO_SETTINGS, STILL + "temporal_compression_ratio: 1}"]
+    assert share_cached(tmp_path / "without") == 0
+    assert share_cached(tmp_path / "cold") < share_cached(tmp_path / "warm") == 1
 
 
 @pytest.mark.parametrize("strides", ["[1]", "[1, -2]"])
-def test_where_frames_are_coded_alone_the_latents_of_a_trajectory_serve_all_its_clips(
-    persist, walks, tmp_path, strides
-):
-    alone = [*ALONE, f"data.strides={strides}"]
+def test_with_a_framewise_codec_the_latents_of_a_trajectory_serve_all_its_clips(persist, walks, tmp_path, strides):
+    alone = [*FRAMEWISE, f"data.strides={strides}"]
     assert persist(*stage("stage1", walks, tmp_path / "without", *alone)).code == 0
     for name in ("cold", "warm"):
         assert persist(*stage("stage1", walks, tmp_path / name, *alone, "--cache", tmp_path / "cache")).code == 0
         assert losses(tmp_path / name) == pytest.approx(losses(tmp_path / "without"), rel=1e-4)
     assert len(entries(tmp_path / "cache")) == 2  # trajectories
-    assert found(tmp_path / "warm") == 1
+    assert share_cached(tmp_path / "warm") == 1
 
 
-def test_a_long_trajectory_is_encoded_in_pieces_and_gives_the_same_latents(walks, tmp_path, monkeypatch):
+def test_a_long_trajectory_is_encoded_in_pieces_to_the_same_latents(walks, tmp_path, monkeypatch):
     backbone = make_backbone("cogvideox", MICRO | {"vae": MICRO["vae"] | {"temporal_compression_ratio": 1}})
     clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
-    made = []
+    latents = []
     for pixels in (1 << 22, 7 * SIZE * SIZE):
         monkeypatch.setattr(sources, "PIXELS_AT_ONCE", pixels)
-        cache = ClipCache(Cache(CacheSettings(tmp_path / str(pixels), 1)), CacheKeys({}, None, backbone.framewise))
+        tensors = TensorCache(CacheSettings(tmp_path / str(pixels), 1))
+        cache = ClipCache(tensors, CacheKeys({}, None, backbone.framewise))
         ClipEncoder(backbone, None, Accelerator(cpu=True), cache).with_latents(CachedClips(clips, cache)[0])
-        made.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["video"])
-    assert len(made[0]) == 24
-    assert torch.equal(*made)
+        latents.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["video"])
+    assert len(latents[0]) == 24
+    assert torch.equal(*latents)
 
 
-def test_where_the_cache_is_full_a_clip_alone_is_encoded(persist, walks, tmp_path):
-    alone = [*ALONE, "data.strides=[1, -2]"]
+def test_with_a_full_cache_only_the_clip_is_encoded_and_not_its_trajectory(persist, walks, tmp_path):
+    alone = [*FRAMEWISE, "data.strides=[1, -2]"]
     assert persist(*stage("stage1", walks, tmp_path / "without", *alone)).code == 0
     bound = ["--cache", tmp_path / "cache", "--cache-gigabytes", "0"]
     assert persist(*stage("stage1", walks, tmp_path / "full", *alone, *bound)).code == 0
@@ -99,14 +100,14 @@ def test_where_the_cache_is_full_a_clip_alone_is_encoded(persist, walks, tmp_pat
 
 
 @pytest.mark.slow
-def test_latents_are_kept_in_the_precision_of_training(walks, stage1, tmp_path):
+def test_latents_are_stored_in_the_precision_of_training(walks, stage1, tmp_path):
     changes = [f"base={stage1}", FEW, "training.precision=bf16"]  # a process of its own: accelerate fixes it for one
     train(*stage("stage1", walks, tmp_path / "without", *changes))
     for name in ("cold", "warm"):
         train(*stage("stage1", walks, tmp_path / name, *changes, "--cache", str(tmp_path / "cache")))
         assert ended_alike(tmp_path / "without", tmp_path / name)
-    kept = [read_tensors(path)[0]["latents"] for path in entries(tmp_path / "cache")]
-    assert {latents.dtype for latents in kept} == {torch.bfloat16}
+    latents = [read_tensors(path)[0]["video"] for path in entries(tmp_path / "cache")]
+    assert {video.dtype for video in latents} == {torch.bfloat16}
 
 
 def test_a_resumed_run_with_a_cache_equals_an_uninterrupted_one_without(persist, walks, stage1, tmp_path):
@@ -121,59 +122,59 @@ def test_a_resumed_run_with_a_cache_equals_an_uninterrupted_one_without(persist,
 
 @pytest.fixture
 def keys_of(walks, voxel):
-    """The keys of one clip for a stage, a budget of tokens, a codec that moves, and changes to the memory."""
+    """Makes the keys of one clip for a stage, a number of tokens, a changed codec, and changes to the memory."""
     checkpoint = find_checkpoint(voxel)
-    backbone, usual = load_backbone(checkpoint), checkpoint.memory_config("voxel")
-    choice = ClipDataset([walks], ClipPlan(9, (1,), 5, 3, (SIZE, SIZE))).choose(0)
+    backbone, usual = load_backbone(checkpoint), adapter_memory(checkpoint, "voxel")
+    frames = ClipDataset([walks], ClipPlan(9, (1,), 5, 3, (SIZE, SIZE))).choose(0)
 
     def of(stage="2", budget=7, codec=0.0, precision="no", **changes):
         memory = replace(usual, **changes) if stage == "2" else None
         backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget})
-        maker = MemoryFactory.of(memory) if memory else None
+        factory = MemoryFactory.of(memory) if memory else None
         recipe = Recipe(stage, memory=memory, training=TrainingSettings(precision=precision))
         with torch.no_grad():
             next(backbone.codec.parameters()).add_(codec)
-        return CacheKeys.of(recipe, backbone, maker, "cpu").of_clip(choice)
+        return CacheKeys.of(recipe, backbone, factory, "cpu").of_clip(frames)
 
     return of
 
 
-def test_stages_and_memories_share_latents_and_nothing_that_depends_on_more(keys_of):
-    found = [keys_of(), keys_of(budget=8), keys_of(settings={"cell": [0.5, 0.5, 0.5]}),
-             keys_of(name="map2d", settings={}), keys_of(encoder_settings={"channels": 12})]  # fmt: skip
-    assert {each.latents for each in found} == {keys_of("1").latents}
-    assert len({each.tokens for each in found}) == len(found)
+def test_stages_and_memories_share_latents_and_not_tokens(keys_of):
+    clip_keys = [keys_of(), keys_of(budget=8), keys_of(settings={"cell": [0.5, 0.5, 0.5]}),
+                 keys_of(name="map2d", settings={}), keys_of(encoder_settings={"channels": 12})]  # fmt: skip
+    assert {clip.latents for clip in clip_keys} == {keys_of("1").latents}
+    assert len({clip.tokens for clip in clip_keys}) == len(clip_keys)
     assert keys_of("1").tokens is None
 
 
-def test_another_codec_or_precision_has_other_latents_and_the_same_tokens(keys_of):
-    found = [keys_of(), keys_of(codec=1.0), keys_of(precision="bf16")]
-    assert len({each.latents for each in found}) == len(found)
-    assert {each.tokens for each in found} == {found[0].tokens}
+def test_another_codec_or_precision_changes_the_key_of_latents_and_not_of_tokens(keys_of):
+    clip_keys = [keys_of(), keys_of(codec=1.0), keys_of(precision="bf16")]
+    assert len({clip.latents for clip in clip_keys}) == len(clip_keys)
+    assert {clip.tokens for clip in clip_keys} == {clip_keys[0].tokens}
 
 
 @pytest.mark.parametrize("newer", ["memory", "encoder"])
-def test_tokens_of_another_version_of_a_plugin_have_another_key(keys_of, monkeypatch, newer):
-    before, find = keys_of(), keys.find_plugin
-    monkeypatch.setattr(
-        keys, "find_plugin", lambda kind, name: replace(find(kind, name), **{"version": "9"} if kind == newer else {})
-    )
+def test_another_version_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypatch, newer):
+    before = keys_of()
+
+    def find(kind, name):
+        plugin = find_plugin(kind, name)
+        return replace(plugin, version="9") if kind == newer else plugin
+
+    monkeypatch.setattr(clip_cache, "find_plugin", find)
     assert keys_of().latents == before.latents
     assert keys_of().tokens != before.tokens
 
 
 def clips_in(walks: Path, folder: Path, **changes: object) -> CachedClips:
-    """Clips that look into a cache, with made-up dependencies."""
+    """Clips that look into a cache, whose keys depend on made-up values."""
     plan = {"frames": 9, "strides": (1, 2), "context_frames": 5, "seed": 3, "image_size": (SIZE, SIZE)} | changes
     clips = ClipDataset([walks], ClipPlan(**plan, clips_per_trajectory=2))
-    made_up = CacheKeys({"encoding": "x"}, {"memory": "y"}, False)
-    return CachedClips(clips, ClipCache(Cache(CacheSettings(folder, 1)), made_up))
+    keys = CacheKeys({"encoding": "x"}, {"memory": "y"}, False)
+    return CachedClips(clips, ClipCache(TensorCache(CacheSettings(folder, 1)), keys))
 
 
-TOKENS = {"features": torch.ones(2, 3), "positions": torch.ones(2, 3).double(), "mask": torch.ones(2).bool()}
-
-
-def test_a_known_clip_is_given_without_reading_an_image(walks, tmp_path):
+def test_no_image_of_a_cached_clip_is_read(walks, tmp_path):
     clips = clips_in(walks, tmp_path)
     before = clips[5]
     clip = before.sample.clip
@@ -192,33 +193,34 @@ def test_a_known_clip_is_given_without_reading_an_image(walks, tmp_path):
     assert (sample.clip.interactions, sample.clip.seed) == (clip.interactions, clip.seed)
 
 
-def test_tokens_of_a_clip_without_context_are_found_again(walks, tmp_path):
+def test_tokens_of_a_clip_without_context_are_cached_too(walks, tmp_path):
     clips = clips_in(walks, tmp_path, context_frames=0)
     clips.cache.put_tokens(clips[5].frames, MemoryTokens(**TOKENS))
     assert torch.equal(clips[5].sample.clip.tokens.features, TOKENS["features"])
 
 
-def test_other_frames_contexts_or_trajectories_have_other_keys(walks, tmp_path):
+def test_clips_of_other_frames_contexts_or_trajectories_have_other_keys(walks, tmp_path):
     clips, less = clips_in(walks, tmp_path), clips_in(walks, tmp_path, context_frames=2)
-    seen = {(str(choice.file.path), choice.frames, choice.context): clips.cache.keys.of_clip(choice)
-            for choice in map(clips.clips.choose, range(60))}  # fmt: skip
-    assert len({each.latents for each in seen.values()}) == len({each.tokens for each in seen.values()}) == 4
-    assert len(seen) == 4
-    one, two = (each.cache.keys.of_clip(each.clips.choose(0)) for each in (clips, less))
-    assert one.latents == two.latents
-    assert one.tokens != two.tokens
+    clip_keys = {(str(clip.file.path), clip.frames, clip.context): clips.cache.keys.of_clip(clip)
+                 for clip in map(clips.clips.choose, range(60))}  # fmt: skip
+    assert len({keys.latents for keys in clip_keys.values()}) == 4
+    assert len({keys.tokens for keys in clip_keys.values()}) == 4
+    assert len(clip_keys) == 4
+    long_context, short_context = (dataset.cache.keys.of_clip(dataset.clips.choose(0)) for dataset in (clips, less))
+    assert long_context.latents == short_context.latents
+    assert long_context.tokens != short_context.tokens
     assert cache_key({"a": 1}) != cache_key({"a": 2})
 
 
 def test_an_entry_that_is_written_again_is_counted_once(tmp_path):
-    cache = Cache(CacheSettings(tmp_path, 1))
+    cache = TensorCache(CacheSettings(tmp_path, 1))
     for _ in range(2):
         cache.put("0" * 40, {"a": torch.ones(1000)})
     assert cache.used == entries(tmp_path)[0].stat().st_size
 
 
-def test_a_disk_that_is_full_ends_the_storing_with_one_line(tmp_path, capsys):
-    cache = Cache(CacheSettings(tmp_path, 1))
+def test_a_full_disk_ends_the_storing_with_one_line(tmp_path, capsys):
+    cache = TensorCache(CacheSettings(tmp_path, 1))
     with file_limit(1000):
         for name in ("0", "1"):
             cache.put(name * 40, {"a": torch.ones(10_000)})
@@ -226,23 +228,23 @@ def test_a_disk_that_is_full_ends_the_storing_with_one_line(tmp_path, capsys):
     assert (entries(tmp_path), capsys.readouterr().out.count("not writable")) == ([], 1)
 
 
-def test_what_killed_writers_left_is_removed_and_what_living_ones_write_is_not(tmp_path):
-    left, written = tmp_path / "aa" / f"{ASIDE}0-x", tmp_path / "bb" / f"{ASIDE}1-x"
-    for folder in (left, written):
+def test_leftovers_of_killed_writers_are_removed_and_files_of_living_ones_are_not(tmp_path):
+    stale, fresh = tmp_path / "aa" / f"{ASIDE}0-x", tmp_path / "bb" / f"{ASIDE}1-x"
+    for folder in (stale, fresh):
         folder.mkdir(parents=True)
-    os.utime(left, times=(0, left.stat().st_mtime - STALE - 60))
-    Cache(CacheSettings(tmp_path, 1))
-    assert (left.exists(), written.exists()) == (False, True)
+    os.utime(stale, times=(0, stale.stat().st_mtime - STALE - 60))
+    TensorCache(CacheSettings(tmp_path, 1))
+    assert (stale.exists(), fresh.exists()) == (False, True)
 
 
-def test_a_cache_may_be_without_bound_and_not_of_no_number(tmp_path):
-    Cache(CacheSettings(tmp_path, float("inf"))).put("0" * 40, {"a": torch.ones(10)})
+def test_a_cache_may_be_unlimited_but_its_limit_must_be_a_number(tmp_path):
+    TensorCache(CacheSettings(tmp_path, float("inf"))).put("0" * 40, {"a": torch.ones(10)})
     assert len(entries(tmp_path)) == 1
     with pytest.raises(PersistError, match="--cache-gigabytes is nan"):
-        Cache(CacheSettings(tmp_path, float("nan")))
+        TensorCache(CacheSettings(tmp_path, float("nan")))
 
 
-def test_a_damaged_entry_is_thrown_away_with_one_line_and_made_anew(persist, walks, codec, tmp_path):
+def test_a_damaged_entry_is_removed_with_one_line_and_made_anew(persist, walks, codec, tmp_path):
     changes = [f"base={codec}", FEW, "--cache", tmp_path / "cache"]
     assert persist(*stage("stage1", walks, tmp_path / "one", *changes)).code == 0
     whole = {path: path.read_bytes() for path in entries(tmp_path / "cache")}
@@ -267,14 +269,14 @@ def test_a_full_cache_says_so_once_and_the_run_goes_on(persist, walks, codec, tm
     assert 0 < sum(sizes) <= 1e4
 
 
-def test_two_writers_keep_to_one_bound(tmp_path):
-    writers = [Cache(CacheSettings(tmp_path, 1e-4)) for _ in range(2)]
+def test_two_writers_keep_to_one_limit(tmp_path):
+    writers = [TensorCache(CacheSettings(tmp_path, 1e-4)) for _ in range(2)]
     for number in range(60):
         writers[number % 2].put(f"{number:040}", {"a": torch.ones(1000)})
     assert 0.9e5 < sum(path.stat().st_size for path in entries(tmp_path)) <= 1e5
 
 
-def test_what_cannot_be_cached_is_one_line(persist, walks, codec, tmp_path):
+def test_each_use_of_a_cache_that_is_impossible_ends_in_one_line(persist, walks, codec, tmp_path):
     (tmp_path / "file").write_text("")
     cache = ["--cache", tmp_path / "cache"]
     for arguments, cause in (

@@ -1,4 +1,4 @@
-"""tests.train.test_finetune."""
+"""Training runs: their files, their numbers, and how they stop, resume and fail."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import time
 import pytest
 import torch
 
-from persist_cli.checkpoints.checkpoint import find_checkpoint
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
 from persist_cli.train.trainer import Trainer
 from tests.support.disk import file_limit
@@ -28,9 +28,9 @@ from tests.support.walking import (
 )
 
 
-def test_a_run_leaves_its_recipe_log_curve_and_checkpoint(codec):
-    left = {"recipe.yaml", "log.jsonl", "loss.png", "speed.jsonl", "step-00000004"}
-    assert {path.name for path in codec.iterdir()} == left
+def test_a_run_writes_its_recipe_logs_loss_curve_and_checkpoint(codec):
+    names = {"recipe.yaml", "log.jsonl", "loss.png", "speed.jsonl", "step-00000004"}
+    assert {path.name for path in codec.iterdir()} == names
     assert json.loads((codec / "speed.jsonl").read_text())["samples_per_second"] > 0
     rows = [json.loads(line) for line in (codec / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
@@ -47,14 +47,14 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, co
     assert ended_alike(tmp_path / "whole", tmp_path / "halves")
 
 
-def test_a_run_of_a_version_without_a_setting_resumes(persist, walks, codec, tmp_path):
+def test_a_run_resumes_that_a_version_without_one_of_the_settings_began(persist, walks, codec, tmp_path):
     assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=1")).code == 0
     recipe = tmp_path / "run/recipe.yaml"
     recipe.write_text(recipe.read_text().replace("  clips_per_trajectory: 0\n", ""))
     assert persist(*stage("stage1", walks, tmp_path / "run", "--resume", f"base={codec}")).code == 0
 
 
-def test_stage_two_leaves_every_stage_one_weight_untouched_to_the_bit(persist, walks, stage1, tmp_path):
+def test_stage_2_leaves_the_weights_of_stage_1_unchanged_to_the_bit(persist, walks, stage1, tmp_path):
     before = find_checkpoint(stage1).fingerprint
     assert persist(*stage("stage2-voxel", walks, tmp_path / "voxel", f"base={stage1}")).code == 0
     assert all(name.split("/")[-1].startswith(("adapters.", "torch")) for name in end_of(tmp_path / "voxel")[0])
@@ -69,10 +69,10 @@ def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_pat
     assert persist(*stage("stage1", walks, tmp_path / "one", *base)).code == 0
     assert persist(*stage("stage1", walks, tmp_path / "two", *base, f"training.accumulation={parts}")).code == 0
     assert losses(tmp_path / "one") == pytest.approx(losses(tmp_path / "two"), rel=1e-4)
-    whole, parted = (end_of(tmp_path / name)[0] for name in ("one", "two"))
-    moments = [name for name in whole if "exp_avg/" in name]
-    assert all(torch.allclose(whole[name], parted[name], rtol=1e-3, atol=1e-6) for name in moments)
-    differences = [(whole[name] - parted[name]).flatten() for name in whole if name.startswith("parameter/")]
+    one, two = (end_of(tmp_path / name)[0] for name in ("one", "two"))
+    moments = [name for name in one if "exp_avg/" in name]
+    assert all(torch.allclose(one[name], two[name], rtol=1e-3, atol=1e-6) for name in moments)
+    differences = [(one[name] - two[name]).flatten() for name in one if name.startswith("parameter/")]
     assert torch.cat(differences).abs().mean() < 1e-2 * 4e-4  # a hundredth of a step
 
 
@@ -85,8 +85,8 @@ def test_gradients_are_clipped_by_the_norm_of_all_of_them(persist, walks, codec,
 def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
     changes = ["training.steps=40", "training.learning_rate=3e-3", "training.batch=4", f"base={codec}"]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
-    found = losses(tmp_path / "run")
-    assert sum(found[-10:]) < 0.9 * sum(found[:10])
+    values = losses(tmp_path / "run")
+    assert sum(values[-10:]) < 0.9 * sum(values[:10])
 
 
 def test_the_saved_weights_are_the_moving_average_of_those_after_each_step(persist, walks, codec, tmp_path):
@@ -95,10 +95,10 @@ def test_the_saved_weights_are_the_moving_average_of_those_after_each_step(persi
         assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)).code == 0
         states.append(end_of(tmp_path / "run")[0])
     model = next((tmp_path / "run").glob("step-*")) / "model/transformer/diffusion_pytorch_model.safetensors"
-    kept = 2 ** (-2 / 3)  # what is new weighs so much in the second step of diffusers' warm-up
+    weight = 2 ** (-2 / 3)  # of the new parameters in the second step of diffusers' warm-up
     for name, saved in read_tensors(model)[0].items():
         first, second = (state[f"parameter/transformer.base.{name}"] for state in states)
-        assert torch.allclose(saved, first + kept * (second - first), atol=1e-7)
+        assert torch.allclose(saved, first + weight * (second - first), atol=1e-7)
     assert not torch.equal(first, second)
 
 
@@ -113,7 +113,7 @@ def uninterrupted(walks, codec, tmp_path_factory):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_run_killed_at_a_random_moment_goes_on_and_ends_like_one_that_was_not(
+def test_a_run_killed_at_a_random_moment_resumes_and_ends_like_an_uninterrupted_one(
     persist, uninterrupted, walks, codec, tmp_path, seed
 ):
     run = tmp_path / "killed"
@@ -131,7 +131,7 @@ def test_a_run_killed_at_a_random_moment_goes_on_and_ends_like_one_that_was_not(
     assert not list(run.glob(".partial-*"))
 
 
-def test_each_step_is_saved_once_and_no_speed_is_that_of_nothing(persist, walks, codec, tmp_path):
+def test_each_step_is_saved_once_and_has_a_speed(persist, walks, codec, tmp_path):
     changes = [f"base={codec}", "training.checkpoint_minutes=0", "training.steps=3"]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
     rows = [json.loads(line) for line in (tmp_path / "run/speed.jsonl").read_text().splitlines()]
@@ -140,23 +140,23 @@ def test_each_step_is_saved_once_and_no_speed_is_that_of_nothing(persist, walks,
 
 
 @pytest.mark.parametrize("step", [3, 5])
-def test_a_signal_that_comes_after_the_look_at_it_loses_no_step(persist, walks, codec, tmp_path, monkeypatch, step):
-    look = Trainer.agreed
+def test_a_signal_right_after_the_check_for_signals_loses_no_step(persist, walks, codec, tmp_path, monkeypatch, step):
+    check = Trainer.agreed
 
-    def look_too_early(trainer, *found):
-        agreed = look(trainer, *found)
+    def check_before_the_signal(trainer, *arguments):
+        agreed = check(trainer, *arguments)
         if trainer.state.step == step:
             signal.raise_signal(signal.SIGTERM)
         return agreed
 
-    monkeypatch.setattr(Trainer, "agreed", look_too_early)
+    monkeypatch.setattr(Trainer, "agreed", check_before_the_signal)
     ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=5"))
-    told = {3: "stopped at step 4 of 5", 5: "trained 5 steps"}[step]
-    assert (ended.code, told in ended.out) == (0, True)
+    message = {3: "stopped at step 4 of 5", 5: "trained 5 steps"}[step]
+    assert (ended.code, message in ended.out) == (0, True)
     assert [path.name for path in (tmp_path / "run").glob("step-*")] == [f"step-0000000{min(step + 1, 5)}"]
 
 
-def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(persist, walks, codec, tmp_path):
+def test_a_full_disk_ends_a_run_with_one_line_and_leaves_the_last_checkpoint(persist, walks, codec, tmp_path):
     changes = ["--resume", f"base={codec}"]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes, "training.steps=1")).code == 0
     with file_limit(20_000):
@@ -166,7 +166,7 @@ def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(persist, walks, c
     assert [path.name for path in (tmp_path / "run").glob("*step*")] == ["step-00000001"]
 
 
-def test_several_data_sets_train_like_one_of_all_their_trajectories(persist, walks, codec, tmp_path):
+def test_several_data_sets_train_like_a_single_one_with_all_trajectories(persist, walks, codec, tmp_path):
     for number in (0, 1):
         (tmp_path / str(number)).mkdir()
         shutil.copy(walks / f"walk-{number}.parquet", tmp_path / str(number))
@@ -176,7 +176,7 @@ def test_several_data_sets_train_like_one_of_all_their_trajectories(persist, wal
     assert ended_alike(tmp_path / "one", tmp_path / "two")
 
 
-def test_the_packaged_sample_is_data_to_train_on(persist, walks, codec, tmp_path, monkeypatch):
+def test_a_run_trains_on_the_bundled_sample_data(persist, walks, codec, tmp_path, monkeypatch):
     shutil.copytree(walks, tmp_path / "home/sample")
     monkeypatch.setenv("PERSIST_REFERENCE", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
@@ -185,7 +185,7 @@ def test_the_packaged_sample_is_data_to_train_on(persist, walks, codec, tmp_path
 
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
-def test_ctrl_c_and_preemption_save_and_say_how_to_go_on(walks, codec, tmp_path, sent, code):
+def test_ctrl_c_and_preemption_save_a_checkpoint_and_say_how_to_resume(walks, codec, tmp_path, sent, code):
     arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=100000")
     child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
@@ -196,13 +196,13 @@ def test_ctrl_c_and_preemption_save_and_say_how_to_go_on(walks, codec, tmp_path,
         child.send_signal(sent)
         out, _ = child.communicate(timeout=300)
     finally:
-        child.kill()  # of a run without end nothing stays behind, whatever failed
+        child.kill()  # the run has no end of its own
     assert child.returncode == code
     assert "go on with --resume" in out
     find_checkpoint(tmp_path / "run")
 
 
-def test_what_a_run_cannot_do_is_one_line(persist, walks, codec, stage1, tmp_path):
+def test_each_impossible_run_ends_in_one_line(persist, walks, codec, stage1, tmp_path):
     base = f"base={codec}"
     for arguments, cause in (
         (stage("stage1", walks, codec), "holds a run already"),
@@ -226,7 +226,7 @@ def test_what_a_run_cannot_do_is_one_line(persist, walks, codec, stage1, tmp_pat
     assert not list((tmp_path / "a").glob("step-*"))
 
 
-def test_a_damaged_checkpoint_or_another_base_is_one_line(persist, walks, codec, tmp_path):
+def test_a_damaged_checkpoint_or_another_base_ends_a_rollout_in_one_line(persist, walks, codec, tmp_path):
     run = tmp_path / "base"
     assert persist(*stage("stage1", walks, run, f"base={codec}", "training.steps=1")).code == 0
     assert persist(*stage("stage2-none", walks, tmp_path / "none", f"base={run}", "training.steps=1")).code == 0

@@ -1,4 +1,4 @@
-"""LoRA in stage 1: nothing changes before it trains, its run holds the change alone, and all else works on it."""
+"""LoRA in stage 1: it changes nothing at first, its run holds only the change, and later stages build on it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from diffusers import (
     CogVideoXTransformer3DModel,
 )
 
-from persist_backbones.cogvideox.build import make_parts
-from persist_backbones.cogvideox.checkpoint import weights_digest
 from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.cogvideox.parts import make_parts, weights_digest
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.stages import Lora
-from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
 from tests.support.micro_model import micro, predicted, random_clips
 from tests.support.twins import load_twin, write_twin
@@ -48,12 +48,12 @@ def pretrained(tmp_path_factory):
     return folder
 
 
-def model(run):
+def model_folder(run):
     return find_checkpoint(run).folder
 
 
 def bytes_of(run):
-    return sum(path.stat().st_size for path in model(run).rglob("*.safetensors"))
+    return sum(path.stat().st_size for path in model_folder(run).rglob("*.safetensors"))
 
 
 def test_before_training_a_model_with_lora_is_the_one_without_to_the_bit():
@@ -62,7 +62,7 @@ def test_before_training_a_model_with_lora_is_the_one_without_to_the_bit():
     assert torch.equal(predicted(changed, random_clips(), None), predicted(plain, random_clips(), None))
 
 
-def test_lora_and_what_is_new_of_the_model_are_trained_and_nothing_else():
+def test_only_lora_and_the_new_parts_of_the_model_are_trained():
     backbone = micro()
     backbone.add_lora(Lora(rank=4, targets=("to_q", "to_out.0")))
     names = set(backbone.trained_parameters("1"))
@@ -72,19 +72,19 @@ def test_lora_and_what_is_new_of_the_model_are_trained_and_nothing_else():
     assert all(".lora_A." in name or ".lora_B." in name for name in names - new)
 
 
-def test_a_run_holds_the_change_alone_and_points_to_what_it_changes(lora, stage1):
-    files = {path.name for path in model(lora).rglob("*.safetensors")}
+def test_a_run_holds_only_the_change_and_points_to_its_base(lora, stage1):
+    files = {path.name for path in model_folder(lora).rglob("*.safetensors")}
     assert files == {"pytorch_lora_weights.safetensors", "world.safetensors"}
     assert bytes_of(lora) < bytes_of(stage1) / 2
-    card = json.loads((model(lora) / "persist.json").read_text())
+    card = json.loads((model_folder(lora) / "persist.json").read_text())
     assert card["changes"] == {"base": "../../../stage1", "fingerprint": find_checkpoint(stage1).fingerprint}
 
 
-def test_a_checkpoint_is_what_was_trained(walks, stage1, lora):
+def test_a_checkpoint_predicts_what_the_trained_model_does(walks, stage1, lora):
     trained, merged = load_backbone(find_checkpoint(stage1)).eval(), load_backbone(find_checkpoint(lora)).eval()
     trained.add_lora(Lora(rank=4, alpha=8))
     before = predicted(trained, random_clips(), None)
-    state, _ = read_tensors(model(lora).parent / "training.safetensors")
+    state, _ = read_tensors(model_folder(lora).parent / "training.safetensors")
     with torch.no_grad():
         for name, parameter in trained.trained_parameters("1").items():
             parameter.copy_(state[f"average/{name}"])
@@ -93,21 +93,21 @@ def test_a_checkpoint_is_what_was_trained(walks, stage1, lora):
     assert torch.allclose(predicted(merged, random_clips(), None), after, atol=1e-5)
 
 
-def test_diffusers_own_pipeline_loads_the_file(lora, stage1):
-    transformer = CogVideoXTransformer3DModel.from_pretrained(model(stage1), subfolder="transformer")
-    vae = AutoencoderKLCogVideoX.from_pretrained(model(stage1), subfolder="vae")
+def test_the_pipeline_of_diffusers_loads_the_file(lora, stage1):
+    transformer = CogVideoXTransformer3DModel.from_pretrained(model_folder(stage1), subfolder="transformer")
+    vae = AutoencoderKLCogVideoX.from_pretrained(model_folder(stage1), subfolder="vae")
     pipeline = CogVideoXImageToVideoPipeline(None, None, vae, transformer, CogVideoXDDIMScheduler())
-    pipeline.load_lora_weights(model(lora))
+    pipeline.load_lora_weights(model_folder(lora))
     ours, config = load_backbone(find_checkpoint(lora)).transformer.base, transformer.config
     draw = torch.Generator().manual_seed(0)
     latents = torch.randn(2, 3, config.in_channels, 8, 8, generator=draw)
     words = torch.randn(2, config.max_text_seq_length, config.text_embed_dim, generator=draw)
-    given = {"hidden_states": latents, "encoder_hidden_states": words, "timestep": torch.tensor([3, 700])}
+    inputs = {"hidden_states": latents, "encoder_hidden_states": words, "timestep": torch.tensor([3, 700])}
     with torch.no_grad():
-        theirs, merged = pipeline.transformer(**given).sample, ours(**given).sample
+        expected, merged = pipeline.transformer(**inputs).sample, ours(**inputs).sample
         pipeline.unload_lora_weights()
-        assert not torch.allclose(pipeline.transformer(**given).sample, merged, atol=1e-3)
-    assert torch.allclose(theirs, merged, atol=1e-5)
+        assert not torch.allclose(pipeline.transformer(**inputs).sample, merged, atol=1e-3)
+    assert torch.allclose(expected, merged, atol=1e-5)
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, stage1, lora, tmp_path):
@@ -117,7 +117,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, st
     assert ended_alike(lora, tmp_path / "halves")
 
 
-def test_rollouts_stage_two_and_lora_stand_on_a_lora_run(persist, walks, lora, tmp_path):
+def test_rollouts_stage_2_and_another_lora_work_on_a_lora_run(persist, walks, lora, tmp_path):
     assert persist(*stage("stage2-voxel", walks, tmp_path / "voxel", f"base={lora}")).code == 0
     assert persist(*stage("stage1", walks, tmp_path / "again", f"base={lora}", *LORA, "training.steps=1")).code == 0
     for run in (lora, tmp_path / "voxel", tmp_path / "again"):
@@ -138,10 +138,10 @@ def test_an_export_stands_alone_and_is_the_same_model(persist, walks, lora, tmp_
     assert {path.name for path in (moved / "recipes").glob("*.yaml")} == {"codec.yaml", "stage1.yaml", "stage1-2.yaml"}
 
 
-def test_a_run_may_change_a_plain_diffusers_directory(persist, walks, pretrained, tmp_path):
-    given = [change for change in MICRO_SETTINGS if "transformer" not in change and "vae" not in change]
-    given += ["base=null", f"backbone.settings.pretrained={pretrained}", *LORA]
-    assert persist(*stage("stage1", walks, tmp_path / "run", *given)).code == 0
+def test_lora_may_change_a_pretrained_directory_of_diffusers(persist, walks, pretrained, tmp_path):
+    changes = [change for change in MICRO_SETTINGS if "transformer" not in change and "vae" not in change]
+    changes += ["base=null", f"backbone.settings.pretrained={pretrained}", *LORA]
+    assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
     backbone = load_backbone(find_checkpoint(tmp_path / "run"))
     before = read_tensors(pretrained / "transformer/diffusion_pytorch_model.safetensors")[0]
     now = backbone.transformer.base.state_dict()
@@ -155,7 +155,7 @@ def test_a_run_may_change_a_plain_diffusers_directory(persist, walks, pretrained
     assert (ended.code, "was trained on other weights than those" in ended.err) == (1, True)
 
 
-def test_a_change_of_low_rank_knows_the_positions_that_it_was_trained_with(tmp_path):
+def test_the_digest_of_the_base_weights_covers_position_embeddings(tmp_path):
     twin = load_twin(write_twin("5b-i2v", tmp_path / "twin")).transformer.base
     before = weights_digest(twin)
     with torch.no_grad():
@@ -163,7 +163,7 @@ def test_a_change_of_low_rank_knows_the_positions_that_it_was_trained_with(tmp_p
     assert weights_digest(twin) != before
 
 
-def test_what_lora_cannot_do_is_one_line(persist, walks, stage1, codec, tmp_path, monkeypatch):
+def test_each_impossible_use_of_lora_ends_in_one_line(persist, walks, stage1, codec, tmp_path, monkeypatch):
     base = f"base={stage1}"
     cases = [
         (stage("stage1", walks, tmp_path / "a", "base=null", *MICRO_SETTINGS, *LORA), "lora changes weights that are"),
@@ -182,22 +182,22 @@ def test_what_lora_cannot_do_is_one_line(persist, walks, stage1, codec, tmp_path
     assert (ended.code, ended.err.count("pip install 'persist-cli[lora]'")) == (1, 1)
 
 
-def test_a_damaged_change_or_another_base_is_one_line(persist, walks, stage1, lora, tmp_path):
+def test_a_damaged_lora_file_or_another_base_ends_in_one_line(persist, walks, stage1, lora, tmp_path):
     for name in ("stage1", "lora"):
         shutil.copytree({"stage1": stage1, "lora": lora}[name], tmp_path / name)
     roll = ("rollout", tmp_path / "lora", "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
-    card = model(tmp_path / "stage1") / "persist.json"
+    card = model_folder(tmp_path / "stage1") / "persist.json"
     card.write_text(card.read_text().replace(find_checkpoint(stage1).fingerprint, "0" * 64))
     assert "another base than the one now at" in persist(*roll).err
     card.write_text(card.read_text().replace("0" * 64, find_checkpoint(stage1).fingerprint))
-    (model(tmp_path / "lora") / "pytorch_lora_weights.safetensors").write_bytes(b"0" * 20)
+    (model_folder(tmp_path / "lora") / "pytorch_lora_weights.safetensors").write_bytes(b"0" * 20)
     ended = persist(*roll)
     assert (ended.code, "pytorch_lora_weights.safetensors: not a whole" in ended.err) == (1, True)
     assert len(ended.err.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize("number", ["stage1", "lora"])
-def test_a_plan_counts_what_lora_trains(persist, stage1, lora, number):
+def test_a_dry_run_counts_what_lora_trains(persist, stage1, lora, number):
     base = {"stage1": stage1, "lora": lora}[number]
     ended = persist("finetune", "tiny-stage1", "--dry-run", "--json", f"base={base}", "lora.rank=4")
     assert ended.code == 0, ended.err
@@ -206,17 +206,19 @@ def test_a_plan_counts_what_lora_trains(persist, stage1, lora, number):
     assert parts["transformer"]["trained"]["1"] == 0 < parts["widening"]["trained"]["1"]
 
 
-def test_checkpointed_steps_are_the_usual_ones_to_the_bit(persist, walks, stage1, lora, tmp_path):
+def test_gradient_checkpointing_changes_no_bit(persist, walks, stage1, lora, tmp_path):
     cheap = [f"base={stage1}", *LORA, "training.gradient_checkpointing=true"]
     assert persist(*stage("stage1", walks, tmp_path / "cheap", *cheap)).code == 0
     assert ended_alike(lora, tmp_path / "cheap")
 
 
 @pytest.mark.usefixtures("fresh_accelerator")
-def test_a_base_in_half_the_bytes_trains_a_change_of_the_whole_one(walks, stage1, lora, tmp_path):
+def test_lora_trained_on_a_base_in_bf16_is_nearly_the_same(walks, stage1, lora, tmp_path):
     half = ["training.precision=bf16", "training.frozen_precision=bf16"]
     train_here(*stage("stage1", walks, tmp_path / "half", f"base={stage1}", *LORA, *half))
-    changes = [read_tensors(model(run) / "pytorch_lora_weights.safetensors")[0] for run in (lora, tmp_path / "half")]
+    changes = [
+        read_tensors(model_folder(run) / "pytorch_lora_weights.safetensors")[0] for run in (lora, tmp_path / "half")
+    ]
     assert {change.dtype for change in changes[1].values()} == {torch.float32}
     whole, low = (
         predicted(load_backbone(find_checkpoint(run)).eval(), random_clips(), None) for run in (lora, tmp_path / "half")

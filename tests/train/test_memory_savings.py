@@ -1,4 +1,4 @@
-"""Settings that make a step cheaper: what they leave as it was, and what they cannot do."""
+"""Settings that save memory in a training step: what stays as it was, and what they cannot do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import torch
 from diffusers.training_utils import EMAModel
 from torch.autograd.graph import saved_tensors_hooks
 
+from persist_cli.api.backbone import Backbone
 from persist_cli.api.stages import MemorySavings
+from persist_cli.errors import PersistError
 from persist_cli.io.files import read_tensors, write_json
 from persist_cli.train.optimizer import update_average
 from persist_cli.train.state import TrainingState
@@ -26,7 +28,7 @@ def saved(run, part):
 
 @pytest.fixture
 def usual(persist, walks, codec, stage1, tmp_path, request):
-    """A run without any of these settings, and the arguments of another that differs by them."""
+    """A run without any of these settings, and a function that gives the arguments of a run with some."""
     number = request.param
     base = f"base={ {'codec': codec, 'stage1': stage1}[BASE[number]] }"
     assert persist(*stage(number, walks, tmp_path / "usual", base)).code == 0
@@ -34,21 +36,21 @@ def usual(persist, walks, codec, stage1, tmp_path, request):
 
 
 @pytest.mark.parametrize("usual", list(BASE), indirect=True)
-def test_checkpointed_steps_and_an_average_on_the_cpu_are_the_usual_ones_to_the_bit(persist, usual, tmp_path):
+def test_gradient_checkpointing_and_an_average_on_the_cpu_change_no_bit(persist, usual, tmp_path):
     run, cheap = usual
     assert persist(*cheap("training.gradient_checkpointing=true", "training.ema_device=cpu")).code == 0
     assert ended_alike(run, tmp_path / "cheap")
 
 
 @pytest.mark.parametrize("usual", ["stage1"], indirect=True)
-def test_clips_encoded_one_by_one_train_the_same(persist, usual, tmp_path):
+def test_vae_slicing_trains_alike(persist, usual, tmp_path):
     run, cheap = usual
     assert persist(*cheap("training.vae_slicing=true")).code == 0
     assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=1e-4)
 
 
 @pytest.mark.parametrize("stage_", ["1", "2"])
-def test_checkpointing_keeps_little_of_the_forward_pass_memory_blocks_included(stage_):
+def test_checkpointing_holds_little_of_the_forward_pass_memory_adapters_included(stage_):
     held = {}
     for checkpointing in (False, True):
         backbone = with_adapter(micro()).train()
@@ -56,7 +58,9 @@ def test_checkpointing_keeps_little_of_the_forward_pass_memory_blocks_included(s
         backbone.trained_parameters(stage_)
         backbone.apply_memory_savings(stage_, MemorySavings(gradient_checkpointing=checkpointing))
         sizes = []
-        with saved_tensors_hooks(lambda tensor, sizes=sizes: sizes.append(tensor.nbytes) or tensor, lambda each: each):
+        with saved_tensors_hooks(
+            lambda tensor, sizes=sizes: sizes.append(tensor.nbytes) or tensor, lambda tensor: tensor
+        ):
             backbone(random_clips(tokens=random_tokens(2, 5)), stage_)
         held[checkpointing] = sum(sizes)
     assert held[True] < held[False] / 3
@@ -64,7 +68,7 @@ def test_checkpointing_keeps_little_of_the_forward_pass_memory_blocks_included(s
 
 @pytest.mark.usefixtures("fresh_accelerator")
 @pytest.mark.parametrize("number", BASE)
-def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, tmp_path, number):
+def test_frozen_weights_in_bf16_train_nearly_alike_and_are_saved_exactly(walks, codec, tmp_path, number):
     base = [f"base={codec if number == 'stage1' else codec.parent / 'stage1'}", "training.precision=bf16"]
     train_here(*stage(number, walks, tmp_path / "usual", *base))
     train_here(*stage(number, walks, tmp_path / "cheap", *base, "training.frozen_precision=bf16"))
@@ -76,51 +80,52 @@ def test_frozen_weights_in_bf16_train_alike_and_are_saved_exactly(walks, codec, 
         assert all(weight.dtype == torch.float32 for weight in saved(tmp_path / "cheap", "transformer").values())
 
 
-def test_what_a_stage_does_not_train_takes_half_the_bytes():
+def test_frozen_precision_leaves_trained_weights_in_float32():
     backbone = with_adapter(micro())
     trained = backbone.trained_parameters("2")
     backbone.apply_memory_savings("2", MemorySavings(frozen=torch.bfloat16))
-    assert {each.dtype for each in trained.values()} == {torch.float32}
-    assert {each.dtype for each in backbone.parameters() if not each.requires_grad} == {torch.bfloat16}
+    assert {parameter.dtype for parameter in trained.values()} == {torch.float32}
+    frozen = [parameter for parameter in backbone.parameters() if not parameter.requires_grad]
+    assert {parameter.dtype for parameter in frozen} == {torch.bfloat16}
 
 
-def test_an_average_moves_towards_copies_of_the_parameters_too():
+def test_an_average_is_updated_as_diffusers_does():
     trained = [torch.nn.Parameter(torch.ones(3))]
-    here, there = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
+    expected, average = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
     trained[0].data += 1
     for _ in range(3):
-        here.step(trained)
-        update_average(there, trained)
-    assert torch.equal(here.shadow_params[0], there.shadow_params[0])
+        expected.step(trained)
+        update_average(average, trained)
+    assert torch.equal(expected.shadow_params[0], average.shadow_params[0])
 
 
-def test_the_state_of_an_8_bit_optimizer_is_kept(tmp_path):
+def test_the_state_of_an_8_bit_optimizer_is_saved_and_restored(tmp_path):
     weights, table = {name: torch.nn.Parameter(torch.ones(3)) for name in ("one", "two")}, torch.arange(4.0)
     states = [TrainingState(weights, torch.optim.AdamW([*weights.values()]).state, None) for _ in range(2)]
-    for parameter in weights.values():  # it counts by plain numbers, and all share the table that bytes stand for
+    for parameter in weights.values():  # bitsandbytes counts steps by int, and all bytes share one table of values
         states[0].moments[parameter] = {"step": 7, "state1": torch.arange(3, dtype=torch.uint8), "qmap1": table}
     write_json(tmp_path / "training.json", states[0].write(tmp_path, main=True))
     states[1].read(tmp_path)
     for parameter in weights.values():
-        kept = states[1].moments[parameter]
-        assert (type(kept["step"]), kept["step"], kept["state1"].dtype) == (int, 7, torch.uint8)
-        assert torch.equal(kept["qmap1"], table)
+        moments = states[1].moments[parameter]
+        assert (type(moments["step"]), moments["step"], moments["state1"].dtype) == (int, 7, torch.uint8)
+        assert torch.equal(moments["qmap1"], table)
 
 
 @pytest.mark.gpu
 def test_an_average_on_the_cpu_follows_parameters_on_the_gpu():
     trained = [torch.nn.Parameter(torch.ones(3, device="cuda"))]
-    here, there = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
-    there.to("cpu")
+    on_gpu, on_cpu = EMAModel(trained, decay=0.5), EMAModel(trained, decay=0.5)
+    on_cpu.to("cpu")
     trained[0].data += 1
-    for average in (here, there):
+    for average in (on_gpu, on_cpu):
         update_average(average, trained)
         update_average(average, trained)
-    assert torch.equal(here.shadow_params[0].cpu(), there.shadow_params[0])
+    assert torch.equal(on_gpu.shadow_params[0].cpu(), on_cpu.shadow_params[0])
 
 
 @pytest.mark.parametrize("usual", ["stage1"], indirect=True)
-def test_a_run_goes_on_with_other_settings_of_what_a_step_costs(persist, usual, tmp_path):
+def test_a_run_resumes_with_other_memory_savings(persist, usual, tmp_path):
     run, cheap = usual
     assert persist(*cheap("training.steps=2")).code == 0
     ended = persist(*cheap("--resume", "training.gradient_checkpointing=true", "training.ema_device=cpu"))
@@ -131,7 +136,7 @@ def test_a_run_goes_on_with_other_settings_of_what_a_step_costs(persist, usual, 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("g++"), reason="no compiler")
 @pytest.mark.parametrize("usual", ["stage2-voxel"], indirect=True)
-def test_compiled_blocks_train_alike_and_keep_the_names_of_their_weights(persist, usual, tmp_path):
+def test_compiled_blocks_train_nearly_alike_and_keep_the_names_of_their_weights(persist, usual, tmp_path):
     run, cheap = usual
     ended = persist(*cheap("training.compile=true"))
     assert ended.code == 0, ended.err
@@ -139,7 +144,7 @@ def test_compiled_blocks_train_alike_and_keep_the_names_of_their_weights(persist
     assert end_of(run)[0].keys() == end_of(tmp_path / "cheap")[0].keys()
 
 
-def test_what_cannot_be_made_cheaper_is_one_line(persist, walks, codec, tmp_path, monkeypatch):
+def test_each_impossible_memory_saving_ends_in_one_line(persist, walks, codec, tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     cases = [("training.compile=true", "training.compile needs a C++ compiler on a CPU (no-such-compiler)")]
     cases += [("training.frozen_precision=bf16", "needs training.precision bf16")]
@@ -150,10 +155,7 @@ def test_what_cannot_be_made_cheaper_is_one_line(persist, walks, codec, tmp_path
         assert (ended.code, cause in ended.err, len(ended.err.strip().splitlines())) == (1, True, 1)
 
 
-def test_a_backbone_that_has_no_cheaper_steps_says_so():
-    from persist_cli.api.backbone import Backbone
-    from persist_cli.errors import PersistError
-
+def test_a_backbone_without_memory_savings_says_so():
     Backbone.apply_memory_savings(micro(), "1", MemorySavings())
     with pytest.raises(PersistError, match="backbone 'cogvideox' has no cheaper steps"):
         Backbone.apply_memory_savings(micro(), "1", MemorySavings(compile=True))
@@ -166,9 +168,9 @@ def test_an_8_bit_optimizer_trains_nearly_alike_and_resumes_to_the_bit(persist, 
     eight = "training.optimizer=adamw-8bit"
     assert persist(*cheap(eight)).code == 0
     assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=0.02)
-    assert torch.uint8 in {each.dtype for each in end_of(tmp_path / "cheap")[0].values()}
+    assert torch.uint8 in {tensor.dtype for tensor in end_of(tmp_path / "cheap")[0].values()}
     halves = tmp_path / "halves"
     for steps, more in ((2, []), (4, ["--resume"])):
-        arguments = [halves if each == str(tmp_path / "cheap") else each for each in cheap(eight)]
-        assert persist(*map(str, arguments), f"training.steps={steps}", *more).code == 0
+        arguments = [str(halves) if word == str(tmp_path / "cheap") else str(word) for word in cheap(eight)]
+        assert persist(*arguments, f"training.steps={steps}", *more).code == 0
     assert ended_alike(tmp_path / "cheap", halves)

@@ -1,4 +1,4 @@
-"""Two processes with gloo on the CPU: DDP and FSDP2 come to what one process comes to."""
+"""Two processes with gloo on the CPU: with DDP and FSDP2 they train what one process trains."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_cli.checkpoints.checkpoint import find_checkpoint, load_backbone
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
 from persist_cli.train.state import read_shards
-from tests.support.two_processes import job, run_pair
+from tests.support.two_processes import job, run_in_two
 from tests.support.walking import (
     MICRO_SETTINGS,
     end_of,
@@ -29,7 +30,7 @@ from tests.support.walking import (
     stage,
     train_here,
 )
-from tests.train.test_clip_cache import FEW, found
+from tests.train.test_clip_cache import FEW, share_cached
 
 FSDP = {"ACCELERATE_USE_FSDP": "true", "FSDP_VERSION": "2"}
 
@@ -39,17 +40,17 @@ BATCH = "training.batch=4"
 
 CLIP = 0.01  # less than the norm of any step's gradients here
 
-NEAR = 2e-5  # of weights, which four steps of these learning rates can move by 1.4e-3
+NEAR = 2e-5  # between weights, which four steps of these learning rates can change by 1.4e-3
 
 BF16 = "training.precision=bf16"
 
-PATIENCE = 300  # seconds, on a machine that has other things to do
+TIMEOUT = 300  # seconds, enough for a busy machine
 
 CHEAP = ["training.gradient_checkpointing=true", "training.frozen_precision=bf16", "training.ema_device=cpu", BF16]
 
 
 def sharded_state(run: Path) -> dict[str, torch.Tensor]:
-    """The training state of a run's newest checkpoint, of the parts of all processes."""
+    """The training state of a run's newest checkpoint, put together from the parts of all processes."""
     folder = max(run.glob("step-*")) / "training"
     return read_shards(folder, lambda _, shape, dtype: torch.empty(shape, dtype=dtype))
 
@@ -57,17 +58,17 @@ def sharded_state(run: Path) -> dict[str, torch.Tensor]:
 def saved_model(run: Path) -> dict[str, torch.Tensor]:
     """All weights of a run's newest checkpoint by file and name."""
     files = sorted(max(run.glob("step-*")).glob("model/**/*.safetensors"))
-    return {f"{path.name} {name}": each for path in files for name, each in read_tensors(path)[0].items()}
+    return {f"{path.name} {name}": tensor for path in files for name, tensor in read_tensors(path)[0].items()}
 
 
-def furthest(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> float:
-    """Largest difference between weights of the same names."""
+def largest_difference(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> float:
+    """The largest difference between weights of the same names."""
     assert one.keys() == two.keys()
     return max(float((one[name].float() - two[name].float()).abs().max()) for name in one if one[name].numel())
 
 
-def begun(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[..., list[str]]:
-    """What makes a run's command line, with both stages trained by one process as ``one-1`` and ``one-2``."""
+def train_by_one(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[..., list[str]]:
+    """Train both stages by one process, as ``one-1`` and ``one-2``; returns what makes the arguments of other runs."""
 
     def of(number: str, name: str, *changes: str) -> list[str]:
         base = f"base={codec if number == 'stage1' else stage1}"
@@ -80,9 +81,9 @@ def begun(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[...,
 
 @pytest.fixture(scope="module")
 def runs(walks, codec, stage1, tmp_path_factory):
-    """Runs of one process and of two, some of them interrupted and gone on with by one and by two again."""
+    """Runs of one process and of two, some of them resumed by one process and by two in turn."""
     folder = tmp_path_factory.mktemp("pair")
-    of = begun(folder, walks, codec, stage1)
+    of = train_by_one(folder, walks, codec, stage1)
     low_rank = [f"base={stage1}", "lora.rank=2"]
     train_here(*of("stage1", "one-lora", *low_rank))
     train_here(*of("stage2-voxel", "one-few", FEW))
@@ -96,13 +97,13 @@ def runs(walks, codec, stage1, tmp_path_factory):
     cached = [FEW, "--cache", str(folder / "cache")]
     first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
     wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
-    ended = run_pair(folder, *first, wrong)
+    ended = run_in_two(folder, *first, wrong)
     assert [code for code, _ in ended[:-1]] == [0] * len(first), ended
     shutil.copytree(folder / "fsdp-parts", folder / "fsdp-first")
     for kind in KINDS:
         train_here(*of("stage1", f"{kind}-parts", "--resume", "training.steps=2"))
     later = [job(*of("stage1", f"{kind}-parts", "--resume", "training.steps=3"), **how) for kind, how in KINDS.items()]
-    assert [code for code, _ in run_pair(folder, *later)] == [0, 0]
+    assert [code for code, _ in run_in_two(folder, *later)] == [0, 0]
     for kind in KINDS:
         train_here(*of("stage1", f"{kind}-parts", "--resume"))
     train_here(*of("stage2-voxel", "one-warm", *cached))
@@ -112,23 +113,23 @@ def runs(walks, codec, stage1, tmp_path_factory):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("number", [1, 2])
-def test_two_processes_come_to_the_losses_and_weights_of_one(runs, kind, number):
-    """Stage 2 also sums two micro-batches on each process."""
+def test_two_processes_train_to_the_losses_and_weights_of_one(runs, kind, number):
+    """In stage 2 each process also adds up two micro-batches."""
     one, two = runs / f"one-{number}", runs / f"{kind}-{number}"
     assert losses(two) == pytest.approx(losses(one), rel=1e-5)
-    assert furthest(saved_model(one), saved_model(two)) < NEAR
+    assert largest_difference(saved_model(one), saved_model(two)) < NEAR
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_of_two_then_one_then_two_then_one_ends_like_one_of_one(runs, kind):
+def test_a_run_resumed_by_other_numbers_of_processes_ends_like_that_of_one(runs, kind):
     assert losses(runs / f"{kind}-parts") == pytest.approx(losses(runs / "one-1"), rel=1e-5)
     one, parts = (end_of(runs / name)[0] for name in ("one-1", f"{kind}-parts"))
     assert torch.equal(one.pop("random/torch"), parts.pop("random/torch"))
-    assert furthest(one, parts) < NEAR
-    assert furthest(saved_model(runs / "one-1"), saved_model(runs / f"{kind}-parts")) < NEAR
+    assert largest_difference(one, parts) < NEAR
+    assert largest_difference(saved_model(runs / "one-1"), saved_model(runs / f"{kind}-parts")) < NEAR
 
 
-def test_a_sharded_checkpoint_is_a_file_a_process_with_its_half_and_no_pickle(runs):
+def test_a_sharded_checkpoint_has_a_file_for_each_process_and_no_pickle(runs):
     step = max((runs / "fsdp-1").glob("step-*"))
     sizes = [path.stat().st_size for path in sorted((step / "training").glob("*.safetensors"))]
     assert max(sizes) < 0.6 * sum(sizes)
@@ -141,70 +142,70 @@ def test_sharded_gradients_are_clipped_by_the_norm_of_all_of_them(runs):
     assert first_gradients(sharded_state(runs / "fsdp-first")).norm() == pytest.approx(CLIP, rel=1e-3)
 
 
-def test_a_sharded_run_saves_the_model_that_others_load(runs):
+def test_a_sharded_run_saves_a_whole_model(runs):
     backbone = load_backbone(find_checkpoint(runs / "fsdp-1"))
     assert not any(parameter.is_meta for parameter in backbone.parameters())
 
 
-def test_bf16_is_as_near_to_one_process_sharded_as_not(runs):
+def test_sharded_training_in_bf16_is_like_that_with_ddp(runs):
     exact, ddp, fsdp = (losses(runs / name) for name in ("one-1", "ddp-bf16", "fsdp-bf16"))
     assert ddp == pytest.approx(exact, rel=1e-2)
     assert fsdp == pytest.approx(ddp, rel=2e-3)
     weights = saved_model(runs / "fsdp-bf16")
     assert losses(runs / "fsdp-offloaded") == fsdp
-    assert furthest(saved_model(runs / "fsdp-offloaded"), weights) == 0
-    assert {each.dtype for each in weights.values()} == {torch.float32}
+    assert largest_difference(saved_model(runs / "fsdp-offloaded"), weights) == 0
+    assert {weight.dtype for weight in weights.values()} == {torch.float32}
 
 
-def test_cheap_steps_train_alike_sharded_and_not(runs):
-    """Recomputed blocks, frozen weights in bf16, averages in the memory of the CPU."""
+def test_memory_savings_train_nearly_alike_sharded_and_not(runs):
+    """Gradient checkpointing, frozen weights in bf16 and averages on the CPU at once."""
     assert losses(runs / "ddp-cheap") == pytest.approx(losses(runs / "one-2"), rel=1e-2)
     assert losses(runs / "fsdp-cheap") == pytest.approx(losses(runs / "ddp-cheap"), rel=2e-3)
 
 
-def test_a_change_of_low_rank_trains_sharded_as_in_one_process(runs):
+def test_lora_trains_sharded_as_in_one_process(runs):
     assert losses(runs / "fsdp-lora") == pytest.approx(losses(runs / "one-lora"), rel=1e-5)
     one, sharded = (saved_model(runs / name) for name in ("one-lora", "fsdp-lora"))
     assert any("lora_B" in name for name in one)
-    assert furthest(one, sharded) < NEAR
+    assert largest_difference(one, sharded) < NEAR
 
 
-def test_processes_share_a_cache_that_one_alone_finds_whole(runs):
+def test_processes_share_a_cache_that_one_alone_can_use_too(runs):
     for name in ("cold-few", "warm-few", "one-warm"):
         assert losses(runs / name) == pytest.approx(losses(runs / "one-few"), rel=1e-5)
     assert ended_alike(runs / "cold-few", runs / "warm-few")
-    assert [found(runs / name) for name in ("warm-few", "one-warm")] == [1, 1]
-    assert found(runs / "cold-few") < 1
+    assert [share_cached(runs / name) for name in ("warm-few", "one-warm")] == [1, 1]
+    assert share_cached(runs / "cold-few") < 1
 
 
-def test_a_missing_or_damaged_part_of_a_checkpoint_is_one_line(persist, walks, codec, runs, tmp_path):
+def test_a_missing_or_damaged_part_of_a_checkpoint_ends_in_one_line(persist, walks, codec, runs, tmp_path):
     run = shutil.copytree(runs / "fsdp-first", tmp_path / "run")
     arguments = stage("stage1", walks, run, f"base={codec}", BATCH, f"training.clip={CLIP}", "--resume")
     part = min(next(run.glob("step-*")).glob("training/*.safetensors"))
     content = part.read_bytes()
-    for left, cause in (
+    for damaged, cause in (
         (content[:-9], "its parts cannot be read"),
         (b"", "its parts cannot be read"),
         (None, "missing"),
     ):
         part.unlink()
-        if left is not None:
-            part.write_bytes(left)
+        if damaged is not None:
+            part.write_bytes(damaged)
         ended = persist(*arguments)
         assert (ended.code, cause in ended.err, len(ended.err.strip().splitlines())) == (1, True, 1), ended.err
 
 
-def test_what_cannot_be_sharded_is_one_line(persist, walks, codec, runs, tmp_path, monkeypatch):
-    said = (runs / "wrong.txt").read_text()
-    assert said.startswith("1 ")
-    assert "stage codec trains codec, which is not sharded" in said
+def test_each_training_that_cannot_be_sharded_ends_in_one_line(persist, walks, codec, runs, tmp_path, monkeypatch):
+    message = (runs / "wrong.txt").read_text()
+    assert message.startswith("1 ")
+    assert "stage codec trains codec, which is not sharded" in message
     monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
     ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))
     assert (ended.code, "add --fsdp_version 2" in ended.err) == (1, True)
 
 
-class Started:
-    """A run of two processes without end."""
+class EndlessRun:
+    """A run of two processes that only a signal ends."""
 
     def __init__(self, run: Path, arguments: list[str], kind: tuple[str, ...]) -> None:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
@@ -212,8 +213,8 @@ class Started:
         self.processes: list[int] = []
 
     def wait(self) -> None:
-        """Until its first checkpoint."""
-        deadline = time.monotonic() + PATIENCE
+        """Wait for its first checkpoint."""
+        deadline = time.monotonic() + TIMEOUT
         while not list(self.run.glob("step-*")) and time.monotonic() < deadline and self.launcher.poll() is None:
             time.sleep(0.05)
         children = Path(f"/proc/{self.launcher.pid}/task/{self.launcher.pid}/children").read_text().split()
@@ -221,12 +222,12 @@ class Started:
         assert len(self.processes) == 2, self.end()
 
     def end(self) -> tuple[int, str]:
-        """The launcher's exit code and all that was said."""
-        said, _ = self.launcher.communicate(timeout=PATIENCE)
-        return self.launcher.returncode, said
+        """Wait for its end; returns the launcher's exit code and all output."""
+        output, _ = self.launcher.communicate(timeout=TIMEOUT)
+        return self.launcher.returncode, output
 
     def kill(self) -> None:
-        """Leave nothing behind."""
+        """End all of its processes."""
         for process in self.processes:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
@@ -236,23 +237,23 @@ class Started:
 
 @pytest.fixture
 def start(walks, codec, tmp_path):
-    """What starts a run as ``run`` by a launcher's options, and returns it after its first checkpoint."""
-    started = []
+    """Starts the run ``run`` with options of the launcher and returns it after its first checkpoint."""
+    runs = []
 
-    def of(*kind: str) -> Started:
+    def of(*kind: str) -> EndlessRun:
         changes = [f"base={codec}", "training.steps=100000", "training.checkpoint_every=2"]
-        started.append(Started(tmp_path / "run", stage("stage1", walks, tmp_path / "run", *changes), kind))
-        started[-1].wait()
-        return started[-1]
+        runs.append(EndlessRun(tmp_path / "run", stage("stage1", walks, tmp_path / "run", *changes), kind))
+        runs[-1].wait()
+        return runs[-1]
 
     yield of
-    for each in started:
-        each.kill()
+    for run in runs:
+        run.kill()
 
 
 @pytest.fixture
-def go_on(persist, walks, codec, tmp_path):
-    """What takes two more steps from the run's checkpoint by one process, which must be whole."""
+def resume(persist, walks, codec, tmp_path):
+    """Takes two more steps from the run's checkpoint with one process."""
 
     def of() -> None:
         run = tmp_path / "run"
@@ -266,34 +267,34 @@ def go_on(persist, walks, codec, tmp_path):
 
 
 @pytest.mark.parametrize("killed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_killed_process_ends_the_run_with_a_line_and_a_checkpoint_to_go_on_from(start, go_on, killed):
-    started = start("--use_fsdp", "--fsdp_version", "2")
-    os.kill(started.processes[killed], signal.SIGKILL)
-    code, said = started.end()
-    lines = [line for line in said.splitlines() if line.startswith("error: ")]
-    assert (code, len(lines)) == (1, 1), said
+def test_a_killed_process_ends_the_run_with_one_line_and_a_checkpoint_to_resume(start, resume, killed):
+    run = start("--use_fsdp", "--fsdp_version", "2")
+    os.kill(run.processes[killed], signal.SIGKILL)
+    code, output = run.end()
+    lines = [line for line in output.splitlines() if line.startswith("error: ")]
+    assert (code, len(lines)) == (1, 1), output
     assert re.search(rf"process {1 - killed} of 2 lost another one.*step-\d+ is whole, go on with --resume", lines[0])
-    assert re.search(rf"rank +: {killed} .*\n.*exitcode +: -9", said)  # the launcher's table
-    go_on()
+    assert re.search(rf"rank +: {killed} .*\n.*exitcode +: -9", output)  # the launcher's table
+    resume()
 
 
 @pytest.mark.parametrize(
-    ("told", "code"), [("rank", 0), pytest.param("launcher", 1, marks=pytest.mark.slow)], ids=["rank", "launcher"]
+    ("receiver", "code"), [("rank", 0), pytest.param("launcher", 1, marks=pytest.mark.slow)], ids=["rank", "launcher"]
 )
-def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(start, go_on, told, code):
-    """The exit code of a launcher that was told to stop is torchrun's own."""
-    started = start("--use_fsdp", "--fsdp_version", "2")
-    os.kill({"rank": started.processes[1], "launcher": started.launcher.pid}[told], signal.SIGTERM)
-    ended, said = started.end()
-    assert ended == code, said
-    assert said.count("go on with --resume") == 1, said
-    go_on()
+def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(start, resume, receiver, code):
+    """A launcher that gets the signal ends with an exit code of torchrun's own."""
+    run = start("--use_fsdp", "--fsdp_version", "2")
+    os.kill({"rank": run.processes[1], "launcher": run.launcher.pid}[receiver], signal.SIGTERM)
+    exit_code, output = run.end()
+    assert exit_code == code, output
+    assert output.count("go on with --resume") == 1, output
+    resume()
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_on_all(start, go_on):
-    started = start("--multi_gpu")
-    os.killpg(started.launcher.pid, signal.SIGINT)  # as a terminal does
-    _, said = started.end()
-    assert said.count("go on with --resume") == 1, said
-    go_on()
+def test_ctrl_c_saves_on_all(start, resume):
+    run = start("--multi_gpu")
+    os.killpg(run.launcher.pid, signal.SIGINT)  # as a terminal does
+    _, output = run.end()
+    assert output.count("go on with --resume") == 1, output
+    resume()

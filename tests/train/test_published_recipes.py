@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from persist_cli.checkpoints.checkpoint import find_checkpoint
+from persist_cli.api.checkpoint import find_checkpoint
 from tests.support.twins import write_twin
 from tests.support.walking import SIZE, end_of
 
@@ -20,7 +20,7 @@ BLOCKS = ["memory.encoder=patches", "adapter={width: 16, heads: 2, token_budget:
 
 @pytest.mark.usefixtures("fresh_accelerator")
 @pytest.mark.parametrize("family", TWINS)
-def test_a_familys_recipes_train_one_after_the_other(persist, walks, tmp_path, family):
+def test_the_recipes_of_a_published_model_train_one_after_the_other(persist, walks, tmp_path, family):
     twin = f"backbone.settings.pretrained={write_twin(TWINS[family], tmp_path / 'twin')}"
 
     def train(name, out, *changes):

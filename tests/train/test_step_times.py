@@ -1,4 +1,4 @@
-"""Where the time of a step goes: only when asked, in every stage, and nothing else changes."""
+"""The times of a step's parts: in every stage, only with ``--profile``, and without changing the training."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ BUSY = {
 
 @pytest.fixture(params=[("codec", False), ("stage1", False), ("stage2-voxel", False), ("stage2-voxel", True)])
 def profiled(request, walks, codec, stage1, tmp_path):
-    """A stage, and the arguments of a profiled run of it, in the end with a cache."""
+    """A stage and the arguments of a profiled run of it, once with a cache."""
     number, cached = request.param
     base = {"codec": MICRO_SETTINGS, "stage1": [f"base={codec}"], "stage2-voxel": [f"base={stage1}"]}[number]
     cache = ["--cache", tmp_path / "cache", "data.clips_per_trajectory=2"] if cached else []
     return number, stage(number, walks, tmp_path / "run", "--profile", *base, *cache)
 
 
-def test_a_profile_says_what_each_part_of_a_step_takes(persist, profiled, tmp_path):
+def test_a_profile_has_the_seconds_of_each_part_of_a_step(persist, profiled, tmp_path):
     number, arguments = profiled
     ended = persist(*arguments)
     assert ended.code == 0, ended.err
@@ -36,7 +36,7 @@ def test_a_profile_says_what_each_part_of_a_step_takes(persist, profiled, tmp_pa
     assert all(name in ended.out for name in PARTS)
 
 
-def test_a_profiled_run_is_the_usual_one_to_the_bit_and_the_usual_one_says_nothing(persist, walks, stage1, tmp_path):
+def test_profiling_changes_no_bit_and_other_runs_print_no_profile(persist, walks, stage1, tmp_path):
     plain, profiled = (stage("stage2-voxel", walks, tmp_path / name, f"base={stage1}") for name in ("one", "two"))
     ended = persist(*plain)
     assert persist(*profiled, "--profile").code == 0
@@ -45,7 +45,7 @@ def test_a_profiled_run_is_the_usual_one_to_the_bit_and_the_usual_one_says_nothi
     assert "backward" not in ended.out
 
 
-def test_the_first_step_and_what_is_not_of_a_step_do_not_count():
+def test_the_first_step_and_parts_outside_of_steps_do_not_count():
     times = StepTimes(torch.device("cpu"), 4)
     assert times.figures() == {}
     for seconds in (100.0, 1.0, 3.0):

@@ -1,4 +1,4 @@
-"""Losses for a tracker beside the run's own log."""
+"""Trackers get the losses of the run's own log."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def test_tensorboard_gets_the_losses_of_the_log(persist, walks, codec, tmp_path)
     assert persist(*arguments).code == 0
     events = loading.EventAccumulator(str(tmp_path / "run" / "persist")).Reload()
     logged = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    found = [(each.step, each.value) for each in events.Scalars("loss")]
-    assert found == [(each["step"], pytest.approx(each["loss"], rel=1e-5)) for each in logged]
+    tracked = [(event.step, event.value) for event in events.Scalars("loss")]
+    assert tracked == [(row["step"], pytest.approx(row["loss"], rel=1e-5)) for row in logged]
 
 
-def test_a_tracker_that_is_not_installed_is_one_line(persist, walks, codec, tmp_path):
+def test_a_tracker_that_is_not_installed_ends_in_one_line(persist, walks, codec, tmp_path):
     if importlib.util.find_spec("tensorboard") is not None:
         pytest.skip("tensorboard is installed")
     ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.tracker=tensorboard"))

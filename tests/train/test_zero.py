@@ -1,4 +1,4 @@
-"""DeepSpeed's ZeRO in two processes with gloo on the CPU: what one process without it comes to."""
+"""DeepSpeed's ZeRO in two processes with gloo on the CPU trains what one process trains without it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import importlib.util
 import pytest
 import torch
 
-from tests.support.two_processes import job, run_pair
+from tests.support.two_processes import job, run_in_two
 from tests.support.walking import end_of, losses, stage, train_here
-from tests.train.test_processes import BF16, NEAR, begun, furthest, saved_model
+from tests.train.test_processes import BF16, NEAR, train_by_one, largest_difference, saved_model
 
 KINDS = {f"zero{number}": {"ACCELERATE_USE_DEEPSPEED": "true", "ACCELERATE_DEEPSPEED_ZERO_STAGE": number}
          for number in ("1", "2")}  # fmt: skip
@@ -19,31 +19,31 @@ needs_deepspeed = pytest.mark.skipif(importlib.util.find_spec("deepspeed") is No
 
 @pytest.fixture(scope="module")
 def runs(walks, codec, stage1, tmp_path_factory):
-    """Runs of one process, of two with ZeRO 1 and 2, and some interrupted and gone on with by one and by two again."""
+    """Runs of one process, of two with ZeRO 1 and 2, and one resumed by one process and by two in turn."""
     folder = tmp_path_factory.mktemp("zero")
-    of = begun(folder, walks, codec, stage1)
+    of = train_by_one(folder, walks, codec, stage1)
     first = [job(*of("stage1", "zero1-1"), **KINDS["zero1"])]
     first += [job(*of("stage2-voxel", "zero2-2", "training.accumulation=2"), **KINDS["zero2"])]
     first += [job(*of("stage1", "zero2-bf16", BF16), **KINDS["zero2"])]
     first += [job(*of("stage1", "zero2-parts", "training.steps=1"), **KINDS["zero2"])]
-    ended = run_pair(folder, *first)
+    ended = run_in_two(folder, *first)
     assert [code for code, _ in ended] == [0] * len(first), ended
     train_here(*of("stage1", "zero2-parts", "--resume", "training.steps=2"))
-    ended = run_pair(folder, job(*of("stage1", "zero2-parts", "--resume"), **KINDS["zero2"]))
+    ended = run_in_two(folder, job(*of("stage1", "zero2-parts", "--resume"), **KINDS["zero2"]))
     assert ended[0][0] == 0, ended
     return folder
 
 
 @needs_deepspeed
 @pytest.mark.parametrize(("one", "two"), [("one-1", "zero1-1"), ("one-2", "zero2-2"), ("one-1", "zero2-parts")])
-def test_zero_comes_to_the_losses_weights_and_files_of_one_process(runs, one, two):
-    """In one go, with two micro-batches on each process, and from two processes to one to two again."""
+def test_zero_trains_to_the_losses_weights_and_files_of_one_process(runs, one, two):
+    """Uninterrupted, with two micro-batches on each process, and resumed by one process and by two in turn."""
     one, two = runs / one, runs / two
     assert losses(two) == pytest.approx(losses(one), rel=1e-5)
-    assert furthest(saved_model(one), saved_model(two)) < NEAR
-    (state, _), (other, _) = end_of(one), end_of(two)
-    assert torch.equal(state.pop("random/torch"), other.pop("random/torch"))
-    assert furthest(state, other) < NEAR
+    assert largest_difference(saved_model(one), saved_model(two)) < NEAR
+    (state_of_one, _), (state_of_two, _) = end_of(one), end_of(two)
+    assert torch.equal(state_of_one.pop("random/torch"), state_of_two.pop("random/torch"))
+    assert largest_difference(state_of_one, state_of_two) < NEAR
     files = [{path.relative_to(run) for path in run.rglob("*") if path.is_file()} for run in (one, two)]
     assert files[0] == files[1]
 
@@ -51,11 +51,11 @@ def test_zero_comes_to_the_losses_weights_and_files_of_one_process(runs, one, tw
 @needs_deepspeed
 def test_zero_in_bf16_keeps_weights_in_float32(runs):
     assert losses(runs / "zero2-bf16") == pytest.approx(losses(runs / "one-1"), rel=1e-2)
-    assert {each.dtype for each in saved_model(runs / "zero2-bf16").values()} == {torch.float32}
+    assert {weight.dtype for weight in saved_model(runs / "zero2-bf16").values()} == {torch.float32}
 
 
 @needs_deepspeed
-def test_what_zero_cannot_do_is_one_line(persist, walks, codec, tmp_path, monkeypatch):
+def test_zero_3_ends_in_one_line(persist, walks, codec, tmp_path, monkeypatch):
     monkeypatch.setenv("ACCELERATE_USE_DEEPSPEED", "true")
     monkeypatch.setenv("ACCELERATE_DEEPSPEED_ZERO_STAGE", "3")
     ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))

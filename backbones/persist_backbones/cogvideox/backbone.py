@@ -15,16 +15,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCondition
+from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCondition, VideoShape
 from persist_backbones.adapters.forms import load_adapter, make_adapter, save_adapter
-from persist_backbones.cogvideox.build import check_fit, starting_parts, video_shape, widen
-from persist_backbones.cogvideox.checkpoint import load_world, merge_lora, save_parts, save_world
 from persist_backbones.cogvideox.codec import Codec, to_uint8
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import (
     SAMPLERS,
     SamplingSchedule,
-    check_sampling,
     draw_timesteps,
     loss_weights,
     noise_like,
@@ -34,20 +31,31 @@ from persist_backbones.cogvideox.diffusion import (
 from persist_backbones.cogvideox.inputs import (
     camera_latents,
     camera_tokens,
+    check_fit,
     clip_shape,
+    fit_positions,
     interaction_rows,
     model_input,
     rotary_positions,
 )
-from persist_backbones.cogvideox.model import NO_MEMORY, Conditions
+from persist_backbones.cogvideox.model import NO_MEMORY, Conditions, widen
 from persist_backbones.cogvideox.parameter_groups import group_parameters, truncate_layers
-from persist_backbones.cogvideox.pretrained import DiffusersParts, load_parts, origin_of
-from persist_backbones.cogvideox.prompt import ORIGINS, check_kept, starting_prompt
+from persist_backbones.cogvideox.parts import (
+    DiffusersParts,
+    load_parts,
+    load_world,
+    merge_lora,
+    origin_of,
+    save_parts,
+    save_world,
+    starting_parts,
+)
+from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_cli.api.backbone import Backbone, ClipLatents, Clips, Sampling
+from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.errors import CheckpointError
-from persist_cli.io.checkpoint_folder import lora_base
+from persist_cli.errors import CheckpointError, PersistError
 
 
 @dataclass
@@ -92,11 +100,11 @@ class CogVideoX(Backbone):
 
     def set_parts(self, parts: DiffusersParts) -> None:
         """Build the model around diffusers' parts; what is new starts at zero."""
+        self.codec, self.scheduler = Codec(parts.vae), parts.scheduler
         check_fit(parts, self.settings)
-        self.codec = Codec(parts.vae)
-        self.transformer = widen(parts, self.settings)
-        self.scheduler = parts.scheduler
         self.shape = clip_shape(parts.transformer, parts.vae, self.settings)
+        fit_positions(parts.transformer, (self.shape.padded_frames, self.shape.height, self.shape.width))
+        self.transformer = widen(parts.transformer, parts.vae, self.settings, self.shape)
         config = parts.transformer.config
         self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
 
@@ -289,7 +297,9 @@ class CogVideoX(Backbone):
     def check_sampling(self, sampling: Sampling) -> None:
         """Raise ``PersistError`` also for more steps than the training has noise levels."""
         super().check_sampling(sampling)
-        check_sampling(self.scheduler, sampling.sampler, sampling.steps)
+        levels = self.scheduler.config.num_train_timesteps
+        if sampling.steps > levels:
+            raise PersistError(f"{sampling.steps} denoising steps; it must be 1 to {levels}")
 
     @property
     def gives_depth(self) -> bool:
@@ -344,8 +354,7 @@ class CogVideoX(Backbone):
 
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter and use it."""
-        shape = video_shape(self.transformer, self.codec)
-        self._take_adapter(name, make_adapter(channels, settings, shape, f"adapter {name!r}"))
+        self._take_adapter(name, make_adapter(channels, settings, self.video_shape, f"adapter {name!r}"))
 
     def use_adapter(self, name: str | None) -> None:
         """Use one of the adapters, or none: plain stage 1."""
@@ -365,14 +374,16 @@ class CogVideoX(Backbone):
 
     def load_base(self, folder: Path) -> None:
         """Take what ``save_base`` wrote, or what ``save_lora`` did merged into the weights that it changes."""
-        check_kept(self.settings, folder)
+        if self.settings.prompt is not None or self.settings.prompt_embedding is not None:
+            raise CheckpointError(
+                f"{folder}: the base was trained with a prompt of its own; leave prompt and prompt_embedding out"
+            )
         base = lora_base(folder)
-        if base is None:
-            self.set_parts(load_parts(folder))
-        elif isinstance(base, Path):
+        if isinstance(base, Path):
             self.load_base(base)
         else:
-            self.set_parts(starting_parts(dataclasses.replace(self.settings, **base)))
+            changed = dataclasses.replace(self.settings, **(base or {}))
+            self.set_parts(load_parts(folder) if base is None else starting_parts(changed))
         if self.prompt.is_meta:
             return
         if base is not None:
@@ -391,7 +402,12 @@ class CogVideoX(Backbone):
 
     def load_adapter(self, name: str, folder: Path) -> None:
         """Add the adapter that ``save_adapter`` wrote, and use it."""
-        self._take_adapter(name, load_adapter(folder, video_shape(self.transformer, self.codec)))
+        self._take_adapter(name, load_adapter(folder, self.video_shape))
+
+    @property
+    def video_shape(self) -> VideoShape:
+        """What an adapter must know of the model."""
+        return self.transformer.video_shape(self.codec.spatial, self.codec.temporal)
 
     def _take_adapter(self, name: str, adapter: Adapter[Any]) -> None:
         self.adapters[name] = adapter.to(self.device)

@@ -171,10 +171,14 @@ class Codec(nn.Module):
 
     Args:
         vae: diffusers' autoencoder.
+
+    Raises:
+        CheckpointError: for a VAE that is none of RGB, or compresses otherwise than it says.
     """
 
     def __init__(self, vae: AutoencoderKLCogVideoX) -> None:
         super().__init__()
+        check_vae(vae)
         self.vae = vae
         self._fingerprint: tuple[object, str] | None = None  # with what tells whether it still holds
         if self.framewise:

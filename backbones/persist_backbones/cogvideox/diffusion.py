@@ -6,7 +6,7 @@ The training loss and the sampling loop that put these together are ``CogVideoX.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from diffusers import (
@@ -17,8 +17,6 @@ from diffusers import (
 )
 from jaxtyping import Float, Int
 from torch import Tensor
-
-from persist_cli.errors import CheckpointError, PersistError
 
 Prediction = Literal["v_prediction", "sample"]
 Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
@@ -43,15 +41,6 @@ def draw_timesteps(scheduler: CogVideoXDDIMScheduler, generators: list[torch.Gen
     """Uniform noise levels, each sample from its own generator."""
     levels = scheduler.config.num_train_timesteps
     return torch.cat([torch.randint(0, levels, (1,), generator=generator) for generator in generators])
-
-
-def check_prediction(scheduler: CogVideoXDDIMScheduler, wanted: Prediction | None) -> None:
-    """Raise ``CheckpointError`` for a scheduler of another prediction than wanted, or of one that cannot be trained."""
-    kind = scheduler.config.prediction_type
-    if kind not in get_args(Prediction):
-        raise CheckpointError(f"the scheduler predicts {kind!r}; known: {', '.join(get_args(Prediction))}")
-    if wanted not in (None, kind):
-        raise CheckpointError(f"prediction is {wanted!r}, but the weights were trained for {kind!r}; leave it out")
 
 
 def prediction_target(
@@ -83,25 +72,14 @@ def loss_weights(
     return weights if scheduler.config.prediction_type == "sample" else weights / (snr + 1)
 
 
-def check_sampling(trained: CogVideoXDDIMScheduler, sampler: str, steps: int) -> None:
-    """Raise ``PersistError`` for an unknown sampler, and for more steps than the training has noise levels."""
-    if sampler not in SAMPLERS:
-        raise PersistError(f"unknown sampler {sampler!r}; known: {', '.join(SAMPLERS)}")
-    if not 1 <= steps <= trained.config.num_train_timesteps:
-        raise PersistError(f"{steps} denoising steps; it must be 1 to {trained.config.num_train_timesteps}")
-
-
 class SamplingSchedule:
     """Denoising steps of one of diffusers' schedulers, each at the noise level that training gives its timestep.
 
     Args:
         config: configuration of the CogVideoX scheduler that the model was trained with.
         sampler: a key of ``SAMPLERS``.
-        steps: denoising steps, each one prediction of the model.
+        steps: denoising steps, each one prediction of the model, at most as many as the training has noise levels.
         generators: one a sample, for samplers that add noise.
-
-    Raises:
-        PersistError: for an unknown sampler, and for more steps than the training has noise levels.
     """
 
     def __init__(self, config: Any, sampler: str, steps: int, generators: list[torch.Generator]) -> None:
@@ -135,7 +113,6 @@ class SamplingSchedule:
 def make_scheduler(config: Any, sampler: str, steps: int) -> Any:
     """diffusers' scheduler for a sampler, with so many timesteps; see ``SamplingSchedule``."""
     trained = CogVideoXDDIMScheduler.from_config(config)
-    check_sampling(trained, sampler, steps)
     scheduler = COGVIDEOX[sampler].from_config(config) if sampler in COGVIDEOX else _multistep(sampler, trained)
     scheduler.set_timesteps(steps)
     scheduler.timesteps = scheduler.timesteps[:steps]  # rounding gives some numbers, as 61, one timestep more: -1

@@ -1,21 +1,23 @@
-"""What the transformer is given besides noisy latents: padding, cameras, interactions and positions."""
+"""What the transformer is given besides noisy latents: the shape of clips, cameras, interactions and positions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, get_args
 
 import torch
 import torch.nn.functional as F
-from diffusers import CogVideoXTransformer3DModel
+from diffusers import CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
 from diffusers.models.embeddings import get_3d_rotary_pos_embed
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from persist_backbones.cogvideox.codec import spatial_compression
 from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.cogvideox.diffusion import Prediction
+from persist_backbones.cogvideox.parts import DiffusersParts
 from persist_backbones.tensors import fold_frames, frames_per_token, tokens_of
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras, invert_rigid
@@ -70,6 +72,48 @@ class ClipShape:
         """The latents of the first frame alone at the very first place, zeros at all others."""
         zeros = first.new_zeros(first.shape[0], self.padded_frames - 1, *first.shape[2:])
         return torch.cat([first, zeros], dim=1)
+
+
+def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
+    """Raise ``CheckpointError`` when the parts do not work together at the settings' size."""
+    check_prediction(parts.scheduler, settings.prediction)
+    check_frames(int(parts.vae.config.temporal_compression_ratio), settings)
+    config, vae = parts.transformer.config, parts.vae.config
+    unit = spatial_compression(parts.vae) * config.patch_size
+    if settings.height % unit or settings.width % unit:
+        raise CheckpointError(f"image size {settings.height}x{settings.width} must be a multiple of {unit}")
+    if config.in_channels not in (vae.latent_channels, 2 * vae.latent_channels):
+        raise CheckpointError(
+            f"a transformer of {config.in_channels} channels does not fit a VAE of {vae.latent_channels}"
+        )
+    if config.ofs_embed_dim and config.ofs_embed_dim != config.time_embed_dim:
+        raise CheckpointError(
+            f"a transformer whose ofs_embed_dim {config.ofs_embed_dim} is not its time_embed_dim "
+            f"{config.time_embed_dim} cannot add one to the other"
+        )
+    tables = config.use_learned_positional_embeddings or not config.use_rotary_positional_embeddings
+    if config.patch_size_t is not None and tables:
+        raise CheckpointError("patch_size_t needs rotary positions alone, as CogVideoX 1.5 has them")
+
+
+def check_prediction(scheduler: CogVideoXDDIMScheduler, wanted: Prediction | None) -> None:
+    """Raise ``CheckpointError`` for a scheduler of another prediction than wanted, or of one that cannot be trained."""
+    kind = scheduler.config.prediction_type
+    if kind not in get_args(Prediction):
+        raise CheckpointError(f"the scheduler predicts {kind!r}; known: {', '.join(get_args(Prediction))}")
+    if wanted not in (None, kind):
+        raise CheckpointError(f"prediction is {wanted!r}, but the weights were trained for {kind!r}; leave it out")
+
+
+def check_frames(temporal: int, settings: CogVideoXSettings) -> None:
+    """Raise ``CheckpointError`` when the codec, of this compression in time, cannot code the settings' frames."""
+    # diffusers' decoder doubles time in halves and tells a first frame from an odd number of latent frames
+    step = 2 * temporal if temporal > 1 else 1
+    rule, window = f"{step}n + 1, " if step > 1 else "", (settings.codec_window or (1,))[0]
+    if settings.frames < 2 or (settings.frames - 1) % step:
+        raise CheckpointError(f"frames must be {rule}at least 2, not {settings.frames}")
+    if window < 1 or (window - 1) % step:
+        raise CheckpointError(f"codec_window's frames must be {rule}at least 1, not {window}")
 
 
 def clip_shape(transformer: Any, vae: Any, settings: CogVideoXSettings) -> ClipShape:

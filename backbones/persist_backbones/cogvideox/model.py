@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from diffusers import CogVideoXTransformer3DModel
+from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import MemoryCondition
-from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches, zero_init
+from persist_backbones.adapters.base import MemoryCondition, VideoShape
+from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
+from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches
 
 OFFSET = 2.0  # what CogVideoX 1.5 image-to-video was trained with as ``ofs``
 
@@ -49,24 +51,27 @@ class WorldTransformer(nn.Module):
 
     Args:
         base: diffusers' transformer.
-        in_channels: all input channels: noisy RGB, RGB image, noisy depth, depth image, camera.
-        out_channels: RGB and depth.
+        latent_channels: of RGB, and of depth.
+        temporal: compression of the codec in time.
+        shape: of a clip.
         interactions: rows of the interaction embedding without the first, which is none.
-        camera_channels: of the camera embedding at a token.
     """
 
     def __init__(
         self,
         base: CogVideoXTransformer3DModel,
-        in_channels: int,
-        out_channels: int,
+        latent_channels: int,
+        temporal: int,
+        shape: ClipShape,
         interactions: int,
-        camera_channels: int,
     ) -> None:
         super().__init__()
         config = base.config
         inner = config.num_attention_heads * config.attention_head_dim
-        patch, frames, new = config.patch_size, frames_per_token(config), in_channels - config.in_channels
+        patch, frames, camera = config.patch_size, frames_per_token(config), RAY_CHANNELS * temporal
+        # noisy RGB, RGB image, noisy depth, depth image and camera in; RGB and depth out
+        in_channels, out_channels = 4 * latent_channels + camera, 2 * latent_channels
+        new = in_channels - config.in_channels
         self.base = base
         self.extra_in: nn.Module
         if config.patch_size_t is None:
@@ -75,9 +80,27 @@ class WorldTransformer(nn.Module):
             self.extra_in = nn.Linear(new * frames * patch**2, inner, bias=False)
         self.extra_out = nn.Linear(inner, frames * patch**2 * (out_channels - config.out_channels))
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
-        self.camera_channels = camera_channels
+        self.camera_channels = camera * shape.token_frames  # at a video token
         self.in_channels, self.out_channels = in_channels, out_channels
-        zero_init(self.extra_in, self.extra_out, self.interactions)
+        for module in (self.extra_in, self.extra_out, self.interactions):
+            for parameter in module.parameters():
+                nn.init.zeros_(parameter)
+
+    def video_shape(self, spatial: int, temporal: int) -> VideoShape:
+        """What an adapter must know of the model, with the compression of its codec in space and time."""
+        config = self.base.config
+        return VideoShape(
+            channels=config.num_attention_heads * config.attention_head_dim,
+            camera_channels=self.camera_channels,
+            time_channels=config.time_embed_dim,
+            layers=config.num_layers,
+            patch=config.patch_size,
+            spatial=spatial,
+            temporal=temporal,
+            inputs=self.in_channels,
+            outputs=self.out_channels,
+            token_frames=frames_per_token(config),
+        )
 
     def forward(
         self, latents: Float[Tensor, "batch frame channel height width"], given: Conditions
@@ -126,3 +149,12 @@ class WorldTransformer(nn.Module):
         config = self.base.config
         size = (like.shape[1], like.shape[3], like.shape[4])
         return unfold_patches(tokens, size, config.patch_size, frames_per_token(config))
+
+
+def widen(
+    base: CogVideoXTransformer3DModel, vae: AutoencoderKLCogVideoX, settings: CogVideoXSettings, shape: ClipShape
+) -> WorldTransformer:
+    """diffusers' transformer with zero-initialised inputs and outputs for RGB-D, cameras and interactions."""
+    interactions = (settings.frames - 1) * len(settings.interactions)
+    temporal = int(vae.config.temporal_compression_ratio)
+    return WorldTransformer(base, vae.config.latent_channels, temporal, shape, interactions)

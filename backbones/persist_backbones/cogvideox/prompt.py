@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.pretrained import pretrained_folder
+from persist_backbones.cogvideox.parts import pretrained_folder
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, read_tensors, reallocate, write_tensors
 from persist_cli.io.hub import without_bars
@@ -30,14 +30,6 @@ def check_choice(settings: CogVideoXSettings) -> None:
         raise CheckpointError("give prompt or prompt_embedding, not both")
     if settings.prompt is not None and settings.pretrained is None:
         raise CheckpointError(f"a prompt needs pretrained weights with a text encoder; {OTHERWISE}")
-
-
-def check_kept(settings: CogVideoXSettings, folder: Path) -> None:
-    """Raise ``CheckpointError`` when the settings name a prompt for a checkpoint, which has its own."""
-    if settings.prompt is not None or settings.prompt_embedding is not None:
-        raise CheckpointError(
-            f"{folder}: the base was trained with a prompt of its own; leave prompt and prompt_embedding out"
-        )
 
 
 def starting_prompt(

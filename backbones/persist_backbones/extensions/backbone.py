@@ -9,10 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from persist_backbones.cogvideox.backbone import CogVideoX, SamplingStep
-from persist_backbones.cogvideox.checkpoint import save_world
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.model import Conditions
-from persist_backbones.cogvideox.pretrained import DiffusersParts
+from persist_backbones.cogvideox.parts import DiffusersParts, save_world
 from persist_backbones.extensions.caches import ClipCaches
 from persist_backbones.extensions.lora import add_lora, save_lora, train_lora
 from persist_backbones.extensions.offload import OffloadedParts, bring_when_run, prepare_inference

@@ -6,16 +6,17 @@ import dataclasses
 from typing import Any
 
 import torch
-from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
+from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 from diffusers.configuration_utils import ConfigMixin, register_to_config
 from diffusers.models.modeling_utils import ModelMixin
 
 from persist_backbones.adapters.base import Adapter, VideoShape
 from persist_backbones.adapters.forms import make_adapter
 from persist_backbones.cogvideox.backbone import CogVideoX
-from persist_backbones.cogvideox.build import widen
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.pretrained import DiffusersParts
+from persist_backbones.cogvideox.inputs import clip_shape
+from persist_backbones.cogvideox.model import widen
+from persist_backbones.cogvideox.parts import DiffusersParts
 from persist_backbones.extensions.backbone import ExtendedCogVideoX
 from persist_cli.io.settings import parse_settings
 
@@ -36,8 +37,9 @@ class WorldModules(ModelMixin, ConfigMixin):  # type: ignore[misc]
         super().__init__()
         with torch.device("meta"):
             theirs = CogVideoXTransformer3DModel.from_config(transformer)
-            parts = DiffusersParts(theirs, AutoencoderKLCogVideoX.from_config(vae), CogVideoXDDIMScheduler())
-        for name, module in widen(parts, self.backbone_settings()).named_children():
+            codec = AutoencoderKLCogVideoX.from_config(vae)
+        own = self.backbone_settings()
+        for name, module in widen(theirs, codec, own, clip_shape(theirs, codec, own)).named_children():
             if name != BASE:
                 self.add_module(name, module)
         words = theirs.config.max_text_seq_length, theirs.config.text_embed_dim

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, get_args
 
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
@@ -16,20 +16,25 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from persist_backbones.cogvideox.backbone import SamplingStep
+from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import SAMPLERS
-from persist_backbones.cogvideox.pretrained import DiffusersParts
+from persist_backbones.cogvideox.parts import DiffusersParts
 from persist_backbones.extensions.backbone import ExtendedCogVideoX
 from persist_backbones.extensions.offload import OffloadingPipeline
 from persist_backbones.pipeline.call_inputs import batch_of_images, make_clips
 from persist_backbones.pipeline.components import MemoryAdapter, WorldModules, assemble
 from persist_cli.api.backbone import Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.checkpoint import CARD, PLAIN, find_checkpoint
+from persist_cli.api.inference import Precision
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.errors import CheckpointError, DataError, PersistError
+from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.io.files import reallocate
+from persist_cli.io.settings import parse_settings
 
 Callback = Callable[["WorldPipeline", int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
 
+NAME = "cogvideox"  # of the plugin
 OUTPUTS = ("pil", "np", "pt", "latent")
 
 
@@ -241,3 +246,21 @@ def generators_for(given: torch.Generator | list[torch.Generator] | None, batch:
             raise PersistError(f"{len(given)} generators for {batch} images; give one, or one for each")
         return given
     return [given or torch.default_generator] * batch
+
+
+def load_pipeline(folder: Path, adapter: str | None, dtype: Precision | None) -> WorldPipeline:
+    """A checkpoint as a pipeline, without the tool; see ``persist_backbones.load``."""
+    if dtype is not None and dtype not in get_args(Precision):
+        raise CheckpointError(f"unknown dtype {dtype!r}; {hint(dtype, get_args(Precision))}")
+    checkpoint = find_checkpoint(folder)
+    card = checkpoint.base_folder / CARD
+    if checkpoint.backbone != NAME:
+        raise CheckpointError(f"{card}: a checkpoint of backbone {checkpoint.backbone!r}, not of {NAME!r}")
+    with torch.device("meta"):  # weights come from the files
+        backbone = ExtendedCogVideoX(parse_settings(CogVideoXSettings, checkpoint.settings, str(card)))
+    backbone.name = NAME
+    backbone.load_base(checkpoint.base_folder)
+    adapter = adapter or checkpoint.default_adapter()
+    if adapter is not None and adapter != PLAIN:
+        backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
+    return WorldPipeline.of(backbone.to(getattr(torch, dtype or "float32")).eval())

@@ -11,7 +11,7 @@ from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.protocols import Protocol
-from persist_cli.evaluate.rows.controls import CodecReconstruction, Copy, Nearest, Truth, Warp
+from persist_cli.evaluate.rows.controls import CodecReconstruction, Control, Copy, Nearest, Truth, Warp
 from persist_cli.evaluate.rows.interventions import (
     Emptied,
     MemoryIntervention,
@@ -26,21 +26,9 @@ from persist_cli.memorize.factory import MemoryFactory
 
 NO_MEMORY = "none"  # name of the memory that never reads a token, so that no intervention can change anything
 
-CONTROLS: dict[str, Callable[[str, Checkpoint, Protocol], Row]] = {
-    "copy": lambda name, base, protocol: Copy(name, base),
-    "nearest": lambda name, base, protocol: Nearest(name, base, protocol.writes),
-    "warp": lambda name, base, protocol: Warp(name, base, protocol.writes),
-    "codec": lambda name, base, protocol: CodecReconstruction(name, base),
-    "truth": lambda name, base, protocol: Truth(name, base),
-}
-
-TITLES = {
-    "copy": "copy of the first frame",
-    "nearest": "nearest earlier frame",
-    "warp": "geometric warp",
-    "codec": "codec reconstruction",
-    "truth": "ground truth",
-}
+CONTROLS: dict[str, type[Control]] = {
+    "copy": Copy, "nearest": Nearest, "warp": Warp, "codec": CodecReconstruction, "truth": Truth,
+}  # fmt: skip
 
 INTERVENTIONS: dict[str, Callable[[RowConfig, Sequence[Case]], MemoryIntervention]] = {
     "shuffled": lambda config, cases: Shuffled(cases),
@@ -89,9 +77,9 @@ def build_model_rows(checkpoints: Sequence[Checkpoint], config: RowConfig, proto
         adapter = None if memory == PLAIN else memory
         owners = checkpoints_with(memory, checkpoints)
         for owner, label in zip(owners, labels(owners), strict=True):
-            maker = MemoryFactory.of(adapter_memory(owner, memory)) if adapter else None
+            factory = MemoryFactory.of(adapter_memory(owner, memory)) if adapter else None
             name = memory if len(owners) == 1 else f"{memory} ({label})"
-            row_memory = RowMemory(maker, Unmodified(), protocol.writes)
+            row_memory = RowMemory(factory, Unmodified(), protocol.writes)
             rows.append(ModelRow(name, owner, adapter, config.sampling, row_memory))
     return rows
 
@@ -115,7 +103,7 @@ def build_control_rows(
         for name, make_intervention in INTERVENTIONS.items():
             if name in config.controls:
                 intervention = make_intervention(config, cases)
-                row_memory = replace(row.row_memory, recall=intervention)
+                row_memory = replace(row.row_memory, intervention=intervention)
                 row_name = f"{row.name}, {intervention.name}"
                 rows.append(ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory))
     if "warp" in config.controls and all(share is None for case in cases for share in case.seen_before):
@@ -124,13 +112,11 @@ def build_control_rows(
     for name, control in CONTROLS.items():
         if name not in (*config.controls, *protocol.guards):
             continue
-        if name == "codec" and len(bases) > 1:  # each base has a codec of its own
-            rows += [
-                control(f"{TITLES[name]} ({label})", base, protocol)
-                for base, label in zip(bases, labels(bases), strict=True)
-            ]
+        if control.uses_model and len(bases) > 1:  # each base has a codec of its own
+            pairs = zip(bases, labels(bases), strict=True)
+            rows += [control(f"{control.title} ({label})", base, protocol.writes) for base, label in pairs]
         else:
-            rows.append(control(TITLES[name], bases[0], protocol))
+            rows.append(control(control.title, bases[0], protocol.writes))
     return rows
 
 

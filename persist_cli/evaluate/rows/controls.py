@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,82 +21,95 @@ from persist_cli.evaluate.coverage import held_frames
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.rows.warp import Surface, warp
 
-Shower = Callable[[Cameras, Tensor], tuple[Tensor, Tensor]]
+ViewRenderer = Callable[[Cameras, Tensor], tuple[Tensor, Tensor]]  # from a camera and distances to RGB and depth
 
 
-class Copy(Row):
+class Control(Row):
+    """A row that needs no training.
+
+    Args:
+        name: name in the table, ``title`` where one control has that title.
+        base: checkpoint whose backbone the row needs.
+        writes: whether the protocol writes predicted frames to the memory.
+    """
+
+    title: ClassVar[str]
+
+    def __init__(self, name: str, base: Checkpoint, writes: bool = False) -> None:
+        super().__init__(name, base)
+        self.writes = writes
+
+
+class Copy(Control):
     """The clip's first frame, repeated."""
 
+    title = "copy of the first frame"
     definition = "the given first frame, repeated: a frozen video"
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """The first frame of each clip as often as it has frames."""
+        """Repeat the first frame of each clip as often as the clip has frames."""
         rgb = torch.stack([clip.observations.rgb[:1].expand_as(clip.observations.rgb) for clip in clips])
         depth = torch.stack([clip.observations.depth[:1].expand_as(clip.observations.depth) for clip in clips])
         return rgb, depth
 
 
-class Truth(Row):
-    """The clip itself: what perfect prediction scores."""
+class Truth(Control):
+    """The clip itself, with the figures of a perfect prediction."""
 
+    title = "ground truth"
     definition = "the true frames themselves"
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """The true frames."""
+        """Return the true frames."""
         return (
             torch.stack([clip.observations.rgb for clip in clips]),
             torch.stack([clip.observations.depth for clip in clips]),
         )
 
 
-class CodecReconstruction(Row):
-    """Ground truth after the codec."""
+class CodecReconstruction(Control):
+    """The true frames, encoded and decoded by the model's codec."""
 
+    title = "codec reconstruction"
     uses_model = True
     definition = "true frames encoded and decoded, clip after clip as the model predicts them: the codec's ceiling"
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Encoded and decoded ground truth, the given frame as it is."""
+        """Encode and decode the true frames, all but the given one."""
         length = backbone.frames_per_clip - 1
         truths = [clip.observations for clip in clips]
-        rgb, depth = (
-            [torch.stack([truth.rgb[:1] for truth in truths])],
-            [torch.stack([truth.depth[:1] for truth in truths])],
-        )
+        rgb = [torch.stack([truth.rgb[:1] for truth in truths])]
+        depth = [torch.stack([truth.depth[:1] for truth in truths])]
         for first in range(0, len(truths[0]) - 1, length):
-            wanted = min(length, len(truths[0]) - 1 - first)
-            colors, metres = backbone.reconstruct(Clips.stack([part_of(truth, first, length) for truth in truths]))
-            rgb.append(colors[:, 1 : wanted + 1].cpu())
-            depth.append(metres[:, 1 : wanted + 1].cpu())
+            count = min(length, len(truths[0]) - 1 - first)
+            colors, metres = backbone.reconstruct(Clips.stack([cut_clip(truth, first, length) for truth in truths]))
+            rgb.append(colors[:, 1 : count + 1].cpu())
+            depth.append(metres[:, 1 : count + 1].cpu())
         return torch.cat(rgb, dim=1), torch.cat(depth, dim=1)
 
 
-class Memoryless(Row):
-    """A control made of the frames that the memory holds by then, as they really were."""
-
-    def __init__(self, name: str, base: Checkpoint, writes: bool) -> None:
-        super().__init__(name, base)
-        self.writes = writes
+class EarlierFramesControl(Control):
+    """A control whose views are made of earlier true frames, those that the memory of a model would hold by then."""
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Each frame made of the true frames held when it is predicted."""
-        made = [self.video(clip, backbone.frames_per_clip - 1) for clip in clips]
-        return torch.stack([rgb for rgb, _ in made]), torch.stack([depth for _, depth in made])
+        """Make each frame of the true frames that are held when it is predicted."""
+        videos = [self.video(clip, backbone.frames_per_clip - 1) for clip in clips]
+        return torch.stack([rgb for rgb, _ in videos]), torch.stack([depth for _, depth in videos])
 
     def video(self, clip: CaseFrames, length: int) -> tuple[Tensor, Tensor]:
-        """One clip; ``length`` frames are predicted at once."""
+        """The video of one clip, where ``length`` frames are predicted at once."""
         truth = clip.observations
         rgb, depth = truth.rgb.clone(), truth.depth.clone()
         earlier = truth if clip.context is None else Observations.concatenate([clip.context, truth])
-        show = self.shower(earlier)
+        render = self.renderer(earlier)
         for frame in range(1, len(rgb)):
             held = self.held(clip, frame, length)
             distances = pose_distances(earlier.cameras, truth.cameras[frame]).where(held, torch.inf)
-            rgb[frame], depth[frame] = show(truth.cameras[frame : frame + 1], distances)
+            rgb[frame], depth[frame] = render(truth.cameras[frame : frame + 1], distances)
         return rgb, depth
 
     def held(self, clip: CaseFrames, frame: int, length: int) -> Bool[Tensor, " earlier"]:
-        """Which of the context's and the clip's frames are known when a frame is predicted: never those to come."""
+        """A mask of the context's and the clip's frames that are known when a frame is predicted, never those to come."""
         case = clip.case
         numbers = held_frames(case.start, case.context, frame, length, self.writes)
         known = torch.zeros(case.context + case.frames, dtype=torch.bool)
@@ -104,47 +118,48 @@ class Memoryless(Row):
         return known
 
     @abstractmethod
-    def shower(self, earlier: Observations) -> Shower:
-        """What makes RGB and depth of a view from the frames whose distance from it is finite."""
+    def renderer(self, earlier: Observations) -> ViewRenderer:
+        """A function that makes RGB and depth of a view from the frames whose distance from it is finite."""
 
 
-class Nearest(Memoryless):
-    """The frame taken at the nearest earlier pose."""
+class Nearest(EarlierFramesControl):
+    """The frame that was taken at the nearest earlier pose."""
 
+    title = "nearest earlier frame"
     definition = "the true earlier frame whose pose is nearest (metres + radians) among those the memory holds by then"
 
-    def shower(self, earlier: Observations) -> Shower:
-        """The nearest frame as it is."""
+    def renderer(self, earlier: Observations) -> ViewRenderer:
+        """A function that returns the nearest frame unchanged."""
 
-        def show(camera: Cameras, distances: Tensor) -> tuple[Tensor, Tensor]:
+        def render(camera: Cameras, distances: Tensor) -> tuple[Tensor, Tensor]:
             nearest = int(distances.argmin())
             return earlier.rgb[nearest], earlier.depth[nearest]
 
-        return show
+        return render
 
 
-class Warp(Memoryless):
-    """Earlier RGB-D frames projected into the asked view."""
+class Warp(EarlierFramesControl):
+    """Earlier RGB-D frames, projected into the view."""
 
+    title = "geometric warp"
     definition = (
         "the true earlier RGB-D frames that the memory holds by then, projected into the asked view with a z-buffer, "
         "colours from the nearest pose that shows the surface, holes filled from the nearest pixel"
     )
 
-    def shower(self, earlier: Observations) -> Shower:
-        """The warped view."""
+    def renderer(self, earlier: Observations) -> ViewRenderer:
+        """A function that warps the earlier frames into the view."""
         return partial(warp, Surface.of(earlier))
 
 
-def pose_distances(cameras: Cameras, asked: Cameras) -> Float[Tensor, " frame"]:
-    """Metres plus radians from every camera to the one asked for."""
+def pose_distances(cameras: Cameras, view: Cameras) -> Float[Tensor, " frame"]:
+    """Metres plus radians from every camera to that of a view."""
     poses = cameras.world_from_camera
-    metres, degrees = pose_differences(poses, asked.world_from_camera.expand_as(poses))
+    metres, degrees = pose_differences(poses, view.world_from_camera.expand_as(poses))
     return metres + torch.deg2rad(degrees)
 
 
-def part_of(truth: Observations, first: int, length: int) -> Clip:
-    """The frames ``first`` to ``first + length`` as a batch's sample, the last repeated to fill it."""
+def cut_clip(truth: Observations, first: int, length: int) -> Clip:
+    """The frames ``first`` to ``first + length`` as a clip for the backbone, the last repeated to fill it."""
     numbers = [min(number, len(truth) - 1) for number in range(first, first + length + 1)]
-    part = truth[numbers]
-    return Clip(part, (None,) * length, seed=0)
+    return Clip(truth[numbers], (None,) * length, seed=0)

@@ -1,4 +1,4 @@
-"""Rows of a model: with a memory adapter, with a disturbed memory, or with none."""
+"""Rows of a model: with a memory, with an intervention in its memory, or without one."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from persist_cli.rollout.world_model import Agent, WorldModel
 
 @dataclass(frozen=True)
 class RowMemory:
-    """What a model row remembers with.
+    """The memory of a model's row.
 
     Args:
-        maker: of its memories; ``None`` without a memory.
-        recall: what they are made of.
+        factory: makes an empty memory for each clip; ``None`` for a row without a memory.
+        intervention: says what is written into the memory.
         writes: whether the protocol writes the model's own output.
     """
 
-    maker: MemoryFactory | None
-    recall: MemoryIntervention
+    factory: MemoryFactory | None
+    intervention: MemoryIntervention
     writes: bool
 
 
@@ -41,42 +41,37 @@ class ModelRow(Row):
     """The model with one memory adapter, or with none.
 
     Args:
-        name: in the table.
-        checkpoint: that has the adapter.
-        adapter: its name; ``None`` is plain stage 1.
-        sampling: how clips are drawn.
-        row_memory: with which memory.
+        name: name in the table.
+        checkpoint: checkpoint that has the adapter.
+        adapter: name of the adapter; ``None`` is plain stage 1.
+        sampling: sampling of the clips.
+        row_memory: memory that the adapter reads.
     """
 
     random = True
     uses_model = True
 
     def __init__(
-        self,
-        name: str,
-        checkpoint: Checkpoint,
-        adapter: str | None,
-        sampling: Sampling,
-        row_memory: RowMemory,
+        self, name: str, checkpoint: Checkpoint, adapter: str | None, sampling: Sampling, row_memory: RowMemory
     ) -> None:
         super().__init__(name, checkpoint)
         self.checkpoint, self.adapter, self.sampling, self.row_memory = checkpoint, adapter, sampling, row_memory
-        self.kind = "model" if isinstance(row_memory.recall, Unmodified) else "memory control"
+        self.kind = "model" if isinstance(row_memory.intervention, Unmodified) else "memory control"
 
     @property
     def definition(self) -> str:
-        """Checkpoint, adapter and what the memory holds."""
+        """A few words with the checkpoint, the adapter and the content of the memory."""
         if self.adapter is None:
             return f"{self.checkpoint.name} without an adapter (stage 1)"
-        return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.row_memory.recall.definition}"
+        return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.row_memory.intervention.definition}"
 
     def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
-        """Load the adapter."""
+        """Load the adapter into the backbone and make it ready."""
         load_adapter(backbone, self.checkpoint, self.adapter)
         super().prepare(backbone, placement)
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Rollouts from each clip's first frame along its cameras."""
+        """Roll out each clip from its first frame along its cameras."""
         agents = [self.agent(clip, seed) for clip, seed in zip(clips, seeds, strict=True)]
         model = WorldModel(backbone, agents, self.sampling)
         model.reset([clip.observations[:1] for clip in clips], [clip.info for clip in clips])
@@ -87,17 +82,17 @@ class ModelRow(Row):
         return torch.stack([video.rgb for video in videos]), torch.stack([video.depth for video in videos])
 
     def agent(self, clip: CaseFrames, seed: int) -> Agent:
-        """An agent with the clip's memory."""
-        intervention = self.row_memory.recall
+        """An agent that holds the clip's memory, before it is placed at the first frame."""
+        intervention = self.row_memory.intervention
         disturb = partial(intervention.disturb, draws=torch.Generator().manual_seed(seed))
         return Agent(self.memory(clip, disturb), seed, self.row_memory.writes and intervention.writes, disturb)
 
     def memory(self, clip: CaseFrames, disturb: Callable[[Observations], Observations]) -> Memory | None:
-        """The clip's memory before it begins."""
-        if self.row_memory.maker is None:
+        """The memory as it is before the clip begins."""
+        if self.row_memory.factory is None:
             return None
-        memory = self.row_memory.maker.empty(clip.info)
-        context = self.row_memory.recall.context(clip)
+        memory = self.row_memory.factory.empty(clip.info)
+        context = self.row_memory.intervention.context(clip)
         if context is not None:
             memory.write(disturb(context))
         return memory

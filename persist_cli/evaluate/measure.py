@@ -1,4 +1,4 @@
-"""Measuring an evaluation: every batch of every row once, by one process or several."""
+"""Measure an evaluation: every batch of every row once, by one process or several."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from persist_cli.evaluate.rows.row import Row
 from persist_cli.rollout.world_model import clip_seed
 from persist_cli.viewing.console import add_task, progress
 
-SHOWN = 3  # clips whose videos are kept of every row, for the contact sheets
+SHEET_CLIPS = 3  # clips whose videos are kept of every row, for the contact sheets
 
 
 def measure_rows(run: Evaluation, loader: BackboneLoader, processes: Processes) -> None:
-    """Measure every batch that the journal does not have, this process its share."""
+    """Measure this process's share of the batches that the journal does not have yet."""
     todo = [
         [unit for unit in run.units(number) if processes.owns(unit.batch) and not run.journal.has(unit)]
         for number in range(len(run.rows))
@@ -43,7 +43,7 @@ def measure_rows(run: Evaluation, loader: BackboneLoader, processes: Processes) 
 
 
 def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
-    """Keep the features of the true videos, which sets of videos are compared with."""
+    """Keep the features of the true videos, with which set metrics compare those of every row."""
     suite = run.suites[0]  # the features are of colours, which every row has
     units = [Unit(TRUTH, 0, batch) for batch in range(run.batches) if processes.owns(batch)]
     todo = [unit for unit in units if suite.set_metrics and not run.journal.has(unit)]
@@ -55,24 +55,24 @@ def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
 
 
 def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> None:
-    """Measure one batch and keep it, with the videos of the clips to be shown."""
+    """Measure one batch and keep it, with the videos of the clips that contact sheets show."""
     clips = [read_case(case) for case in run.batch(unit.batch)]
     rgb, depth = predict(row, backbone, clips, unit.seed, unit.batch * run.plan.batch)
-    kept = run.suites[unit.row].measure(rgb, depth, clips, f"row {row.name!r}")
-    shown = max(0, SHOWN - unit.batch * run.plan.batch) if unit.seed == 0 else 0
-    if shown:
-        kept[VIDEO] = rgb[:shown].cpu()
-    run.journal.write(unit, kept)
+    tensors = run.suites[unit.row].measure(rgb, depth, clips, f"row {row.name!r}")
+    videos = max(0, SHEET_CLIPS - unit.batch * run.plan.batch) if unit.seed == 0 else 0
+    if videos:
+        tensors[VIDEO] = rgb[:videos].cpu()
+    run.journal.write(unit, tensors)
 
 
 def predict(row: Row, backbone: Backbone, clips: Sequence[CaseFrames], seed: int, first: int) -> tuple[Tensor, Tensor]:
-    """The row's videos of consecutive clips; a clip's noise is the same for every row, so that rows are paired.
+    """Predict the row's videos of consecutive clips; a clip has equal noise in every row, so that rows are paired.
 
     Args:
-        row: prepared.
-        backbone: of the row.
-        clips: to predict.
-        seed: of the sampling.
+        row: the row.
+        backbone: backbone that was prepared for the row.
+        clips: the clips.
+        seed: sampling seed.
         first: number of the first clip.
     """
     with torch.no_grad():

@@ -1,0 +1,357 @@
+"""What a model is made around: diffusers' transformer, VAE and scheduler, fresh or pretrained, and whether they fit.
+
+Pretrained ones lie in a local directory of diffusers' layout or in a repository of the hub.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
+from diffusers.loaders.lora_base import LORA_ADAPTER_METADATA_KEY, LORA_WEIGHT_NAME_SAFE
+from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
+from torch import Tensor, nn
+
+from persist_backbones.cogvideox.codec import spatial_compression
+from persist_backbones.cogvideox.config import PRESETS, CogVideoXSettings
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import load_exactly, read_json, read_tensors, reallocate, write_tensors
+from persist_cli.io.hub import hub_obstacle, silent
+
+SUBFOLDERS = {
+    "transformer": CogVideoXTransformer3DModel,
+    "vae": AutoencoderKLCogVideoX,
+    "scheduler": CogVideoXDDIMScheduler,
+}
+WEIGHTS = "diffusion_pytorch_model.safetensors"  # of a part that is not split into several files
+REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+PUBLISHED = {  # what the repositories of THUDM, now zai-org, hold
+    "CogVideoX-2b": "2b",
+    "CogVideoX-5b": "5b",
+    "CogVideoX-5b-I2V": "5b-i2v",
+    "CogVideoX1.5-5B": "1.5-5b",
+    "CogVideoX1.5-5B-I2V": "1.5-5b-i2v",
+}
+INITIAL_LOG_VARIANCE = -6.0  # of fresh latents: noise that does not drown what has not been learnt yet
+PREFIX = "transformer."  # of the names in a pipeline's LoRA file
+DOWN, UP = ".lora_A.weight", ".lora_B.weight"
+SAMPLED = 256  # values of a tensor that its digest looks at
+MAY_BE_ZERO = {"dropout", "freq_shift", "ofs_embed_dim", "norm_eps", "shift_factor"}  # of numbers in configurations
+
+
+@dataclass(frozen=True)
+class DiffusersParts:
+    """What diffusers brings: transformer, autoencoder and scheduler."""
+
+    transformer: CogVideoXTransformer3DModel
+    vae: AutoencoderKLCogVideoX
+    scheduler: CogVideoXDDIMScheduler
+
+
+def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
+    """The parts that a model of these settings begins with.
+
+    A plan asks no network: of weights that are not here it takes the sizes that their name tells, else the preset's.
+    """
+    if settings.pretrained is None:
+        return make_parts(settings)
+    if not on_meta_device():
+        return load_parts(pretrained_folder(settings.pretrained))
+    folder = folder_here(settings.pretrained)
+    if folder is not None:
+        return load_parts(folder)
+    check_name(settings.pretrained)
+    preset: Any = published_preset(settings.pretrained) or settings.preset
+    return make_parts(dataclasses.replace(settings, preset=preset))
+
+
+def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
+    """Freshly initialised parts of the settings' preset and sizes."""
+    preset = PRESETS[settings.preset]
+    shown = {"sample_height": settings.height, "sample_width": settings.width}
+    vae = make_part("vae", preset["vae"] | shown | settings.vae)
+    initialize(vae)
+    spatial = spatial_compression(vae)
+    size = {
+        "sample_height": settings.height // spatial,
+        "sample_width": settings.width // spatial,
+        "sample_frames": settings.frames,
+    }
+    transformer = make_part("transformer", preset["transformer"] | size | settings.transformer)
+    prediction = {"prediction_type": settings.prediction} if settings.prediction else {}
+    return DiffusersParts(transformer, vae, CogVideoXDDIMScheduler(**(preset["scheduler"] | prediction)))
+
+
+def initialize(vae: AutoencoderKLCogVideoX) -> None:
+    """Begin a fresh VAE with residual blocks that are the identity and latents with little noise."""
+    with torch.no_grad():
+        vae.encoder.conv_out.conv.bias[vae.config.latent_channels :] = INITIAL_LOG_VARIANCE
+        for module in vae.modules():
+            if isinstance(module, CogVideoXResnetBlock3D):
+                module.conv2.conv.weight.zero_()
+                module.conv2.conv.bias.zero_()
+
+
+def load_parts(folder: Path) -> DiffusersParts:
+    """The parts of a diffusers directory with ``transformer/``, ``vae/`` and ``scheduler/``; of a plan, their shapes.
+
+    Raises:
+        CheckpointError: one line when a part is missing, corrupt or does not fit its configuration.
+    """
+    return DiffusersParts(*(_load_part(folder, name) for name in SUBFOLDERS))
+
+
+def on_meta_device() -> bool:
+    """Whether what is made now is a plan: torch's default device is the meta device, so no weights are read."""
+    return torch.empty(0).is_meta
+
+
+def make_part(name: str, config: dict[str, Any]) -> Any:
+    """A fresh part of this configuration; of a plan, its shapes.
+
+    Args:
+        name: a key of ``SUBFOLDERS``.
+        config: what its class takes.
+
+    Raises:
+        CheckpointError: one line for what diffusers cannot make, and for sizes below 1.
+    """
+    values = name == "scheduler"  # its tables are values and no weights, also of a plan
+    _check_sizes(name, config)
+    try:
+        with torch.device("cpu") if values else contextlib.nullcontext():
+            return SUBFOLDERS[name](**config)
+    except (TypeError, ValueError, IndexError, ArithmeticError) as error:
+        raise CheckpointError(f"diffusers cannot make a {name} of these settings ({_cause(error)})") from error
+
+
+def save_parts(parts: DiffusersParts, folder: Path) -> None:
+    """Write diffusers' parts, each loadable by diffusers alone."""
+    parts.transformer.save_pretrained(folder / "transformer")
+    parts.vae.save_pretrained(folder / "vae")
+    parts.scheduler.save_pretrained(folder / "scheduler")
+
+
+def save_world(transformer: nn.Module, prompt: Tensor, folder: Path) -> None:
+    """Write ``world.safetensors``: widening, interactions and the prompt's embedding."""
+    own = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
+    write_tensors(folder / "world.safetensors", own | {"prompt": prompt})
+
+
+def load_world(transformer: nn.Module, folder: Path) -> Tensor:
+    """Take what ``save_world`` wrote, in whatever precision; returns the prompt's embedding in the transformer's."""
+    path = folder / "world.safetensors"
+    tensors, _ = read_tensors(path)
+    prompt = tensors.pop("prompt", None)
+    if prompt is None:
+        raise CheckpointError(f"{path}: no prompt embedding in it")
+    own = {name for name in transformer.state_dict() if not name.startswith("base.")}
+    load_exactly(transformer, tensors, own, path)
+    return prompt.to(next(transformer.parameters()).dtype)
+
+
+@torch.no_grad()
+def merge_lora(transformer: CogVideoXTransformer3DModel, folder: Path, check: bool) -> None:
+    """Add what ``save_lora`` wrote to the weights that it was trained on.
+
+    Args:
+        transformer: with those weights.
+        folder: that was written into.
+        check: whether these are those weights.
+
+    Raises:
+        CheckpointError: when the file is missing or corrupt, or these are other weights.
+    """
+    path = folder / LORA_WEIGHT_NAME_SAFE
+    tensors, metadata = read_tensors(path)
+    scale = _scale(metadata, path)
+    if check and metadata.get("digest") != weights_digest(transformer):
+        raise CheckpointError(f"{path}: was trained on other weights than those that it is to change")
+    weights = dict(transformer.named_parameters())
+    for name in sorted(name for name in tensors if name.endswith(DOWN)):
+        module = name.removeprefix(PREFIX).removesuffix(DOWN)
+        down, up = tensors[name], tensors.get(name.removesuffix(DOWN) + UP)
+        weight = weights.get(f"{module}.weight")
+        if up is None or weight is None or weight.shape != (up.shape[0], down.shape[1]):
+            raise CheckpointError(f"{path}: does not fit this model at {module!r}")
+        weight.add_((scale * up.double() @ down.double()).to(weight))
+
+
+def weights_digest(transformer: CogVideoXTransformer3DModel) -> str:
+    """A hash of names, shapes and some values of each weight: tells models apart without reading all of them."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(transformer.state_dict().items()):  # tables of positions too
+        values = tensor.detach().flatten()
+        some = values[:: max(1, len(values) // SAMPLED)].float().cpu().contiguous()
+        digest.update(f"{name} {tuple(tensor.shape)}".encode() + some.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def pretrained_folder(name: str) -> Path:
+    """The local directory of this name, else that of a repository of the hub in its cache.
+
+    What the cache lacks of transformer, VAE and scheduler is downloaded; a text encoder never is.
+
+    Raises:
+        CheckpointError: one line when there is no such directory, and the repository cannot be had either.
+    """
+    folder = folder_here(name)
+    if folder is not None and (not _of_the_hub(name) or not any(missing_files(folder / part) for part in SUBFOLDERS)):
+        return folder
+    check_name(name)
+    obstacle = hub_obstacle()
+    if obstacle:
+        parts = " ".join(f"'{part}/*'" for part in SUBFOLDERS)
+        raise CheckpointError(
+            f"{name}: no such directory, not whole in the hub's cache, and the hub: {obstacle}; give a local diffusers "
+            f"directory, or fetch it elsewhere: hf download {name} --include {parts}"
+        )
+    return _download(name)
+
+
+def folder_here(name: str) -> Path | None:
+    """The local directory of this name, else what the hub's cache has of a repository; ``None`` when there is neither.
+
+    The network is not asked.
+    """
+    from huggingface_hub import errors, snapshot_download
+
+    folder = Path(name).expanduser()
+    if folder.is_dir():
+        return folder
+    if not REPOSITORY.fullmatch(name):
+        return None
+    try:
+        return Path(snapshot_download(name, local_files_only=True))
+    except errors.LocalEntryNotFoundError:
+        return None
+
+
+def missing_files(part: Path) -> list[str]:
+    """Names of the configuration and of the weights that a part's folder ought to have and has not."""
+    if part.name == "scheduler":
+        wanted = ["scheduler_config.json"]
+    else:
+        index = part / "diffusion_pytorch_model.safetensors.index.json"
+        weights = set(read_json(index)["weight_map"].values()) if index.is_file() else {WEIGHTS}
+        wanted = ["config.json", *sorted(weights)]
+    return [name for name in wanted if not (part / name).is_file()]
+
+
+def published_preset(name: str) -> str | None:
+    """The preset that has the sizes of a published model's repository, ``None`` for any other name."""
+    owner, _, model = name.partition("/")
+    return PUBLISHED.get(model) if owner in ("THUDM", "zai-org") else None
+
+
+def origin_of(pretrained: str | None) -> dict[str, str]:
+    """The setting that finds pretrained weights from wherever one stands; none for none."""
+    if not pretrained:
+        return {}
+    return {"pretrained": str(Path(pretrained).resolve()) if Path(pretrained).is_dir() else pretrained}
+
+
+def check_name(name: str) -> None:
+    """Raise ``CheckpointError`` for what is no local directory and cannot be a repository of the hub either."""
+    if not REPOSITORY.fullmatch(name):
+        raise CheckpointError(f"{name}: no such directory, and not the name of a repository on the hub (owner/model)")
+
+
+def _load_part(folder: Path, name: str) -> Any:
+    if not (folder / name).is_dir():
+        raise CheckpointError(
+            f"{folder}: no {name}/ folder; a diffusers CogVideoX directory has {', '.join(SUBFOLDERS)}"
+        )
+    config = _read_config(folder, name)
+    if on_meta_device():
+        return make_part(name, config)
+    missing = missing_files(folder / name)
+    if missing:
+        raise CheckpointError(f"{folder / name}: no {missing[0]} in it; take a whole copy, its weights as safetensors")
+    options: dict[str, Any] = {"subfolder": name, "local_files_only": True}
+    try:
+        if name == "scheduler":
+            return SUBFOLDERS[name].from_pretrained(folder, **options)
+        with silent("diffusers.models.modeling_utils"):  # what it warns of is refused below
+            part, found = SUBFOLDERS[name].from_pretrained(
+                folder, use_safetensors=True, low_cpu_mem_usage=False, output_loading_info=True, **options
+            )
+    except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
+    computed = () if config.get("use_learned_positional_embeddings") else ("patch_embed.pos_embedding",)
+    _check_all_loaded(folder / name, found, computed)
+    reallocate(part)
+    return part
+
+
+def _read_config(folder: Path, name: str) -> dict[str, Any]:
+    try:
+        config = SUBFOLDERS[name].load_config(folder, subfolder=name, local_files_only=True)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{folder / name}: its configuration cannot be read ({_cause(error)})") from error
+    if not isinstance(config, dict):
+        raise CheckpointError(f"{folder / name}: its configuration is no mapping; take a whole copy")
+    return {key: value for key, value in config.items() if not key.startswith("_")}
+
+
+def _check_all_loaded(folder: Path, found: dict[str, Any], computed: Sequence[str]) -> None:
+    """Raise ``CheckpointError`` where weights and configuration differ, of which diffusers leaves the rest random.
+
+    Args:
+        folder: of both.
+        found: what diffusers says of loading them.
+        computed: tensors that may stand in the weights or not.
+    """
+    for problem, names in (("lack", found["missing_keys"]), ("have besides", found["unexpected_keys"])):
+        names = sorted(set(names) - set(computed))
+        if names:
+            raise CheckpointError(
+                f"{folder}: its weights {problem} {len(names)} tensors of its config.json, first {names[0]!r}; "
+                "take a whole copy of both"
+            )
+
+
+def _check_sizes(name: str, config: dict[str, Any]) -> None:
+    """Raise ``CheckpointError`` for sizes below 1, which torch takes and nobody can compute with."""
+    empty = [key for key, value in config.items() if type(value) is int and value < 1 and key not in MAY_BE_ZERO]
+    if empty and name != "scheduler":
+        given = ", ".join(f"{key} {config[key]}" for key in empty)
+        raise CheckpointError(f"diffusers cannot make a {name} of these settings ({given}: at least 1)")
+
+
+def _of_the_hub(name: str) -> bool:
+    return not Path(name).expanduser().is_dir()
+
+
+def _download(name: str) -> Path:
+    from huggingface_hub import errors, snapshot_download
+
+    wanted = [f"{part}/*.{kind}" for part in SUBFOLDERS for kind in ("json", "safetensors")]
+    try:
+        return Path(snapshot_download(name, allow_patterns=wanted))
+    except (OSError, ValueError, errors.HfHubHTTPError) as error:
+        cause = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise CheckpointError(f"{name}: the hub does not give it ({cause})") from error
+
+
+def _cause(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).strip().splitlines()]
+    first = " ".join(lines[: 2 if lines and lines[0].endswith(":") else 1])
+    return first or type(error).__name__
+
+
+def _scale(metadata: dict[str, str], path: Path) -> float:
+    try:
+        config: dict[str, Any] = json.loads(metadata[LORA_ADAPTER_METADATA_KEY])
+        return float(config[f"{PREFIX}lora_alpha"]) / int(config[f"{PREFIX}r"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise CheckpointError(f"{path}: it does not say its rank and alpha") from error

@@ -1,0 +1,262 @@
+"""Checkpoints on disk: one base, and small memory adapters that load onto it by name.
+
+A checkpoint's folder holds the card ``persist.json``, the backbone's own files and ``adapters/NAME/``. That of a
+stage-2 run holds adapters only, and its card says where the base is. That of a LoRA run holds the change of low rank,
+and its card says what it changes. A run's folder stands for its newest checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from persist_cli.api.inference import SamplingOverrides
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_json
+
+if TYPE_CHECKING:
+    from persist_cli.api.backbone import Sampling
+
+CARD: Final = "persist.json"
+VERSION: Final = 1
+STEP: Final = "step-"  # what the folders of a run's checkpoints begin with
+PLAIN: Final = "stage1"  # what the base without any adapter is called
+SAMPLING_TYPES: Final = {"steps": (int,), "sampler": (str,), "memory_guidance": (int, float)}  # a bool is no int here
+NUMBERED: Final = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint on disk; its weights are not loaded yet.
+
+    Args:
+        folder: the folder of ``persist.json``.
+        name: the name of the run or folder, which tables show.
+        base_folder: the folder of the backbone's own files.
+        backbone: the name of the backbone plugin.
+        settings: the plain settings of the backbone.
+        fingerprint: a hash of the base's weights.
+        adapters: folders of the memory adapters by name.
+        default: the name of the adapter to use when a command names none.
+        sampling: how to sample when a command does not say; ``None`` when the card does not say either.
+        training_scenes: the scenes that base and adapters were trained on; ``None`` for cards of earlier versions.
+    """
+
+    folder: Path
+    name: str
+    base_folder: Path
+    backbone: str
+    settings: dict[str, Any]
+    fingerprint: str
+    adapters: dict[str, Path]
+    default: str | None = None
+    sampling: Sampling | None = None
+    training_scenes: TrainingScenes | None = None
+
+    def adapter_folder(self, adapter: str) -> Path:
+        """The adapter's folder.
+
+        Raises:
+            CheckpointError: when there is no such adapter, naming those that there are.
+        """
+        if adapter not in self.adapters:
+            known = ", ".join(self.adapters) or "none"
+            raise CheckpointError(f"{self.folder}: no memory adapter {adapter!r} in it; it has {known}")
+        return self.adapters[adapter]
+
+    def sampling_with(self, overrides: SamplingOverrides) -> Sampling:
+        """The overrides on top of the checkpoint's default, which else is 50 steps of DDIM without guidance."""
+        from persist_cli.api.backbone import Sampling
+
+        return dataclasses.replace(self.sampling or Sampling(), **overrides.requested())
+
+    def default_adapter(self) -> str | None:
+        """The card's default or only adapter, ``None`` when there is no adapter.
+
+        Raises:
+            CheckpointError: when there are several adapters and no default.
+        """
+        if self.default in self.adapters:
+            return self.default
+        if len(self.adapters) > 1:
+            raise CheckpointError(f"{self.folder}: choose an adapter of {', '.join(self.adapters)} with --adapter")
+        return next(iter(self.adapters), None)
+
+
+def find_checkpoint(path: Path) -> Checkpoint:
+    """The checkpoint in a folder, or the newest of a run.
+
+    Raises:
+        CheckpointError: when there is none, it is damaged, or its base is gone or another.
+    """
+    folder = model_folder(path)
+    card = read_card(folder)
+    base, base_card = _open_base(folder, card) if card.get("base") else (folder, card)
+    return Checkpoint(
+        folder=folder,
+        name=run_folder(folder).name,
+        base_folder=base,
+        backbone=base_card["backbone"],
+        settings=base_card["settings"],
+        fingerprint=str(card.get("fingerprint", "")),
+        adapters={path.name: path for path in sorted((folder / "adapters").glob("*")) if path.is_dir()},
+        default=base_card.get("default_adapter"),
+        sampling=_sampling(card, folder / CARD),
+        training_scenes=_training_scenes(card, folder / CARD),
+    )
+
+
+def lora_base(folder: Path) -> Path | dict[str, Any] | None:
+    """What the LoRA in a base's folder changes, ``None`` for a base that is whole.
+
+    Returns:
+        The folder of another base, or those settings of the backbone that bring pretrained weights.
+
+    Raises:
+        CheckpointError: when that base is gone or another.
+    """
+    changes = read_card(folder).get("changes") if (folder / CARD).is_file() else None
+    if changes is None:
+        return None
+    if "settings" in changes:
+        return dict(changes["settings"])
+    return _open_base(folder, changes)[0]
+
+
+def step_folders(run: Path) -> list[Path]:
+    """Whole checkpoints of a run, the newest last."""
+    return sorted(folder for folder in run.glob(f"{STEP}*") if folder.is_dir())
+
+
+def run_folder(folder: Path) -> Path:
+    """The run whose checkpoint a folder is, else the folder itself."""
+    return folder.parent.parent if folder.parent.name.startswith(STEP) else folder
+
+
+def model_folder(path: Path) -> Path:
+    """The folder itself, or that of the newest checkpoint of a run."""
+    if (path / CARD).is_file():
+        return path
+    steps = step_folders(path)
+    if not steps:
+        raise CheckpointError(f"{path}: no checkpoint there (neither persist.json nor a finetune run's step-* folder)")
+    return steps[-1] / "model"
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """A checkpoint's card, whole and of the version that this ``persist`` reads."""
+    path = folder / CARD
+    card = read_json(path)
+    if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
+        raise CheckpointError(f"{path}: not the card of a persist checkpoint")
+    if card.get("version") != VERSION:
+        raise CheckpointError(f"{path}: checkpoint version {card.get('version')}, this persist reads {VERSION}")
+    if not card.get("fingerprint") or not (card.get("base") or {"backbone", "settings"} <= set(card)):
+        raise CheckpointError(f"{path}: the card is incomplete")
+    return card
+
+
+@dataclass(frozen=True)
+class TrainingScenes:
+    """Names of the scenes that a model was trained on.
+
+    Args:
+        names: as trajectories give them.
+        complete: whether these are known to be all.
+    """
+
+    names: frozenset[str] = frozenset()
+    complete: bool = True
+
+    def __or__(self, other: TrainingScenes) -> TrainingScenes:
+        return TrainingScenes(self.names | other.names, self.complete and other.complete)
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values, with the names as ``name_ranges`` writes them."""
+        return {"complete": self.complete, "names": name_ranges(self.names)}
+
+    @staticmethod
+    def from_json(values: Any) -> TrainingScenes:
+        """The scenes that ``to_json`` wrote.
+
+        Raises:
+            ValueError: when the values are anything else.
+        """
+        match values:
+            case {"complete": bool(complete), "names": list(entries), **rest} if not rest:
+                return TrainingScenes(frozenset(name for entry in entries for name in _expand(entry)), complete)
+        raise ValueError("not a list of scenes")
+
+
+def name_ranges(names: Iterable[str]) -> list[str | list[str]]:
+    """The names in order, consecutive numbers as first and last: a1, a2, a3, b becomes ["a1", "a3"], "b".
+
+    Only numbers of equally many digits make a range: 8, 9, 10 becomes ["8", "9"], "10".
+    """
+    runs: list[list[str]] = []
+    for name in sorted(set(names), key=_split_number):
+        if runs and _split_number(name) == _successor(runs[-1][-1]):
+            runs[-1].append(name)
+        else:
+            runs.append([name])
+    return [run[0] if len(run) == 1 else [run[0], run[-1]] for run in runs]
+
+
+def _open_base(folder: Path, pointer: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
+    """The folder and the card of the base that a checkpoint points to, if it is still the one it was trained on."""
+    base = model_folder((folder / pointer["base"]).resolve())
+    card = read_card(base)
+    if card["fingerprint"] != str(pointer.get("fingerprint", "")):
+        raise CheckpointError(f"{folder}: was trained on another base than the one now at {base}")
+    return base, card
+
+
+def _sampling(card: dict[str, Any], path: Path) -> Sampling | None:
+    """The default sampling of a checkpoint's card, ``None`` when it has none."""
+    from persist_cli.api.backbone import Sampling
+
+    value = card.get("sampling")
+    if value is None or value == {}:
+        return None
+    valid = isinstance(value, dict) and all(type(item) in SAMPLING_TYPES.get(key, ()) for key, item in value.items())
+    if not valid or value.get("steps", 1) < 1 or not 0 <= value.get("memory_guidance", 1) < float("inf"):
+        raise CheckpointError(
+            f"{path}: its sampling is {value}; it holds steps, at least 1, the name of a sampler and memory_guidance, "
+            "at least 0"
+        )
+    return Sampling(**value)
+
+
+def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:
+    if "training_scenes" not in card:
+        return None
+    try:
+        return TrainingScenes.from_json(card["training_scenes"])
+    except ValueError as error:
+        raise CheckpointError(f"{path}: its training scenes cannot be read ({error})") from error
+
+
+def _split_number(name: str) -> tuple[str, int, int]:
+    """The text before the final digits of a name, how many digits there are, and their number; -1 without any."""
+    match = NUMBERED.fullmatch(name)
+    return (match["prefix"], len(match["number"]), int(match["number"])) if match else (name, 0, -1)
+
+
+def _successor(name: str) -> tuple[str, int, int] | None:
+    prefix, digits, number = _split_number(name)
+    return (prefix, digits, number + 1) if digits else None
+
+
+def _expand(entry: Any) -> list[str]:
+    if isinstance(entry, str):
+        return [entry]
+    if not (isinstance(entry, list) and len(entry) == 2 and all(isinstance(end, str) for end in entry)):
+        raise ValueError(f"neither a scene nor a range of scenes: {entry!r}")
+    (prefix, digits, first), last = _split_number(entry[0]), _split_number(entry[1])
+    if not digits or last[:2] != (prefix, digits):
+        raise ValueError(f"no range of scenes: {entry!r}")
+    return [f"{prefix}{number:0{digits}d}" for number in range(first, last[2] + 1)]

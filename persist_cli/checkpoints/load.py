@@ -1,0 +1,89 @@
+"""Models loaded from checkpoints: the base's backbone, its adapters, and what a training begins with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from persist_cli.api.checkpoint import CARD, Checkpoint
+from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.io.bundled import bundled_folder
+from persist_cli.io.files import read_json
+from persist_cli.io.settings import parse_settings
+from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
+
+if TYPE_CHECKING:
+    from persist_cli.api.backbone import Backbone
+
+
+def reference_checkpoint() -> Path:
+    """The folder of the reference model that comes with the package, a checkpoint with an adapter for each memory.
+
+    Raises:
+        CheckpointError: when this installation does not have it.
+    """
+    folder = bundled_folder("reference")
+    if not (folder / CARD).is_file():
+        raise CheckpointError(f"no reference model in {folder}: it comes with the package; give a CHECKPOINT")
+    return folder
+
+
+def load_backbone(
+    checkpoint: Checkpoint, settings: dict[str, Any] | None = None, adapter: str | None = None
+) -> Backbone:
+    """The base's backbone, LoRA merged, with one of the checkpoint's adapters in use or none: plain stage 1.
+
+    Args:
+        checkpoint: that has the base and the adapters.
+        settings: of the backbone that replace those of the base.
+        adapter: the name of the adapter.
+    """
+    backbone = empty_backbone(checkpoint, settings)
+    backbone.load_base(checkpoint.base_folder)
+    if adapter is not None:
+        backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
+    return backbone
+
+
+def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
+    """The base's backbone on the meta device: weights come from the files, where they are needed."""
+    import torch
+
+    from persist_cli.plugins import make_backbone
+
+    with torch.device("meta"):
+        return make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
+
+
+def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:
+    """Load an adapter of the checkpoint onto its backbone and use it; ``None`` is plain stage 1."""
+    if adapter is None:
+        backbone.use_adapter(None)
+    else:
+        backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
+
+
+def adapter_memory(checkpoint: Checkpoint, adapter: str) -> MemoryConfig:
+    """The choice of the memory that an adapter of the checkpoint reads."""
+    path = checkpoint.adapter_folder(adapter) / "memory.json"
+    return parse_settings(MemoryConfig, read_json(path), str(path))
+
+
+def start_backbone(choice: BackboneConfig, base: Checkpoint | None) -> Backbone:
+    """The backbone that a training begins with: fresh, or the base's with the choice's settings on top.
+
+    Raises:
+        RecipeError: when the base is of another backbone.
+    """
+    if base is None:
+        from persist_cli.plugins import make_backbone
+
+        return make_backbone(choice.name, choice.settings)
+    if base.backbone != choice.name:
+        raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {choice.name!r}")
+    return load_backbone(base, choice.settings)
+
+
+def starts_from_random_codec(recipe: Recipe, backbone: Backbone) -> bool:
+    """Whether the video model would be trained on the latents of a codec with random weights."""
+    return recipe.stage == "1" and recipe.base is None and not backbone.origin()
