@@ -19,7 +19,7 @@ from persist_cli.doctor.meta_model import build_meta_model
 from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
 from persist_cli.doctor.tracing import LiveBytes, fake_tensors
 from persist_cli.train.distributed import check_sharded
-from tests.support.walking import MICRO_SETTINGS
+from tests.support.micro_runs import MICRO_SETTINGS
 
 MICRO = [*MICRO_SETTINGS, "base=null"]
 SMALL = ["training.batch=8", "training.precision=bf16"]

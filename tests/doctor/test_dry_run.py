@@ -13,7 +13,7 @@ from persist_cli.checkpoints.load import load_backbone
 from persist_cli.doctor.meta_model import build_meta_model
 from tests.support.export_runs import write_base
 from tests.support.micro_model import micro
-from tests.support.walking import MICRO_SETTINGS
+from tests.support.micro_runs import MICRO_SETTINGS
 
 
 def test_a_meta_model_has_the_parameters_of_the_trained_model(tmp_path):

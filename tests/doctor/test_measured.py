@@ -12,7 +12,7 @@ from persist_cli.doctor.memory_estimate import Estimator, Launch
 from persist_cli.doctor.meta_model import build_meta_model
 from tests.support import resident_memory as resident
 from tests.support.measured_memory import SHORT, Run, measured_peaks, trained_bytes
-from tests.support.walking import train_here, write_walks
+from tests.support.micro_runs import run_persist, write_walks
 
 WITHIN = 0.15
 CHECKPOINTING = "training.gradient_checkpointing=true"
@@ -49,7 +49,7 @@ def estimate(run: Run, cuda: bool = False) -> int:
 
 def trained_stage1(data: str, settings: list[str]) -> Path:
     out = Path(data).parent / "stage1"
-    train_here("finetune", "tiny-stage1", "--data", data, "--out", str(out), *SHORT, *settings)
+    run_persist("finetune", "tiny-stage1", "--data", data, "--out", str(out), *SHORT, *settings)
     return out
 
 

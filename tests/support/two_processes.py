@@ -18,7 +18,7 @@ from typing import Any
 from accelerate.state import AcceleratorState
 
 from persist_cli.cli.app import main
-from tests.support.walking import launched
+from tests.support.micro_runs import two_process_launch
 
 Job = dict[str, Any]
 
@@ -32,7 +32,7 @@ def run_in_two(folder: Path, *jobs: Job) -> list[tuple[int, str]]:
     """Run jobs in two processes with gloo; returns the exit code and the error output of each."""
     (folder / "jobs.json").write_text(json.dumps(jobs))
     process = subprocess.run(
-        **launched("tests.support.two_processes", str(folder / "jobs.json")), capture_output=True, text=True
+        **two_process_launch("tests.support.two_processes", str(folder / "jobs.json")), capture_output=True, text=True
     )
     assert process.returncode == 0, process.stderr
     return [(code, errors) for code, errors in json.loads((folder / "ended.json").read_text())]

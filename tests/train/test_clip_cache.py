@@ -34,7 +34,7 @@ from persist_cli.train.clip_cache import (
     cache_key,
 )
 from tests.support.disk import file_limit
-from tests.support.walking import MICRO, MICRO_SETTINGS, SIZE, ended_alike, losses, stage, train
+from tests.support.micro_runs import MICRO, MICRO_SETTINGS, SIZE, equal_runs, losses, run_persist_process, stage
 
 FEW = "data.clips_per_trajectory=3"
 
@@ -60,7 +60,7 @@ def test_cached_steps_equal_uncached_ones_to_the_bit(persist, walks, stage1, tmp
     assert persist(*stage(number, walks, tmp_path / "without", *changes)).code == 0
     for name in ("cold", "warm"):
         assert persist(*stage(number, walks, tmp_path / name, *changes, "--cache", tmp_path / "cache")).code == 0
-        assert ended_alike(tmp_path / "without", tmp_path / name)
+        assert equal_runs(tmp_path / "without", tmp_path / name)
     assert share_cached(tmp_path / "without") == 0
     assert share_cached(tmp_path / "cold") < share_cached(tmp_path / "warm") == 1
 
@@ -102,10 +102,10 @@ def test_with_a_full_cache_only_the_clip_is_encoded_and_not_its_trajectory(persi
 @pytest.mark.slow
 def test_latents_are_stored_in_the_precision_of_training(walks, stage1, tmp_path):
     changes = [f"base={stage1}", FEW, "training.precision=bf16"]  # a process of its own: accelerate fixes it for one
-    train(*stage("stage1", walks, tmp_path / "without", *changes))
+    run_persist_process(*stage("stage1", walks, tmp_path / "without", *changes))
     for name in ("cold", "warm"):
-        train(*stage("stage1", walks, tmp_path / name, *changes, "--cache", str(tmp_path / "cache")))
-        assert ended_alike(tmp_path / "without", tmp_path / name)
+        run_persist_process(*stage("stage1", walks, tmp_path / name, *changes, "--cache", str(tmp_path / "cache")))
+        assert equal_runs(tmp_path / "without", tmp_path / name)
     latents = [read_tensors(path)[0]["video"] for path in entries(tmp_path / "cache")]
     assert {video.dtype for video in latents} == {torch.bfloat16}
 
@@ -117,7 +117,7 @@ def test_a_resumed_run_with_a_cache_equals_an_uninterrupted_one_without(persist,
     first = stage("stage2-voxel", walks, tmp_path / "halves", *changes, "training.steps=2", *cache)
     assert persist(*first).code == 0
     assert persist(*stage("stage2-voxel", walks, tmp_path / "halves", "--resume", *changes, *cache)).code == 0
-    assert ended_alike(tmp_path / "whole", tmp_path / "halves")
+    assert equal_runs(tmp_path / "whole", tmp_path / "halves")
 
 
 @pytest.fixture
@@ -254,7 +254,7 @@ def test_a_damaged_entry_is_removed_with_one_line_and_made_anew(persist, walks, 
     run = persist(*stage("stage1", walks, tmp_path / "two", *changes))
     assert run.code == 0
     assert run.out.count("removed, made anew") == 2
-    assert ended_alike(tmp_path / "one", tmp_path / "two")
+    assert equal_runs(tmp_path / "one", tmp_path / "two")
     assert {path: path.read_bytes() for path in entries(tmp_path / "cache")} == whole
 
 
@@ -264,7 +264,7 @@ def test_a_full_cache_says_so_once_and_the_run_goes_on(persist, walks, codec, tm
     assert persist(*stage("stage1", walks, tmp_path / "one", *changes)).code == 0
     run = persist(*stage("stage1", walks, tmp_path / "two", *changes, *bound))
     assert (run.code, run.out.count("what is not in it is made anew each time")) == (0, 1)
-    assert ended_alike(tmp_path / "one", tmp_path / "two")
+    assert equal_runs(tmp_path / "one", tmp_path / "two")
     sizes = [path.stat().st_size for path in entries(tmp_path / "cache")]
     assert 0 < sum(sizes) <= 1e4
 

@@ -16,15 +16,15 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
 from persist_cli.train.trainer import Trainer
 from tests.support.disk import file_limit
-from tests.support.walking import (
+from tests.support.micro_runs import (
     MICRO_SETTINGS,
     PERSIST,
-    end_of,
-    ended_alike,
+    equal_runs,
     first_gradients,
     losses,
+    run_persist,
+    run_result,
     stage,
-    train_here,
 )
 
 
@@ -44,7 +44,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, co
     assert persist(*stage(number, walks, tmp_path / "halves", *base, "training.steps=1")).code == 0
     assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base, "training.steps=2")).code == 0
     assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base)).code == 0
-    assert ended_alike(tmp_path / "whole", tmp_path / "halves")
+    assert equal_runs(tmp_path / "whole", tmp_path / "halves")
 
 
 def test_a_run_resumes_that_a_version_without_one_of_the_settings_began(persist, walks, codec, tmp_path):
@@ -57,7 +57,7 @@ def test_a_run_resumes_that_a_version_without_one_of_the_settings_began(persist,
 def test_stage_2_leaves_the_weights_of_stage_1_unchanged_to_the_bit(persist, walks, stage1, tmp_path):
     before = find_checkpoint(stage1).fingerprint
     assert persist(*stage("stage2-voxel", walks, tmp_path / "voxel", f"base={stage1}")).code == 0
-    assert all(name.split("/")[-1].startswith(("adapters.", "torch")) for name in end_of(tmp_path / "voxel")[0])
+    assert all(name.split("/")[-1].startswith(("adapters.", "torch")) for name in run_result(tmp_path / "voxel")[0])
     assert find_checkpoint(tmp_path / "voxel").fingerprint == before
     assert find_checkpoint(stage1).fingerprint == before
 
@@ -69,7 +69,7 @@ def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_pat
     assert persist(*stage("stage1", walks, tmp_path / "one", *base)).code == 0
     assert persist(*stage("stage1", walks, tmp_path / "two", *base, f"training.accumulation={parts}")).code == 0
     assert losses(tmp_path / "one") == pytest.approx(losses(tmp_path / "two"), rel=1e-4)
-    one, two = (end_of(tmp_path / name)[0] for name in ("one", "two"))
+    one, two = (run_result(tmp_path / name)[0] for name in ("one", "two"))
     moments = [name for name in one if "exp_avg/" in name]
     assert all(torch.allclose(one[name], two[name], rtol=1e-3, atol=1e-6) for name in moments)
     differences = [(one[name] - two[name]).flatten() for name in one if name.startswith("parameter/")]
@@ -79,7 +79,7 @@ def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_pat
 def test_gradients_are_clipped_by_the_norm_of_all_of_them(persist, walks, codec, tmp_path):
     changes = [f"base={codec}", "training.steps=1", "training.clip=0.001"]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
-    assert first_gradients(end_of(tmp_path / "run")[0]).norm() == pytest.approx(0.001, rel=1e-3)
+    assert first_gradients(run_result(tmp_path / "run")[0]).norm() == pytest.approx(0.001, rel=1e-3)
 
 
 def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
@@ -93,7 +93,7 @@ def test_the_saved_weights_are_the_moving_average_of_those_after_each_step(persi
     states = []
     for changes in (["training.steps=1"], ["training.steps=2", "--resume"]):
         assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)).code == 0
-        states.append(end_of(tmp_path / "run")[0])
+        states.append(run_result(tmp_path / "run")[0])
     model = next((tmp_path / "run").glob("step-*")) / "model/transformer/diffusion_pytorch_model.safetensors"
     weight = 2 ** (-2 / 3)  # of the new parameters in the second step of diffusers' warm-up
     for name, saved in read_tensors(model)[0].items():
@@ -108,7 +108,7 @@ SIX = ["training.checkpoint_every=1", "training.steps=6"]
 @pytest.fixture(scope="module")
 def uninterrupted(walks, codec, tmp_path_factory):
     run = tmp_path_factory.mktemp("whole") / "run"
-    train_here(*stage("stage1", walks, run, f"base={codec}", *SIX))
+    run_persist(*stage("stage1", walks, run, f"base={codec}", *SIX))
     return run
 
 
@@ -127,7 +127,7 @@ def test_a_run_killed_at_a_random_moment_resumes_and_ends_like_an_uninterrupted_
     child.wait()
     find_checkpoint(run)
     assert persist(*arguments).code == 0
-    assert ended_alike(run, uninterrupted)
+    assert equal_runs(run, uninterrupted)
     assert not list(run.glob(".partial-*"))
 
 
@@ -173,7 +173,7 @@ def test_several_data_sets_train_like_a_single_one_with_all_trajectories(persist
     changes = [f"base={codec}", "training.steps=2"]
     assert persist(*stage("stage1", walks, tmp_path / "one", *changes)).code == 0
     assert persist(*stage("stage1", tmp_path / "0", tmp_path / "two", "--data", tmp_path / "1", *changes)).code == 0
-    assert ended_alike(tmp_path / "one", tmp_path / "two")
+    assert equal_runs(tmp_path / "one", tmp_path / "two")
 
 
 def test_a_run_trains_on_the_bundled_sample_data(persist, walks, codec, tmp_path, monkeypatch):

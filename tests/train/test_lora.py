@@ -22,8 +22,8 @@ from persist_cli.api.stages import Lora
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
 from tests.support.micro_model import micro, predicted, random_clips
+from tests.support.micro_runs import MICRO, MICRO_SETTINGS, equal_runs, run_persist, stage
 from tests.support.twins import load_twin, write_twin
-from tests.support.walking import MICRO, MICRO_SETTINGS, ended_alike, stage, train_here
 
 LORA = ["lora.rank=4", "lora.alpha=8", "training.learning_rate=0.01"]
 
@@ -32,7 +32,7 @@ LORA = ["lora.rank=4", "lora.alpha=8", "training.learning_rate=0.01"]
 def lora(walks, codec, stage1):
     """A LoRA run on the stage-1 run."""
     run = codec.parent / "lora"
-    train_here(*stage("stage1", walks, run, f"base={stage1}", *LORA))
+    run_persist(*stage("stage1", walks, run, f"base={stage1}", *LORA))
     return run
 
 
@@ -114,7 +114,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, st
     halves = stage("stage1", walks, tmp_path / "halves", f"base={stage1}", *LORA)
     assert persist(*halves, "training.steps=2").code == 0
     assert persist(*halves, "--resume").code == 0
-    assert ended_alike(lora, tmp_path / "halves")
+    assert equal_runs(lora, tmp_path / "halves")
 
 
 def test_rollouts_stage_2_and_another_lora_work_on_a_lora_run(persist, walks, lora, tmp_path):
@@ -209,13 +209,13 @@ def test_a_dry_run_counts_what_lora_trains(persist, stage1, lora, number):
 def test_gradient_checkpointing_changes_no_bit(persist, walks, stage1, lora, tmp_path):
     cheap = [f"base={stage1}", *LORA, "training.gradient_checkpointing=true"]
     assert persist(*stage("stage1", walks, tmp_path / "cheap", *cheap)).code == 0
-    assert ended_alike(lora, tmp_path / "cheap")
+    assert equal_runs(lora, tmp_path / "cheap")
 
 
 @pytest.mark.usefixtures("fresh_accelerator")
 def test_lora_trained_on_a_base_in_bf16_is_nearly_the_same(walks, stage1, lora, tmp_path):
     half = ["training.precision=bf16", "training.frozen_precision=bf16"]
-    train_here(*stage("stage1", walks, tmp_path / "half", f"base={stage1}", *LORA, *half))
+    run_persist(*stage("stage1", walks, tmp_path / "half", f"base={stage1}", *LORA, *half))
     changes = [
         read_tensors(model_folder(run) / "pytorch_lora_weights.safetensors")[0] for run in (lora, tmp_path / "half")
     ]

@@ -17,7 +17,7 @@ from persist_cli.io.files import read_tensors, write_json
 from persist_cli.train.optimizer import update_average
 from persist_cli.train.state import TrainingState
 from tests.support.micro_model import micro, random_clips, random_tokens, with_adapter
-from tests.support.walking import end_of, ended_alike, losses, stage, train_here
+from tests.support.micro_runs import equal_runs, losses, run_persist, run_result, stage
 
 BASE = {"stage1": "codec", "stage2-voxel": "stage1"}
 
@@ -39,7 +39,7 @@ def usual(persist, walks, codec, stage1, tmp_path, request):
 def test_gradient_checkpointing_and_an_average_on_the_cpu_change_no_bit(persist, usual, tmp_path):
     run, cheap = usual
     assert persist(*cheap("training.gradient_checkpointing=true", "training.ema_device=cpu")).code == 0
-    assert ended_alike(run, tmp_path / "cheap")
+    assert equal_runs(run, tmp_path / "cheap")
 
 
 @pytest.mark.parametrize("usual", ["stage1"], indirect=True)
@@ -58,9 +58,12 @@ def test_checkpointing_holds_little_of_the_forward_pass_memory_adapters_included
         backbone.trained_parameters(stage_)
         backbone.apply_memory_savings(stage_, MemorySavings(gradient_checkpointing=checkpointing))
         sizes = []
-        with saved_tensors_hooks(
-            lambda tensor, sizes=sizes: sizes.append(tensor.nbytes) or tensor, lambda tensor: tensor
-        ):
+
+        def pack(tensor, sizes=sizes):
+            sizes.append(tensor.nbytes)
+            return tensor
+
+        with saved_tensors_hooks(pack, lambda tensor: tensor):
             backbone(random_clips(tokens=random_tokens(2, 5)), stage_)
         held[checkpointing] = sum(sizes)
     assert held[True] < held[False] / 3
@@ -70,10 +73,10 @@ def test_checkpointing_holds_little_of_the_forward_pass_memory_adapters_included
 @pytest.mark.parametrize("number", BASE)
 def test_frozen_weights_in_bf16_train_nearly_alike_and_are_saved_exactly(walks, codec, tmp_path, number):
     base = [f"base={codec if number == 'stage1' else codec.parent / 'stage1'}", "training.precision=bf16"]
-    train_here(*stage(number, walks, tmp_path / "usual", *base))
-    train_here(*stage(number, walks, tmp_path / "cheap", *base, "training.frozen_precision=bf16"))
+    run_persist(*stage(number, walks, tmp_path / "usual", *base))
+    run_persist(*stage(number, walks, tmp_path / "cheap", *base, "training.frozen_precision=bf16"))
     assert losses(tmp_path / "cheap") == pytest.approx(losses(tmp_path / "usual"), rel=0.05)
-    assert all(weight.dtype != torch.bfloat16 for weight in end_of(tmp_path / "cheap")[0].values())
+    assert all(weight.dtype != torch.bfloat16 for weight in run_result(tmp_path / "cheap")[0].values())
     if number == "stage1":
         exact = saved(codec, "vae").items()
         assert all(torch.equal(weight, saved(tmp_path / "cheap", "vae")[name]) for name, weight in exact)
@@ -130,7 +133,7 @@ def test_a_run_resumes_with_other_memory_savings(persist, usual, tmp_path):
     assert persist(*cheap("training.steps=2")).code == 0
     ended = persist(*cheap("--resume", "training.gradient_checkpointing=true", "training.ema_device=cpu"))
     assert ended.code == 0, ended.err
-    assert ended_alike(run, tmp_path / "cheap")
+    assert equal_runs(run, tmp_path / "cheap")
 
 
 @pytest.mark.slow
@@ -141,7 +144,7 @@ def test_compiled_blocks_train_nearly_alike_and_keep_the_names_of_their_weights(
     ended = persist(*cheap("training.compile=true"))
     assert ended.code == 0, ended.err
     assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=1e-3)
-    assert end_of(run)[0].keys() == end_of(tmp_path / "cheap")[0].keys()
+    assert run_result(run)[0].keys() == run_result(tmp_path / "cheap")[0].keys()
 
 
 def test_each_impossible_memory_saving_ends_in_one_line(persist, walks, codec, tmp_path, monkeypatch):
@@ -168,9 +171,9 @@ def test_an_8_bit_optimizer_trains_nearly_alike_and_resumes_to_the_bit(persist, 
     eight = "training.optimizer=adamw-8bit"
     assert persist(*cheap(eight)).code == 0
     assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=0.02)
-    assert torch.uint8 in {tensor.dtype for tensor in end_of(tmp_path / "cheap")[0].values()}
+    assert torch.uint8 in {tensor.dtype for tensor in run_result(tmp_path / "cheap")[0].values()}
     halves = tmp_path / "halves"
     for steps, more in ((2, []), (4, ["--resume"])):
         arguments = [str(halves) if word == str(tmp_path / "cheap") else str(word) for word in cheap(eight)]
         assert persist(*arguments, f"training.steps={steps}", *more).code == 0
-    assert ended_alike(tmp_path / "cheap", halves)
+    assert equal_runs(tmp_path / "cheap", halves)

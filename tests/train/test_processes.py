@@ -19,17 +19,17 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
 from persist_cli.train.state import read_shards
-from tests.support.two_processes import job, run_in_two
-from tests.support.walking import (
+from tests.support.micro_runs import (
     MICRO_SETTINGS,
-    end_of,
-    ended_alike,
+    equal_runs,
     first_gradients,
-    in_two,
     losses,
+    run_persist,
+    run_result,
     stage,
-    train_here,
+    two_process_launch,
 )
+from tests.support.two_processes import job, run_in_two
 from tests.train.test_clip_cache import FEW, share_cached
 
 FSDP = {"ACCELERATE_USE_FSDP": "true", "FSDP_VERSION": "2"}
@@ -74,8 +74,8 @@ def train_by_one(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callab
         base = f"base={codec if number == 'stage1' else stage1}"
         return stage(number, walks, folder / name, base, BATCH, f"training.clip={CLIP}", *changes)
 
-    train_here(*of("stage1", "one-1"))
-    train_here(*of("stage2-voxel", "one-2"))
+    run_persist(*of("stage1", "one-1"))
+    run_persist(*of("stage2-voxel", "one-2"))
     return of
 
 
@@ -85,8 +85,8 @@ def runs(walks, codec, stage1, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pair")
     of = train_by_one(folder, walks, codec, stage1)
     low_rank = [f"base={stage1}", "lora.rank=2"]
-    train_here(*of("stage1", "one-lora", *low_rank))
-    train_here(*of("stage2-voxel", "one-few", FEW))
+    run_persist(*of("stage1", "one-lora", *low_rank))
+    run_persist(*of("stage2-voxel", "one-few", FEW))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
@@ -101,12 +101,12 @@ def runs(walks, codec, stage1, tmp_path_factory):
     assert [code for code, _ in ended[:-1]] == [0] * len(first), ended
     shutil.copytree(folder / "fsdp-parts", folder / "fsdp-first")
     for kind in KINDS:
-        train_here(*of("stage1", f"{kind}-parts", "--resume", "training.steps=2"))
+        run_persist(*of("stage1", f"{kind}-parts", "--resume", "training.steps=2"))
     later = [job(*of("stage1", f"{kind}-parts", "--resume", "training.steps=3"), **how) for kind, how in KINDS.items()]
     assert [code for code, _ in run_in_two(folder, *later)] == [0, 0]
     for kind in KINDS:
-        train_here(*of("stage1", f"{kind}-parts", "--resume"))
-    train_here(*of("stage2-voxel", "one-warm", *cached))
+        run_persist(*of("stage1", f"{kind}-parts", "--resume"))
+    run_persist(*of("stage2-voxel", "one-warm", *cached))
     (folder / "wrong.txt").write_text(f"{ended[-1][0]} {ended[-1][1]}")
     return folder
 
@@ -123,7 +123,7 @@ def test_two_processes_train_to_the_losses_and_weights_of_one(runs, kind, number
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_resumed_by_other_numbers_of_processes_ends_like_that_of_one(runs, kind):
     assert losses(runs / f"{kind}-parts") == pytest.approx(losses(runs / "one-1"), rel=1e-5)
-    one, parts = (end_of(runs / name)[0] for name in ("one-1", f"{kind}-parts"))
+    one, parts = (run_result(runs / name)[0] for name in ("one-1", f"{kind}-parts"))
     assert torch.equal(one.pop("random/torch"), parts.pop("random/torch"))
     assert largest_difference(one, parts) < NEAR
     assert largest_difference(saved_model(runs / "one-1"), saved_model(runs / f"{kind}-parts")) < NEAR
@@ -135,7 +135,7 @@ def test_a_sharded_checkpoint_has_a_file_for_each_process_and_no_pickle(runs):
     assert max(sizes) < 0.6 * sum(sizes)
     kinds = {path.suffix for path in step.rglob("*") if path.is_file()}
     assert kinds == {".safetensors", ".json", ".yaml"}
-    assert sharded_state(runs / "fsdp-1").keys() == end_of(runs / "one-1")[0].keys()
+    assert sharded_state(runs / "fsdp-1").keys() == run_result(runs / "one-1")[0].keys()
 
 
 def test_sharded_gradients_are_clipped_by_the_norm_of_all_of_them(runs):
@@ -173,7 +173,7 @@ def test_lora_trains_sharded_as_in_one_process(runs):
 def test_processes_share_a_cache_that_one_alone_can_use_too(runs):
     for name in ("cold-few", "warm-few", "one-warm"):
         assert losses(runs / name) == pytest.approx(losses(runs / "one-few"), rel=1e-5)
-    assert ended_alike(runs / "cold-few", runs / "warm-few")
+    assert equal_runs(runs / "cold-few", runs / "warm-few")
     assert [share_cached(runs / name) for name in ("warm-few", "one-warm")] == [1, 1]
     assert share_cached(runs / "cold-few") < 1
 
@@ -209,7 +209,10 @@ class EndlessRun:
 
     def __init__(self, run: Path, arguments: list[str], kind: tuple[str, ...]) -> None:
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
-        self.run, self.launcher = run, subprocess.Popen(**in_two(*arguments, kind=kind), **pipes)
+        self.run, self.launcher = (
+            run,
+            subprocess.Popen(**two_process_launch("persist_cli", *arguments, kind=kind), **pipes),
+        )
         self.processes: list[int] = []
 
     def wait(self) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from persist_cli.api.checkpoint import find_checkpoint
+from tests.support.micro_runs import SIZE, run_result
 from tests.support.twins import write_twin
-from tests.support.walking import SIZE, end_of
 
 TWINS = {"cogvideox-2b": "2b", "cogvideox-5b-i2v": "5b-i2v"}
 
@@ -26,7 +26,7 @@ def test_the_recipes_of_a_published_model_train_one_after_the_other(persist, wal
     def train(name, out, *changes):
         ended = persist("finetune", f"{family}-{name}", "--data", walks, "--out", tmp_path / out, *SMALL, *changes)
         assert ended.code == 0, ended.err
-        assert end_of(tmp_path / out)[1].count("loss") == 2
+        assert run_result(tmp_path / out)[1].count("loss") == 2
         return find_checkpoint(tmp_path / out)
 
     train("stage1", "whole", twin)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from persist_cli.train.log import PARTS, StepTimes
-from tests.support.walking import MICRO_SETTINGS, ended_alike, stage
+from tests.support.micro_runs import MICRO_SETTINGS, equal_runs, stage
 
 BUSY = {
     "codec": {"data", "forward", "backward", "optimizer"},
@@ -40,7 +40,7 @@ def test_profiling_changes_no_bit_and_other_runs_print_no_profile(persist, walks
     plain, profiled = (stage("stage2-voxel", walks, tmp_path / name, f"base={stage1}") for name in ("one", "two"))
     ended = persist(*plain)
     assert persist(*profiled, "--profile").code == 0
-    assert ended_alike(tmp_path / "one", tmp_path / "two")
+    assert equal_runs(tmp_path / "one", tmp_path / "two")
     assert not (tmp_path / "one/profile.json").exists()
     assert "backward" not in ended.out
 

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from tests.support.walking import stage
+from tests.support.micro_runs import stage
 
 
 def test_tensorboard_gets_the_losses_of_the_log(persist, walks, codec, tmp_path):

@@ -7,9 +7,9 @@ import importlib.util
 import pytest
 import torch
 
+from tests.support.micro_runs import losses, run_persist, run_result, stage
 from tests.support.two_processes import job, run_in_two
-from tests.support.walking import end_of, losses, stage, train_here
-from tests.train.test_processes import BF16, NEAR, train_by_one, largest_difference, saved_model
+from tests.train.test_processes import BF16, NEAR, largest_difference, saved_model, train_by_one
 
 KINDS = {f"zero{number}": {"ACCELERATE_USE_DEEPSPEED": "true", "ACCELERATE_DEEPSPEED_ZERO_STAGE": number}
          for number in ("1", "2")}  # fmt: skip
@@ -28,7 +28,7 @@ def runs(walks, codec, stage1, tmp_path_factory):
     first += [job(*of("stage1", "zero2-parts", "training.steps=1"), **KINDS["zero2"])]
     ended = run_in_two(folder, *first)
     assert [code for code, _ in ended] == [0] * len(first), ended
-    train_here(*of("stage1", "zero2-parts", "--resume", "training.steps=2"))
+    run_persist(*of("stage1", "zero2-parts", "--resume", "training.steps=2"))
     ended = run_in_two(folder, job(*of("stage1", "zero2-parts", "--resume"), **KINDS["zero2"]))
     assert ended[0][0] == 0, ended
     return folder
@@ -41,7 +41,7 @@ def test_zero_trains_to_the_losses_weights_and_files_of_one_process(runs, one, t
     one, two = runs / one, runs / two
     assert losses(two) == pytest.approx(losses(one), rel=1e-5)
     assert largest_difference(saved_model(one), saved_model(two)) < NEAR
-    (state_of_one, _), (state_of_two, _) = end_of(one), end_of(two)
+    (state_of_one, _), (state_of_two, _) = run_result(one), run_result(two)
     assert torch.equal(state_of_one.pop("random/torch"), state_of_two.pop("random/torch"))
     assert largest_difference(state_of_one, state_of_two) < NEAR
     files = [{path.relative_to(run) for path in run.rglob("*") if path.is_file()} for run in (one, two)]
