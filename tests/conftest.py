@@ -1,4 +1,4 @@
-"""What every test may use: the command line in this process, walking data, a micro model."""
+"""Fixtures of all tests: the command line in this process, a small data set, and trained micro models."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.support.walking import MICRO_SETTINGS, stage, train_here, write_walks
+from tests.support.micro_runs import MICRO_SETTINGS, run_persist, stage, write_walks
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
-os.environ["PERSIST_REFERENCE"] = os.devnull  # tests bring their own model; those of the packaged one say so
+os.environ["PERSIST_REFERENCE"] = os.devnull  # tests bring their own model, unless they test the packaged one
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # micro models are slower on many threads than on one
 torch.set_num_threads(1)
-if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell's background job, and commands would inherit it
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in a background job of a shell; commands would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -29,28 +29,28 @@ DIFFUSERS_MARKERS = (  # of diffusers' own tests, which test_diffusers_mixins ru
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Know the marks of what a checkout brings."""
+    """Register the markers of diffusers' own tests."""
     for name in DIFFUSERS_MARKERS if os.environ.get("DIFFUSERS_CHECKOUT") else ():
         config.addinivalue_line("markers", f"{name}: of diffusers' own tests")
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip what wants a CUDA device where there is none, before its fixtures train anything."""
-    device = getattr(getattr(item, "module", None), "DEVICE", "cuda")  # test_on_gpu may be told another
+    """Skip tests of a CUDA device where there is none, before their fixtures train anything."""
+    device = getattr(getattr(item, "module", None), "DEVICE", "cuda")  # test_on_gpu can run on another one
     if item.get_closest_marker("gpu") and device == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device here")
 
 
 @dataclass(frozen=True)
-class Ended:
-    """How a command ended."""
+class CommandResult:
+    """Exit code, standard output and standard error of a command."""
 
     code: int
     out: str
     err: str
 
 
-Persist = Callable[..., Ended]
+Persist = Callable[..., CommandResult]
 
 
 @pytest.fixture
@@ -58,19 +58,19 @@ def persist(capsys: pytest.CaptureFixture[str]) -> Persist:
     """The command line, run in this process."""
     from persist_cli.cli.app import main
 
-    def run(*arguments: object) -> Ended:
+    def run(*arguments: object) -> CommandResult:
         capsys.readouterr()
         with pytest.raises(SystemExit) as ended:
-            main([str(each) for each in arguments])
+            main([str(argument) for argument in arguments])
         printed = capsys.readouterr()
-        return Ended(int(ended.value.code or 0), printed.out, printed.err)
+        return CommandResult(int(ended.value.code or 0), printed.out, printed.err)
 
     return run
 
 
 @pytest.fixture
 def fresh_accelerator() -> Iterator[None]:
-    """Accelerate fixes the precision of a process by its first accelerator; here it may be another."""
+    """Let a test choose a precision, which accelerate else fixes for a process by its first accelerator."""
     from accelerate.state import AcceleratorState
 
     AcceleratorState._reset_state(reset_partial_state=True)
@@ -88,19 +88,19 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def codec(walks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A codec run of four steps of the micro model."""
     run = tmp_path_factory.mktemp("runs") / "codec"
-    train_here(*stage("codec", walks, run, *MICRO_SETTINGS))
+    run_persist(*stage("codec", walks, run, *MICRO_SETTINGS))
     return run
 
 
 @pytest.fixture(scope="session")
 def stage1(walks: Path, codec: Path) -> Path:
-    """A stage-1 run of four steps on it."""
-    train_here(*stage("stage1", walks, codec.parent / "stage1", f"base={codec}"))
+    """A stage-1 run of four steps on that codec."""
+    run_persist(*stage("stage1", walks, codec.parent / "stage1", f"base={codec}"))
     return codec.parent / "stage1"
 
 
 @pytest.fixture(scope="session")
 def voxel(walks: Path, stage1: Path) -> Path:
-    """A stage-2 run with a voxel memory on that."""
-    train_here(*stage("stage2-voxel", walks, stage1.parent / "voxel", f"base={stage1}"))
+    """A stage-2 run of four steps with a voxel memory on that stage-1 run."""
+    run_persist(*stage("stage2-voxel", walks, stage1.parent / "voxel", f"base={stage1}"))
     return stage1.parent / "voxel"

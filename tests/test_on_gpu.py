@@ -18,8 +18,8 @@ from persist_cli.plugins import make_encoder
 from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
+from tests.support.micro_runs import MICRO_SETTINGS, SIZE, losses, run_persist, stage
 from tests.support.room_views import empty_memory, room_walk, same_bits
-from tests.support.walking import MICRO_SETTINGS, SIZE, losses, stage, train_here
 
 DEVICE = os.environ.get("PERSIST_TEST_DEVICE", "cuda")
 pytestmark = pytest.mark.gpu
@@ -154,11 +154,11 @@ def test_branches_see_what_rollouts_alone_see(world):
 @pytest.mark.parametrize("precision", ["no", "bf16"])
 def test_all_stages_train_and_roll_out_by_the_command_line(precision, fresh_accelerator, walks, tmp_path, capsys):
     changes = ["training.steps=2", f"training.precision={precision}"]
-    train_here(*stage("codec", walks, tmp_path / "codec", *MICRO_SETTINGS, *changes))
-    train_here(*stage("stage1", walks, tmp_path / "stage1", f"base={tmp_path / 'codec'}", *changes))
+    run_persist(*stage("codec", walks, tmp_path / "codec", *MICRO_SETTINGS, *changes))
+    run_persist(*stage("stage1", walks, tmp_path / "stage1", f"base={tmp_path / 'codec'}", *changes))
     for name in MAPS:
         run = tmp_path / name
-        train_here(*stage(f"stage2-{name}", walks, run, f"base={tmp_path / 'stage1'}", *changes))
+        run_persist(*stage(f"stage2-{name}", walks, run, f"base={tmp_path / 'stage1'}", *changes))
         assert len(losses(run)) == 2
         assert all(0 < loss < 10 for loss in losses(run))
         capsys.readouterr()

@@ -1,4 +1,4 @@
-"""Plugins from other packages: installed ones are used by name, broken ones harm nothing."""
+"""Plugins from other packages: installed ones are used by name, and broken ones stop no others."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from persist_cli.errors import PluginError
 from persist_cli.plugins import list_plugins, load_plugin
-from tests.support.walking import stage
+from tests.support.micro_runs import stage
 
 LAST_FRAME = """
     import torch
@@ -29,7 +29,7 @@ LAST_FRAME = """
 
 
 def install(folder: Path, package: str, group: str, target: str, code: str = "") -> None:
-    """A distribution as pip leaves it: a module and its metadata."""
+    """Install a distribution as pip does: a module and its metadata."""
     module = target.partition("=")[2].partition(":")[0].strip()
     if code:
         (folder / f"{module}.py").write_text(textwrap.dedent(code))
@@ -48,7 +48,7 @@ def site(tmp_path, monkeypatch):
     return folder
 
 
-def test_a_third_partys_memory_of_ten_lines_works_in_every_command_by_name(persist, site, walks, stage1, tmp_path):
+def test_a_memory_of_another_package_works_in_every_command_by_name(persist, site, walks, stage1, tmp_path):
     install(site, "persist-last", "persist.memories", "last = last_frame:LastFrame", LAST_FRAME)
     recipe = ("memory.name=last", f"base={stage1}")
     assert "persist-last" in persist("plugins").out
@@ -62,7 +62,7 @@ def test_a_third_partys_memory_of_ten_lines_works_in_every_command_by_name(persi
     assert (evaluated.code, "last" in evaluated.out) == (0, True)
 
 
-def test_a_broken_plugin_shows_its_cause_and_harms_nothing(persist, site):
+def test_a_broken_plugin_shows_its_cause_and_stops_no_others(persist, site):
     install(site, "persist-broken", "persist.memories", "broken = broken_memory:Broken", "raise OSError('no such lib')")
     install(site, "persist-wrong", "persist.encoders", "wrong = wrong_kind:Wrong", "Wrong = dict")
     rows = {row["name"]: row for row in json.loads(persist("plugins", "--json").out)}
@@ -80,13 +80,13 @@ def test_a_name_that_two_packages_claim_is_an_error_that_names_both(persist, sit
     assert "claimed by 2 packages" in persist("plugins").out
 
 
-def test_an_unknown_plugin_is_an_error_that_says_what_was_meant():
+def test_an_unknown_plugin_is_an_error_with_the_nearest_name():
     with pytest.raises(PluginError, match="unknown memory 'voxle'; did you mean 'voxel'"):
         load_plugin("memory", "voxle")
     with pytest.raises(PluginError, match="unknown importer 'zip'; installed: 7scenes"):
         load_plugin("importer", "zip")
 
 
-def test_listing_imports_nothing(site):
+def test_listing_imports_no_plugin(site):
     install(site, "persist-broken", "persist.simulators", "broken = not_there:Broken")
     assert "broken" in {plugin.name for plugin in list_plugins("simulator")}

@@ -1,18 +1,26 @@
-"""tests.test_recipe."""
+"""Recipes: they extend each other, take overrides, and name everything that is wrong with them."""
 
 from __future__ import annotations
+
+from importlib import resources
 
 import pytest
 
 from persist_cli.errors import RecipeError
-from persist_cli.recipe import TrainingSettings, apply_overrides, make_recipe, read_recipe, recipe_names, to_yaml
+from persist_cli.recipe import (
+    TrainingSettings,
+    apply_overrides,
+    changeable_on_resume,
+    make_recipe,
+    read_recipe,
+    recipe_names,
+    to_yaml,
+)
 from persist_cli.train.trainer import learning_rate
 
 
 @pytest.mark.parametrize("name", recipe_names())
-def test_every_recipe_reads_and_says_how_to_run_it(name):
-    from importlib import resources
-
+def test_every_recipe_can_be_read_and_begins_with_the_command_that_runs_it(name):
     assert make_recipe(read_recipe(name), name).description
     text = (resources.files("persist_recipes") / f"{name}.yaml").read_text()
     assert text.startswith(f"# persist finetune {name} ")
@@ -33,12 +41,18 @@ def test_overrides_reach_nested_settings():
     assert recipe.backbone.settings["rays"] == "printed"
 
 
+def test_a_run_resumes_with_another_length_or_cost_of_its_steps_and_not_with_another_result():
+    training = ["steps", "cooldown", "accumulation", "checkpoint_every", "checkpoint_minutes", "workers", "threads"]
+    costs = ["tracker", "gradient_checkpointing", "compile", "ema_device", "vae_slicing"]
+    assert changeable_on_resume() == {f"training.{name}" for name in training + costs}
+
+
 def test_the_word_no_is_a_precision_though_yaml_reads_it_as_false():
     values = apply_overrides(read_recipe("tiny-codec"), ["training.precision=no"])
     assert make_recipe(values, "recipe").training.precision == "no"
 
 
-def test_one_data_folder_may_stand_alone():
+def test_the_data_path_is_one_folder_or_a_list():
     for text, folders in (("a", ("a",)), ("[a, b/c]", ("a", "b/c")), ("''", ()), ("[]", ())):
         values = apply_overrides(read_recipe("tiny-stage1"), [f"data.path={text}"])
         assert make_recipe(values, "x").data.path == folders
@@ -53,7 +67,7 @@ def test_one_data_folder_may_stand_alone():
      (["training.steps=200", "training.cooldown=201"], "set both, as in training.steps=200 training.cooldown=66"),
      (["a=[1"], "cannot read the value")],
 )  # fmt: skip
-def test_what_is_wrong_with_a_recipe_is_one_line(overrides, cause):
+def test_an_error_in_a_recipe_is_one_line(overrides, cause):
     with pytest.raises(RecipeError, match=cause) as error:
         make_recipe(apply_overrides(read_recipe("tiny-stage1"), overrides), "tiny-stage1")
     assert "\n" not in str(error.value)
@@ -65,7 +79,7 @@ def test_what_is_wrong_with_a_recipe_is_one_line(overrides, cause):
      "warmup=-1", "cooldown=-1", "weight_decay=-1", "clip=0", "ema=1", "ema=.nan", "seed=-1", "seed=4294967296",
      "checkpoint_every=0", "checkpoint_minutes=-1", "checkpoint_minutes=.nan", "workers=-1", "threads=-1"],
 )  # fmt: skip
-def test_a_setting_out_of_its_bounds_is_named(override):
+def test_a_setting_out_of_its_range_is_named(override):
     with pytest.raises(RecipeError, match=f"training.{override.split('=')[0]}: Input should be"):
         make_recipe(apply_overrides(read_recipe("tiny-stage1"), [f"training.{override}"]), "x")
     for override in ("data.context_frames=-1", "data.clips_per_trajectory=-1"):
@@ -76,51 +90,51 @@ def test_a_setting_out_of_its_bounds_is_named(override):
 def test_a_recipe_says_only_what_differs_from_the_one_it_extends(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: b.yaml\ntraining: {steps: 7}\nadapter: {form: cross}\n")
     (tmp_path / "b.yaml").write_text("extends: tiny-stage2-voxel\nmemory: {name: none}\n")
-    found, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
-    assert found["training"] == extended["training"] | {"steps": 7}
-    assert found["memory"] == {"name": "none"}
-    assert found["adapter"] == {"form": "cross"}
-    assert {key: found[key] for key in ("stage", "base", "data")} == {
+    recipe, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
+    assert recipe["training"] == extended["training"] | {"steps": 7}
+    assert recipe["memory"] == {"name": "none"}
+    assert recipe["adapter"] == {"form": "cross"}
+    assert {key: recipe[key] for key in ("stage", "base", "data")} == {
         key: extended[key] for key in ("stage", "base", "data")
     }
-    assert "extends" not in to_yaml(make_recipe(found, "a.yaml"))
+    assert "extends" not in to_yaml(make_recipe(recipe, "a.yaml"))
 
 
-def test_a_recipe_changes_the_memory_and_adapter_it_extends_unless_it_names_another(tmp_path):
+def test_a_recipe_changes_single_settings_of_the_memory_and_adapter_that_it_extends(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: tiny-stage2-voxel\nadapter: {every: 2}\nmemory: {encoder: dinov2}\n")
-    found, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
-    assert found["adapter"] == extended["adapter"] | {"every": 2}
-    assert found["memory"] == extended["memory"] | {"encoder": "dinov2"}
+    recipe, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
+    assert recipe["adapter"] == extended["adapter"] | {"every": 2}
+    assert recipe["memory"] == extended["memory"] | {"encoder": "dinov2"}
 
 
-def test_a_recipe_changes_one_setting_of_the_backbone_and_keeps_the_others(tmp_path):
+def test_a_recipe_changes_one_setting_of_the_backbone_and_inherits_the_others(tmp_path):
     (tmp_path / "a.yaml").write_text(
         "extends: cogvideox-5b-i2v-stage1\nbackbone: {settings: {pretrained: DIR, transformer: {num_layers: 2}}}\n"
     )
     (tmp_path / "b.yaml").write_text("extends: a.yaml\nbackbone: {settings: {transformer: {dropout: 0.1}}}\n")
     names = (str(tmp_path / "b.yaml"), "cogvideox-5b-i2v-stage1")
-    found, extended = (make_recipe(read_recipe(name), name) for name in names)
+    recipe, extended = (make_recipe(read_recipe(name), name) for name in names)
     changed = {"pretrained": "DIR", "transformer": {"num_layers": 2, "dropout": 0.1}}
-    assert found.backbone.settings == extended.backbone.settings | changed
+    assert recipe.backbone.settings == extended.backbone.settings | changed
 
 
-def test_an_encoder_that_is_named_begins_without_the_settings_of_the_one_before(tmp_path):
+def test_another_encoder_does_not_inherit_encoder_settings(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: cogvideox-5b-i2v-stage2-voxel\nmemory: {encoder: patches}\n")
-    found, extended = read_recipe(str(tmp_path / "a.yaml"))["memory"], read_recipe("cogvideox-5b-i2v-stage2-voxel")
+    memory, extended = read_recipe(str(tmp_path / "a.yaml"))["memory"], read_recipe("cogvideox-5b-i2v-stage2-voxel")
     assert "encoder_settings" in extended["memory"]
-    assert found == {"name": "voxel", "encoder": "patches"}
+    assert memory == {"name": "voxel", "encoder": "patches"}
 
 
 @pytest.mark.parametrize("change", ["memory.encoder=patches", "memory={encoder: patches}"])
-def test_another_encoder_on_the_command_line_begins_without_settings_too(change):
+def test_another_encoder_on_the_command_line_does_not_inherit_encoder_settings(change):
     recipe = read_recipe("cogvideox-5b-i2v-stage2-voxel")
-    found = make_recipe(apply_overrides(recipe, ["memory.encoder_settings.patch=2", change]), "x").memory
+    changed = make_recipe(apply_overrides(recipe, ["memory.encoder_settings.patch=2", change]), "x").memory
     same = make_recipe(apply_overrides(recipe, ["memory.encoder=dinov2", "memory.settings.cell=[1, 1, 1]"]), "x").memory
-    assert found.encoder_settings == ({"patch": 2} if "." in change else {})
+    assert changed.encoder_settings == ({"patch": 2} if "." in change else {})
     assert same.encoder_settings == recipe["memory"]["encoder_settings"]
 
 
-def test_a_recipe_cannot_extend_itself_nor_what_there_is_not(tmp_path):
+def test_a_recipe_cannot_extend_itself_or_an_unknown_recipe(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: b.yaml")
     (tmp_path / "b.yaml").write_text("extends: a.yaml")
     (tmp_path / "c.yaml").write_text("extends: tiny-stage3")
@@ -138,7 +152,7 @@ def test_the_learning_rate_falls_to_zero_over_the_cooldown():
     assert rates[80:] == pytest.approx([2 * left / 21 for left in range(20, 0, -1)])
 
 
-def test_unknown_missing_and_broken_recipes_are_one_line(tmp_path):
+def test_an_unknown_missing_or_broken_recipe_is_one_line(tmp_path):
     (tmp_path / "a.yaml").write_text("stage: [")
     (tmp_path / "b.yaml").write_text("- 1")
     for name, cause in (

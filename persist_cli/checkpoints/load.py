@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from persist_cli.api.checkpoint import CARD, Checkpoint
 from persist_cli.errors import CheckpointError, RecipeError
-from persist_cli.io.bundled import bundled_folder
-from persist_cli.io.files import read_json
+from persist_cli.io.files import bundled_folder, read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from persist_cli.api.observations import Trajectory
 from persist_cli.data.store import SUFFIX, Store, TrajectoryFile
 from persist_cli.errors import DataError
-from persist_cli.io.bundled import bundled_folder
+from persist_cli.io.files import bundled_folder
 
 FRAMES = re.compile(r"^(?P<first>\d+)(?:-(?P<end>\d+))?$")
 SAMPLE = "sample"  # names the data set that comes with the package

@@ -11,6 +11,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 ASIDE: Final = ".partial-"  # the beginning of the names of files and folders that are being written
+ENVIRONMENT: Final = "PERSIST_REFERENCE"  # a folder that holds the bundled model and data instead of the package
 
 
 def check_folder(path: Path) -> None:
@@ -205,3 +207,8 @@ def _os_error(path: Path, message: str) -> OSError:
 
 def _path_aside(path: Path) -> Path:
     return path.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{path.name}"
+
+
+def bundled_folder(name: str) -> Path:
+    """The folder of this name beside the recipes, or where the environment variable says; it need not exist."""
+    return Path(os.environ.get(ENVIRONMENT) or str(resources.files("persist_recipes"))) / name

@@ -17,7 +17,7 @@ from tests.support.micro_model import (
     shaken,
     with_adapter,
 )
-from tests.support.walking import SIZE
+from tests.support.micro_runs import SIZE
 
 BEHIND = MemoryTokens(
     torch.full((2, 1, CHANNELS), 0.7),

@@ -9,7 +9,7 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX
 
-from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.codec import batch_to_frames, fold_pixels, frames_to_batch, to_uint8, unfold_pixels
 from persist_cli.api.backbone import Sampling
 from persist_cli.doctor.tracing import fake_tensors

@@ -28,7 +28,7 @@ import pytest
 from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.api.tokens import MemoryTokens
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
-from tests.support.walking import MICRO
+from tests.support.micro_runs import MICRO
 
 CHECKOUT = os.environ.get("DIFFUSERS_CHECKOUT")
 NAME = "diffusers_tests"  # their package is called as ours is

@@ -17,7 +17,7 @@ from diffusers import (
 from PIL import Image
 
 import persist_backbones
-from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.extensions.offload import enable_tiling
 from persist_backbones.pipeline.pipeline import WorldPipeline, WorldPipelineOutput
 from persist_cli.api.backbone import Sampling

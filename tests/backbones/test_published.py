@@ -8,7 +8,7 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 
-from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.stages import STAGES
 from persist_cli.plugins import make_backbone
 from tests.support.published_configs import SCHEDULERS, TRANSFORMERS, VAES

@@ -7,7 +7,7 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXT
 from persist_backbones.cogvideox.parts import load_parts
 from persist_cli.errors import CheckpointError
 from persist_cli.plugins import make_backbone
-from tests.support.walking import MICRO, SIZE
+from tests.support.micro_runs import MICRO, SIZE
 
 
 @pytest.fixture

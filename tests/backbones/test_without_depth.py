@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.backbone import Sampling
 from tests.support.micro_model import micro, random_clips, shaken
 

@@ -1,7 +1,7 @@
-"""Which of diffusers' caches pay, with memory blocks and without: ``python tests/benchmarks/bench_caches.py``.
+"""What diffusers' caches save and cost, with memory blocks and without: ``python tests/benchmarks/bench_caches.py``.
 
 Prints a table for each number of DDIM steps, asserts nothing: seconds a clip, PSNR to the clip that is computed without
-a cache, and PSNR to what is really there. The model is the reference model, or the checkpoint given, on the sample
+a cache, and PSNR to the recorded frames. The model is the reference model, or that of ``--checkpoint``, on the sample
 houses; MagCache is calibrated on the same clips.
 """
 
@@ -30,27 +30,23 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.api.backbone import Backbone, Clips, Sampling
+from persist_cli.api.backbone import Backbone, Clip, Clips, Sampling
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import InferenceOptions
-from persist_cli.checkpoints.checkpoint import (
-    find_checkpoint,
-    load_adapter,
-    load_backbone,
-    reference_checkpoint,
-)
+from persist_cli.api.observations import Observations
+from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone, reference_checkpoint
 from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.rollout.world_model import ClipRequest, batch_of
 from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 
 UNCACHED = "none"
-PLACES = (48,)  # where clips begin; memory holds what was seen before
+STARTS = (48,)  # frames at which clips begin; the memory holds the frames before
 
 
 def configs(ratios: list[float]) -> dict[str, Any]:
-    """Each cache as its papers and diffusers' own examples set it, and first-block with two thresholds."""
+    """Every cache by name, with the settings of its paper and diffusers' examples; first-block has two thresholds."""
     steps, exact = len(ratios), {"taylor_factors_dtype": torch.float32}
     return {
         "first-block 0.05": FirstBlockCacheConfig(threshold=0.05),
@@ -63,68 +59,68 @@ def configs(ratios: list[float]) -> dict[str, Any]:
     }
 
 
-def make_clips(backbone: Backbone, maker: MemoryFactory | None) -> tuple[Clips, Tensor]:
-    """A batch that goes on from each place of each sample house, and the true colours of its frames."""
-    requests, truth, frames = [], [], backbone.frames_per_clip
+def make_clips(backbone: Backbone, factory: MemoryFactory | None) -> tuple[Clips, Tensor]:
+    """A batch of clips to predict, one from each start in each sample house, and the recorded colours of its frames."""
+    clips, truth, frames = [], [], backbone.frames_per_clip
     for number, file in enumerate(Store(sample_data())):
-        for place in PLACES:
-            seen = file.read(range(place)).observations
-            clip = file.read(range(place, place + frames)).observations
+        for start in STARTS:
+            past = file.read(range(start)).observations
+            recorded = file.read(range(start, start + frames)).observations
             tokens = None
-            if maker is not None:
-                memory = maker.empty(file.info)
-                memory.write(seen)
-                tokens = memory.read(clip.cameras, backbone.token_budget)
-            seed = len(PLACES) * number + place
-            requests.append(ClipRequest(clip[:1], clip.cameras, (None,) * (frames - 1), tokens, seed))
-            truth.append(clip.rgb)
-    return batch_of(requests), torch.stack(truth)
+            if factory is not None:
+                memory = factory.empty(file.info)
+                memory.write(past)
+                tokens = memory.read(recorded.cameras, backbone.token_budget)
+            first = Observations(recorded.rgb[:1], recorded.depth[:1], recorded.cameras)
+            clips.append(Clip(first, (None,) * (frames - 1), len(STARTS) * number + start, tokens))
+            truth.append(recorded.rgb)
+    return Clips.stack(clips), torch.stack(truth)
 
 
 def calibrate(backbone: Any, draw: Callable[[], Any], steps: int) -> list[float]:
-    """What MagCache says of these clips; it prints it."""
+    """MagCache's magnitude ratios of these clips, read from what it prints."""
     backbone.transformer.enable_cache(MagCacheConfig(num_inference_steps=steps, calibrate=True))
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         draw()
     backbone.transformer.disable_cache()
-    found = next(line for line in said.getvalue().splitlines() if line.startswith("[") and "," in line)
-    return [float(each) for each in ast.literal_eval(found)]
+    ratios = next(line for line in output.getvalue().splitlines() if line.startswith("[") and "," in line)
+    return [float(ratio) for ratio in ast.literal_eval(ratios)]
 
 
 def with_cache(backbone: Any, config: Any, draw: Callable[[], Any]) -> Any:
-    """The clips drawn with a cache."""
-    if config is not None:
-        backbone.transformer.enable_cache(config)
-    drawn = draw()
-    if config is not None:
-        backbone.transformer.disable_cache()
-    return drawn
+    """The clips drawn with a cache; ``None`` is no cache."""
+    if config is None:
+        return draw()
+    backbone.transformer.enable_cache(config)
+    clips = draw()
+    backbone.transformer.disable_cache()
+    return clips
 
 
 def psnr(one: Tensor, two: Tensor) -> float:
-    """Of the frames after the given one, over all clips."""
+    """PSNR in dB of the predicted frames (all but the first), over all clips."""
     error = (one[:, 1:].double() - two[:, 1:].double()).square().mean()
     return float(10 * torch.log10(255**2 / error))
 
 
-def rows(
-    backbone: Any, maker: MemoryFactory | None, name: str, sampling: Sampling, rounds: int
+def table_rows(
+    backbone: Any, factory: MemoryFactory | None, memory: str, sampling: Sampling, rounds: int
 ) -> list[tuple[str, ...]]:
-    """One for each cache."""
-    clips, truth = make_clips(backbone, maker)
+    """A row for every cache, with this memory."""
+    clips, truth = make_clips(backbone, factory)
     draw = partial(backbone.generate, clips, sampling)
     caches = {UNCACHED: None} | configs(calibrate(backbone, draw, sampling.steps))
-    drawn: dict[str, Tensor] = {}
+    videos: dict[str, Tensor] = {}
 
-    def work(each: str) -> None:
-        drawn[each] = with_cache(backbone, caches[each], draw)[0].cpu()
+    def draw_with(cache: str) -> None:
+        videos[cache] = with_cache(backbone, caches[cache], draw)[0].cpu()
 
-    times = alternate({each: partial(work, each) for each in caches}, rounds)
+    times = alternate({cache: partial(draw_with, cache) for cache in caches}, rounds)
     return [
-        (f"{name}, {each}", f"{times.median(each) / len(truth):.3f}", f"{times.ratio(UNCACHED, each):.2f}×",
-         "" if each == UNCACHED else f"{psnr(video, drawn[UNCACHED]):.1f}", f"{psnr(video, truth):.2f}")
-        for each, video in drawn.items()
+        (f"{memory}, {cache}", f"{times.median(cache) / len(truth):.3f}", f"{times.ratio(UNCACHED, cache):.2f}×",
+         "" if cache == UNCACHED else f"{psnr(video, videos[UNCACHED]):.1f}", f"{psnr(video, truth):.2f}")
+        for cache, video in videos.items()
     ]  # fmt: skip
 
 
@@ -140,11 +136,11 @@ if __name__ == "__main__":
     backbone = load_backbone(checkpoint)
     say_conditions(f"{checkpoint.name}, DDIM, guidance over memory {options.guidance:g}")
     for steps in map(int, options.steps.split(",")):
-        table = []
+        rows = []
         for adapter in (None, checkpoint.default_adapter()):
             load_adapter(backbone, checkpoint, adapter)
             backbone.prepare_inference(InferenceOptions())
-            maker = MemoryFactory.of(checkpoint.memory_config(adapter)) if adapter else None
+            factory = MemoryFactory.of(adapter_memory(checkpoint, adapter)) if adapter else None
             sampling = Sampling(steps, "ddim", options.guidance)
-            table += rows(backbone, maker, adapter or "no memory", sampling, options.rounds)
-        print_table(f"{steps} steps", ["memory, cache", "s a clip", "faster", "PSNR to none", "PSNR to truth"], table)
+            rows += table_rows(backbone, factory, adapter or "no memory", sampling, options.rounds)
+        print_table(f"{steps} steps", ["memory, cache", "s a clip", "faster", "PSNR to none", "PSNR to truth"], rows)

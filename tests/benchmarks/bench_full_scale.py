@@ -1,14 +1,14 @@
-"""CogVideoX at size, on whatever device is there, in one table: ``python tests/benchmarks/bench_at_size.py``.
+"""CogVideoX at full scale, on a GPU or a CPU, in one table: ``python tests/benchmarks/bench_full_scale.py``.
 
-On a GPU the published sizes at 9×512×512 in bfloat16, on a CPU small twins in float32, both with random weights: steps
-of both training stages (samples/s, peak memory, model FLOP utilisation), the latency of a clip with and without memory,
-the codec, the map. Beside them the same step and pipeline written plainly on diffusers, which take turns with ours.
-Steps are of latents that are known; weights, gradients and moments have the same precision, with ``--precision mixed``
-float32 as in the recipes, under autocast; nothing is averaged. FLOPs are counted by the formula of
-``at_size/flops.py``. Targets are those for one H200; asserts nothing.
+On a GPU it measures the published sizes at 9×512×512 in bfloat16, on a CPU small twins in float32, both with random
+weights: steps of both training stages (samples/s, peak memory, model FLOP utilisation), the latency of a clip with and
+without memory, the codec, and the map. The same step and pipeline written plainly on diffusers take turns with them.
+Steps begin at latents, without the codec. Weights, gradients and moments have one precision; with
+``--precision mixed`` they are float32 under autocast, as in the recipes. No average of weights is kept. FLOPs follow
+the formulas of ``full_scale/flops.py``. Targets are those for one H200. It asserts nothing.
 
-    python tests/benchmarks/bench_at_size.py --models 5b --only steps,clips --json at-size.json
-    python tests/benchmarks/bench_at_size.py --set training.compile=true
+    python tests/benchmarks/bench_full_scale.py --models 5b --only steps,clips --json full-scale.json
+    python tests/benchmarks/bench_full_scale.py --set training.compile=true
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from typing import Any
 import diffusers
 import torch
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
+
 from persist_cli.io.files import write_json
 from persist_cli.viewing.console import say
 from tests.benchmarks.full_scale.measuring import device_name, peak_flops, release
@@ -32,8 +34,6 @@ from tests.benchmarks.full_scale.rows import Row, print_rows
 from tests.benchmarks.full_scale.sampling import clip_rows, codec_rows, map_rows
 from tests.benchmarks.full_scale.shapes import MODELS, Bench
 from tests.benchmarks.full_scale.training import step_rows
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 PARTS: dict[str, Callable[[Bench, Path], Iterable[Row]]] = {
     "steps": lambda bench, _: step_rows(bench),
@@ -46,7 +46,7 @@ PUBLISHED, TWINS = ("2b", "5b"), ("tiny", "small")
 
 
 def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line; what depends on the device is filled in."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--models", help=f"of {', '.join(MODELS)}; {','.join(PUBLISHED)} on a GPU, else the twins")
     parser.add_argument("--only", default=",".join(PARTS), help="parts to measure (default: all)")
@@ -65,15 +65,15 @@ def read_options(arguments: list[str] | None = None) -> argparse.Namespace:
     options.precision = options.precision or ("bfloat16" if on_gpu else "float32")
     options.dtype = torch.float32 if options.precision == "float32" else torch.bfloat16
     options.rounds = 1 if options.quick else options.rounds or (5 if on_gpu else 2)
-    for kind, given, known in (("model", options.models, MODELS), ("part", options.only, PARTS)):
-        for name in given:
-            if name not in known:
-                parser.error(f"unknown {kind} {name!r}; known: {', '.join(known)}")
+    for kind, names, known_names in (("model", options.models, MODELS), ("part", options.only, PARTS)):
+        for name in names:
+            if name not in known_names:
+                parser.error(f"unknown {kind} {name!r}; known: {', '.join(known_names)}")
     return options
 
 
 def conditions(options: argparse.Namespace, peak: float, source: str) -> dict[str, Any]:
-    """On what, when and how it was measured."""
+    """Device, precision, versions and date of the measurement."""
     return {
         "device": device_name(options.device),
         "precision": options.precision,
@@ -88,7 +88,7 @@ def conditions(options: argparse.Namespace, peak: float, source: str) -> dict[st
 
 
 def measure(options: argparse.Namespace, peak: float) -> list[Row]:
-    """All parts of all models."""
+    """The rows of all parts of all models, each also printed to stderr when it is measured."""
     rows: list[Row] = []
     for name in options.models:
         mixed = options.precision == "mixed"
@@ -97,7 +97,9 @@ def measure(options: argparse.Namespace, peak: float) -> list[Row]:
             began = time.monotonic()
             with TemporaryDirectory() as folder:
                 for row in PARTS[part](bench, Path(folder)):
-                    print(" | ".join(filter(None, row.cells())), file=sys.stderr)  # for a run that is stopped
+                    print(
+                        " | ".join(filter(None, row.cells())), file=sys.stderr
+                    )  # so that a run that is stopped has said something
                     rows.append(row)
             print(f"{name}, {part}: {time.monotonic() - began:.0f} s", file=sys.stderr)
             release(options.device)
@@ -107,7 +109,7 @@ def measure(options: argparse.Namespace, peak: float) -> list[Row]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure and print."""
+    """Measure, print the table and write the JSON file."""
     options = read_options(arguments)
     torch.manual_seed(0)
     peak, source = peak_flops(options.device, options.dtype)
@@ -118,7 +120,7 @@ def main(arguments: list[str] | None = None) -> None:
         f"{facts['diffusers']}; utilisation of {peak / 1e12:.4g} TFLOP/s ({source}); medians of {facts['rounds']} "
         "rounds in which the works take turns"
     )
-    print_rows("CogVideoX at size", rows)
+    print_rows("CogVideoX at full scale", rows)
     if options.json:
         write_json(options.json, facts | {"rows": [row.to_json() for row in rows]})
 

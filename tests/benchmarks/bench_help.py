@@ -1,6 +1,6 @@
 """How long ``persist --help`` takes: ``python tests/benchmarks/bench_help.py``; prints a table, asserts nothing.
 
-Against the help of the smallest typer program there is; each run is a process of its own.
+It is compared with the help of the smallest typer program; each run is a process of its own.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ REFERENCE = "typer hello world --help"
 
 
 def run(arguments: list[str]) -> None:
-    """Run Python with these arguments."""
+    """Run Python with these arguments in a process of its own."""
     subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
 
 

@@ -1,11 +1,11 @@
-"""Quality against seconds for each sampler and number of steps, and what each memory costs beside none.
+"""Quality and time of each sampler and number of steps, and the time that each memory adds to a clip.
 
     python tests/benchmarks/bench_sampling.py --checkpoint runs/none runs/voxel --data runs/test --out runs/sampling
 
 Prints two tables, asserts nothing; ``--out`` keeps them as ``sampling.json`` and the curve as ``sampling.png``. The
 clips are those of ``persist eval --protocol revisit``, one at a time as in a rollout, and all settings take turns on
-each. Without a checkpoint it is the reference model on the sample houses; where that is not installed a tiny model of
-random weights stands in, whose seconds say something and whose quality nothing.
+each. Without a checkpoint it is the reference model on the sample houses. Where that is not installed a tiny model of
+random weights stands in: then the times mean something, and the quality nothing.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.backbone import Sampling
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.observations import Observations
-from persist_cli.checkpoints.checkpoint import find_checkpoint, reference_checkpoint, save_adapter, save_base
+from persist_cli.checkpoints.load import reference_checkpoint
+from persist_cli.checkpoints.save import save_adapter, save_base
 from persist_cli.data.reference import sample_data
 from persist_cli.errors import CheckpointError
 from persist_cli.evaluate.backbones import BackboneLoader
@@ -35,15 +37,16 @@ from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
 from persist_cli.evaluate.provenance import checkpoint_json, environment, metric_json
 from persist_cli.evaluate.rows.build_rows import NO_MEMORY, PLAIN, RowConfig, build_model_rows
-from persist_cli.evaluate.rows.model import ModelRow
+from persist_cli.evaluate.rows.model_rows import ModelRow
 from persist_cli.io.files import write_json, written_aside
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics import METRICS
 from persist_cli.plugins import make_backbone
 from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.rollout.world_model import WorldModel, clip_seed, imagine_together
+from persist_cli.rollout.world_model import WorldModel, clip_seed
 from persist_cli.viewing.console import print_table, say, watched
-from tests.benchmarks.timing import Times, say_conditions, write_walks
+from tests.benchmarks.timing import Times, say_conditions
+from tests.support.room_views import write_room_walks
 
 PROTOCOL = PROTOCOLS["revisit"]
 FIGURES = ("psnr", "lpips-alex")
@@ -51,16 +54,16 @@ STAND_IN = ("none", "voxel")  # memories of the model of random weights
 
 
 @dataclass(frozen=True)
-class Bench:
+class Comparison:
     """What is measured.
 
     Args:
-        rows: one for each adapter of the checkpoints, and one without.
-        row: whose clips are sampled in every way.
-        samplings: the ways; times are told as ratios to the first.
+        rows: one for each adapter of the checkpoints, and one without adapter.
+        row: the row whose clips are sampled with every sampling.
+        samplings: sampler and steps of each; times are also given as ratios to the first.
         cases: the clips.
-        suite: of their quality.
-        loader: of the backbones that make them.
+        suite: the metrics of their quality.
+        loader: loads the backbones of the rows.
     """
 
     rows: Sequence[ModelRow]
@@ -73,27 +76,31 @@ class Bench:
     def start(self, row: ModelRow, number: int) -> tuple[WorldModel, CaseFrames]:
         """The row's world model at the beginning of a clip, its memory filled, and the clip."""
         backbone, clip = self.loader.load_for(row), read_case(self.cases[number])
-        return row.start(backbone, clip, clip_seed(0, number)), clip
+        model = WorldModel(backbone, [row.agent(clip, clip_seed(0, number))], row.sampling)
+        model.reset([clip.observations[:1]], [clip.info])
+        return model, clip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Compare samplers and memories, print the tables and write what ``--out`` asks for."""
     options = parse(arguments)
     say_conditions("one clip at a time, all settings taking turns on each")
     with TemporaryDirectory() as folder:
         if not options.checkpoint:
             find_model(Path(folder), options)
-        bench = make_bench(options)
-        samplers, memories = compare_samplers(bench), compare_memories(bench)
-    show(bench, samplers, memories)
+        comparison = make_comparison(options)
+        samplers, memories = compare_samplers(comparison), compare_memories(comparison)
+    show(comparison, samplers, memories)
     if options.out:
         options.out.mkdir(parents=True, exist_ok=True)
-        results = {"samplers": samplers, "memories": memories} | conditions(bench)
+        results = {"samplers": samplers, "memories": memories} | conditions(comparison)
         write_json(options.out / "sampling.json", results)
-        draw(samplers, bench.suite, options.out / "sampling.png")
+        draw(samplers, comparison.suite, options.out / "sampling.png")
         say(f"written to {options.out / 'sampling.json'} and {options.out / 'sampling.png'}")
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", type=Path, nargs="+", default=[], help="finetune runs or checkpoints")
     parser.add_argument("--data", type=Path, nargs="+", default=[], help="data sets of held-out scenes")
@@ -110,18 +117,18 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def find_model(folder: Path, options: argparse.Namespace) -> None:
-    """The reference model, or else a tiny one of random weights and walks in its size, for one clip."""
+    """Set the reference model and the sample houses, or else a tiny model of random weights and one walk."""
     try:
         options.checkpoint, options.data = [reference_checkpoint()], [sample_data()]
         return
     except CheckpointError as error:
         say(f"{error}; a tiny model of random weights stands in")
     options.checkpoint = fresh_model(folder, {})
-    options.data, options.clips = [write_walks(folder / "walks", 64, trajectories=1)], 1
+    options.data, options.clips = [write_room_walks(folder / "walks", 64, trajectories=1)], 1
 
 
 def fresh_model(folder: Path, settings: dict[str, Any]) -> list[Path]:
-    """Checkpoints of an untrained model with an adapter for each memory of ``STAND_IN``."""
+    """Write checkpoints of an untrained model with an adapter for each memory of ``STAND_IN``."""
     (folder / "base").mkdir()
     backbone = make_backbone("cogvideox", settings)
     save_base(backbone, folder / "base")
@@ -134,7 +141,8 @@ def fresh_model(folder: Path, settings: dict[str, Any]) -> list[Path]:
     return [folder / name for name in STAND_IN]
 
 
-def make_bench(options: argparse.Namespace) -> Bench:
+def make_comparison(options: argparse.Namespace) -> Comparison:
+    """The rows, samplings and clips of the command line."""
     checkpoints = [find_checkpoint(path) for path in options.checkpoint]
     loader = BackboneLoader()
     backbone = loader.load(checkpoints[0])
@@ -142,119 +150,124 @@ def make_bench(options: argparse.Namespace) -> Bench:
     counts = [int(steps) for steps in options.steps.split(",")]
     samplings = [Sampling(steps, sampler, options.guidance) for sampler in samplers for steps in counts]
     cases = PROTOCOL.find(ClipSearch(options.data, 0, options.clips, backbone.frames_per_clip - 1))
-    adapters = sorted({name for each in checkpoints for name in each.adapters})
+    adapters = sorted({name for checkpoint in checkpoints for name in checkpoint.adapters})
     models = build_model_rows(checkpoints, RowConfig([PLAIN, *adapters], (), samplings[0]), PROTOCOL)
-    wanted = options.adapter or next((name for name in ("voxel", *adapters) if name in adapters), None)
-    row = next((row for row in models if row.adapter == wanted), None)
+    adapter = options.adapter or next((name for name in ("voxel", *adapters) if name in adapters), None)
+    row = next((row for row in models if row.adapter == adapter), None)
     if row is None:
-        raise CheckpointError(f"no checkpoint has a memory adapter {wanted!r}; there are: {', '.join(adapters)}")
+        raise CheckpointError(f"no checkpoint has a memory adapter {adapter!r}; there are: {', '.join(adapters)}")
     suite = MetricSuite(choose_metrics(FIGURES, METRICS), make_setup(cases))
-    return Bench(models, row, samplings, cases, suite, loader)
+    return Comparison(models, row, samplings, cases, suite, loader)
 
 
 def imagine(model: WorldModel, clip: CaseFrames) -> tuple[float, Observations]:
-    """Seconds that a clip took, its memory read and its frames decoded, and the frames with the given one."""
+    """Seconds of imagining a clip, from reading its memory to decoding its frames, and all its frames."""
     first = clip.observations[:1]
-    model.reset(first, clip.info)
+    model.reset([first], [clip.info])
     start = time.perf_counter()
-    parts = [part[0] for part in imagine_together([model], [clip.observations.cameras[1:]], [clip.interactions])]
+    parts = [frames[0] for frames in model.imagine([clip.observations.cameras[1:]], [clip.interactions])]
     return time.perf_counter() - start, Observations.concatenate([first, *parts])
 
 
-def compare_samplers(bench: Bench) -> list[dict[str, Any]]:
+def compare_samplers(comparison: Comparison) -> list[dict[str, Any]]:
     """Seconds a clip, their ratio to the first sampling's, and figures of the predicted frames, for each sampling."""
-    names = [f"{each.sampler} {each.steps}" for each in bench.samplings]
-    seconds: dict[str, list[float]] = {name: [] for name in names}
-    figures: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for number in watched(range(len(bench.cases)), "samplers", "clip"):
-        model, clip = bench.start(bench.row, number)
+    samplings = {f"{sampling.sampler} {sampling.steps}": sampling for sampling in comparison.samplings}
+    seconds: dict[str, list[float]] = {name: [] for name in samplings}
+    figures: dict[str, list[np.ndarray]] = {name: [] for name in samplings}
+    for number in watched(range(len(comparison.cases)), "samplers", "clip"):
+        model, clip = comparison.start(comparison.row, number)
         if number == 0:
             model.sampling = Sampling(1)
-            imagine(model, clip)  # does not count
-        for name, model.sampling in zip(names, bench.samplings, strict=True):
-            took, seen = imagine(model, clip)
-            seconds[name].append(took)
-            figures[name].append(bench.suite.figures(seen.rgb, seen.depth, clip, name)[1:].mean(0).numpy())
+            imagine(model, clip)  # a warm-up that does not count
+        for name, sampling in samplings.items():
+            model.sampling = sampling
+            clip_seconds, video = imagine(model, clip)
+            seconds[name].append(clip_seconds)
+            frame_figures = comparison.suite.figures(video.rgb, video.depth, clip, name)[1:]
+            figures[name].append(frame_figures.mean(0).numpy())
     times = Times({name: np.array(values) for name, values in seconds.items()})
+    first = next(iter(samplings))
     return [
-        {"sampler": each.sampler, "steps": each.steps, "memory_guidance": each.memory_guidance}
+        {"sampler": sampling.sampler, "steps": sampling.steps, "memory_guidance": sampling.memory_guidance}
         | {"seconds": times.median(name)}
-        | {"ratio": times.ratio(name, names[0])}
-        | dict(zip(bench.suite.frame_metrics, np.mean(figures[name], axis=0).tolist(), strict=True))
-        for name, each in zip(names, bench.samplings, strict=True)
+        | {"ratio": times.ratio(name, first)}
+        | dict(zip(comparison.suite.frame_metrics, np.mean(figures[name], axis=0).tolist(), strict=True))
+        for name, sampling in samplings.items()
     ]
 
 
-def compare_memories(bench: Bench) -> list[dict[str, Any]]:
-    """Seconds to read each memory, seconds a clip of the first sampling, and their ratio to no memory's."""
-    reads: dict[str, list[float]] = {row.name: [] for row in bench.rows}
-    clips: dict[str, list[float]] = {row.name: [] for row in bench.rows}
-    for number in watched(range(len(bench.cases)), "memories", "clip"):
-        for row in bench.rows:
-            model, clip = bench.start(row, number)
+def compare_memories(comparison: Comparison) -> list[dict[str, Any]]:
+    """Seconds to read each memory, seconds a clip of the first sampling, and their ratio to the row without memory."""
+    rows = comparison.rows
+    reads: dict[str, list[float]] = {row.name: [] for row in rows}
+    clips: dict[str, list[float]] = {row.name: [] for row in rows}
+    for number in watched(range(len(comparison.cases)), "memories", "clip"):
+        for row in rows:
+            model, clip = comparison.start(row, number)
             length = model.backbone.frames_per_clip - 1
             start = time.perf_counter()
-            model.recall(clip.observations.cameras[1 : length + 1], clip.interactions[:length])
+            model.recall([0], [clip.observations.cameras[1 : length + 1]], [clip.interactions[:length]])
             reads[row.name].append(time.perf_counter() - start)
             clips[row.name].append(imagine(model, clip)[0])
-    reading, whole = (Times({name: np.array(each) for name, each in part.items()}) for part in (reads, clips))
-    reference = next((row.name for row in bench.rows if row.adapter == NO_MEMORY), bench.rows[0].name)
+    read_times = Times({name: np.array(seconds) for name, seconds in reads.items()})
+    clip_times = Times({name: np.array(seconds) for name, seconds in clips.items()})
+    reference = next((row.name for row in rows if row.adapter == NO_MEMORY), rows[0].name)
     return [
-        {"memory": row.name, "read": reading.median(row.name), "seconds": whole.median(row.name)}
-        | {"ratio": whole.ratio(row.name, reference), "reference": reference}
-        for row in bench.rows
+        {"memory": row.name, "read": read_times.median(row.name), "seconds": clip_times.median(row.name)}
+        | {"ratio": clip_times.ratio(row.name, reference), "reference": reference}
+        for row in rows
     ]
 
 
-def show(bench: Bench, samplers: Sequence[dict[str, Any]], memories: Sequence[dict[str, Any]]) -> None:
-    """The two tables."""
-    for name, why in bench.suite.obstacles.items():
-        say(f"{name}: n/a ({why})")
-    first = bench.samplings[0]
-    clips = f"clips of {bench.cases[0].frames - 1} frames: {len(bench.cases)}"
-    title = f"samplers, memory {bench.row.name}, guidance {first.memory_guidance:g}, {clips}"
+def show(comparison: Comparison, samplers: Sequence[dict[str, Any]], memories: Sequence[dict[str, Any]]) -> None:
+    """Print the two tables."""
+    for name, obstacle in comparison.suite.obstacles.items():
+        say(f"{name}: n/a ({obstacle})")
+    first = comparison.samplings[0]
+    clips = f"clips of {comparison.cases[0].frames - 1} frames: {len(comparison.cases)}"
+    title = f"samplers, memory {comparison.row.name}, guidance {first.memory_guidance:g}, {clips}"
     columns = ["sampler", "steps", "s a clip", f"time to {first.sampler} {first.steps}"]
     rows = [
-        [each["sampler"], str(each["steps"]), f"{each['seconds']:.2f}", f"{each['ratio']:.3f}×"]
-        + [f"{each[name]:.3f}" if name in each else "n/a" for name in FIGURES]
-        for each in samplers
+        [result["sampler"], str(result["steps"]), f"{result['seconds']:.2f}", f"{result['ratio']:.3f}×"]
+        + [f"{result[name]:.3f}" if name in result else "n/a" for name in FIGURES]
+        for result in samplers
     ]
     print_table(title, columns + [METRICS[name].title for name in FIGURES], rows)
     costs = [
-        (each["memory"], f"{1e3 * each['read']:.1f}", f"{each['seconds']:.2f}", f"{each['ratio']:.2f}×")
-        for each in memories
+        (result["memory"], f"{1e3 * result['read']:.1f}", f"{result['seconds']:.2f}", f"{result['ratio']:.2f}×")
+        for result in memories
     ]
     columns = ["memory", "read, ms", "s a clip", f"time to {memories[0]['reference']}"]
     print_table(f"memories, {first.sampler} {first.steps}", columns, costs)
 
 
-def conditions(bench: Bench) -> dict[str, Any]:
-    """What was measured where, JSON values."""
-    clips = [{"trajectory": case.trajectory, "start": case.start, "frames": case.frames} for case in bench.cases]
-    checkpoints = {row.checkpoint.folder: checkpoint_json(row.checkpoint) for row in bench.rows}
+def conditions(comparison: Comparison) -> dict[str, Any]:
+    """What was measured, on what and where, as JSON values."""
+    clips = [{"trajectory": case.trajectory, "start": case.start, "frames": case.frames} for case in comparison.cases]
+    checkpoints = {row.checkpoint.folder: checkpoint_json(row.checkpoint) for row in comparison.rows}
     return {
         "protocol": PROTOCOL.name,
-        "memory": bench.row.name,
+        "memory": comparison.row.name,
         "clips": clips,
         "checkpoints": list(checkpoints.values()),
-        "metrics": metric_json(bench.suite.frame_metrics),
+        "metrics": metric_json(comparison.suite.frame_metrics),
         "threads": torch.get_num_threads(),
         "environment": environment(1),
     }
 
 
 def draw(samplers: Sequence[dict[str, Any]], suite: MetricSuite, path: Path) -> None:
-    """A plot for each figure: a line a sampler over seconds a clip, its dots named by their steps."""
+    """Write a plot for each figure: one line for each sampler over seconds a clip, its dots labelled by steps."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6 * len(suite.frame_metrics), 4), layout="constrained")
     plots = figure.subplots(1, len(suite.frame_metrics), squeeze=False)[0]
     for axes, (name, metric) in zip(plots, suite.frame_metrics.items(), strict=True):
-        for sampler in dict.fromkeys(each["sampler"] for each in samplers):
-            dots = [each for each in samplers if each["sampler"] == sampler]
-            axes.plot([each["seconds"] for each in dots], [each[name] for each in dots], "o-", label=sampler)
-            for each in dots:
-                axes.annotate(f" {each['steps']}", (each["seconds"], each[name]))
+        for sampler in dict.fromkeys(result["sampler"] for result in samplers):
+            dots = [result for result in samplers if result["sampler"] == sampler]
+            axes.plot([dot["seconds"] for dot in dots], [dot[name] for dot in dots], "o-", label=sampler)
+            for dot in dots:
+                axes.annotate(f" {dot['steps']}", (dot["seconds"], dot[name]))
         axes.set(xlabel="seconds a clip", ylabel=f"{metric.title}, {metric.better} is better", xscale="log")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("{x:g}")

@@ -1,7 +1,7 @@
-"""How fast clips come out of the store: ``python tests/benchmarks/bench_store.py``; prints tables, asserts nothing.
+"""How fast clips are read from the store: ``python tests/benchmarks/bench_store.py``; prints tables, asserts nothing.
 
-Clips of nine frames at random places of walks through the furnished room; their PNGs decoded alone, from memory,
-are what the store is measured against.
+Clips of nine frames at random places of walks through the furnished room. The store is compared with decoding the
+same frames' PNGs from memory.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
 from persist_cli.data.store import Store
 from persist_cli.viewing.console import print_table
-from tests.benchmarks.timing import Times, alternate, say_conditions, write_walks
+from tests.benchmarks.timing import Times, alternate, say_conditions
+from tests.support.room_views import write_room_walks
 
 FRAMES, CLIPS = 9, 8  # frames a clip, clips a run
 ALONE = "the same frames' PNGs alone"
@@ -29,19 +30,19 @@ CONTEXT = "ClipDataset, with up to 48 frames before"
 
 
 def images_of(observations: Observations) -> list[tuple[bytes, bytes]]:
-    """The PNGs of these frames, byte for byte as they lie in the store."""
+    """The PNGs of these frames, as the store has them."""
     pairs = zip(observations.rgb.numpy(), observations.depth.numpy(), strict=True)
     return [(encode_rgb(rgb), encode_depth(depth)) for rgb, depth in pairs]
 
 
 def decode(images: list[tuple[bytes, bytes]]) -> tuple[np.ndarray, np.ndarray]:
-    """What any loader must do at least."""
-    rgb, depth = zip(*((decode_rgb(color), decode_depth(far)) for color, far in images), strict=True)
+    """Decode the PNGs, which is the least that any loader must do."""
+    rgb, depth = zip(*((decode_rgb(rgb_png), decode_depth(depth_png)) for rgb_png, depth_png in images), strict=True)
     return np.stack(rgb), np.stack(depth)
 
 
-def works(folder: Path, size: int) -> dict[str, Callable[[], Any]]:
-    """Ways to get the clips; the first three decode the same number of images."""
+def readers(folder: Path, size: int) -> dict[str, Callable[[], Any]]:
+    """Functions that read the clips, by name; the first three decode the same number of images."""
     store, random = Store(folder), np.random.default_rng(0)
     files = [store[int(number)] for number in random.integers(len(store), size=CLIPS)]
     spans = [
@@ -54,7 +55,7 @@ def works(folder: Path, size: int) -> dict[str, Callable[[], Any]]:
 
     plain, strided, remembered = dataset((1,), 0), dataset((1, 2, 3), 0), dataset((1,), 48)
     return {
-        ALONE: lambda: [decode(each) for each in images],
+        ALONE: lambda: [decode(clip_images) for clip_images in images],
         "Store, nine frames in a row": lambda: [file.read(span) for file, span in spans],
         "ClipDataset, stride 1": lambda: [plain[number] for number in range(CLIPS)],
         "ClipDataset, strides 1, 2, 3": lambda: [strided[number] for number in range(CLIPS)],
@@ -62,18 +63,18 @@ def works(folder: Path, size: int) -> dict[str, Callable[[], Any]]:
     }
 
 
-def rows(times: Times) -> list[tuple[str, ...]]:
-    """Clips a second, milliseconds a clip, and how many times as long as the PNGs alone."""
-    found = []
+def table_rows(times: Times) -> list[tuple[str, ...]]:
+    """Clips a second, milliseconds a clip, and the ratio to the time of the PNGs alone."""
+    rows = []
     for name in times.seconds:
         clip = times.median(name) / CLIPS
-        found.append((name, f"{1 / clip:,.0f}", f"{1e3 * clip:.2f}", f"{times.ratio(name, ALONE):.2f}×"))
-    return found
+        rows.append((name, f"{1 / clip:,.0f}", f"{1e3 * clip:.2f}", f"{times.ratio(name, ALONE):.2f}×"))
+    return rows
 
 
 if __name__ == "__main__":
     say_conditions(f"clips of {FRAMES} frames, one process")
     for size in (64, 256):
         with TemporaryDirectory() as folder:
-            times = alternate(works(write_walks(Path(folder), size), size))
-        print_table(f"store, {size}×{size} images", ["clips", "clips/s", "ms a clip", "time"], rows(times))
+            times = alternate(readers(write_room_walks(Path(folder), size), size))
+        print_table(f"store, {size}×{size} images", ["clips", "clips/s", "ms a clip", "time"], table_rows(times))

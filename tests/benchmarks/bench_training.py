@@ -1,8 +1,8 @@
 """How fast the tiny model trains: ``python tests/benchmarks/bench_training.py``; prints a table, asserts nothing.
 
-Each recipe's own training step on a fixed batch: loss, backward, clipping, optimizer, average. How long the batch
-takes to make stands beside it: reading the clips, and building their memories. The stages that a cache serves stand
-there a second time, with all clips of the batch in it.
+Each recipe's own training step on a fixed batch: loss, backward, clipping, optimizer, average. Beside it stands the
+time of making the batch: reading the clips, and building their memories. The stages that can use a cache stand there a
+second time, with all clips of the batch in it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from persist_cli.train.clip_cache import CacheSettings
 from persist_cli.train.finetune import prepare_backbone
 from persist_cli.train.trainer import Trainer
 from persist_cli.viewing.console import print_table
-from tests.benchmarks.timing import Times, alternate, say_conditions, write_walks
+from tests.benchmarks.timing import Times, alternate, say_conditions
+from tests.support.room_views import MEMORIES, write_room_walks
 
 BATCH, ROUNDS = 4, 4
-MEMORIES = ("none", "voxel", "map2d", "snapshots")
-FORMS = ("projected", "canvas")  # the recipes' own is cross
+FORMS = ("projected", "canvas")  # that of the recipes is cross
 RECIPES = (
     {"codec": "tiny-codec", "1": "tiny-stage1"}
     | {f"2, {name}": f"tiny-stage2-{name}" for name in MEMORIES}
@@ -43,28 +43,35 @@ class FixedBatchTrainer(Trainer):
     """The training loop on one batch over and over."""
 
     def samples(self) -> list[Any]:
-        """The first samples, read from the store."""
+        """Read the first samples from the store."""
         return [self.clips[number] for number in range(BATCH)]
 
     def loader(self) -> Iterator[Clips]:
+        """The same batch without end."""
         return repeat(self.to_batch(self.samples()))
 
 
-def make_trainer(words: str, data: Path, cache: CacheSettings | None = None) -> FixedBatchTrainer:
-    """The trainer of a recipe and changes to it, with fresh weights; with a cache, its batch's clips are in it."""
-    name, *changes = words.split()
-    given = [f"data.path={data}", f"data.clips_per_trajectory={0 if cache is None else 8}", *changes]
-    recipe = make_recipe(apply_overrides(read_recipe(name), given), name)
-    maker = MemoryFactory.of(recipe.memory) if recipe.memory else None
-    backbone = prepare_backbone(recipe, None, maker)
-    trainer = FixedBatchTrainer(recipe, backbone, maker, Accelerator(cpu=True), cache)
+def make_trainer(recipe_line: str, data: Path, cache: CacheSettings | None = None) -> FixedBatchTrainer:
+    """The trainer of a recipe with untrained weights; with a cache, the clips of its batch are in it.
+
+    Args:
+        recipe_line: the recipe's name, followed by changes to it.
+        data: the data set.
+        cache: where latents and tokens are kept.
+    """
+    name, *changes = recipe_line.split()
+    data_changes = [f"data.path={data}", f"data.clips_per_trajectory={0 if cache is None else 8}"]
+    recipe = make_recipe(apply_overrides(read_recipe(name), [*data_changes, *changes]), name)
+    factory = MemoryFactory.of(recipe.memory) if recipe.memory else None
+    backbone = prepare_backbone(recipe, None, factory)
+    trainer = FixedBatchTrainer(recipe, backbone, factory, Accelerator(cpu=True), cache)
     if cache is not None:
         trainer.to_batch(trainer.samples())
     return trainer
 
 
 def measure(data: Path) -> tuple[Times, Times, Times]:
-    """Steps, reading of samples, and making a batch of them, for each recipe."""
+    """Times of a step, of reading its samples and of making a batch of them, for each recipe."""
     trainers = {stage: make_trainer(name, data) for stage, name in RECIPES.items()}
     cache = CacheSettings(data / "cache", 1)
     trainers |= {stage: make_trainer(name, data, cache) for stage, name in CACHED.items()}
@@ -80,11 +87,11 @@ def measure(data: Path) -> tuple[Times, Times, Times]:
 if __name__ == "__main__":
     say_conditions(f"tiny model, 64×64, batches of {BATCH}")
     with TemporaryDirectory() as folder:
-        steps, reads, batches = measure(write_walks(Path(folder), 64))
+        steps, reads, batches = measure(write_room_walks(Path(folder), 64))
     rows = []
     for stage in RECIPES | CACHED:
         step, read, batch = (times.median(stage) / BATCH for times in (steps, reads, batches))
-        ratios = [f"{steps.ratio(stage, to):.2f}×" for to in ("1", "2, voxel")]
+        ratios = [f"{steps.ratio(stage, reference):.2f}×" for reference in ("1", "2, voxel")]
         rows.append((stage, f"{1 / step:.1f}", *ratios, *(f"{1e3 * part:.1f}" for part in (step, read, batch))))
     columns = [
         "stage",

@@ -1,4 +1,4 @@
-"""The FLOPs that utilisation is counted with, against torch's own counter."""
+"""The formulas of FLOPs that utilisation is computed with agree with torch's counter."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from tests.benchmarks.full_scale import flops
 from tests.support.micro_model import micro, random_clips, random_tokens, with_adapter
-from tests.support.walking import MICRO
+from tests.support.micro_runs import MICRO
 
 TOKENS = 12
 
@@ -29,23 +29,23 @@ def counted(backbone, stage, tokens):
     backbone.use_adapter("voxel" if tokens is not None else None)
     backbone.trained_parameters(stage)
     latents = backbone.shape.pad(backbone.codec.encode(clips.rgb, clips.depth))
-    given, image = backbone.conditions(clips, torch.full((2,), 500), None), backbone.encode_first(clips)
+    conditions, image = backbone.conditions(clips, torch.full((2,), 500)), backbone.encode_first(clips)
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
-        memory = backbone.prepare_memory(clips)
-        predicted = backbone.predict(latents, image, dataclasses.replace(given, memory=memory))
+        memory = backbone.memory_condition(clips)
+        predicted = backbone.predict(latents, image, dataclasses.replace(conditions, memory=memory))
         forward = counter.get_total_flops()
         predicted.square().mean().backward()
     return forward, counter.get_total_flops()
 
 
-def test_a_step_of_stage_one_counts_what_torch_counts(backbone):
+def test_the_formulas_of_stage_one_give_the_flops_that_torch_counts(backbone):
     video = flops.video_sizes(backbone, 2)
     forward, step = counted(backbone, "1", None)
     assert forward == flops.forward(video)
     assert step == flops.stage1_step(video)
 
 
-def test_a_step_of_stage_two_counts_what_torch_counts(backbone):
+def test_the_formulas_of_stage_two_give_the_flops_that_torch_counts(backbone):
     video, memory = flops.video_sizes(backbone, 2), flops.memory_sizes(backbone, TOKENS)
     forward, step = counted(backbone, "2", random_tokens(2, TOKENS))
     assert forward == flops.forward(video, memory)

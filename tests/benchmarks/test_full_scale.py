@@ -1,4 +1,4 @@
-"""The benchmark at size runs from end to end, and what it compares is the same arithmetic."""
+"""The benchmark at full scale runs from end to end, and compares models that compute the same."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from tests.benchmarks import bench_full_scale as bench_at_size
+from tests.benchmarks import bench_full_scale
 from tests.benchmarks.full_scale import sampling, shapes
 from tests.benchmarks.full_scale.measuring import Timing, Turns
 from tests.benchmarks.full_scale.plain import Plain
 from tests.benchmarks.full_scale.rows import Row, Target
 from tests.benchmarks.full_scale.sampling import Scene
-from tests.benchmarks.full_scale.training import make_batch, plain_batch, stage1_works
-from tests.support import resident_memory as resident
-from tests.support.walking import MICRO
+from tests.benchmarks.full_scale.training import make_batch, plain_batch, stage1_steps
+from tests.support import resident_memory
+from tests.support.micro_runs import MICRO
 
 
 @pytest.fixture
@@ -33,22 +33,22 @@ def micro(monkeypatch):
 
 @pytest.mark.usefixtures("fresh_accelerator")
 @pytest.mark.parametrize(("name", "precision"), [("micro", "float32"), ("5b", "bfloat16"), ("5b", "mixed")])
-def test_all_parts_run_on_whatever_device_is_there(name, precision, micro, tmp_path, capsys):
+def test_every_part_of_the_benchmark_runs_on_the_cpu(name, precision, micro, tmp_path, capsys):
     file = tmp_path / "rows.json"
     options = ["--models", name, "--precision", precision, "--device", "cpu", "--json", str(file)]
-    bench_at_size.main(["--quick", *options])
-    found = json.loads(file.read_text())
-    assert [row["what"].split(",")[0] for row in found["rows"]] == [
+    bench_full_scale.main(["--quick", *options])
+    rows = json.loads(file.read_text())["rows"]
+    assert [row["what"].split(",")[0] for row in rows] == [
         "stage-1 step", "stage-2 step", "clip", "clip with voxel map", "VAE", "VAE", "map", "map",
     ]  # fmt: skip
-    assert all(0 < row["utilisation"] < 1 for row in found["rows"][:4])
-    assert all(row["ratio"] > 0 for row in found["rows"] if row["beside"])
-    targets = [target["text"] for row in found["rows"] for target in row["targets"]]
+    assert all(0 < row["utilisation"] < 1 for row in rows[:4])
+    assert all(row["ratio"] > 0 for row in rows if row["beside"])
+    targets = [target["text"] for row in rows for target in row["targets"]]
     assert targets == (["no slower than plain", "utilisation ≥ 45%", "≤ 1 s", "≤ 10 % more"] if name == "5b" else [])
     assert "stage-1" in capsys.readouterr().out
 
 
-def test_the_plain_model_says_what_ours_does_when_it_has_its_weights(micro):
+def test_the_plain_model_with_our_weights_predicts_what_ours_does(micro):
     bench = shapes.Bench(micro, torch.device("cpu"), torch.float32, 1, 1.0)
     ours, plain = bench.backbone, Plain(bench)
     ours.use_adapter(None)
@@ -68,7 +68,7 @@ def test_the_plain_model_says_what_ours_does_when_it_has_its_weights(micro):
     latents, image, camera = plain_batch(bench, clips)
     timesteps = torch.tensor([10, 800])
     with torch.no_grad():
-        ours.predict(latents, image, ours.conditions(clips, timesteps, None))
+        ours.predict(latents, image, ours.conditions(clips, timesteps))
         color, depth = latents.chunk(2, dim=2)
         color_image, depth_image = image.chunk(2, dim=2)
         joined = torch.cat([color, color_image, depth, depth_image, camera], dim=2)
@@ -76,33 +76,35 @@ def test_the_plain_model_says_what_ours_does_when_it_has_its_weights(micro):
     assert torch.allclose(seen[0], seen[1][:, -seen[0].shape[1] :], atol=1e-5)
 
 
-def counted(work):
-    """FLOPs of a work, backward included, by torch."""
+def counted(function):
+    """FLOPs of a function, backward included, by torch."""
     with FlopCounterMode(display=False) as counter:
-        work()
+        function()
     return counter.get_total_flops()
 
 
-def test_ours_and_the_plain_loop_pipeline_and_codec_do_the_same_work(micro, tmp_path):
-    """Within a thousandth, for cameras."""
+def test_our_step_clip_and_codec_take_as_many_flops_as_the_plain_ones(micro, tmp_path):
+    """Up to a thousandth, which the embedding of cameras takes."""
     bench = shapes.Bench(micro, torch.device("cpu"), torch.float32, 1, 1.0)
-    steps = {name: counted(work) for name, work in stage1_works(bench, 2).items()}
+    steps = {name: counted(function) for name, function in stage1_steps(bench, 2).items()}
     assert steps["ours"] == pytest.approx(steps["plain"], rel=1e-3)
     bench.backbone.requires_grad_(False)
     plain = Plain(bench)
-    clips = {name: counted(work) for name, work in sampling.clip_works(Scene(bench, tmp_path), plain, 3).items()}
+    clips = {
+        name: counted(function) for name, function in sampling.clip_functions(Scene(bench, tmp_path), plain, 3).items()
+    }
     assert clips["alone"] == pytest.approx(clips["plain"], rel=1e-3)
     assert clips["memory"] > clips["alone"]
     seen, images = bench.clips(1, bench.size[0]), sampling.plain_images(bench)
     codec, latents = bench.backbone.codec, plain.encode(images)
     assert counted(lambda: codec.encode(seen.rgb, seen.depth)) == counted(lambda: plain.encode(images))
-    assert counted(lambda: codec.decode(latents)) == counted(lambda: plain.decode(latents))
+    assert counted(lambda: sampling.decode(codec, latents)) == counted(lambda: plain.decode(latents))
 
 
 def test_an_unknown_model_or_part_is_a_usage_error(capsys):
     for option, name in (("--models", "7b"), ("--only", "step")):
         with pytest.raises(SystemExit) as ended:
-            bench_at_size.main([option, name])
+            bench_full_scale.main([option, name])
         assert ended.value.code == 2
         assert name in capsys.readouterr().err
 
@@ -110,24 +112,24 @@ def test_an_unknown_model_or_part_is_a_usage_error(capsys):
 def test_targets_are_reached_not_reached_or_not_measured():
     assert Target("≤ 1 s", 0.9, 1.0).reached
     assert not Target("≥ 45 %", 0.4, 0.45, at_most=False).reached
-    assert Target("≤ 1 s", None, 1.0).said() == "≤ 1 s: not measured"
+    assert Target("≤ 1 s", None, 1.0).cell() == "≤ 1 s: not measured"
 
 
-def test_a_work_that_does_not_fit_has_a_row_that_says_so():
+def test_the_row_of_a_function_that_does_not_fit_says_so():
     row = Row("5b", "clip", None, "plain diffusers", Timing((2.0, 1.0, 3.0), 10**9))
     assert row.ratio is None
     assert {"does not fit", "plain diffusers", "2 (1)", "1.00"} <= set(row.cells())
 
 
-@pytest.mark.skipif(not resident.KNOWN, reason="peak memory is asked of Linux")
-def test_a_peak_is_that_of_the_largest_run_and_what_does_not_fit_has_no_timing():
+@pytest.mark.skipif(not resident_memory.KNOWN, reason="peak memory is asked of Linux")
+def test_the_peak_is_that_of_the_largest_run_and_a_function_that_does_not_fit_has_no_timing():
     numbers = iter([1, 30_000_000, 1])  # floats of the run that does not count, and of two that do
 
     def tight():
         raise torch.OutOfMemoryError
 
-    works = {"little": lambda: None, "tight": tight, "much": lambda: torch.ones(next(numbers))}
-    found = Turns(torch.device("cpu"), 2).measure(works)
-    assert found["tight"] is None
-    assert found["much"].peak - found["little"].peak == pytest.approx(120e6, rel=0.1)
-    assert len(found["much"].seconds) == 2
+    functions = {"little": lambda: None, "tight": tight, "much": lambda: torch.ones(next(numbers))}
+    timings = Turns(torch.device("cpu"), 2).measure(functions)
+    assert timings["tight"] is None
+    assert timings["much"].peak - timings["little"].peak == pytest.approx(120e6, rel=0.1)
+    assert len(timings["much"].seconds) == 2

@@ -1,4 +1,4 @@
-"""The reference model and the sample data: what commands use when none is named."""
+"""The bundled reference model and sample data, which commands use when no other is named."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from persist_cli.api.inference import SamplingOverrides
+from persist_cli.checkpoints.export import ExportPlan, run_export
 from persist_cli.checkpoints.load import reference_checkpoint
 from persist_cli.data.reference import parse_reference, sample_data
 from persist_cli.memorize.memory_file import load_memory
@@ -18,9 +19,7 @@ from tests.support.export_runs import write_runs
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory, walks):
-    """A reference model of a micro model, and the walks as its sample."""
-    from persist_cli.checkpoints.export import ExportPlan, run_export
-
+    """A folder with a micro model as the reference model and the walks as the sample data."""
     folder = tmp_path_factory.mktemp("home")
     runs = write_runs(folder / "runs")
     plan = ExportPlan(
@@ -50,13 +49,13 @@ def roll(persist, out, *options):
     return json.loads((out / "rollout.json").read_text())
 
 
-def test_a_rollout_without_checkpoint_is_the_reference_models_with_its_default_adapter(persist, reference, here):
-    told = roll(persist, here / "a")
-    assert (told["checkpoint"], told["plan"]["adapter"]) == (str(reference), "voxel")
+def test_a_rollout_without_a_checkpoint_uses_the_reference_model_and_its_default_adapter(persist, reference, here):
+    record = roll(persist, here / "a")
+    assert (record["checkpoint"], record["plan"]["adapter"]) == (str(reference), "voxel")
     assert roll(persist, here / "b", "--adapter", "none")["plan"]["adapter"] == "none"
 
 
-def test_a_memory_is_made_for_the_reference_models_adapter_and_a_line_says_so(persist, reference, here):
+def test_memorize_uses_the_settings_of_the_reference_models_adapter_and_a_line_says_so(persist, reference, here):
     ended = persist("memorize", "sample#0:0-12", "--out", "m.safetensors")
     assert f"those of adapter 'voxel' of {reference}" in ended.out
     memory = load_memory(here / "m.safetensors")
@@ -64,7 +63,7 @@ def test_a_memory_is_made_for_the_reference_models_adapter_and_a_line_says_so(pe
     assert roll(persist, here / "a", "--memory", "m.safetensors")["memory"]["cells"] > 0
 
 
-def test_settings_or_an_encoder_of_ones_own_leave_the_reference_model_aside(persist, reference, here):
+def test_memorize_with_own_settings_or_encoder_ignores_the_reference_model(persist, reference, here):
     for number, option in enumerate((("--encoder", "patches"), ("--set", "memory.max_depth=5"))):
         ended = persist("memorize", "sample#0:0-2", *option, "--out", f"{number}.safetensors", "--json")
         assert json.loads(ended.out)["settings_of"] is None
@@ -72,7 +71,7 @@ def test_settings_or_an_encoder_of_ones_own_leave_the_reference_model_aside(pers
     assert json.loads(persist("memorize", "sample#0:0-2", "--memory", "map2d", "--json").out)["settings_of"] is None
 
 
-def test_a_memory_is_the_one_that_the_named_checkpoint_reads(persist, home, reference, walks, here):
+def test_memorize_with_a_checkpoint_makes_the_memory_that_its_adapter_reads(persist, home, reference, walks, here):
     out = ("--out", "m.safetensors")
     assert persist("memorize", f"{walks}#0:0-2", "--checkpoint", home / "runs/none", *out).code == 0
     assert load_memory(here / "m.safetensors").name == "none"
@@ -84,7 +83,7 @@ def test_a_memory_is_the_one_that_the_named_checkpoint_reads(persist, home, refe
         assert (ended.code, cause in ended.err) == (1, True), ended.err
 
 
-def test_a_memory_is_made_for_the_checkpoint_that_is_named(persist, home, walks, here):
+def test_memorize_with_a_checkpoint_takes_no_other_memory_encoder_or_settings(persist, home, walks, here):
     out = ("--out", "m.safetensors")
     ended = persist("memorize", f"{walks}#0:0-2", "--checkpoint", home / "runs/voxel", *out)
     assert f"those of adapter 'voxel' of {home / 'runs/voxel'}" in ended.out
@@ -98,27 +97,27 @@ def test_a_memory_is_made_for_the_checkpoint_that_is_named(persist, home, walks,
         assert (ended.code, cause in ended.err) == (1, True), ended.err
 
 
-def test_an_evaluation_without_checkpoint_is_the_reference_models(persist, reference, here):
+def test_an_evaluation_without_a_checkpoint_uses_the_reference_model(persist, reference, here):
     options = ["--metrics", "psnr", "--seeds", 1, "--steps", 1, "--clips", 1, "--controls", "copy", "--out", "o"]
     ended = persist("eval", "--data", "sample", *options)
     assert ended.code == 0, ended.err
-    found = json.loads((here / "o/metrics.json").read_text())
-    assert [each["path"] for each in found["checkpoints"]] == [str(reference)]
-    assert list(found["tables"][0]["rows"])[:2] == ["none", "voxel"]
+    results = json.loads((here / "o/metrics.json").read_text())
+    assert [checkpoint["path"] for checkpoint in results["checkpoints"]] == [str(reference)]
+    assert list(results["tables"][0]["rows"])[:2] == ["none", "voxel"]
 
 
-def test_inspect_takes_the_sample(persist, reference, here):
+def test_inspect_finds_the_sample_by_name(persist, reference, here):
     assert len(json.loads(persist("inspect", "sample", "--json").out)["trajectories"]) == 2
 
 
-def test_a_folder_called_sample_goes_before_the_packaged_one(reference, here, walks):
+def test_a_folder_called_sample_takes_precedence_over_the_bundled_one(reference, here, walks):
     assert parse_reference("sample#0").folder == sample_data()
     shutil.copytree(walks, here / "sample")
     assert str(parse_reference("sample#0").folder) == "sample"
     assert str(parse_reference("./sample").folder) == "sample"
 
 
-def test_an_installation_without_them_says_so_in_one_line(persist, here, walks):
+def test_an_installation_without_model_and_sample_says_so_in_one_line(persist, here, walks):
     start = ("--start", f"{walks}#0:2", "--out", "o", "--actions", "left")
     for command, cause in (
         (("rollout", *start), "it comes with the package; give a CHECKPOINT"),
@@ -133,7 +132,7 @@ def test_an_installation_without_them_says_so_in_one_line(persist, here, walks):
     assert list(here.iterdir()) == []
 
 
-def test_without_the_variable_both_are_sought_in_the_package(monkeypatch):
+def test_without_the_environment_variable_both_are_in_the_package(monkeypatch):
     monkeypatch.delenv("PERSIST_REFERENCE")
     package = Path(str(resources.files("persist_recipes")))
     assert sample_data() == package / "sample"
@@ -150,6 +149,6 @@ def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monk
     names = {path.name for path in (here / "demo").iterdir()}
     assert {"rollout.mp4", "rollout.gif", "sheet.png", "map.png", "metrics.json", "report"} <= names
     assert (here / "demo/report/report.html").is_file()
-    said = capsys.readouterr().out
-    assert "On the way back (12 frames) PSNR is" in said
-    assert "with memory and" in said
+    output = capsys.readouterr().out
+    assert "On the way back (12 frames) PSNR is" in output
+    assert "with memory and" in output

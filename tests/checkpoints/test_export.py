@@ -1,4 +1,4 @@
-"""tests.checkpoints.test_export."""
+"""Exports stand alone, generate what the runs do, and refuse what does not fit together."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from persist_cli.io.files import load_exactly, read_tensors, write_tensors
 from tests.support.disk import file_limit
 from tests.support.export_runs import write_adapter, write_base, write_runs
 from tests.support.micro_model import random_clips, random_tokens
-from tests.support.walking import stage
+from tests.support.micro_runs import stage
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def export(persist, runs):
 
 
 def generated(path, adapter, original=None):
-    """A clip with memory tokens, from the checkpoint's base and one of its adapters."""
+    """A clip that the checkpoint's base and one of its adapters generate from memory tokens."""
     checkpoint = find_checkpoint(path)
     backbone = load_backbone(checkpoint).eval()
     load_adapter(backbone, checkpoint, adapter)
@@ -56,21 +56,21 @@ def test_a_float32_export_generates_bit_for_bit_what_the_runs_do(export, runs, t
 
 
 @pytest.mark.parametrize(("dtype", "kind"), [("float16", torch.float16), ("bfloat16", torch.bfloat16)])
-def test_weights_equal_the_originals_to_the_precision_asked_for(export, runs, tmp_path, dtype, kind):
+def test_exported_weights_are_the_originals_rounded_to_the_requested_precision(export, runs, tmp_path, dtype, kind):
     export(tmp_path / "m", runs / "voxel", "--dtype", dtype)
     files = list((tmp_path / "m").rglob("*.safetensors"))
     assert len(files) == 4
     for path in files:
         owner = runs / ("voxel" if "adapters" in path.parts else "stage1")
         original, metadata = read_tensors(owner / path.relative_to(tmp_path / "m"))
-        found, kept = read_tensors(path)
-        assert metadata == kept
-        assert found.keys() == original.keys()
-        assert all(torch.equal(found[name], original[name].to(kind)) for name in original)
+        exported, exported_metadata = read_tensors(path)
+        assert metadata == exported_metadata
+        assert exported.keys() == original.keys()
+        assert all(torch.equal(exported[name], original[name].to(kind)) for name in original)
 
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
-def test_half_precision_files_give_float32_parameters(export, runs, tmp_path, dtype):
+def test_files_in_half_precision_are_loaded_as_float32_parameters(export, runs, tmp_path, dtype):
     export(tmp_path / "m", runs / "voxel", "--dtype", dtype)
     checkpoint = find_checkpoint(tmp_path / "m")
     backbone = load_backbone(checkpoint)
@@ -80,7 +80,7 @@ def test_half_precision_files_give_float32_parameters(export, runs, tmp_path, dt
     assert torch.allclose(backbone.prompt, expected["prompt"], atol=1e-2)
 
 
-def test_tensors_assigned_to_a_module_without_storage_take_its_precision(tmp_path):
+def test_tensors_loaded_into_a_module_on_the_meta_device_take_its_precision(tmp_path):
     with torch.device("meta"):
         module = torch.nn.Linear(2, 2)
     tensors = {"weight": torch.ones(2, 2).half(), "bias": torch.ones(2).bfloat16()}
@@ -89,20 +89,20 @@ def test_tensors_assigned_to_a_module_without_storage_take_its_precision(tmp_pat
     assert module(torch.ones(1, 2)).tolist() == [[3, 3]]
 
 
-def test_an_export_of_an_export_is_the_same(export, persist, runs, tmp_path):
+def test_an_export_of_an_export_has_the_same_files(export, persist, runs, tmp_path):
     export(tmp_path / "m", runs / "none", runs / "voxel", "--default", "voxel")
     assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
     assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
     assert find_checkpoint(tmp_path / "again").default_adapter() == "voxel"
 
 
-def test_a_stage_2_run_stands_for_its_base_and_adapter(persist, export, runs, tmp_path):
+def test_exporting_a_stage_2_run_exports_its_base_and_adapter(persist, export, runs, tmp_path):
     assert persist("export", runs / "voxel", "--out", tmp_path / "a").code == 0
     export(tmp_path / "b", runs / "voxel")
     assert (tmp_path / "a/SHA256SUMS").read_bytes() == (tmp_path / "b/SHA256SUMS").read_bytes()
 
 
-def test_the_sampling_of_the_card_is_meant_where_nothing_is_asked_for(export, runs, tmp_path):
+def test_the_exported_sampling_is_the_default_of_the_checkpoint(export, runs, tmp_path):
     export(tmp_path / "m", "--steps", "7", "--sampler", "unipc", "--guidance", "1.5")
     exported, run = find_checkpoint(tmp_path / "m"), find_checkpoint(runs / "stage1")
     assert exported.sampling_with(SamplingOverrides()) == Sampling(7, "unipc", 1.5)
@@ -125,7 +125,7 @@ def test_the_sampling_of_the_card_is_meant_where_nothing_is_asked_for(export, ru
         {"memory_guidance": "1"},
     ],
 )
-def test_a_card_with_a_sampling_that_is_none_is_refused(export, tmp_path, value):
+def test_a_card_with_an_invalid_sampling_is_refused(export, tmp_path, value):
     export(tmp_path / "m")
     card = json.loads((tmp_path / "m/persist.json").read_text())
     (tmp_path / "m/persist.json").write_text(json.dumps(card | {"sampling": value}))
@@ -133,7 +133,7 @@ def test_a_card_with_a_sampling_that_is_none_is_refused(export, tmp_path, value)
         find_checkpoint(tmp_path / "m")
 
 
-def test_the_sums_are_those_of_all_files(export, runs, tmp_path):
+def test_the_sums_file_has_the_hash_of_every_file(export, runs, tmp_path):
     export(tmp_path / "m", runs / "voxel")
     lines = [line.split("  ") for line in (tmp_path / "m/SHA256SUMS").read_text().splitlines()]
     files = {path.relative_to(tmp_path / "m").as_posix() for path in (tmp_path / "m").rglob("*") if path.is_file()}
@@ -141,17 +141,17 @@ def test_the_sums_are_those_of_all_files(export, runs, tmp_path):
     assert all(hashlib.sha256((tmp_path / "m" / name).read_bytes()).hexdigest() == sum_ for sum_, name in lines)
 
 
-def test_the_table_and_json_tell_the_size_of_every_file(export, runs, tmp_path):
+def test_the_table_and_json_have_the_size_of_every_file(export, runs, tmp_path):
     assert "adapters/voxel/adapter.safetensors" in export(tmp_path / "m", runs / "voxel")
-    told = json.loads(export(tmp_path / "n", runs / "voxel", "--json"))
-    sizes = {name: (tmp_path / "n" / name).stat().st_size for name in told["files"]}
-    assert sizes == {name: each["bytes"] for name, each in told["files"].items()}
-    assert told["bytes"] == sum(sizes.values())
-    assert told["fingerprint"] == find_checkpoint(tmp_path / "n").fingerprint
-    assert told["default_adapter"] == "voxel"
+    record = json.loads(export(tmp_path / "n", runs / "voxel", "--json"))
+    sizes = {name: (tmp_path / "n" / name).stat().st_size for name in record["files"]}
+    assert sizes == {name: file["bytes"] for name, file in record["files"].items()}
+    assert record["bytes"] == sum(sizes.values())
+    assert record["fingerprint"] == find_checkpoint(tmp_path / "n").fingerprint
+    assert record["default_adapter"] == "voxel"
 
 
-def test_an_adapter_trained_on_the_export_joins_it(export, persist, runs, tmp_path):
+def test_an_adapter_trained_on_an_export_can_be_exported_with_it(export, persist, runs, tmp_path):
     export(tmp_path / "m")
     model = find_checkpoint(tmp_path / "m")
     later = write_adapter(load_backbone(model), tmp_path / "m", tmp_path / "later", "voxel")
@@ -189,7 +189,7 @@ def test_an_export_may_be_called_model(persist, walks, stage1, tmp_path):
     assert find_checkpoint(tmp_path / "runs/none").base_folder == model
 
 
-def test_a_full_disk_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
+def test_a_full_disk_ends_an_export_in_one_line_and_leaves_no_file(persist, runs, tmp_path):
     with file_limit(5000):
         ended = persist("export", runs / "stage1", "--out", tmp_path / "m")
     assert (ended.code, "cannot be exported" in ended.err) == (1, True)
@@ -197,7 +197,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(persist, runs, tmp_path):
+def test_each_impossible_export_ends_in_one_line_and_leaves_no_file(persist, runs, tmp_path):
     (tmp_path / "here").mkdir()
     base, voxel, canvas, out = runs / "stage1", runs / "voxel", runs / "canvas", tmp_path / "m"
     for arguments, cause in (
@@ -220,7 +220,7 @@ def test_what_cannot_be_exported_is_one_line_and_leaves_nothing(persist, runs, t
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
-def test_a_value_beyond_float16_is_refused_by_name_and_bfloat16_takes_it(persist, tmp_path):
+def test_a_value_beyond_float16_is_refused_by_its_name_and_fits_in_bfloat16(persist, tmp_path):
     write_base(tmp_path / "stage1")
     path = tmp_path / "stage1/world.safetensors"
     tensors, metadata = read_tensors(path)
@@ -232,7 +232,7 @@ def test_a_value_beyond_float16_is_refused_by_name_and_bfloat16_takes_it(persist
     assert persist("export", tmp_path / "stage1", "--dtype", "bfloat16", "--out", tmp_path / "m").code == 0
 
 
-def test_several_adapters_without_a_default_must_be_chosen_from(export, runs, tmp_path):
+def test_one_of_several_adapters_without_a_default_must_be_chosen(export, runs, tmp_path):
     export(tmp_path / "m", runs / "voxel", runs / "none")
     with pytest.raises(CheckpointError, match="choose an adapter of none, voxel with --adapter"):
         find_checkpoint(tmp_path / "m").default_adapter()

@@ -1,4 +1,4 @@
-"""What checkpoints know of the recipes and scenes behind them."""
+"""The recipes and scenes behind a checkpoint, with its runs and data there or removed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from persist_cli.api.checkpoint import TrainingScenes, find_checkpoint
 from persist_cli.checkpoints.lineage import stage_recipes, training_scenes
 from persist_cli.evaluate.provenance import checkpoint_json, scenes_json
 from persist_cli.evaluate.provenance import training_scenes as scenes_to_avoid
-from tests.support.walking import stage
+from tests.support.micro_runs import stage
 
 ROOMS = TrainingScenes(frozenset({"room-0", "room-1"}))
 
@@ -26,7 +26,7 @@ def halves(walks, tmp_path):
 
 
 def forget(run):
-    """The run as a version left it that wrote no scenes and no earlier recipes down."""
+    """Make the run one of an earlier version, which wrote down no scenes and no recipes of earlier stages."""
     model = next(run.glob("step-*")) / "model"
     card = json.loads((model / "persist.json").read_text())
     del card["training_scenes"]
@@ -34,14 +34,14 @@ def forget(run):
     shutil.rmtree(model / "recipes", ignore_errors=True)
 
 
-def test_scenes_of_every_base_are_known_when_neither_runs_nor_data_are_there_any_more(persist, codec, halves, tmp_path):
-    made, short = [], ["training.steps=1", f"base={tmp_path / 'codec'}"]
+def test_scenes_of_all_bases_are_known_after_runs_and_data_are_removed(persist, codec, halves, tmp_path):
+    scenes, short = [], ["training.steps=1", f"base={tmp_path / 'codec'}"]
     shutil.copytree(codec, tmp_path / "codec")
     for name, data in zip(("one", "two"), halves, strict=True):
         assert persist(*stage("stage1", data, tmp_path / name, *short)).code == 0
-        made.append(training_scenes(find_checkpoint(tmp_path / name)))
+        scenes.append(training_scenes(find_checkpoint(tmp_path / name)))
         shutil.rmtree(data)
-    assert made == [ROOMS, ROOMS]  # the codec saw both
+    assert scenes == [ROOMS, ROOMS]  # the codec was trained on both
 
 
 def test_an_adapters_scenes_are_also_those_of_its_base(persist, codec, halves, tmp_path):
@@ -60,7 +60,7 @@ def test_an_adapters_scenes_are_also_those_of_its_base(persist, codec, halves, t
         shutil.rmtree(tmp_path / "m")
 
 
-def test_what_no_card_says_is_what_the_recipes_data_hold_as_far_as_they_are_there(
+def test_scenes_that_no_card_has_are_those_in_the_recipes_data_sets_that_still_exist(
     persist, walks, codec, tmp_path, capsys
 ):
     shutil.copytree(codec, tmp_path / "codec")
@@ -80,7 +80,7 @@ def test_what_no_card_says_is_what_the_recipes_data_hold_as_far_as_they_are_ther
     assert scenes_json(checkpoint)["training_scenes"] == {"known": 0, "complete": False}
 
 
-def test_an_exports_recipes_have_a_hash_that_depends_on_each(persist, stage1, voxel, tmp_path):
+def test_the_hash_of_an_exports_recipes_depends_on_each_of_them(persist, stage1, voxel, tmp_path):
     assert persist("export", stage1, voxel, "--out", tmp_path / "m").code == 0
     before = checkpoint_json(find_checkpoint(tmp_path / "m"))["recipe_sha256"]
     assert len(before) == 64
@@ -89,7 +89,7 @@ def test_an_exports_recipes_have_a_hash_that_depends_on_each(persist, stage1, vo
     assert checkpoint_json(find_checkpoint(tmp_path / "m"))["recipe_sha256"] != before
 
 
-def test_recipes_of_all_stages_before_are_kept_when_training_starts(persist, walks, codec, tmp_path):
+def test_a_run_keeps_the_recipes_of_all_stages_before(persist, walks, codec, tmp_path):
     shutil.copytree(codec, tmp_path / "codec")
     for name, base in (("one", "codec"), ("two", "one")):
         options = [f"base={tmp_path / base}", "training.steps=1"]
@@ -97,13 +97,11 @@ def test_recipes_of_all_stages_before_are_kept_when_training_starts(persist, wal
         shutil.rmtree(tmp_path / base)
     recipes = stage_recipes(find_checkpoint(tmp_path / "two").folder)
     assert list(recipes) == ["codec.yaml", "stage1.yaml", "stage1-2.yaml"]
-    assert ["description: one" in recipes["stage1.yaml"], "description: two" in recipes["stage1-2.yaml"]] == [
-        True,
-        True,
-    ]
+    assert "description: one" in recipes["stage1.yaml"]
+    assert "description: two" in recipes["stage1-2.yaml"]
 
 
-def test_a_run_that_kept_none_asks_its_base_and_says_when_that_is_gone(persist, walks, codec, tmp_path, capsys):
+def test_a_run_without_those_recipes_reads_its_bases_or_warns(persist, walks, codec, tmp_path, capsys):
     shutil.copytree(codec, tmp_path / "codec")
     base = f"base={tmp_path / 'codec'}"
     assert persist(*stage("stage1", walks, tmp_path / "one", base, "training.steps=1")).code == 0

@@ -1,4 +1,4 @@
-"""The reference model that comes with the package: whole, small enough for git, and better with its memory."""
+"""The bundled reference model is whole, small enough for git, and better with its memory than without."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ BACK = ("--start", "sample#0:32", "--follow", "--frames", 24, "--seed", 0)
 
 @pytest.fixture
 def packaged(monkeypatch):
-    """The folder in the package, which other tests do without."""
+    """The folder in the package; other tests use a folder of their own."""
     monkeypatch.delenv("PERSIST_REFERENCE")
     return reference_checkpoint()
 
 
-def test_every_file_is_the_one_of_its_sum(packaged):
+def test_every_file_has_its_hash_and_all_are_small_enough(packaged):
     lines = [line.split("  ") for line in (packaged / "SHA256SUMS").read_text().splitlines()]
     assert {name for _, name in lines} | {"SHA256SUMS", "README.md"} == {
         os.path.relpath(path, packaged) for path in packaged.rglob("*") if path.is_file()
@@ -32,7 +32,7 @@ def test_every_file_is_the_one_of_its_sum(packaged):
     assert sum((packaged / name).stat().st_size for _, name in lines) <= MOST_BYTES
 
 
-def test_what_was_seen_on_the_way_out_is_drawn_on_the_way_back(packaged, persist, tmp_path):
+def test_with_memory_the_way_back_is_closer_to_the_truth_than_without(packaged, persist, tmp_path):
     assert persist("memorize", "sample#0:0-33", "--out", tmp_path / "house.safetensors").code == 0
     means = []
     for options in (("--memory", tmp_path / "house.safetensors"), ("--adapter", "none")):

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from tests.support.disk import file_limit
-from tests.support.walking import MICRO_SETTINGS, stage
+from tests.support.micro_runs import MICRO_SETTINGS, stage
 
 COMMANDS = (
     *("collect", "import", "inspect", "finetune", "doctor", "export", "memorize", "rollout", "eval"),

@@ -9,7 +9,7 @@ import torch
 
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.errors import DataError, RecipeError
-from tests.support.walking import SIZE
+from tests.support.micro_runs import SIZE
 
 
 def plan(**changes) -> ClipPlan:

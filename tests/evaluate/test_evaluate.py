@@ -13,7 +13,7 @@ import pytest
 
 from persist_cli.cli.app import main
 from persist_cli.io.files import read_json, write_json
-from tests.support.walking import PERSIST, together, without_depth
+from tests.support.micro_runs import PERSIST, run_persist_in_two_processes, without_depth
 
 QUICK = ["--memories", "stage1,voxel", "--metrics", "psnr,absrel", "--seeds", 2, "--steps", 2]
 
@@ -105,7 +105,7 @@ def test_a_killed_eval_goes_on_to_the_same_figures(uninterrupted, voxel, walks, 
 
 def test_two_processes_give_the_same_figures_as_one(uninterrupted, voxel, walks, tmp_path):
     command = ["eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", tmp_path / "eval"]
-    together(*map(str, command))
+    run_persist_in_two_processes(*map(str, command))
     assert results(tmp_path / "eval")["environment"]["processes"] == 2
     assert tables(tmp_path / "eval") == tables(uninterrupted)
 

@@ -14,8 +14,8 @@ from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.coverage import held_frames, recalled_share, seen_share
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, turning_point
+from tests.support.micro_runs import slow_turn, without_depth
 from tests.support.rooms import Room, look
-from tests.support.walking import smoothed, without_depth
 
 
 def search(folder, frames=0, scenes=()):
@@ -41,7 +41,7 @@ def test_a_revisit_remembers_every_frame_up_to_the_first_and_none_of_the_clip(wa
 
 
 def test_a_path_that_never_returns_has_no_clip_to_evaluate(tmp_path):
-    Room(32, 32).write(tmp_path / "a.parquet", smoothed(24))
+    Room(32, 32).write(tmp_path / "a.parquet", slow_turn(24))
     with pytest.raises(DataError, match=r"no clip of 9 frames returns to a place seen before"):
         PROTOCOLS["revisit"].find(search(tmp_path))
     with pytest.raises(DataError, match=r"no trajectory goes away and comes back"):
@@ -61,13 +61,13 @@ def test_first_visits_of_there_and_back_have_the_same_pose(walks):
 
 
 def test_the_turning_point_may_lie_on_a_frame_or_between_two():
-    out = smoothed(6)
+    out = slow_turn(6)
     assert turning_point(torch.from_numpy(np.concatenate([out, out[::-1][1:]]))) == (10, 11)
     assert turning_point(torch.from_numpy(np.concatenate([out, out[::-1]]))) == (11, 12)
 
 
 def test_standing_still_is_no_return(tmp_path):
-    Room(32, 32).write(tmp_path / "a.parquet", np.repeat(smoothed(1), 24, axis=0))
+    Room(32, 32).write(tmp_path / "a.parquet", np.repeat(slow_turn(1), 24, axis=0))
     with pytest.raises(DataError, match="comes back"):
         PROTOCOLS["return"].find(search(tmp_path))
 
@@ -89,7 +89,7 @@ def test_unseen_refuses_scenes_that_were_trained_on(walks, tmp_path):
         PROTOCOLS["unseen"].find(search(walks, scenes=["room-1"]))
     assert len(PROTOCOLS["unseen"].find(search(walks))) == 2
     info = replace(Room(32, 32).info, source={"simulator": "miniworld", "split": "train"})
-    write_trajectory(tmp_path / "a.parquet", info, Room(32, 32).frames(smoothed(24)))
+    write_trajectory(tmp_path / "a.parquet", info, Room(32, 32).frames(slow_turn(24)))
     with pytest.raises(DataError, match="of the training split"):
         PROTOCOLS["unseen"].find(search(tmp_path))
 

@@ -1,4 +1,4 @@
-"""tests.io.test_files."""
+"""Files are written whole or not at all, and damaged ones are errors of one line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.misaligned import ALIGNMENT, write_misaligned
 def test_a_failed_writer_leaves_the_old_file_and_nothing_else(tmp_path):
     write_text(tmp_path / "a.txt", "old")
     with pytest.raises(FileNotFoundError), written_aside(tmp_path / "a.txt"):
-        pass  # nothing was written aside, as when a disk is full
+        pass  # writes nothing, as with a full disk
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
 
@@ -31,9 +31,9 @@ def test_a_failed_writer_leaves_the_old_file_and_nothing_else(tmp_path):
 def test_tensors_are_read_into_memory_that_torch_allocated(tmp_path):
     tensors = {name: torch.randn(7, 5) for name in "abc"}
     write_misaligned(tmp_path / "a.safetensors", tensors)
-    found, _ = read_tensors(tmp_path / "a.safetensors")
-    assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
-    assert all(tensor.data_ptr() % ALIGNMENT == 0 for tensor in found.values())
+    copies, _ = read_tensors(tmp_path / "a.safetensors")
+    assert all(torch.equal(copies[name], tensor) for name, tensor in tensors.items())
+    assert all(tensor.data_ptr() % ALIGNMENT == 0 for tensor in copies.values())
 
 
 def test_a_truncated_tensor_file_is_one_line(tmp_path):
@@ -53,13 +53,13 @@ def test_a_missing_or_foreign_file_is_one_line(tmp_path):
         read_json(tmp_path / "a.json")
 
 
-def test_tensors_that_do_not_fit_on_the_disk_are_an_error_of_the_system_and_leave_nothing(tmp_path):
+def test_writing_tensors_to_a_full_disk_is_an_os_error_and_leaves_no_file(tmp_path):
     with file_limit(1000), pytest.raises(OSError, match=r"too large: .*a\.safetensors"):
         write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(10_000)})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_leftovers_of_one_name_are_those_of_that_name_alone(tmp_path):
+def test_only_leftovers_of_the_given_name_are_removed(tmp_path):
     (tmp_path / f"{ASIDE}0123abcd-m").mkdir()
     for name in (f"{ASIDE}0123abcd-big-m", f"{ASIDE}0123abcd-m-big", "m"):
         (tmp_path / name).touch()
@@ -69,7 +69,7 @@ def test_leftovers_of_one_name_are_those_of_that_name_alone(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["m"]
 
 
-def test_a_folder_written_aside_takes_the_place_of_the_old_one_only_when_it_is_whole(tmp_path):
+def test_a_folder_written_aside_replaces_the_old_one_only_when_it_is_whole(tmp_path):
     for text in ("old", "new"):
         with folder_aside(tmp_path / "m") as folder:
             write_text(folder / "a.txt", text)

@@ -1,4 +1,4 @@
-"""tests.io.test_settings."""
+"""Settings are parsed strictly, and all their errors are reported at once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_plain_values_become_the_dataclass():
     )
 
 
-def test_every_problem_is_reported_at_once_with_what_was_meant():
+def test_all_errors_are_reported_at_once_with_the_nearest_keys():
     with pytest.raises(RecipeError) as error:
         parse_settings(Outer, {"inner": {"widht": 4}, "cell": [1, 2], "nmae": "a"}, "my.yaml")
     text = str(error.value)

@@ -7,7 +7,7 @@ import torch
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import MemoryConfig
-from tests.support.walking import SIZE
+from tests.support.micro_runs import SIZE
 
 
 def test_an_encoder_computes_where_its_maker_is_told(tmp_path):

@@ -14,7 +14,7 @@ from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.outputs import quaternion
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.video import read_video
-from tests.support.walking import SIZE
+from tests.support.micro_runs import SIZE
 
 
 def roll(persist, run, walks, out, *options):

@@ -17,7 +17,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def rewrite(good: Path, bad: Path, change: Change, intrinsics: float = 1.0) -> Path:
-    """The trajectory with every frame changed and the first two rows of the intrinsics multiplied."""
+    """Write the trajectory with every frame changed and the first two rows of the intrinsics multiplied."""
     file = TrajectoryFile(good)
     info = replace(file.info, intrinsics=np.diag([intrinsics, intrinsics, 1.0]) @ file.info.intrinsics)
     write_trajectory(bad, info, (change(frame, file.info) for frame in _frames(file)))
@@ -26,8 +26,8 @@ def rewrite(good: Path, bad: Path, change: Change, intrinsics: float = 1.0) -> P
 
 def _frames(file: TrajectoryFile) -> list[Frame]:
     trajectory = file.read()
-    seen = trajectory.observations
-    columns = (seen.rgb.numpy(), seen.depth.numpy(), seen.cameras.world_from_camera.numpy(), trajectory.actions)
+    images = trajectory.observations
+    columns = (images.rgb.numpy(), images.depth.numpy(), images.cameras.world_from_camera.numpy(), trajectory.actions)
     return [Frame(*row, number / 10) for number, row in enumerate(zip(*columns, strict=True))]
 
 
@@ -58,7 +58,7 @@ def scaled(scale: float) -> Change:
 
 
 def shuffled(frame: Frame, info: TrajectoryInfo) -> Frame:
-    """Poses that belong to other images: no convention explains it."""
+    """Turn every pose by another angle, as if it belonged to another image: no convention explains it."""
     angle = 40 * np.sin(1e3 * frame.timestamp)
     turn = np.eye(4)
     turn[0, 0] = turn[2, 2] = np.cos(np.radians(angle))

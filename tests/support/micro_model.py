@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from persist_backbones.adapters.base import MemoryCondition
-from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.backbone import Clips
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.plugins import make_backbone
-from tests.support.walking import MICRO, SIZE
+from tests.support.micro_runs import MICRO, SIZE
 
 CHANNELS = 6
 

@@ -1,4 +1,4 @@
-"""Frames of noise: for what only has to come back as it was."""
+"""Frames of noise, for tests of data that come back as they were."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ INFO = TrajectoryInfo("house-7", INTRINSICS, 16, 24, (0.0, 1.0, 0.0), walking_ac
 
 
 def make_frames(count: int = 20) -> list[Frame]:
+    """Frames with random images and positions, always the same ones."""
     random = np.random.default_rng(0)
     frames = []
     for number in range(count):

@@ -1,4 +1,4 @@
-"""A furnished room in closed form: textured boxes seen by rays, so that depth and colour are exact."""
+"""A furnished room of textured boxes that is ray traced, so that depth and colour are exact."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ FURNITURE = (
 
 @dataclass(frozen=True)
 class Room:
-    """Images of the room.
+    """The room as a camera with this image size and field of view sees it.
 
     Args:
-        height: pixels.
-        width: pixels.
-        field_of_view: degrees across.
+        height: image height in pixels.
+        width: image width in pixels.
+        field_of_view: degrees from the left to the right border.
     """
 
     height: int = 48
@@ -39,7 +39,7 @@ class Room:
 
     @property
     def intrinsics(self) -> np.ndarray:
-        """Square pixels, principal point in the middle."""
+        """Intrinsics ``[3, 3]`` with square pixels and the principal point in the middle."""
         focal = self.width / 2 / math.tan(math.radians(self.field_of_view) / 2)
         return np.array([[focal, 0, self.width / 2], [0, focal, self.height / 2], [0, 0, 1]])
 
@@ -48,7 +48,7 @@ class Room:
         return TrajectoryInfo("room", self.intrinsics, self.height, self.width, UP, free_motion(), {"format": "room"})
 
     def see(self, pose: np.ndarray, action: str | None = None, timestamp: float = 0.0) -> Frame:
-        """What a camera at this world_from_camera sees."""
+        """The frame that a camera at this world_from_camera sees."""
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(self.intrinsics).T @ pose[:3, :3].T
         depth = _hit(rays, pose[:3, 3])
@@ -56,12 +56,12 @@ class Room:
         return Frame(_texture(points), depth.astype(np.float32), pose, action, timestamp)
 
     def frames(self, poses: np.ndarray) -> Iterator[Frame]:
-        """What a camera on this path sees."""
+        """The frames that a camera on this path sees."""
         for number, pose in enumerate(poses):
             yield self.see(pose, FREE if number + 1 < len(poses) else None, number / 10)
 
     def write(self, path: Path, poses: np.ndarray | None = None) -> Path:
-        """A trajectory file; by default of a walk through the room."""
+        """Write a trajectory file; by default of a walk through the room."""
         from persist_cli.data.store import write_trajectory
 
         write_trajectory(path, self.info, self.frames(walk() if poses is None else poses))
@@ -69,7 +69,7 @@ class Room:
 
 
 def look(position: tuple[float, float, float], yaw: float, pitch: float = -10.0) -> np.ndarray:
-    """World_from_camera at a position; yaw in degrees to the left of -z, negative pitch looks down."""
+    """A pose (world_from_camera) at a position; yaw in degrees to the left of -z, negative pitch looks down."""
     yaw, pitch = math.radians(yaw), math.radians(pitch)
     forward = np.array([-math.sin(yaw) * math.cos(pitch), math.sin(pitch), -math.cos(yaw) * math.cos(pitch)])
     right = np.cross(forward, UP)
@@ -81,7 +81,7 @@ def look(position: tuple[float, float, float], yaw: float, pitch: float = -10.0)
 
 
 def walk(frames: int = 24) -> np.ndarray:
-    """A path once around the middle of the room that looks about: every axis moves and turns."""
+    """Poses of a path once around the middle of the room, which move and turn along every axis."""
     angles = np.linspace(0, 2 * math.pi, frames, endpoint=False)
     return np.stack(
         [
@@ -101,8 +101,8 @@ def _hit(rays: np.ndarray, origin: np.ndarray) -> np.ndarray:
     ends = np.maximum((ROOM[0] - origin) / rays, (ROOM[1] - origin) / rays)
     nearest = ends.min(-1)
     for low, high in FURNITURE:
-        one, other = (low - origin) / rays, (high - origin) / rays
-        enter, leave = np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
+        at_low, at_high = (low - origin) / rays, (high - origin) / rays
+        enter, leave = np.minimum(at_low, at_high).max(-1), np.maximum(at_low, at_high).min(-1)
         nearest = np.where((enter > 0) & (enter < leave) & (enter < nearest), enter, nearest)
     return nearest
 

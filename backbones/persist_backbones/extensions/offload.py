@@ -10,8 +10,8 @@ from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel, Diffu
 from diffusers.models.modeling_utils import ModelMixin
 from torch import nn
 
-from persist_backbones.cogvideox.backbone import CogVideoX
 from persist_backbones.cogvideox.codec import pixel_patch
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.model import WorldTransformer
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.errors import CheckpointError

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.extensions.lora import has_lora
 from persist_cli.api.stages import MemorySavings, Stage
 

@@ -12,12 +12,12 @@ from diffusers.models.modeling_utils import ModelMixin
 
 from persist_backbones.adapters.base import Adapter, VideoShape
 from persist_backbones.adapters.forms import make_adapter
-from persist_backbones.cogvideox.backbone import CogVideoX
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.inputs import clip_shape
 from persist_backbones.cogvideox.model import widen
 from persist_backbones.cogvideox.parts import DiffusersParts
-from persist_backbones.extensions.backbone import ExtendedCogVideoX
+from persist_backbones.extensions.extended import ExtendedCogVideoX
 from persist_cli.io.settings import parse_settings
 
 BASE = "base"  # diffusers' transformer inside ours, a component of its own

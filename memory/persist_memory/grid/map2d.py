@@ -10,7 +10,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
-from persist_memory.grid.memory import GridMemory
+from persist_memory.grid.grid_memory import GridMemory
 from persist_memory.grid.pooling import GridSettings, Lattice
 from persist_memory.grid.visibility import Views, horizontal_views
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from persist_cli.api.geometry import nearest_at
-from persist_memory.snapshots.store import SnapshotStore
+from persist_memory.snapshots.snapshot_store import SnapshotStore
 
 SAME_PLACE = 0.25  # two depths along a ray agree within a quarter: a patch of oblique floor spans about as much
 

@@ -20,7 +20,7 @@ from persist_cli.evaluate.rows.interventions import (
     Shuffled,
     Unmodified,
 )
-from persist_cli.evaluate.rows.model import ModelRow, RowMemory
+from persist_cli.evaluate.rows.model_rows import ModelRow, RowMemory
 from persist_cli.evaluate.rows.row import Row, unique_bases
 from persist_cli.memorize.factory import MemoryFactory
 

@@ -28,7 +28,7 @@ class Control(Row):
     """A row that needs no training.
 
     Args:
-        name: name in the table, ``title`` where one control has that title.
+        name: name in the table: the title, followed by a checkpoint where several rows have that title.
         base: checkpoint whose backbone the row needs.
         writes: whether the protocol writes predicted frames to the memory.
     """
@@ -109,7 +109,7 @@ class EarlierFramesControl(Control):
         return rgb, depth
 
     def held(self, clip: CaseFrames, frame: int, length: int) -> Bool[Tensor, " earlier"]:
-        """A mask of the context's and the clip's frames that are known when a frame is predicted, never those to come."""
+        """A mask of the context and the clip: the frames known when a frame is predicted, never those to come."""
         case = clip.case
         numbers = held_frames(case.start, case.context, frame, length, self.writes)
         known = torch.zeros(case.context + case.frames, dtype=torch.bool)

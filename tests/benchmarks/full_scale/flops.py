@@ -16,15 +16,15 @@ class VideoSizes:
     """Sizes of a pass through the transformer.
 
     Args:
-        batch: clips.
+        batch: number of clips.
         text: tokens of the prompt.
-        text_channels: of the prompt's embedding.
+        text_channels: channels of the prompt's embedding.
         video: tokens of the latents.
-        channels: of the hidden states.
-        layers: transformer blocks.
+        channels: channels of the hidden states.
+        layers: number of transformer blocks.
         time: channels of the time embedding.
-        inputs: numbers of a video token that come in, over the time and area of its patch.
-        outputs: numbers that come out.
+        inputs: numbers that go into a video token, over the time and area of its patch.
+        outputs: numbers that come out of a video token.
     """
 
     batch: int
@@ -39,7 +39,7 @@ class VideoSizes:
 
     @property
     def tokens(self) -> int:
-        """Text and video."""
+        """Tokens of text and video together."""
         return self.text + self.video
 
 
@@ -48,10 +48,10 @@ class MemorySizes:
     """Sizes of memory blocks of the form ``cross``.
 
     Args:
-        tokens: of the memory, padding included.
+        tokens: tokens of the memory, padding included.
         embedded: channels of a token with its position code.
-        width: of the attention.
-        hidden: of the feed-forward.
+        width: channels of the attention.
+        hidden: hidden channels of the feed-forward.
         camera: channels of the camera embedding beside the hidden states in the query.
         layers: the transformer blocks after which they stand.
     """
@@ -65,50 +65,50 @@ class MemorySizes:
 
 
 def product(rows: int, inner: int, outer: int) -> int:
-    """Of a matrix product [rows, inner] [inner, outer]."""
+    """FLOPs of a matrix product [rows, inner] [inner, outer]."""
     return 2 * rows * inner * outer
 
 
 def attention(batch: int, queries: int, keys: int, channels: int) -> int:
-    """Of Q Kᵀ and its product with V."""
+    """FLOPs of Q Kᵀ and of its product with V."""
     return 2 * batch * product(queries, channels, keys)
 
 
 def modulation(video: VideoSizes) -> int:
-    """Of the two adaptive norms of a transformer block."""
+    """FLOPs of the two adaptive norms of a transformer block."""
     return 2 * product(video.batch, video.time, 6 * video.channels)
 
 
 def block_products(video: VideoSizes) -> int:
-    """Of queries, keys, values, output and the feed-forward of four times the width in a transformer block."""
+    """FLOPs of queries, keys, values, output and feed-forward (four times the width) of a transformer block."""
     rows, width = video.batch * video.tokens, video.channels
     return 4 * product(rows, width, width) + 2 * product(rows, width, 4 * width)
 
 
 def block_attention(video: VideoSizes) -> int:
-    """Of the joint attention of text and video in a transformer block."""
+    """FLOPs of the joint attention of text and video in a transformer block."""
     return attention(video.batch, video.tokens, video.tokens, video.channels)
 
 
 def entrance(video: VideoSizes) -> int:
-    """Of what takes data in: prompt, patches and the first layer of the time embedding; no gradient leaves there."""
+    """FLOPs of the first layers: prompt, patches and time embedding; their inputs need no gradient."""
     text = product(video.batch * video.text, video.text_channels, video.channels)
     patches = product(video.batch * video.video, video.inputs, video.channels)
     return text + patches + product(video.batch, video.channels, video.time)
 
 
 def rest_of_ends(video: VideoSizes) -> int:
-    """Of the second layer of the time embedding and the modulation of the last norm."""
+    """FLOPs of the second layer of the time embedding and of the modulation of the last norm."""
     return product(video.batch, video.time, video.time) + product(video.batch, video.time, 2 * video.channels)
 
 
 def exit_product(video: VideoSizes) -> int:
-    """Of the projection to latents."""
+    """FLOPs of the projection to latents."""
     return product(video.batch * video.video, video.channels, video.outputs)
 
 
 def memory_products(video: VideoSizes, memory: MemorySizes) -> int:
-    """Of queries, keys, values, output and the feed-forward of a memory block."""
+    """FLOPs of queries, keys, values, output and the feed-forward of a memory block."""
     rows, width = video.batch * video.video, video.channels
     query = product(rows, width + memory.camera, memory.width) + product(rows, memory.width, width)
     return (
@@ -119,43 +119,43 @@ def memory_products(video: VideoSizes, memory: MemorySizes) -> int:
 
 
 def memory_attention(video: VideoSizes, memory: MemorySizes) -> int:
-    """Of the cross-attention of a memory block."""
+    """FLOPs of the cross-attention of a memory block."""
     return attention(video.batch, video.video, memory.tokens, memory.width)
 
 
 def memory_modulation(video: VideoSizes, memory: MemorySizes) -> int:
-    """Of the expert adaptive norm of a memory block."""
+    """FLOPs of the expert adaptive norm of a memory block."""
     return product(video.batch, video.time, 4 * video.channels + 2 * memory.width)
 
 
 def embedding(video: VideoSizes, memory: MemorySizes) -> int:
-    """Of the tokens' embedding, once a clip."""
+    """FLOPs of the embedding of the memory's tokens, once a clip."""
     return product(video.batch * memory.tokens, memory.embedded, memory.width)
 
 
 def forward(video: VideoSizes, memory: MemorySizes | None = None) -> int:
-    """Of one pass, the embedding of the memory's tokens included."""
+    """FLOPs of one pass, the embedding of the memory's tokens included."""
     block = modulation(video) + block_products(video) + block_attention(video)
     total = entrance(video) + rest_of_ends(video) + exit_product(video) + video.layers * block
     if memory is None:
         return total
-    each = memory_products(video, memory) + memory_attention(video, memory) + memory_modulation(video, memory)
-    return total + embedding(video, memory) + len(memory.layers) * each
+    memory_block = memory_products(video, memory) + memory_attention(video, memory) + memory_modulation(video, memory)
+    return total + embedding(video, memory) + len(memory.layers) * memory_block
 
 
 def clip(steps: int, video: VideoSizes, memory: MemorySizes | None = None) -> int:
-    """Of so many passes, of which the first embeds the memory's tokens; the codec is not counted."""
+    """FLOPs of the passes of a clip, of which the first embeds the memory's tokens; the codec is not counted."""
     again = 0 if memory is None else embedding(video, memory)
     return steps * forward(video, memory) - (steps - 1) * again
 
 
 def stage1_step(video: VideoSizes) -> int:
-    """Of the forward and backward pass when the whole transformer is trained."""
+    """FLOPs of the forward and backward pass when the whole transformer is trained."""
     return 3 * forward(video) - entrance(video)
 
 
 def stage2_step(video: VideoSizes, memory: MemorySizes) -> int:
-    """Of the forward and backward pass when only memory blocks are trained: gradients begin at the first of them."""
+    """FLOPs of both passes when only memory blocks are trained: gradients end at the first of them."""
     later = video.layers - 1 - memory.layers[0]
     through = later * (block_products(video) + 2 * block_attention(video)) + exit_product(video)
     trained = 2 * (memory_products(video, memory) + memory_attention(video, memory))

@@ -1,4 +1,4 @@
-"""Seconds and peak memory of works that take turns, and what a device can do at most."""
+"""Seconds and peak memory of functions that take turns, and the peak FLOP/s of a device."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tests.support import resident_memory as resident
+from tests.support import resident_memory
 
 Work = Callable[[], Any]
 
@@ -31,12 +31,12 @@ PEAKS = {  # dense bf16 FLOP/s by the vendors' datasheets, the most special name
 
 @dataclass(frozen=True)
 class Timing:
-    """Runs of one work.
+    """Runs of one function.
 
     Args:
-        seconds: of each run.
-        peak: most bytes of device memory in any of them, on a CPU of resident memory, with all that was held before;
-            ``None`` where nobody counts.
+        seconds: seconds of each run.
+        peak: largest number of bytes held in any run, those held before included: device memory, on a CPU resident
+            memory; ``None`` where it cannot be measured.
     """
 
     seconds: tuple[float, ...]
@@ -49,43 +49,43 @@ class Timing:
 
     @property
     def median(self) -> float:
-        """Seconds of the run in the middle."""
+        """The median seconds of a run."""
         return float(np.median(self.seconds))
 
     def ratio(self, to: Timing) -> float:
-        """How many times as long as another, round by round, so that a busy machine slows both."""
+        """The median, over the rounds, of these seconds over another's, so that a busy machine slows both."""
         return float(np.median(np.array(self.seconds) / np.array(to.seconds)))
 
 
 @dataclass
 class Turns:
-    """Works that take turns; one that does not fit into the device's memory has no timing.
+    """Runs functions in turns; one that does not fit into the device's memory has no timing.
 
     Args:
-        device: whose work is waited for.
-        rounds: runs of each work, after one that does not count.
+        device: device that the functions compute on.
+        rounds: runs of each function, after a warm-up that does not count.
     """
 
     device: torch.device
     rounds: int
 
     def measure(self, works: Mapping[str, Work]) -> dict[str, Timing | None]:
-        """Timings by name."""
+        """Run every function once a round; returns their timings by name."""
         runs: dict[str, list[tuple[float, int | None]]] = {name: [] for name in works}
         for number in range(self.rounds + 1):
             for name in list(runs):
-                found = self.run(works[name])
-                if found is None:
+                result = self.run(works[name])
+                if result is None:
                     del runs[name]
                 elif number:
-                    runs[name].append(found)
+                    runs[name].append(result)
         return {name: timing_of(runs[name]) if name in runs else None for name in works}
 
     def run(self, work: Work) -> tuple[float, int | None] | None:
         """Seconds of one run and the most memory that was held in it; ``None`` when it does not fit."""
         with contextlib.suppress(torch.OutOfMemoryError):
             return self.timed(work)
-        release(self.device)  # only here, where the error no longer holds what the work had made
+        release(self.device)  # not before: the error held what the function had allocated
         return None
 
     def timed(self, work: Work) -> tuple[float, int | None]:
@@ -99,48 +99,48 @@ class Turns:
 
 
 def timing_of(runs: Sequence[tuple[float, int | None]]) -> Timing:
-    """Of the seconds and the peak memory of each run."""
+    """The timing of some runs, of each of which the seconds and the peak memory are given."""
     peaks = [peak for _, peak in runs if peak is not None]
     return Timing(tuple(seconds for seconds, _ in runs), max(peaks, default=None))
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until the device has done what it was asked."""
+    """Wait until the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def release(device: torch.device) -> None:
-    """Give back memory that nothing holds any more."""
+    """Return memory that is no longer used."""
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
 
 
 def forget_peak(device: torch.device) -> None:
-    """Begin to look for the most memory anew."""
+    """Measure the peak memory from now on."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    elif resident.KNOWN:
-        resident.forget_peak()
+    elif resident_memory.KNOWN:
+        resident_memory.forget_peak()
 
 
 def peak_memory(device: torch.device) -> int | None:
-    """The most bytes held since ``forget_peak``; ``None`` where nobody counts."""
+    """The largest number of bytes held since ``forget_peak``; ``None`` where it cannot be measured."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    return resident.peak_resident() if resident.KNOWN else None
+    return resident_memory.peak_resident() if resident_memory.KNOWN else None
 
 
 def device_name(device: torch.device) -> str:
-    """What the device calls itself."""
+    """The name of the device."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"CPU, {torch.get_num_threads()} thread(s)"
 
 
 def peak_flops(device: torch.device, precision: torch.dtype) -> tuple[float, str]:
-    """FLOP/s that the device can do at most, and where the figure is from."""
+    """The peak FLOP/s of the device, and the source of the figure."""
     if device.type == "cuda" and precision == torch.bfloat16:
         for name, peak in PEAKS.items():
             if name in device_name(device):
@@ -151,6 +151,6 @@ def peak_flops(device: torch.device, precision: torch.dtype) -> tuple[float, str
 def matmul_flops(device: torch.device, precision: torch.dtype) -> float:
     """FLOP/s of large square matrix products, the fastest of ten."""
     side = 8192 if device.type == "cuda" else 1024
-    one, other = (torch.randn(side, side, device=device, dtype=precision) for _ in range(2))
-    timing = Turns(device, 10).measure({"product": lambda: one @ other})["product"]
+    first, second = (torch.randn(side, side, device=device, dtype=precision) for _ in range(2))
+    timing = Turns(device, 10).measure({"product": lambda: first @ second})["product"]
     return 2 * side**3 / timing.least if timing else float("nan")

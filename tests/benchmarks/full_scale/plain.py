@@ -20,7 +20,7 @@ class Plain:
     It computes with the very blocks and the VAE of the model that it is compared with, so that both fit on one device.
 
     Args:
-        bench: whose model it is compared with.
+        bench: the model that it is compared with.
     """
 
     def __init__(self, bench: Bench) -> None:
@@ -28,7 +28,7 @@ class Plain:
         config = dict(ours.base.config) | {
             "num_layers": 0, "in_channels": ours.in_channels, "out_channels": ours.out_channels,
         }  # fmt: skip
-        with bench.made_here():
+        with bench.built_on_device():
             self.transformer = CogVideoXTransformer3DModel.from_config(config)
         torch.nn.Module.to(self.transformer, bench.device, bench.precision)  # buffers; diffusers' own warns of nothing
         self.transformer.transformer_blocks = ours.base.transformer_blocks
@@ -58,7 +58,7 @@ class Plain:
         return predicted
 
     def step(self, batch: tuple[Tensor, Tensor, Tensor], optimizer: torch.optim.Optimizer, clip: float) -> float:
-        """A training step on latents, image latents and camera latents; the loss."""
+        """Take a training step on latents, image latents and camera latents; returns the loss."""
         latents, image, camera = batch
         noise = torch.randn_like(latents)
         timesteps = torch.randint(0, self.scheduler.config.num_train_timesteps, (len(latents),), device=latents.device)
@@ -89,9 +89,9 @@ class Plain:
     @torch.no_grad()
     def generate(self, first: Tensor, camera: Tensor, steps: int) -> Tensor:
         """A clip by DDIM from the first frames of RGB and depth, ``[2, 3, 1, height, width]``, on the CPU."""
-        given = self.encode(first)
-        frames = camera.shape[1]
-        image = torch.cat([given, given.new_zeros(len(given), frames - 1, *given.shape[2:])], dim=1)
+        first_latents = self.encode(first)
+        later = first_latents.new_zeros(len(first_latents), camera.shape[1] - 1, *first_latents.shape[2:])
+        image = torch.cat([first_latents, later], dim=1)
         latents, rotary = torch.randn_like(image), self.rotary(image)
         self.scheduler.set_timesteps(steps)
         for timestep in self.scheduler.timesteps:
@@ -102,7 +102,7 @@ class Plain:
 
 
 def share_moments(ours: Mapping[Any, Any], plain: MutableMapping[Any, Any], shared: Sequence[Tensor]) -> None:
-    """Let one optimizer's state use the other's moments of the weights that both train, so that they are held once."""
+    """Let the plain optimizer use our moments of the weights that both train, so that they are stored once."""
     for parameter in shared:
         if parameter in ours:
             plain[parameter] = ours[parameter]

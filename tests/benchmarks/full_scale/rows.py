@@ -1,4 +1,4 @@
-"""What was measured: rows of the table, and whether they reach their targets."""
+"""Rows of the table, and whether they reach their targets."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Target:
-    """What a row shall reach.
+    """A target of a row.
 
     Args:
-        text: in words.
-        value: measured; ``None`` when it could not be.
-        limit: of the value.
-        at_most: whether the limit is the greatest value that reaches it, else the least.
+        text: the target in words.
+        value: the measured value; ``None`` when it could not be measured.
+        limit: the value that must not be passed.
+        at_most: whether the value must be at most the limit, else at least.
     """
 
     text: str
@@ -34,30 +34,31 @@ class Target:
 
     @property
     def reached(self) -> bool | None:
-        """Whether it is; ``None`` when it could not be measured."""
+        """Whether the value reaches the target; ``None`` when it could not be measured."""
         if self.value is None:
             return None
         return self.value <= self.limit if self.at_most else self.value >= self.limit
 
-    def said(self) -> str:
-        """For the table."""
-        return f"{self.text}: {({None: 'not measured', True: 'reached', False: 'not reached'})[self.reached]}"
+    def cell(self) -> str:
+        """The text of the table's cell."""
+        outcomes = {None: "not measured", True: "reached", False: "not reached"}
+        return f"{self.text}: {outcomes[self.reached]}"
 
 
 @dataclass(frozen=True)
 class Row:
-    """One work and what it is compared with.
+    """One measurement and what it is compared with.
 
     Args:
-        model: whose.
-        what: was done.
-        ours: how long it took; ``None`` when it did not fit.
-        beside: what it is compared with, empty for nothing.
-        other: how long that took.
-        samples: of one run.
-        flops: model FLOPs of one run by formula, 0 where nobody counts.
+        model: name of the model.
+        what: what was measured, in words.
+        ours: its timing; ``None`` when it did not fit into memory.
+        beside: what it is compared with; empty for nothing.
+        other: timing of what it is compared with.
+        samples: samples of one run.
+        flops: model FLOPs of one run by formula; 0 where none are counted.
         peak: FLOP/s of the device.
-        targets: what it shall reach.
+        targets: the targets of the row.
     """
 
     model: str
@@ -77,20 +78,20 @@ class Row:
 
     @property
     def ratio(self) -> float | None:
-        """Time over that of the other, the median of the rounds."""
+        """The median, over the rounds, of our time over the other's."""
         return self.ours.ratio(self.other) if self.ours and self.other else None
 
     @property
     def ratio_of_least(self) -> float | None:
-        """The fastest run over the other's fastest."""
+        """The time of our fastest run over that of the other's fastest."""
         return self.ours.least / self.other.least if self.ours and self.other else None
 
     def with_targets(self, *targets: Target) -> Row:
-        """The row with what it shall reach."""
+        """The row with these targets."""
         return dataclasses.replace(self, targets=targets)
 
     def cells(self) -> tuple[str, ...]:
-        """For the table."""
+        """The cells of the row in the order of ``COLUMNS``."""
         ours, other = self.ours, self.other
         ratios = self.ratio is not None and f"{self.ratio:.2f} ({self.ratio_of_least:.2f})"
         return (
@@ -104,28 +105,28 @@ class Row:
             times(other) if self.beside else "",
             gigabytes(other),
             ratios or "",
-            "; ".join(target.said() for target in self.targets),
+            "; ".join(target.cell() for target in self.targets),
         )
 
     def to_json(self) -> dict[str, Any]:
-        """All figures, JSON values."""
+        """All figures as JSON values."""
         figures = {"utilisation": self.utilisation, "ratio": self.ratio, "ratio_of_least": self.ratio_of_least}
         targets = [dataclasses.asdict(target) | {"reached": target.reached} for target in self.targets]
         return dataclasses.asdict(self) | figures | {"targets": targets}
 
 
 def times(timing: Timing | None) -> str:
-    """Median and least seconds."""
+    """The text of a timing: median and least seconds."""
     return f"{timing.median:.3g} ({timing.least:.3g})" if timing else "does not fit"
 
 
 def gigabytes(timing: Timing | None) -> str:
-    """Peak memory."""
+    """The text of a timing's peak memory, in GB."""
     return "" if timing is None or timing.peak is None else f"{timing.peak / 1e9:.2f}"
 
 
 def print_rows(title: str, rows: Sequence[Row]) -> None:
-    """The table, without the columns that are empty in every row."""
-    cells = [row.cells() for row in rows]
-    kept = [number for number in range(len(COLUMNS)) if any(row[number] for row in cells)]
-    print_table(title, [COLUMNS[number] for number in kept], [[row[number] for number in kept] for row in cells])
+    """Print the table without the columns that are empty in every row."""
+    columns = list(zip(COLUMNS, *(row.cells() for row in rows), strict=True))
+    header, *cells = zip(*(column for column in columns if any(column[1:])), strict=True)
+    print_table(title, header, cells)

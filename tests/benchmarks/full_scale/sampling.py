@@ -1,4 +1,4 @@
-"""Clips of a rollout, with and without memory, beside the plain pipeline; the codec and the map alone."""
+"""Clips of a rollout, with and without memory, compared with the plain pipeline; the codec and the map alone."""
 
 from __future__ import annotations
 
@@ -10,25 +10,29 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from persist_backbones.cogvideox.codec import Codec, to_uint8
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.plugins import make_encoder, make_memory
-from persist_cli.rollout.world_model import WorldModel
+from persist_cli.rollout.world_model import Agent, WorldModel
 from tests.benchmarks.full_scale import flops
 from tests.benchmarks.full_scale.measuring import Turns, Work
 from tests.benchmarks.full_scale.plain import Plain
 from tests.benchmarks.full_scale.rows import Row, Target
 from tests.benchmarks.full_scale.shapes import ADAPTER, Bench
+from tests.support.room_views import observe
 from tests.support.rooms import UP, walk
 
 STEPS = (50, 20, 10, 4)
 
-OVERHEAD, SECONDS, FAST = 1.1, 1.0, 10
+OVERHEAD = 1.1  # target of a clip with memory over one without
+
+FAST, SECONDS = 10, 1.0  # steps of the fast sampling, and its target
 
 CONTEXT = 24  # frames in the map before the clip
 
-CELL = (0.125, 0.5, 0.125)  # metres; half the usual ones, so that a clip sees more cells than it is told of
+CELL = (0.125, 0.5, 0.125)  # metres; half the usual size, so that a clip sees more cells than its token budget
 
 DINO = {"hidden_size": 384, "num_attention_heads": 6, "num_hidden_layers": 12, "image_size": 518, "patch_size": 14}
 
@@ -39,7 +43,7 @@ class Scene:
 
     Args:
         bench: the model.
-        folder: where an encoder's weights may be written.
+        folder: folder into which the encoder's weights may be written.
     """
 
     bench: Bench
@@ -49,7 +53,7 @@ class Scene:
         bench = self.bench
         self.info = bench.info()
         memory = make_memory("voxel", {"cell": CELL}, self.encoder(), FrameOfReference("room", UP)).to(bench.device)
-        memory.write(bench.observe(walk(CONTEXT)).to(bench.device))
+        memory.write(observe(walk(CONTEXT), *bench.size[1:]).to(bench.device))
         self.memory: Memory = memory
         self.clip = bench.walk()
         self.actions = ["forward", "left"] * ((bench.backbone.frames_per_clip - 1) // 2)
@@ -66,30 +70,31 @@ class Scene:
     def tokens(self, budget: int) -> int:
         """How many tokens the map gives the clip, at most the budget."""
         world = self.world(1, True)
-        assert world.memory is not None
-        return len(world.memory.read(world.clip_path(world.cameras_after(self.actions)), budget))
+        agent = world.agents[0]
+        return len(self.memory.read(world.clip_path(agent, agent.cameras_after(self.actions)), budget))
 
-    def world(self, steps: int, row_memory: bool) -> WorldModel:
-        """A world model that stands at the clip's first frame."""
-        memory = self.memory.copy() if remembering else None
-        model = WorldModel(self.bench.backbone, memory, Sampling(steps))
-        model.reset(self.clip[:1], self.info)
+    def world(self, steps: int, with_map: bool) -> WorldModel:
+        """A world model that stands at the clip's first frame, with the map as its memory or without memory."""
+        memory = self.memory.copy() if with_map else None
+        model = WorldModel(self.bench.backbone, [Agent(memory)], Sampling(steps))
+        model.reset([self.clip[:1]], [self.info])
         return model
 
 
-def clip_works(scene: Scene, plain: Plain, steps: int) -> dict[str, Work]:
-    """A clip by the plain pipeline, and one of a rollout without memory and with it, from the first frame on."""
+def clip_functions(scene: Scene, plain: Plain, steps: int) -> dict[str, Work]:
+    """Functions that make a clip: by the plain pipeline, and by a rollout without and with memory."""
     bench = scene.bench
-    given, camera = plain_images(bench)[:, :, :1], bench.backbone.camera_latents(bench.clips(1, 1)).to(bench.precision)
+    first_images = plain_images(bench)[:, :, :1]
+    camera = bench.backbone.conditions(bench.clips(1, 1), torch.zeros(1).long()).camera.to(bench.precision)
 
-    def rolled(world: WorldModel, adapter: str | None) -> None:
+    def roll(world: WorldModel, adapter: str | None) -> None:
         bench.backbone.use_adapter(adapter)
-        world.branches(1)[0].step(scene.actions)
+        world.branches(1).step([scene.actions])
 
     return {
-        "plain": partial(plain.generate, given, camera, steps),
-        "alone": partial(rolled, scene.world(steps, False), None),
-        "memory": partial(rolled, scene.world(steps, True), ADAPTER),
+        "plain": partial(plain.generate, first_images, camera, steps),
+        "alone": partial(roll, scene.world(steps, False), None),
+        "memory": partial(roll, scene.world(steps, True), ADAPTER),
     }
 
 
@@ -100,16 +105,16 @@ def plain_images(bench: Bench) -> Tensor:
 
 
 def clip_rows(bench: Bench, folder: Path) -> Iterator[Row]:
-    """Latency of a clip for each number of steps."""
+    """Rows with the latency of a clip for each number of steps."""
     scene, plain, name = Scene(bench, folder), Plain(bench), bench.model.name
     bench.backbone.use_adapter(ADAPTER)
     tokens = scene.tokens(bench.backbone.token_budget)
     video, more = flops.video_sizes(bench.backbone, 1), flops.memory_sizes(bench.backbone, tokens)
     for steps in STEPS:
-        found = Turns(bench.device, bench.rounds).measure(clip_works(scene, plain, steps))
-        alone, memory = found["alone"], found["memory"]
+        timings = Turns(bench.device, bench.rounds).measure(clip_functions(scene, plain, steps))
+        alone, memory = timings["alone"], timings["memory"]
         row = Row(
-            name, f"clip, {steps} steps", alone, "plain diffusers", found["plain"],
+            name, f"clip, {steps} steps", alone, "plain diffusers", timings["plain"],
             flops=flops.clip(steps, video), peak=bench.peak,
         )  # fmt: skip
         if name == "5b" and steps == FAST:
@@ -122,36 +127,44 @@ def clip_rows(bench: Bench, folder: Path) -> Iterator[Row]:
         yield row.with_targets(Target("≤ 10 % more", row.ratio, OVERHEAD)) if bench.model.published else row
 
 
+def decode(codec: Codec, latents: Tensor) -> tuple[Tensor, Tensor]:
+    """RGB in 8 bits and depth of latents."""
+    colors, depth = codec.decode_images(latents)
+    return to_uint8(colors), depth
+
+
 def codec_rows(bench: Bench) -> Iterator[Row]:
-    """Encoding and decoding a clip of RGB and depth."""
+    """Rows of encoding and decoding a clip of RGB and depth."""
     clips, plain, codec = bench.clips(1, bench.size[0]), Plain(bench), bench.backbone.codec
     images = plain_images(bench)
     with torch.no_grad():
         latents = plain.encode(images)
-        works: dict[str, Work] = {
+        functions: dict[str, Work] = {
             "encode": partial(codec.encode, clips.rgb, clips.depth),
             "plain encode": partial(plain.encode, images),
-            "decode": partial(codec.decode, latents),
+            "decode": lambda: decode(codec, latents),
             "plain decode": partial(plain.decode, latents),
         }
-        found = Turns(bench.device, bench.rounds).measure(works)
+        timings = Turns(bench.device, bench.rounds).measure(functions)
     for what in ("encode", "decode"):
-        yield Row(bench.model.name, f"VAE, {what} RGB-D clip", found[what], "plain diffusers", found[f"plain {what}"])
+        yield Row(
+            bench.model.name, f"VAE, {what} RGB-D clip", timings[what], "plain diffusers", timings[f"plain {what}"]
+        )
 
 
 def map_rows(bench: Bench, folder: Path) -> Iterator[Row]:
-    """Writing a clip into a voxel map of the room and reading it, and several readings at once."""
+    """Rows of writing a clip into a voxel map of the room and of reading it."""
     scene = Scene(bench, folder)
     clip, memory = scene.clip.to(bench.device), scene.memory
     bench.backbone.use_adapter(ADAPTER)
     budget, frames = bench.backbone.token_budget, len(clip)
-    works: dict[str, Work] = {
+    functions: dict[str, Work] = {
         "encoder": partial(memory.encoder.encode, clip.rgb),
         "write": lambda: memory.copy().write(clip),
         "read": partial(memory.read, clip.cameras, budget),
     }
-    found = Turns(bench.device, bench.rounds).measure(works)
+    timings = Turns(bench.device, bench.rounds).measure(functions)
     read, cells, encoder = len(memory.read(clip.cameras, budget)), memory.figures().cells, memory.encoder.name
     name = bench.model.name
-    yield Row(name, f"map, write {frames} frames ({encoder})", found["write"], "encoder alone", found["encoder"])
-    yield Row(name, f"map, read {read} of {cells} cells for {frames} cameras", found["read"])
+    yield Row(name, f"map, write {frames} frames ({encoder})", timings["write"], "encoder alone", timings["encoder"])
+    yield Row(name, f"map, read {read} of {cells} cells for {frames} cameras", timings["read"])

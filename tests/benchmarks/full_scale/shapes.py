@@ -1,13 +1,12 @@
-"""The models that are measured, made with random weights on the device: the published sizes, and their small twins."""
+"""The measured models with random weights on the device: the published sizes and small twins of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
 from diffusers import CogVideoXDDIMScheduler
 
@@ -16,6 +15,7 @@ from persist_cli.api.backbone import Clips
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.plugins import make_backbone
+from tests.support.room_views import observe
 from tests.support.rooms import UP, Room, look
 
 ADAPTER = "voxel"
@@ -26,11 +26,11 @@ class Model:
     """A model to measure.
 
     Args:
-        name: in the table.
-        settings: of the backbone.
-        adapter: of its memory adapter.
-        batch: clips of a training step.
-        channels: of the map's features.
+        name: its name in the table.
+        settings: settings of the backbone.
+        adapter: settings of its memory adapter.
+        batch: clips in a training step.
+        channels: channels of the map's features.
         published: whether it is one of the published sizes, for which there are targets.
     """
 
@@ -47,7 +47,7 @@ SMALL = {
     "use_rotary_positional_embeddings": True,
 }  # fmt: skip
 
-AT_SIZE = {"height": 512, "width": 512}
+FULL_SCALE = {"height": 512, "width": 512}
 
 BLOCKS = {"form": "cross", "every": 2, "ff_factor": 0.5, "token_budget": 1024}
 
@@ -58,8 +58,8 @@ MODELS = {
         Model("small", {"preset": "tiny", "height": 96, "width": 96, "transformer": SMALL,
                         "vae": {"block_out_channels": [16, 32, 64]}},
               BLOCKS | {"width": 128, "token_budget": 256}, 1, 96),
-        Model("2b", {"preset": "2b"} | AT_SIZE, BLOCKS | {"width": 640, "heads": 10}, 8, 384, True),
-        Model("5b", {"preset": "5b-i2v"} | AT_SIZE, BLOCKS | {"width": 1024, "heads": 16}, 4, 384, True),
+        Model("2b", {"preset": "2b"} | FULL_SCALE, BLOCKS | {"width": 640, "heads": 10}, 8, 384, True),
+        Model("5b", {"preset": "5b-i2v"} | FULL_SCALE, BLOCKS | {"width": 1024, "heads": 16}, 4, 384, True),
     )
 }  # fmt: skip
 
@@ -69,12 +69,12 @@ class Bench:
     """One model on one device.
 
     Args:
-        model: which.
-        device: where.
-        precision: of weights and arithmetic.
-        rounds: measured runs of each work, after one that does not count.
+        model: the model to build.
+        device: device of its weights.
+        precision: precision of weights and arithmetic.
+        rounds: measured runs of each function, after a warm-up that does not count.
         peak: FLOP/s that the device can do in this precision.
-        changes: of the training recipes, as ``training.compile=true``.
+        changes: changes of the training recipes, as ``training.compile=true``.
         mixed: whether steps hold float32 weights and compute in bf16, as the recipes of the published models do.
     """
 
@@ -88,7 +88,7 @@ class Bench:
     backbone: Any = field(init=False)
 
     def __post_init__(self) -> None:
-        with self.made_here():
+        with self.built_on_device():
             self.backbone = make_backbone("cogvideox", self.model.settings)
             self.backbone.add_adapter(ADAPTER, self.model.channels, self.model.adapter)
         scheduler = CogVideoXDDIMScheduler.from_config(self.backbone.scheduler.config)  # one whose tables are float32
@@ -97,7 +97,7 @@ class Bench:
 
     @contextmanager
     def training(self) -> Iterator[None]:
-        """Within the block weights are as steps hold them."""
+        """Within the block weights have the precision of training steps."""
         usual, self.precision = self.precision, torch.float32 if self.mixed else self.precision
         self.backbone.to(self.precision)
         try:
@@ -107,8 +107,8 @@ class Bench:
             self.backbone.to(usual)
 
     @contextmanager
-    def made_here(self) -> Iterator[None]:
-        """What is made within has its weights on the device, in its precision, from the beginning."""
+    def built_on_device(self) -> Iterator[None]:
+        """Within the block modules are built on the device, in its precision, rather than moved there."""
         before = torch.get_default_dtype()
         torch.set_default_dtype(self.precision)
         try:
@@ -125,24 +125,16 @@ class Bench:
 
     def walk(self) -> Observations:
         """A clip of the furnished room: ahead, turning to the left."""
-        return self.observe([look((0.0, 1.4, 1.2 - 0.1 * step), 5.0 * step) for step in range(self.size[0])])
-
-    def observe(self, poses: Sequence[np.ndarray]) -> Observations:
-        """What the furnished room looks like from these world_from_camera."""
-        _, height, width = self.size
-        room = Room(height, width)
-        seen = [room.see(pose) for pose in poses]
-        intrinsics = torch.from_numpy(room.intrinsics).expand(len(poses), 3, 3)
-        rgb, depth = (torch.from_numpy(np.stack([getattr(each, name) for each in seen])) for name in ("rgb", "depth"))
-        return Observations(rgb, depth, Cameras(torch.from_numpy(np.stack(poses)), intrinsics, height, width))
+        frames, height, width = self.size
+        return observe([look((0.0, 1.4, 1.2 - 0.1 * step), 5.0 * step) for step in range(frames)], height, width)
 
     def info(self) -> TrajectoryInfo:
-        """The room, whose agent walks by quarters of a metre and turns by 15°."""
+        """The info of the room, whose agent walks by quarters of a metre and turns by 15°."""
         _, height, width = self.size
         return TrajectoryInfo("room", Room(height, width).intrinsics, height, width, UP, walking_actions(0.25, 15.0))
 
     def clips(self, batch: int, frames: int, observations: Observations | None = None) -> Clips:
-        """A batch of the same clip, of which the first frames are known."""
+        """A batch of the same clip, whose first ``frames`` frames have images."""
         seen = observations or self.walk()
         spread, cameras = [batch, -1, -1, -1], seen.cameras
         poses, intrinsics = cameras.world_from_camera.expand(spread), cameras.intrinsics.expand(spread)

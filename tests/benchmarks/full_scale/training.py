@@ -1,4 +1,4 @@
-"""Training steps of both stages, beside the plain loop."""
+"""Training steps of both stages, compared with the plain loop."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from accelerate import Accelerator
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from persist_cli.api.backbone import Clips
+from persist_cli.api.backbone import ClipLatents, Clips
 from persist_cli.api.stages import Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
@@ -26,24 +26,24 @@ from tests.benchmarks.full_scale.shapes import ADAPTER, Bench
 
 RECIPES: dict[Stage, str] = {"1": "tiny-stage1", "2": "tiny-stage2-voxel"}
 
-ENDLESS = 1_000_000
+ENDLESS = 1_000_000  # steps
 
-UTILISATION = 0.45
+UTILISATION = 0.45  # target of model FLOP utilisation
 
 
 class NoClips(Dataset[Any]):
-    """No data: the batch is given."""
+    """A data set without a clip; the trainer gets its batch directly."""
 
     files: tuple[()] = ()
 
 
 class FixedBatchTrainer(Trainer):
-    """The training loop on one batch over and over, its latents known.
+    """The training loop on one batch over and over, which begins at latents.
 
     Args:
         bench: the model.
-        stage: which.
-        batch: the clips.
+        stage: stage of the training.
+        batch: the clips, with their latents.
     """
 
     def __init__(self, bench: Bench, stage: Stage, batch: Clips) -> None:
@@ -58,44 +58,46 @@ class FixedBatchTrainer(Trainer):
         super().__init__(recipe, bench.backbone, None, accelerator)
 
     def all_clips(self) -> Any:
+        """No clip."""
         return NoClips()
 
     def loader(self) -> Iterator[Clips]:
+        """The same batch without end."""
         return repeat(self.batch)
 
 
 def make_batch(bench: Bench, batch: int, tokens: int) -> Clips:
-    """Clips whose latents are known, and random ones, with so many tokens of a memory."""
-    backbone, (frames, height, width) = bench.backbone, bench.size
-    codec = backbone.codec
-    times = (frames - 1) // codec.temporal + 1 + (not backbone.framewise)  # behind it that of the first image alone
-    shape = (batch, times, 2 * codec.channels, height // codec.spatial, width // codec.spatial)
+    """Clips with random latents and ``tokens`` random tokens of a memory; 0 for no memory."""
+    frames, height, width = bench.size
+    codec = bench.backbone.codec
+    latent_frames = (frames - 1) // codec.temporal + 1
+    shape = (batch, latent_frames, 2 * codec.channels, height // codec.spatial, width // codec.spatial)
     features = torch.randn(batch, tokens, bench.model.channels)
     memory = MemoryTokens(features, 2 * torch.randn(batch, tokens, 3).double(), torch.ones(batch, tokens).bool())
-    latents = torch.randn(shape, device=bench.device, dtype=bench.precision)
+    video = torch.randn(shape, device=bench.device, dtype=bench.precision)
+    latents = ClipLatents(video, video[:, :1] if bench.backbone.framewise else torch.randn_like(video[:, :1]))
     return dataclasses.replace(bench.clips(batch, 0), latents=latents, tokens=memory if tokens else None)
 
 
 def plain_batch(bench: Bench, clips: Clips) -> tuple[Tensor, Tensor, Tensor]:
     """Latents, image latents and camera latents of the clips, for the plain loop."""
-    backbone, kept = bench.backbone, clips.latents
-    assert kept is not None
-    latents, first = (kept, kept[:, :1]) if backbone.framewise else (kept[:, :-1], kept[:, -1:])
-    image, camera = backbone.image_condition(first), backbone.camera_latents(clips)
-    return latents, image.to(bench.precision), camera.to(bench.precision)
+    assert clips.latents is not None
+    camera = bench.backbone.conditions(clips, torch.zeros(len(clips.seeds)).long()).camera
+    image = bench.backbone.image_condition(clips.latents.image)
+    return bench.backbone.shape.pad(clips.latents.video), image.to(bench.precision), camera.to(bench.precision)
 
 
-def stage1_works(bench: Bench, batch: int) -> dict[str, Work]:
-    """A step of ours and of the plain loop; both train the same blocks, whose moments are held once."""
+def stage1_steps(bench: Bench, batch: int) -> dict[str, Work]:
+    """Functions that take a step of ours and of the plain loop; both train the same blocks and share their moments."""
     bench.backbone.use_adapter(None)
     clips = make_batch(bench, batch, 0)
     trainer = FixedBatchTrainer(bench, "1", clips)
     settings, plain = trainer.recipe.training, Plain(bench)
     if settings.gradient_checkpointing:
         plain.transformer.enable_gradient_checkpointing()
-    rest = {"lr": settings.learning_rate, "weight_decay": settings.weight_decay}
-    optimizer = torch.optim.AdamW(plain.transformer.parameters(), **rest)
-    given, steps = plain_batch(bench, clips), trainer.steps()
+    options = {"lr": settings.learning_rate, "weight_decay": settings.weight_decay}
+    optimizer = torch.optim.AdamW(plain.transformer.parameters(), **options)
+    batch_latents, steps = plain_batch(bench, clips), trainer.steps()
 
     def ours() -> None:
         next(steps)
@@ -103,19 +105,19 @@ def stage1_works(bench: Bench, batch: int) -> dict[str, Work]:
             blocks = plain.transformer.transformer_blocks
             share_moments(trainer.state.moments, optimizer.state, list(blocks.parameters()))
 
-    return {"ours": ours, "plain": partial(plain.step, given, optimizer, settings.clip)}
+    return {"ours": ours, "plain": partial(plain.step, batch_latents, optimizer, settings.clip)}
 
 
-def stage2_works(bench: Bench, batch: int) -> dict[str, Work]:
-    """A step of ours with as many tokens as the adapter takes."""
+def stage2_steps(bench: Bench, batch: int) -> dict[str, Work]:
+    """A function that takes a step of ours with as many tokens as the adapter takes."""
     bench.backbone.use_adapter(ADAPTER)
     trainer = FixedBatchTrainer(bench, "2", make_batch(bench, batch, bench.backbone.token_budget))
     return {"ours": partial(next, trainer.steps())}
 
 
 def fitting(bench: Bench, stage: Stage) -> tuple[int, dict[str, Timing | None]]:
-    """The timings of steps with the greatest batch that fits, halved until it does, and that batch."""
-    make, batch = stage1_works if stage == "1" else stage2_works, bench.model.batch
+    """The largest batch that fits, halving from the model's own, and the timings of steps with it."""
+    make, batch = stage1_steps if stage == "1" else stage2_steps, bench.model.batch
     while True:
         bench.backbone.train()
         try:

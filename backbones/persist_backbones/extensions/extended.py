@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from persist_backbones.cogvideox.backbone import CogVideoX, SamplingStep
+from persist_backbones.cogvideox.cogvideox import CogVideoX, SamplingStep
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.model import Conditions
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world

@@ -1,4 +1,4 @@
-"""Walks through the furnished room by named actions, and the smallest model that takes their images."""
+"""Runs of the smallest model on walks through a furnished room by named actions: how to start and compare them."""
 
 from __future__ import annotations
 
@@ -37,12 +37,7 @@ MICRO = {
 }  # fmt: skip
 
 MICRO_SETTINGS = [
-    f"backbone.settings.height={SIZE}",
-    f"backbone.settings.width={SIZE}",
-    "backbone.settings.transformer={num_layers: 2, num_attention_heads: 2, attention_head_dim: 32, in_channels: 8, "
-    "out_channels: 4, time_embed_dim: 32, text_embed_dim: 8}",
-    "backbone.settings.vae={block_out_channels: [8, 8, 8], norm_num_groups: 4, latent_channels: 4}",
-    "backbone.settings.codec_window=null",
+    f"backbone.settings.{name}={json.dumps(value)}" for name, value in {**MICRO, "codec_window": None}.items()
 ]
 
 SHORT = ["training.steps=4", "training.batch=2", "training.workers=0", "training.warmup=2"]
@@ -57,55 +52,49 @@ def stage(number: str, data: Path, out: Path, *changes: str) -> list[str]:
     return ["finetune", f"tiny-{number}", "--data", str(data), "--out", str(out), *SHORT, *changes]
 
 
-def train(*arguments: str) -> None:
+def run_persist_process(*arguments: str) -> None:
     """Run ``persist`` in a process of its own."""
     subprocess.run([*PERSIST, *arguments], check=True, capture_output=True)
 
 
-def train_here(*arguments: str) -> None:
+def run_persist(*arguments: str) -> None:
     """Run ``persist`` in this process."""
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said), pytest.raises(SystemExit) as ended:
+    stderr = io.StringIO()
+    with contextlib.redirect_stderr(stderr), pytest.raises(SystemExit) as ended:
         main(list(arguments))
-    assert not ended.value.code, said.getvalue()
+    assert not ended.value.code, stderr.getvalue()
 
 
-def launched(module: str, *arguments: str, kind: Sequence[str] = ("--multi_gpu",)) -> dict[str, Any]:
-    """How to start a module as two processes with gloo; ``--multi_gpu`` is accelerate's word for several."""
+def two_process_launch(module: str, *arguments: str, kind: Sequence[str] = ("--multi_gpu",)) -> dict[str, Any]:
+    """Arguments of ``subprocess`` that start a module as two processes with gloo.
+
+    Args:
+        module: name of the module.
+        arguments: arguments of the module.
+        kind: options of the launcher; ``--multi_gpu`` is accelerate's word for several processes, here on the CPU.
+    """
     launch = [
-        *kind,
-        "--num_machines",
-        "1",
-        "--num_processes",
-        "2",
-        "--mixed_precision",
-        "no",
-        "--main_process_port",
-        "0",
-    ]
-    command = [sys.executable, "-m", "accelerate.commands.launch", *launch, "--dynamo_backend", "no", "--module"]
+        *kind, "--num_machines", "1", "--num_processes", "2", "--mixed_precision", "no", "--main_process_port", "0",
+        "--dynamo_backend", "no",
+    ]  # fmt: skip
+    command = [sys.executable, "-m", "accelerate.commands.launch", *launch, "--module"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
     return {"args": [*command, module, *arguments], "env": environment}
 
 
-def in_two(*arguments: str, kind: Sequence[str] = ("--multi_gpu",)) -> dict[str, Any]:
-    """How to start ``persist`` as two processes."""
-    return launched("persist_cli", *arguments, kind=kind)
-
-
-def together(*arguments: str) -> None:
+def run_persist_in_two_processes(*arguments: str) -> None:
     """Run ``persist`` as two processes."""
-    subprocess.run(**in_two(*arguments), check=True, capture_output=True)
+    subprocess.run(**two_process_launch("persist_cli", *arguments), check=True, capture_output=True)
 
 
-def end_of(run: Path) -> tuple[dict[str, torch.Tensor], str]:
-    """All that a run came to: its newest training state and its log."""
+def run_result(run: Path) -> tuple[dict[str, torch.Tensor], str]:
+    """The newest training state of a run, and its log."""
     return read_tensors(max(run.glob("step-*")) / "training.safetensors")[0], (run / "log.jsonl").read_text()
 
 
 def first_gradients(state: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    """All gradients of a run's first step, of the training state after it."""
-    moments = [each.flatten() for name, each in state.items() if "exp_avg/" in name]
+    """All gradients of a run's first step, from the training state after it."""
+    moments = [tensor.flatten() for name, tensor in state.items() if "exp_avg/" in name]
     return torch.cat(moments) / 0.1  # AdamW's first moments begin with so much of them
 
 
@@ -114,15 +103,16 @@ def losses(run: Path) -> list[float]:
     return [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
 
 
-def ended_alike(one: Path, two: Path) -> bool:
-    """Whether two runs came to the same, to the bit."""
-    (weights, log), (others, other_log) = end_of(one), end_of(two)
-    same = weights.keys() == others.keys() and all(torch.equal(weights[name], others[name]) for name in weights)
-    return same and log == other_log
+def equal_runs(first: Path, second: Path) -> bool:
+    """Whether the training states and logs of two runs are equal to the bit."""
+    (state, log), (second_state, second_log) = run_result(first), run_result(second)
+    if state.keys() != second_state.keys() or log != second_log:
+        return False
+    return all(torch.equal(tensor, second_state[name]) for name, tensor in state.items())
 
 
 def write_walks(folder: Path, size: int = SIZE) -> Path:
-    """Two trajectories, out and back by the reversed actions, in rooms of two names."""
+    """Write two trajectories, out and back by the reversed actions, in scenes of two names."""
     room, vocabulary = Room(size, size), walking_actions(0.2, 15.0)
     out = list(OUT)
     for number, start in enumerate((look((0.0, 1.3, 0.2), 0.0, 0.0), look((0.3, 1.3, -0.2), 90.0, 0.0))):
@@ -138,16 +128,16 @@ def write_walks(folder: Path, size: int = SIZE) -> Path:
 
 
 def without_depth(walks: Path, folder: Path) -> Path:
-    """The same walks seen by a camera that gives no depth."""
+    """Write the walks as a camera without depth sees them."""
     for file in Store(walks):
-        whole = file.read()
-        steps = zip(whole.observations.rgb, whole.observations.cameras.world_from_camera, whole.actions, strict=True)
-        nothing = np.zeros((SIZE, SIZE), np.float32)
-        frames = [Frame(rgb.numpy(), nothing, pose.numpy(), name) for rgb, pose, name in steps]
+        walk = file.read()
+        steps = zip(walk.observations.rgb, walk.observations.cameras.world_from_camera, walk.actions, strict=True)
+        depth = np.zeros((SIZE, SIZE), np.float32)
+        frames = [Frame(rgb.numpy(), depth, pose.numpy(), name) for rgb, pose, name in steps]
         write_trajectory(folder / file.path.name, file.info, frames)
     return folder
 
 
-def smoothed(frames: int) -> np.ndarray:
-    """Poses of a slow turn to the left that never turns back."""
+def slow_turn(frames: int) -> np.ndarray:
+    """Poses of a turn to the left by six degrees a frame that never turns back."""
     return np.stack([look((0.0, 1.3, 0.0), 6.0 * number, 0.0) for number in range(frames)])

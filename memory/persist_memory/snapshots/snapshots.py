@@ -23,7 +23,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.snapshots.cover import covered_view, greedy_cover, most_redundant, seen_patches
-from persist_memory.snapshots.store import SnapshotStore
+from persist_memory.snapshots.snapshot_store import SnapshotStore
 from persist_memory.validation import check_mergeable, check_observations, check_tensors
 
 FRAMES_AT_ONCE = 16  # encoded and written
