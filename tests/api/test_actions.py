@@ -33,7 +33,7 @@ def test_walking_keeps_the_height_of_a_camera_that_looks_down():
     assert WALK.move(pose, "forward", UP)[1, 3] == pytest.approx(1.5)
 
 
-def test_text_and_actions_are_two_forms_of_one_thing():
+def test_writing_actions_as_text_and_parsing_them_gives_them_back():
     assert format_actions(WALK.parse("forward*4 left left forward")) == "forward*4 left*2 forward"
     assert ActionVocabulary.from_json(WALK.to_json()) == WALK
 
@@ -42,7 +42,7 @@ def test_text_and_actions_are_two_forms_of_one_thing():
     ("text", "cause"),
     [("foward*2", "did you mean 'forward'"), ("forward*x", "cannot read"), ("", "no action"), ("jump", "known: ")],
 )
-def test_what_is_no_action_is_said_in_one_line(text, cause):
+def test_unknown_actions_are_refused(text, cause):
     with pytest.raises(DataError, match=cause) as error:
         WALK.parse(text)
     assert "\n" not in str(error.value)

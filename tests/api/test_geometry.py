@@ -75,12 +75,12 @@ def test_a_rigid_transform_and_its_inverse_cancel():
     [(torch.full((4, 4), math.nan), "not finite"), (torch.diag(torch.tensor([1.0, 1, -1, 1])), "not rigid"),
      (torch.eye(4) * 2, "not rigid")],
 )  # fmt: skip
-def test_a_pose_that_is_no_rigid_motion_is_named(broken, cause):
+def test_an_error_names_the_pose_that_is_not_rigid(broken, cause):
     with pytest.raises(DataError, match=rf"walk: the pose of frame 1 is {cause}"):
         check_poses(torch.stack([torch.eye(4), broken]).double(), "walk")
 
 
-def test_singular_intrinsics_are_named():
+def test_an_error_names_singular_intrinsics():
     with pytest.raises(DataError, match=r"kitchen: the intrinsics .* singular"):
         check_intrinsics(torch.zeros(3, 3), "kitchen")
 

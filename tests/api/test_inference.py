@@ -32,26 +32,26 @@ def test_options_by_name_become_inference_options():
         (None, "model-offload,sequential-offload", "give one of them$"),
     ],
 )
-def test_other_words_are_one_line(dtype, save_memory, cause):
+def test_unknown_inference_options_are_refused(dtype, save_memory, cause):
     with pytest.raises(PersistError, match=cause):
         InferenceOptions.of(dtype, save_memory)
 
 
-def test_only_what_changes_results_is_told_apart():
+def test_changes_of_inference_options_are_only_those_that_change_results():
     assert InferenceOptions.of(None, "model-offload,vae-slicing").changes() == {}
     assert InferenceOptions.of("bfloat16", "vae-tiling").changes() == {"dtype": "bfloat16", "tiling": True}
 
 
 @NO_GPU
 @pytest.mark.parametrize("offload", ["model", "sequential"])
-def test_offloading_without_an_accelerator_is_one_line(offload):
+def test_offloading_without_an_accelerator_is_refused(offload):
     with pytest.raises(
         PersistError, match=rf"^--save-memory {offload}-offload keeps weights .* there is none; leave it"
     ):
         micro().prepare_inference(InferenceOptions(offload=offload))
 
 
-def test_a_backbone_that_says_no_more_moves_and_saves_no_memory():
+def test_by_default_a_backbone_moves_to_the_device_and_saves_no_memory():
     backbone = micro()
     Backbone.prepare_inference(backbone.train(), InferenceOptions("bfloat16"))
     assert backbone.prompt.dtype == torch.bfloat16

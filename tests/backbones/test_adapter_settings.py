@@ -19,7 +19,7 @@ SHARED = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dr
 
 
 @pytest.mark.parametrize("form", OWN)
-def test_a_form_has_the_settings_that_it_uses(form: str, tmp_path: Path) -> None:
+def test_every_adapter_form_has_exactly_the_settings_that_it_uses(form: str, tmp_path: Path) -> None:
     with_adapter(micro(), form=form).save_adapter(tmp_path)
     assert set(json.loads((tmp_path / "adapter.json").read_text())) == SHARED | OWN[form]
 
@@ -55,14 +55,14 @@ def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Pat
         ({"form": "splat"}, "unknown adapter form 'splat'; known: cross, projected, canvas"),
     ],
 )
-def test_an_adapter_that_cannot_work_is_refused_in_one_line(settings: dict, cause: str) -> None:
+def test_adapter_settings_that_cannot_work_are_refused(settings: dict, cause: str) -> None:
     with pytest.raises(PersistError, match=cause) as error:
         micro().add_adapter("other", CHANNELS, settings)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("card", ["[]", "{}", '{"channels": "many"}'])
-def test_a_damaged_card_is_one_line(card: str, tmp_path: Path) -> None:
+def test_a_damaged_adapter_card_is_refused(card: str, tmp_path: Path) -> None:
     backbone = with_adapter(micro())
     backbone.save_adapter(tmp_path)
     (tmp_path / "adapter.json").write_text(card)

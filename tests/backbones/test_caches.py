@@ -60,7 +60,7 @@ def test_a_cache_that_skips_nothing_changes_nothing(name):
 
 
 @EVERY
-def test_a_cache_changes_the_clip_and_keeps_nothing_for_the_next(name):
+def test_a_cache_changes_a_clip_and_not_the_next_one(name):
     backbone = trained()
     plain = backbone.generate(CLIPS, SAMPLING)
     enable_cache(backbone.transformer, BUSY[name]())
@@ -75,7 +75,7 @@ def test_a_cache_changes_the_clip_and_keeps_nothing_for_the_next(name):
 
 
 @EVERY
-def test_a_clip_that_is_broken_off_leaves_nothing_for_the_next(name):
+def test_an_interrupted_clip_leaves_nothing_in_the_cache(name):
     backbone, left = trained(), [None] * 7  # two predictions a step
     enable_cache(backbone.transformer, BUSY[name]())
     whole = backbone.generate(CLIPS, SAMPLING)
@@ -87,7 +87,7 @@ def test_a_clip_that_is_broken_off_leaves_nothing_for_the_next(name):
 
 
 @EVERY
-def test_what_is_cached_without_memory_is_not_mixed_with_what_is_cached_with_it(name):
+def test_predictions_with_and_without_memory_have_caches_of_their_own(name):
     backbone = trained()
     enable_cache(backbone.transformer, BUSY[name]())
     nothing = dataclasses.replace(CLIPS, tokens=MemoryTokens.stack([MemoryTokens.empty(CHANNELS)]))
@@ -97,7 +97,7 @@ def test_what_is_cached_without_memory_is_not_mixed_with_what_is_cached_with_it(
 
 @pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
 @pytest.mark.parametrize("name", ["first-block", "MagCache"])
-def test_blocks_that_are_skipped_add_their_memory_once(name, form):
+def test_skipped_blocks_add_their_memory_once(name, form):
     backbone = with_adapter(micro(transformer={**micro().settings.transformer, "num_layers": 4}), form=form)
     shaken(backbone)
     config = MagCacheConfig(threshold=9.0, retention_ratio=0.0, **RATIOS) if name == "MagCache" else BUSY[name]()
@@ -113,7 +113,7 @@ def test_blocks_that_are_skipped_add_their_memory_once(name, form):
 
 
 @EVERY
-def test_a_pipeline_caches_as_diffusers_users_enable_it(name):
+def test_a_cache_is_enabled_on_a_pipeline_as_on_one_of_diffusers(name):
     backbone = trained()
     enable_cache(backbone.transformer, BUSY[name]())
     rgb, _ = backbone.generate(CLIPS, SAMPLING)
@@ -131,7 +131,7 @@ def test_a_pipeline_caches_as_diffusers_users_enable_it(name):
     assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
 
 
-def test_a_cache_that_cannot_work_is_one_line():
+def test_a_cache_that_cannot_work_is_refused():
     backbone = trained()
     with pytest.raises(
         PersistError, match=r"^TextKVCacheConfig does not work with this transformer; known: FirstBlock"

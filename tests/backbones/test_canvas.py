@@ -33,7 +33,7 @@ def test_patches_are_in_the_order_of_the_video_tokens() -> None:
     assert patches.any(-1).nonzero().tolist() == [[0, 16 + 2 * 4 + 1]]
 
 
-def test_the_mask_of_a_canvas_is_where_tokens_fell() -> None:
+def test_the_mask_of_a_canvas_marks_where_tokens_fell() -> None:
     adapter, clips, tokens = with_adapter(micro(), form="canvas").adapter, random_clips(), random_tokens(2, 40)
     assert adapter is not None
     memory = adapter.prepare(tokens, clips.cameras)
@@ -45,7 +45,7 @@ def test_the_mask_of_a_canvas_is_where_tokens_fell() -> None:
 
 @pytest.mark.parametrize("head", [0, 8])
 @pytest.mark.parametrize("tokens", [None, BEHIND], ids=["none", "behind"])
-def test_a_canvas_on_which_nothing_falls_is_stage_one_to_the_bit_even_once_trained(
+def test_an_empty_canvas_equals_stage_one_to_the_bit_even_after_training(
     tokens: MemoryTokens | None, head: int
 ) -> None:
     backbone, clips = micro(), random_clips()
@@ -56,14 +56,14 @@ def test_a_canvas_on_which_nothing_falls_is_stage_one_to_the_bit_even_once_train
     assert torch.equal(predicted(backbone, clips, tokens), bare)
 
 
-def test_a_fresh_head_changes_nothing() -> None:
+def test_an_untrained_head_changes_nothing() -> None:
     backbone, clips, tokens = micro(), random_clips(), random_tokens(2, 40)
     shaken(backbone)
     bare = predicted(backbone, clips, None)
     assert torch.equal(predicted(with_adapter(backbone, form="canvas", head_width=8), clips, tokens), bare)
 
 
-def test_the_head_corrects_the_pixels_of_video_tokens_on_which_a_memory_token_fell_and_no_others() -> None:
+def test_the_head_corrects_only_video_tokens_on_which_a_memory_token_fell() -> None:
     backbone, clips, tokens = micro(), random_clips(), random_tokens(2, 40)
     bare = predicted(backbone, clips, None)
     adapter = with_adapter(backbone, form="canvas", head_width=8).adapter
@@ -76,7 +76,7 @@ def test_the_head_corrects_the_pixels_of_video_tokens_on_which_a_memory_token_fe
     assert torch.equal(changed, fell.repeat_interleave(2, -1).repeat_interleave(2, -2))
 
 
-def test_the_head_tells_apart_what_falls_on_one_video_token() -> None:
+def test_the_head_distinguishes_memory_tokens_within_one_video_token() -> None:
     backbone, clips = micro(), random_clips()
     adapter = with_adapter(backbone, form="canvas", head_width=8, canvas_scale=2, token_size=0.0).adapter
     assert isinstance(adapter, CanvasAdapter)

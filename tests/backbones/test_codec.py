@@ -51,7 +51,7 @@ def test_a_frame_coded_alone_does_not_depend_on_the_others(still: CogVideoX) -> 
     assert torch.equal(latents.image, whole[:, :1])
 
 
-def test_the_fast_convolution_gives_what_diffusers_gives_for_videos_of_one_frame(still: CogVideoX) -> None:
+def test_the_fast_convolution_equals_that_of_diffusers_for_videos_of_one_frame(still: CogVideoX) -> None:
     plain = AutoencoderKLCogVideoX(**{k: v for k, v in still.codec.vae.config.items() if not k.startswith("_")})
     plain.load_state_dict(still.codec.vae.state_dict())
     image = torch.randn(3, 48, 1, 8, 8, generator=torch.Generator().manual_seed(0))
@@ -60,7 +60,7 @@ def test_the_fast_convolution_gives_what_diffusers_gives_for_videos_of_one_frame
     assert torch.allclose(still.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
 
 
-def test_the_fast_convolution_goes_on_with_a_video_as_diffusers_does(still: CogVideoX) -> None:
+def test_the_fast_convolution_continues_a_video_as_diffusers_does(still: CogVideoX) -> None:
     plain = AutoencoderKLCogVideoX(**{k: v for k, v in still.codec.vae.config.items() if not k.startswith("_")})
     plain.load_state_dict(still.codec.vae.state_dict())
     for vae in (plain, still.codec.vae):
@@ -71,7 +71,7 @@ def test_the_fast_convolution_goes_on_with_a_video_as_diffusers_does(still: CogV
     assert torch.allclose(still.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
 
 
-def test_the_fast_convolution_learns_what_diffusers_would(still: CogVideoX) -> None:
+def test_the_fast_convolution_has_the_gradients_of_diffusers(still: CogVideoX) -> None:
     plain = AutoencoderKLCogVideoX(**{k: v for k, v in still.codec.vae.config.items() if not k.startswith("_")})
     plain.load_state_dict(still.codec.vae.state_dict())
     image = torch.randn(1, 48, 1, 8, 8, generator=torch.Generator().manual_seed(0))
@@ -83,7 +83,7 @@ def test_the_fast_convolution_learns_what_diffusers_would(still: CogVideoX) -> N
 
 
 @torch.no_grad()
-def test_samples_that_are_too_many_at_once_for_diffusers_go_through_it_in_parts() -> None:
+def test_batches_too_large_for_diffusers_are_coded_in_parts() -> None:
     codec = micro().codec
     few, many = (random_clips(count, size=(9, 32, 32)) for count in (1, 3))
     whole = codec.encode(many.rgb, many.depth)
@@ -94,7 +94,7 @@ def test_samples_that_are_too_many_at_once_for_diffusers_go_through_it_in_parts(
 
 
 @torch.no_grad()
-def test_the_papers_clips_are_decoded_whatever_their_number() -> None:
+def test_clips_of_the_papers_size_are_decoded_in_batches_of_any_number() -> None:
     sizes = {"height": 512, "width": 512, "frames": 9}
     with torch.device("meta"):
         codec = make_backbone("cogvideox", {"preset": "5b-i2v"} | sizes).codec
@@ -106,7 +106,7 @@ def test_the_papers_clips_are_decoded_whatever_their_number() -> None:
     assert (colors.shape, depth.shape) == ((4, 3, 9, 512, 512), (4, 9, 512, 512))
 
 
-def test_folding_loses_nothing() -> None:
+def test_unfolding_undoes_folding() -> None:
     videos = torch.randn(2, 3, 5, 8, 12)
     assert torch.equal(unfold_pixels(fold_pixels(videos, 4), 4), videos)
     assert torch.equal(batch_to_frames(frames_to_batch(videos), 5), videos)
@@ -122,7 +122,7 @@ def test_a_fresh_codec_hardly_adds_noise_and_its_residual_blocks_do_nothing(sett
     assert torch.equal(block(hidden)[0], hidden)
 
 
-def test_a_model_that_codes_frames_alone_trains_and_generates(still: CogVideoX) -> None:
+def test_a_model_with_a_framewise_codec_trains_and_generates(still: CogVideoX) -> None:
     clips = random_clips(1)
     assert all(bool(still(clips, stage)["loss"].isfinite()) for stage in ("codec", "1"))
     rgb, depth = still.generate(clips, Sampling(2))
@@ -131,7 +131,7 @@ def test_a_model_that_codes_frames_alone_trains_and_generates(still: CogVideoX) 
 
 
 @pytest.mark.parametrize("settings", [{}, STILL], ids=["video", "frames alone"])
-def test_kept_latents_train_as_the_images_that_they_were_made_of(settings: dict) -> None:
+def test_training_on_encoded_latents_equals_training_on_their_images(settings: dict) -> None:
     backbone, clips = micro(**settings), random_clips(2)
     shaken(backbone)
     kept = dataclasses.replace(clips, latents=backbone.encode(clips), rgb=clips.rgb[:, :0], depth=clips.depth[:, :0])
@@ -139,7 +139,7 @@ def test_kept_latents_train_as_the_images_that_they_were_made_of(settings: dict)
     assert all(torch.equal(value, again[name]) for name, value in losses.items())
 
 
-def test_a_fingerprint_follows_the_weights_and_their_scale_and_nothing_else(still: CogVideoX) -> None:
+def test_a_fingerprint_depends_on_the_weights_and_their_scale_only(still: CogVideoX) -> None:
     first = still.encoding()
     shaken(still.transformer)
     assert still.encoding() == first
@@ -170,7 +170,7 @@ def test_unchanged_weights_are_hashed_once(still: CogVideoX, monkeypatch: pytest
         ({"chanels": 3}, "diffusers cannot make a vae of these settings"),
     ],
 )
-def test_a_vae_that_cannot_work_is_refused_in_one_line(change: dict, cause: str) -> None:
+def test_a_vae_that_cannot_work_is_refused(change: dict, cause: str) -> None:
     vae = {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4}
     with pytest.raises(CheckpointError, match=cause) as error:
         micro(vae=vae | change)

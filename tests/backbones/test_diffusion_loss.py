@@ -16,7 +16,7 @@ STEPS = torch.tensor([10, 300, 990])
 
 
 @pytest.mark.parametrize("weighting", ["uniform", "min-snr", "min-snr-plus-one"])
-def test_an_error_counts_the_same_said_as_velocity_or_as_clean_latents(weighting: str) -> None:
+def test_the_loss_of_an_error_is_the_same_for_velocities_and_clean_latents(weighting: str) -> None:
     draw = torch.Generator().manual_seed(0)
     latents, noise, wrong = (torch.randn(3, 2, 4, 8, 8, generator=draw) for _ in range(3))
     losses = {}
@@ -31,7 +31,7 @@ def test_an_error_counts_the_same_said_as_velocity_or_as_clean_latents(weighting
     assert torch.allclose(losses["sample"].double(), losses["v_prediction"].double(), rtol=1e-3)
 
 
-def test_the_clean_latents_survive_saving_and_loading(tmp_path: Path) -> None:
+def test_the_prediction_of_clean_latents_survives_saving_and_loading(tmp_path: Path) -> None:
     backbone, clips = micro(prediction="sample"), random_clips(1)
     shaken(backbone)
     backbone.save_base(tmp_path)
@@ -40,7 +40,7 @@ def test_the_clean_latents_survive_saving_and_loading(tmp_path: Path) -> None:
     assert torch.equal(backbone.generate(clips, Sampling(2))[0], other.generate(clips, Sampling(2))[0])
 
 
-def test_a_card_says_what_the_weights_predict(tmp_path: Path) -> None:
+def test_the_model_card_states_what_the_weights_predict(tmp_path: Path) -> None:
     kinds = {kind: micro(prediction=kind).checkpoint_settings()["prediction"] for kind in ("v_prediction", "sample")}
     assert all(kind == said for kind, said in kinds.items())
     micro(prediction="sample").save_base(tmp_path)
@@ -51,7 +51,7 @@ def test_a_card_says_what_the_weights_predict(tmp_path: Path) -> None:
     assert micro(pretrained=str(tmp_path)).checkpoint_settings()["prediction"] == "sample"
 
 
-def test_weights_cannot_be_asked_for_another_prediction(tmp_path: Path) -> None:
+def test_weights_trained_for_another_prediction_are_refused(tmp_path: Path) -> None:
     micro(prediction="sample").save_base(tmp_path)
     cause = "^prediction is 'v_prediction', but the weights were trained for 'sample'; leave it out$"
     with pytest.raises(CheckpointError, match=cause):
@@ -69,6 +69,6 @@ def test_a_scheduler_that_predicts_noise_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("snr_gamma", 0.0), ("snr_gamma", -5.0), ("kl_weight", -1e-6)])
-def test_a_weight_that_would_turn_the_loss_around_is_refused(name: str, value: float) -> None:
+def test_a_loss_weight_out_of_range_is_refused(name: str, value: float) -> None:
     with pytest.raises(RecipeError, match=f"{name}: Input should be greater than"):
         micro(**{name: value})

@@ -13,13 +13,13 @@ from persist_cli.errors import CheckpointError, DataError, PersistError
 from tests.support.micro_model import micro, random_clips, shaken
 
 
-def test_depth_survives_its_code_from_a_hand_to_a_hall():
+def test_depth_from_centimetres_to_a_hall_survives_its_code():
     depth = torch.tensor([0.1, 0.3, 1.0, 5.0, 20.0, 64.0])
     assert torch.allclose(decode_depth(encode_depth(depth)), depth, rtol=1e-4)
     assert decode_depth(encode_depth(torch.zeros(1))).item() == 0
 
 
-def test_filling_keeps_what_is_known_and_leaves_no_hole():
+def test_filling_missing_depth_keeps_measured_values_and_leaves_no_hole():
     depth = torch.full((1, 13, 17), 3.0)
     depth[:, 4:9, 3:12] = 0
     filled = fill_missing(depth)
@@ -78,7 +78,7 @@ def test_interactions_change_nothing_at_first_and_something_once_learned():
     assert not torch.equal(backbone(picked, "1")["loss"], backbone(dropped, "1")["loss"])
 
 
-def test_an_unknown_interaction_sampler_or_window_is_one_line():
+def test_an_unknown_interaction_sampler_or_window_is_refused():
     backbone = micro()
     with pytest.raises(DataError, match="no interaction 'jump'; it has pick_up, drop, toggle"):
         backbone(random_clips(1, interactions=[("jump",) * 8]), "1")
@@ -88,7 +88,7 @@ def test_an_unknown_interaction_sampler_or_window_is_one_line():
         micro(codec_window=[9, 64, 64])(random_clips(1), "codec")
 
 
-def test_a_loss_is_drawn_from_the_seeds_alone():
+def test_a_loss_depends_on_the_seeds_alone():
     backbone, clips = micro(), random_clips(2)
     for stage in ("codec", "1"):
         assert torch.equal(backbone(clips, stage)["loss"], backbone(clips, stage)["loss"])
@@ -112,7 +112,7 @@ def test_the_codec_stage_measures_the_scale_of_its_latents():
     assert float(backbone.codec.encode(clips.rgb, clips.depth).detach().std()) == pytest.approx(1.0, abs=0.01)
 
 
-def test_the_printed_rays_are_another_model_input():
+def test_rays_as_printed_in_the_paper_change_the_model_input():
     correct, printed = (
         micro(rays=rays).conditions(random_clips(1), torch.tensor([0])).camera for rays in ("correct", "printed")
     )
@@ -129,7 +129,7 @@ def test_the_printed_rays_are_another_model_input():
         (Sampling(1001), "^1001 denoising steps; it must be 1 to 1000$"),
     ],
 )
-def test_a_sampling_that_cannot_be_drawn_is_told_before_anything_is_made(sampling, cause):
+def test_an_impossible_sampling_is_refused_by_the_check_and_by_generate(sampling, cause):
     backbone = micro()
     for attempt in (lambda: backbone.check_sampling(sampling), lambda: backbone.generate(random_clips(1), sampling)):
         with pytest.raises(PersistError, match=cause):
@@ -138,7 +138,7 @@ def test_a_sampling_that_cannot_be_drawn_is_told_before_anything_is_made(samplin
         backbone.check_sampling(Sampling(1000, sampler))
 
 
-def test_a_backbone_that_says_no_more_has_depth_and_keeps_nothing_of_a_clip():
+def test_by_default_a_backbone_gives_depth_and_encodes_nothing():
     backbone = micro(depth=False)
     for attempt in (lambda: Backbone.encode(backbone, random_clips(1)), lambda: Backbone.encoding(backbone)):
         with pytest.raises(NotImplementedError, match="backbone 'cogvideox' keeps nothing of a clip"):

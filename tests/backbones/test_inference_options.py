@@ -16,7 +16,7 @@ CLIPS, SAMPLING = random_clips(2, random_tokens(2, 5)), Sampling(2, "ddim", 1.5)
 CPU = torch.device("cpu")
 
 
-def test_slices_of_the_codec_change_no_colour_and_are_undone_by_another_placement():
+def test_slices_of_the_codec_change_no_colour_and_are_undone_by_other_options():
     backbone = trained()
     rgb, depth = backbone.generate(CLIPS, SAMPLING)
     backbone.prepare_inference(InferenceOptions(slicing=True, tiling=True))
@@ -31,7 +31,7 @@ def test_slices_of_the_codec_change_no_colour_and_are_undone_by_another_placemen
     assert equal(backbone.generate(CLIPS, SAMPLING), (rgb, depth))
 
 
-def test_lower_precision_is_kept_and_comes_near():
+def test_a_backbone_in_lower_precision_stays_so_and_samples_nearly_the_same():
     backbone = trained()
     rgb, _ = backbone.generate(CLIPS, SAMPLING)
     backbone.prepare_inference(InferenceOptions("bfloat16"))
@@ -42,7 +42,7 @@ def test_lower_precision_is_kept_and_comes_near():
     assert backbone.reconstruct(CLIPS)[0].dtype == torch.uint8
 
 
-def test_whole_parts_that_rest_elsewhere_give_the_same_clip_again_and_after_another_adapter():
+def test_offloading_whole_parts_changes_no_clip_even_after_another_adapter():
     backbone = trained()
     before = backbone.generate(CLIPS, SAMPLING)
     for _ in range(2):

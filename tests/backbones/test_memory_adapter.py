@@ -39,7 +39,7 @@ def padded(tokens: MemoryTokens, extra: int) -> MemoryTokens:
 
 @every_form
 @pytest.mark.parametrize("count", [1, 30])
-def test_a_fresh_adapter_changes_not_one_bit_whatever_the_tokens(form, count):
+def test_an_untrained_adapter_changes_no_bit_of_the_prediction(form, count):
     backbone, clips = micro(), random_clips()
     shaken(backbone.transformer)
     bare = backbone.generate(clips, QUICK)
@@ -59,7 +59,7 @@ def test_a_trained_adapter_uses_its_tokens(form):
 
 
 @every_form
-def test_padding_behind_the_mask_changes_nothing(form):
+def test_masked_padding_tokens_change_nothing(form):
     backbone, clips, tokens = with_adapter(micro(), form=form), random_clips(), random_tokens(2, 9)
     shaken(backbone)
     assert torch.allclose(predicted(backbone, clips, tokens), predicted(backbone, clips, padded(tokens, 20)), atol=1e-5)
@@ -117,7 +117,7 @@ def test_moving_the_whole_world_changes_no_prediction(form):
     assert torch.allclose(here, there, atol=1e-4)
 
 
-def test_absolute_positions_see_where_the_origin_is():
+def test_absolute_positions_depend_on_the_origin_of_the_world():
     backbone, clips, tokens = with_adapter(micro(), positions="absolute"), random_clips(), random_tokens(2, 9)
     shaken(backbone)
     moved = dataclasses.replace(tokens, positions=tokens.positions + 1.0)
@@ -125,7 +125,7 @@ def test_absolute_positions_see_where_the_origin_is():
 
 
 @every_form
-def test_guidance_over_memory_of_weight_one_is_no_guidance_and_more_pushes_away_from_none(form):
+def test_memory_guidance_of_weight_one_changes_nothing_and_more_moves_away_from_no_memory(form):
     backbone, clips = with_adapter(micro(), form=form), random_clips(tokens=random_tokens(2, 9))
     shaken(backbone)
     plain, strong = (backbone.generate(clips, Sampling(2, "ddim", weight))[1] for weight in (1.0, 3.0))
@@ -136,7 +136,7 @@ def test_guidance_over_memory_of_weight_one_is_no_guidance_and_more_pushes_away_
     )
 
 
-def test_blocks_stand_where_every_says():
+def test_an_adapter_has_a_block_at_every_nth_layer():
     assert set(with_adapter(micro(), every=2).adapter.blocks) == {"1"}
     assert set(with_adapter(micro()).adapter.blocks) == {"0", "1"}
     assert set(with_adapter(micro(), form="projected", every=2).adapter.blocks) == {"1"}
@@ -156,7 +156,7 @@ def test_an_adapter_survives_saving_to_the_bit(form, tmp_path):
     )
 
 
-def test_what_does_not_fit_is_one_line(tmp_path):
+def test_adapters_and_tokens_that_do_not_fit_are_refused(tmp_path):
     backbone = with_adapter(micro())
     backbone.save_adapter(tmp_path)
     (tmp_path / "adapter.safetensors").write_bytes(b"rubbish")

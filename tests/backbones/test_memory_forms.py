@@ -112,7 +112,7 @@ def test_training_in_bfloat16_follows_training_in_float32(form):
 
 
 @every_variant
-def test_an_adapter_kept_in_bfloat16_takes_the_same_tokens(form):
+def test_an_adapter_in_bfloat16_takes_the_same_tokens(form):
     backbone, clips, tokens = trained(form).to(torch.bfloat16), random_clips(), random_tokens(2, 40)
     memory = backbone.memory_condition(dataclasses.replace(clips, tokens=tokens))
     video, time = torch.zeros(2, 48, 64, dtype=torch.bfloat16), torch.zeros(2, 32, dtype=torch.bfloat16)
@@ -125,13 +125,13 @@ def test_an_adapter_kept_in_bfloat16_takes_the_same_tokens(form):
 
 @told_by_cameras
 @pytest.mark.parametrize("place", [(0.0, 0.0, -1.0), (9.0, 0.0, 3.0), (0.0, -9.0, 3.0)])
-def test_what_no_camera_of_the_clip_sees_changes_nothing(form, place):
+def test_tokens_that_no_camera_of_the_clip_sees_change_nothing(form, place):
     backbone, clips = trained(form), random_clips()
     assert torch.equal(predicted(backbone, clips, token_at(*place)), predicted(backbone, clips, None))
     assert not torch.allclose(predicted(backbone, clips, token_at(0.0, 0.0, 3.0)), predicted(backbone, clips, None))
 
 
-def test_projected_frames_attend_to_what_they_see_themselves():
+def test_a_projected_frame_attends_only_to_tokens_that_it_sees():
     # the cameras move 2 m ahead: past the token, which the first latent frames see and the last does not
     adapter = with_adapter(micro(), form="projected").adapter
     memory = adapter.prepare(token_at(0.0, 0.0, 1.0), random_clips().cameras)

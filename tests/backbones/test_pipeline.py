@@ -87,7 +87,7 @@ def test_in_bfloat16_a_clip_comes_out_near_that_of_float32(form):
 
 @pytest.mark.parametrize("settings", [{}, FRAMEWISE], ids=["4 frames a latent", "framewise"])
 @FORMS
-def test_weights_that_rest_elsewhere_change_nothing(form, settings):
+def test_offloaded_weights_change_no_result(form, settings):
     exact = call(WorldPipeline.of(trained(form, **settings)))
     whole, layers = (WorldPipeline.of(trained(form, **settings)) for _ in range(2))
     whole.enable_model_cpu_offload(device="cpu")  # hooks and all; only the other device is missing here
@@ -113,7 +113,7 @@ def test_offloaded_weights_sample_on_the_gpu(form, offload):
     assert torch.cuda.memory_allocated() < sum(each.nbytes for each in pipeline.transformer.parameters())
 
 
-def test_slicing_and_tiling_of_the_codec_change_next_to_nothing():
+def test_slicing_and_tiling_of_the_codec_hardly_change_a_clip():
     exact, sliced, tiled = (WorldPipeline.of(trained()) for _ in range(3))
     sliced.vae.enable_slicing()
     enable_tiling(tiled.vae, 32, 32)
@@ -137,7 +137,7 @@ def test_a_sample_does_not_depend_on_its_batch():
     assert torch.allclose(alone.frames[0], whole.frames[1], atol=1e-4)
 
 
-def test_samples_may_come_as_lists():
+def test_a_pipeline_takes_lists_of_samples():
     pipeline = WorldPipeline.of(trained())
     whole = call(pipeline)
     listed = pipeline(
@@ -148,7 +148,7 @@ def test_samples_may_come_as_lists():
     assert same(listed, whole)
 
 
-def test_a_callback_sees_every_step_and_what_it_changes_counts():
+def test_a_callback_runs_at_every_step_and_its_changes_take_effect():
     pipeline, seen = WorldPipeline.of(trained()), []
 
     def watch(pipe, number, timestep, tensors):
@@ -160,7 +160,7 @@ def test_a_callback_sees_every_step_and_what_it_changes_counts():
     assert pipeline.current_timestep is None
 
 
-def test_an_interrupted_call_makes_no_further_step_and_the_next_makes_all():
+def test_an_interrupted_call_stops_and_the_next_call_makes_all_steps():
     pipeline, steps = WorldPipeline.of(trained()), []
 
     def stop(pipe, number, timestep, tensors):
@@ -173,7 +173,7 @@ def test_an_interrupted_call_makes_no_further_step_and_the_next_makes_all():
     assert same(call(pipeline), call(WorldPipeline.of(trained())))
 
 
-def test_another_scheduler_is_another_sampler():
+def test_replacing_the_scheduler_changes_the_sampler():
     backbone = trained()
     pipeline = WorldPipeline.of(backbone)
     pipeline.scheduler = CogVideoXDPMScheduler.from_config(pipeline.scheduler.config)
@@ -184,7 +184,7 @@ def test_another_scheduler_is_another_sampler():
         call(pipeline)
 
 
-def test_pictures_arrays_and_noise_of_ones_own_are_taken_and_given():
+def test_a_pipeline_takes_and_returns_pictures_and_arrays_and_takes_noise():
     pipeline = WorldPipeline.of(trained())
     pipeline.set_progress_bar_config(disable=True)
     picture, way = Image.fromarray(CLIPS.rgb[0, 0].numpy()), CLIPS.cameras[0]
@@ -208,12 +208,12 @@ def test_pictures_arrays_and_noise_of_ones_own_are_taken_and_given():
         ({"callback_on_step_end_tensor_inputs": ["prompt"]}, "tensor_inputs has prompt; known: latents$"),
     ],
 )
-def test_what_cannot_be_sampled_is_one_line(changes, cause):
+def test_arguments_that_cannot_be_sampled_are_refused(changes, cause):
     with pytest.raises(PersistError, match=cause):
         call(WorldPipeline.of(trained()), **changes)
 
 
-def test_images_depth_and_cameras_of_other_sizes_are_one_line():
+def test_images_depth_and_cameras_of_other_sizes_are_refused():
     pipeline, rgb, depth = WorldPipeline.of(trained()), CLIPS.rgb[:, 0], CLIPS.depth[:, 0]
     with pytest.raises(PersistError, match=r"^an image of 16x32 pixels; this model takes 32x32"):
         pipeline(rgb[:, :16], depth, CLIPS.cameras)
@@ -236,7 +236,7 @@ def checkpoints(tmp_path: Path) -> tuple[CogVideoX, Path, Path]:
     return backbone, base, stage2
 
 
-def test_a_checkpoint_is_a_pipeline_by_one_line(checkpoints):
+def test_one_call_makes_a_pipeline_of_a_checkpoint(checkpoints):
     backbone, base, stage2 = checkpoints
     assert same(call(persist_backbones.load(stage2)), call(WorldPipeline.of(backbone)))
     backbone.use_adapter(None)
@@ -246,7 +246,7 @@ def test_a_checkpoint_is_a_pipeline_by_one_line(checkpoints):
     assert persist_backbones.load(str(stage2), dtype="bfloat16").transformer.dtype == torch.bfloat16
 
 
-def test_a_checkpoint_that_cannot_be_loaded_is_one_line(checkpoints, tmp_path):
+def test_a_checkpoint_that_cannot_be_loaded_is_refused(checkpoints, tmp_path):
     _, base, stage2 = checkpoints
     with pytest.raises(PersistError, match=r"no memory adapter 'map2d' in it; it has voxel$"):
         persist_backbones.load(stage2, adapter="map2d")
@@ -259,7 +259,7 @@ def test_a_checkpoint_that_cannot_be_loaded_is_one_line(checkpoints, tmp_path):
         persist_backbones.load(base)
 
 
-def test_diffusers_own_pipeline_runs_the_parts_that_we_save(checkpoints):
+def test_the_pipeline_of_diffusers_runs_the_parts_that_we_save(checkpoints):
     _, base, _ = checkpoints
     pipeline = CogVideoXImageToVideoPipeline(
         tokenizer=None, text_encoder=None,

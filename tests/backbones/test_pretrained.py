@@ -29,7 +29,7 @@ def snapshot(cache):
     return write_twin("5b-i2v", write_snapshot(cache, NAME))
 
 
-def test_a_name_on_the_hub_is_opened_from_its_cache_without_the_hub(snapshot):
+def test_a_name_on_the_hub_is_opened_from_the_cache_without_the_network(snapshot):
     by_name, by_folder = load_twin(NAME), load_twin(snapshot)
     assert pretrained_folder(NAME) == snapshot
     pairs = zip(by_name.state_dict().values(), by_folder.state_dict().values(), strict=True)
@@ -42,13 +42,13 @@ def test_a_local_directory_comes_before_a_name_on_the_hub(snapshot, tmp_path):
 
 
 @pytest.mark.parametrize("part", ["transformer", "vae", "scheduler"])
-def test_half_a_download_is_not_taken_for_the_whole(snapshot, part):
+def test_an_incomplete_download_is_refused(snapshot, part):
     next(path for path in (snapshot / part).iterdir() if path.suffix == ".safetensors" or part == "scheduler").unlink()
     with pytest.raises(CheckpointError, match="not whole in the hub's cache, and the hub: HF_HUB_OFFLINE is set; give"):
         pretrained_folder(NAME)
 
 
-def test_a_lost_shard_is_not_taken_for_the_whole(snapshot):
+def test_weights_that_lack_a_shard_are_refused(snapshot):
     model = load_twin(snapshot)
     (snapshot / "transformer" / "diffusion_pytorch_model.safetensors").unlink()
     model.transformer.base.save_pretrained(snapshot / "transformer", max_shard_size="20KB")
@@ -58,7 +58,7 @@ def test_a_lost_shard_is_not_taken_for_the_whole(snapshot):
         pretrained_folder(NAME)
 
 
-def test_what_is_nowhere_is_one_line_at_once(cache, monkeypatch):
+def test_a_name_that_is_neither_here_nor_on_the_hub_is_refused_at_once(cache, monkeypatch):
     with pytest.raises(CheckpointError, match=f"^{NAME}: no such directory, .* hf download {NAME} --include") as error:
         load_twin(NAME)
     assert "\n" not in str(error.value)
@@ -71,7 +71,7 @@ def test_what_is_nowhere_is_one_line_at_once(cache, monkeypatch):
         load_twin(NAME)
 
 
-def test_a_plan_of_weights_that_are_not_here_has_the_size_that_their_name_tells(cache):
+def test_a_meta_model_of_weights_that_are_not_here_has_the_size_of_their_name(cache):
     frames, height, width = SIZE
     with torch.device("meta"):
         settings = {"pretrained": NAME, "frames": frames, "height": height, "width": width}
@@ -80,7 +80,7 @@ def test_a_plan_of_weights_that_are_not_here_has_the_size_that_their_name_tells(
     assert folder_here(NAME) is None
 
 
-def test_a_plan_of_weights_in_the_cache_has_their_size(snapshot):
+def test_a_meta_model_of_weights_in_the_cache_has_their_size(snapshot):
     with torch.device("meta"):
         model = load_twin(NAME)
     assert model.transformer.base.config.num_layers == 2
@@ -95,14 +95,14 @@ def test_the_names_of_both_publishers_are_known():
 @pytest.mark.parametrize(
     ("layers", "cause"), [(3, "lack .* first 'transformer_blocks.2"), (1, "have besides .*blocks.1")]
 )
-def test_weights_of_another_configuration_are_neither_filled_up_nor_cut(tmp_path, layers, cause):
+def test_weights_of_another_configuration_are_refused(tmp_path, layers, cause):
     config = write_twin("5b-i2v", tmp_path) / "transformer" / "config.json"
     write_json(config, read_json(config) | {"num_layers": layers})
     with pytest.raises(CheckpointError, match=rf"transformer: its weights {cause}.*take a whole copy of both"):
         load_twin(tmp_path, SIZE)
 
 
-def test_what_of_a_part_is_missing_or_no_mapping_is_one_line_that_diffusers_adds_nothing_to(tmp_path, capfd, caplog):
+def test_a_missing_or_malformed_part_is_refused_in_one_line_without_messages_of_diffusers(tmp_path, capfd, caplog):
     folder = write_twin("5b-i2v", tmp_path) / "transformer"
     weights = folder / "diffusion_pytorch_model.safetensors"
     tensors = read_tensors(weights)[0]
@@ -118,7 +118,7 @@ def test_what_of_a_part_is_missing_or_no_mapping_is_one_line_that_diffusers_adds
     assert capfd.readouterr().err + caplog.text == ""
 
 
-def test_weights_of_other_shapes_are_one_line_that_names_one(tmp_path):
+def test_weights_of_other_shapes_are_refused_with_the_name_of_one(tmp_path):
     config = write_twin("2b", tmp_path) / "transformer" / "config.json"
     write_json(config, read_json(config) | {"num_attention_heads": 4})
     with pytest.raises(CheckpointError, match=r"transformer: cannot be loaded \(.*shape") as error:

@@ -52,11 +52,11 @@ def test_a_prompt_is_embedded_as_diffusers_pipeline_embeds_it(folder):
     assert not torch.equal(load_twin(folder, prompt="").prompt, ours)
 
 
-def test_without_a_prompt_its_embedding_is_zeros_whatever_is_there(folder):
+def test_without_a_prompt_the_embedding_is_zeros(folder):
     assert not load_twin(folder).prompt.any()
 
 
-def test_a_prompt_is_stored_with_the_checkpoint_and_nobody_else_needs_t5(folder, tmp_path):
+def test_a_checkpoint_stores_the_embedding_of_its_prompt_and_needs_no_t5(folder, tmp_path):
     model = load_twin(folder, prompt=PROMPT)
     model.save_base(tmp_path)
     settings = model.checkpoint_settings()
@@ -66,7 +66,7 @@ def test_a_prompt_is_stored_with_the_checkpoint_and_nobody_else_needs_t5(folder,
     assert torch.equal(again.prompt, model.prompt)
 
 
-def test_an_embedding_made_elsewhere_is_the_same_model(folder, tmp_path):
+def test_a_model_from_an_embedding_equals_the_one_from_its_prompt(folder, tmp_path):
     alone = tmp_path / "without T5"
     shutil.copytree(folder, alone, ignore=shutil.ignore_patterns("text_encoder", "tokenizer"))
     write_prompt(PROMPT, str(folder), tmp_path / "walk.safetensors")
@@ -86,14 +86,14 @@ def test_an_embedding_made_elsewhere_is_the_same_model(folder, tmp_path):
         ({"prompt_embedding": "gone.safetensors"}, "gone.safetensors"),
     ],
 )
-def test_a_prompt_that_cannot_be_is_one_line(folder, change, cause):
+def test_a_prompt_that_cannot_be_embedded_is_refused(folder, change, cause):
     with pytest.raises(CheckpointError, match=cause) as error:
         load_twin(folder, **change)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("part", ["text_encoder", "tokenizer"])
-def test_a_prompt_without_its_encoder_is_one_line_that_says_what_else_to_do(folder, tmp_path, part):
+def test_a_prompt_without_its_encoder_is_refused_with_another_way_to_go(folder, tmp_path, part):
     shutil.copytree(folder, tmp_path / "twin")
     for file in (tmp_path / "twin" / part).glob("*.json"):
         file.write_text("{")
@@ -104,7 +104,7 @@ def test_a_prompt_without_its_encoder_is_one_line_that_says_what_else_to_do(fold
         load_twin(tmp_path / "twin", prompt=PROMPT)
 
 
-def test_a_prompt_asks_no_hub_even_where_one_could_be_asked(tmp_path, monkeypatch):
+def test_embedding_a_prompt_never_uses_the_network(tmp_path, monkeypatch):
     asked, name = [], "zai-org/CogVideoX-2b"
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
@@ -116,7 +116,7 @@ def test_a_prompt_asks_no_hub_even_where_one_could_be_asked(tmp_path, monkeypatc
     assert asked == []
 
 
-def test_an_embedding_of_another_size_or_name_is_one_line(folder, tmp_path):
+def test_an_embedding_of_another_size_or_name_is_refused(folder, tmp_path):
     file = tmp_path / "other.safetensors"
     write_tensors(file, {"prompt": torch.zeros(1, 3, 8)})
     with pytest.raises(CheckpointError, match=r"embedding of \(1, 3, 8\), but the transformer takes \(1, 10, 8\)"):

@@ -60,7 +60,7 @@ def count(parameters: Iterable[torch.nn.Parameter]) -> int:
 
 
 @pytest.mark.parametrize(("name", "published", "new", "memory"), COUNTS)
-def test_the_stages_of_a_preset_train_so_many_parameters(name, published, new, memory):
+def test_the_stages_of_a_preset_train_the_expected_number_of_parameters(name, published, new, memory):
     model = on_meta(name)
     with torch.device("meta"):
         model.add_adapter("voxel", 384, {})

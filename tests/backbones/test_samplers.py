@@ -84,7 +84,7 @@ def drawn(seeds: list[int]) -> tuple[Tensor, list[torch.Generator]]:
 @CONFIGS
 @EVERY
 @STEPS
-def test_a_denoiser_that_knows_the_clean_latents_is_asked_once_a_step_and_brings_them_back(config, sampler, steps):
+def test_a_perfect_denoiser_is_called_once_a_step_and_the_clean_latents_come_back(config, sampler, steps):
     clean, asked = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4)), []
     knows = knowing(clean, config)
 
@@ -102,7 +102,7 @@ def test_a_denoiser_that_knows_the_clean_latents_is_asked_once_a_step_and_brings
 
 @EVERY
 @pytest.mark.parametrize("steps", [4, 7, 50, 61])
-def test_a_model_that_predicts_clean_latents_is_sampled_alike(sampler, steps):
+def test_a_perfect_prediction_of_clean_latents_is_sampled_exactly(sampler, steps):
     clean = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4))
     noise, generators = drawn([0, 1])
     config = UNSHIFTED | {"prediction_type": "sample"}
@@ -156,7 +156,7 @@ def test_a_multistep_sampler_has_the_noise_levels_of_training(config, sampler, s
 
 
 @pytest.mark.parametrize("sampler", MULTISTEP)
-def test_a_schedule_without_zero_terminal_snr_stays_so(sampler):
+def test_a_schedule_without_zero_terminal_snr_is_not_rescaled(sampler):
     config = SHIFTED | {"rescale_betas_zero_snr": False}
     trained, schedule = make_scheduler(config, "ddim", 10), make_scheduler(config, sampler, 10)
     assert torch.allclose(schedule.alphas_cumprod.double(), trained.alphas_cumprod, rtol=1e-5, atol=0)

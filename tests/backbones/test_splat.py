@@ -48,7 +48,7 @@ def test_a_nearer_token_hides_a_farther_one(order):
 
 
 @pytest.mark.parametrize("point", [[0.0, 0.0, -2.0], [0.0, 0.0, 0.0], [9.0, 0.0, 2.0], [0.0, -9.0, 2.0]])
-def test_what_is_behind_the_camera_or_out_of_view_does_not_appear(point):
+def test_tokens_behind_the_camera_or_out_of_view_do_not_appear(point):
     assert not drawn([point], [1.0], size=0.25, most=5).any()
 
 
@@ -68,7 +68,7 @@ def test_a_token_outside_the_image_reaches_into_it():
     assert drawn([on_ray(-1, 3, 2.0)], [1.0], size=1.0, most=5)[1].nonzero().tolist() == [[2, 0], [3, 0], [4, 0]]
 
 
-def test_a_wall_of_cells_seen_face_on_is_the_same_picture_however_the_world_is_turned():
+def test_the_splat_of_a_wall_does_not_depend_on_how_the_world_is_turned():
     motion = torch.eye(4, dtype=torch.float64)
     motion[:3, :3], motion[:3, 3] = rotation_about(torch.tensor([0.6, 0.0, 0.8]), 1.1), torch.tensor([40.0, -3, 12])
     cells = torch.tensor([[x * 0.25, y * 0.25, 2.0] for x in range(-4, 5) for y in range(-4, 5)], dtype=torch.float64)

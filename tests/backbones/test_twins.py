@@ -57,7 +57,7 @@ def given_to(model, run):
 
 @torch.no_grad()
 @every_model
-def test_the_widened_twin_is_diffusers_own_to_the_bit(twins, name):
+def test_the_widened_twin_predicts_what_diffusers_does_to_the_bit(twins, name):
     model, pipe, clips = load_twin(twins[name]), plain_pipeline(twins[name], name), random_clips(2, size=SIZE)
     torch.manual_seed(0)
     noisy, image = torch.randn(2, 2, model.shape.padded_frames, 8, 8, 12)
@@ -107,7 +107,7 @@ def test_our_own_pipeline_generates_what_the_backbone_does(twins, name):
 
 @torch.no_grad()
 @every_model
-def test_training_sees_the_image_as_sampling_does_and_as_diffusers_scales_it(twins, name):
+def test_training_and_sampling_scale_the_image_latents_as_diffusers_does(twins, name):
     model, clips = load_twin(twins[name]), random_clips(1, size=SIZE)
     trained, sampled = (given_to(model, run)[0][:, :, 4:8] for run in (
         lambda: model(clips, "1"), lambda: model.generate(clips, Sampling(steps=1)),
@@ -175,7 +175,7 @@ def test_weights_are_loaded_into_memory_that_torch_allocated_wherever_they_lie_i
 
 
 @pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
-def test_a_memory_reaches_the_tokens_of_1_5_whose_frames_see_it(twins, form):
+def test_in_version_1_5_a_memory_reaches_the_tokens_of_the_frames_that_see_it(twins, form):
     model = with_adapter(
         load_twin(twins["1.5-5b-i2v"], OTHER), form=form, **({"head_width": 8} if form == "canvas" else {})
     )
@@ -196,7 +196,7 @@ def test_a_memory_reaches_the_tokens_of_1_5_whose_frames_see_it(twins, form):
 
 
 @pytest.mark.parametrize(("frames", "multiple"), [(3, 2), (4, 2), (5, 3), (5, 1)])
-def test_dropping_what_was_padded_gives_the_latents_back(frames, multiple):
+def test_dropping_the_padding_gives_the_latents_back(frames, multiple):
     shape, latents = ClipShape(frames, 2, 2, 2, multiple), torch.randn(1, frames, 4, 2, 2)
     padded = shape.pad(latents)
     assert padded.shape[1] % multiple == 0
@@ -218,13 +218,13 @@ def test_a_learned_table_is_cut_to_the_clip_and_its_middle_resampled(twins):
 
 
 @every_model
-def test_a_twin_differs_from_the_published_model_by_its_sizes_alone(twins, name):
+def test_a_twin_differs_from_the_published_model_only_in_its_sizes(twins, name):
     config = load_twin(twins[name]).transformer.base.config
     sizes = {*SMALL, "in_channels", "out_channels", "ofs_embed_dim"}
     assert {key for key, value in TRANSFORMERS[name].items() if config[key] != value} <= sizes
 
 
-def test_a_pipeline_of_pretrained_weights_is_saved_without_where_they_were(twins, tmp_path):
+def test_a_saved_pipeline_does_not_contain_the_path_of_its_pretrained_weights(twins, tmp_path):
     WorldPipeline.of(load_twin(twins["2b"])).save_pretrained(tmp_path)
     assert str(twins["2b"]) not in (tmp_path / "world" / "config.json").read_text()
     assert WorldPipeline.from_pretrained(tmp_path).backbone.shape == load_twin(twins["2b"]).shape

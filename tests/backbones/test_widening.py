@@ -42,7 +42,7 @@ def test_diffusers_loads_the_base_that_we_save(plain_folder, tmp_path):
 
 
 @pytest.mark.parametrize("part", ["transformer", "vae", "scheduler"])
-def test_a_missing_or_truncated_part_is_one_line(plain_folder, part):
+def test_a_missing_or_truncated_part_is_refused(plain_folder, part):
     for file in (plain_folder / part).iterdir():
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(CheckpointError, match=rf"{part}: its configuration cannot be read") as error:
@@ -62,7 +62,7 @@ def test_a_missing_or_truncated_part_is_one_line(plain_folder, part):
      ({"transformer": {"patch_size_t": 2}}, "patch_size_t needs rotary positions alone"),
      ({"transformer": {"ofs_embed_dim": 8}}, "ofs_embed_dim 8 is not its time_embed_dim 256")],
 )  # fmt: skip
-def test_sizes_that_cannot_work_are_refused(change, cause):
+def test_settings_of_impossible_sizes_are_refused(change, cause):
     with pytest.raises(CheckpointError, match=cause):
         make_backbone("cogvideox", {"transformer": {"num_layers": 1}} | change)
 

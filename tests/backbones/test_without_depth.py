@@ -19,7 +19,7 @@ def backbone() -> CogVideoX:
     return backbone
 
 
-def test_a_model_without_depth_neither_sees_nor_gives_any(backbone: CogVideoX) -> None:
+def test_a_model_without_depth_neither_uses_nor_gives_depth(backbone: CogVideoX) -> None:
     clips = random_clips(1)
     other = dataclasses.replace(clips, depth=clips.depth + 1)
     rgb, depth = backbone.generate(clips, Sampling(2))
@@ -37,12 +37,12 @@ def test_a_model_without_depth_reconstructs_the_same_colours_and_no_depth(backbo
     assert not depth.any()
 
 
-def test_a_model_without_depth_says_so(backbone: CogVideoX) -> None:
+def test_a_model_without_depth_reports_that_it_gives_none(backbone: CogVideoX) -> None:
     assert not backbone.gives_depth
     assert micro().gives_depth
 
 
-def test_a_model_without_depth_logs_no_loss_that_nothing_trains(backbone: CogVideoX) -> None:
+def test_a_model_without_depth_logs_no_loss_of_depth(backbone: CogVideoX) -> None:
     losses = backbone(random_clips(1), "1")
     assert set(losses) == {"loss", "rgb"}
     assert torch.equal(losses["loss"], losses["rgb"])

@@ -10,7 +10,7 @@ from persist_cli.recipe import MemoryConfig
 from tests.support.micro_runs import SIZE
 
 
-def test_an_encoder_computes_where_its_maker_is_told(tmp_path):
+def test_an_encoder_computes_on_the_device_of_its_factory(tmp_path):
     from transformers import Dinov2Config, Dinov2Model
 
     sizes = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 56, "patch_size": 14}
@@ -21,7 +21,7 @@ def test_an_encoder_computes_where_its_maker_is_told(tmp_path):
     assert not MemoryFactory.of(choice).encoder.encode(seen).is_meta
 
 
-def test_a_batch_holds_tokens_of_a_memory_that_saw_something_and_of_one_that_did_not(walks):
+def test_a_batch_may_mix_tokens_of_a_written_and_of_an_empty_memory(walks):
     clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
     aware = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))
     factory = MemoryFactory.of(MemoryConfig("voxel"), torch.device("cpu"))

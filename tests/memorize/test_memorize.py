@@ -87,13 +87,13 @@ def test_several_trajectories_of_one_scene_make_one_memory(data, tmp_path, capsy
     assert (tmp_path / "m.safetensors").read_bytes() == (tmp_path / "both.safetensors").read_bytes()
 
 
-def test_the_table_for_people_says_cells_bytes_bounds_and_rate(data, tmp_path, capsys):
+def test_the_printed_table_has_cells_bytes_bounds_and_rate(data, tmp_path, capsys):
     succeed(f"{data}#b", "--out", tmp_path / "room.safetensors")
     printed = capsys.readouterr().out
     assert all(word in printed for word in ("cells", "bytes", "bounds", "frames/s", "room.png"))
 
 
-def test_what_cannot_be_memorized_ends_in_one_line(data, tmp_path, capsys):
+def test_data_that_cannot_be_memorized_is_refused_in_one_line(data, tmp_path, capsys):
     out = ["--out", tmp_path / "room.safetensors"]
     assert "a memory holds one scene" in failure(capsys, data, *out)
     assert "has 12 frames (0-11)" in failure(capsys, f"{data}#a:0-13", *out)
@@ -106,7 +106,7 @@ def test_what_cannot_be_memorized_ends_in_one_line(data, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_cannot_be_merged_ends_in_one_line(data, tmp_path, capsys):
+def test_memories_that_cannot_be_merged_are_refused_in_one_line(data, tmp_path, capsys):
     for name in "ac":
         memorize(capsys, f"{data}#{name}", "--out", tmp_path / name)
     (tmp_path / "broken").write_bytes((tmp_path / "a").read_bytes()[:99])
@@ -119,7 +119,7 @@ def test_what_cannot_be_merged_ends_in_one_line(data, tmp_path, capsys):
     assert not (tmp_path / "merged").exists()
 
 
-def test_settings_are_told_apart_by_their_first_word():
+def test_plugin_settings_go_to_memory_or_encoder_by_their_first_word():
     parsed = plugin_settings(["memory.cell=[1, 2, 3]", "encoder.seed=4", "memory.max_depth=null"])
     assert parsed == {"memory": {"cell": [1, 2, 3], "max_depth": None}, "encoder": {"seed": 4}}
     for wrong in ("cell=1", "memory.cell", "memory.=1", "camera.cell=1", "memory.cell=[1,"):
@@ -128,7 +128,7 @@ def test_settings_are_told_apart_by_their_first_word():
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.01, 0.2])
-def test_killing_memorize_while_it_writes_leaves_no_half_file_and_a_state_that_goes_on(data, tmp_path, capsys, delay):
+def test_killing_memorize_leaves_no_partial_file_and_it_can_run_again(data, tmp_path, capsys, delay):
     memorize(capsys, f"{data}#a", "--out", tmp_path / "expected" / "room.safetensors")
     expected = (tmp_path / "expected" / "room.safetensors").read_bytes()
     out = tmp_path / "killed" / "room.safetensors"

@@ -68,7 +68,7 @@ def test_a_truncated_file_is_refused_in_one_line(saved, keep):
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_and_a_foreign_one_are_told_apart(tmp_path):
+def test_a_missing_file_and_a_foreign_file_have_different_errors(tmp_path):
     with pytest.raises(CheckpointError, match="no such memory file"):
         load_memory(tmp_path / "none.safetensors")
     save_file({"weight": torch.zeros(3)}, tmp_path / "model.safetensors")
@@ -99,7 +99,7 @@ def test_a_header_that_does_not_fit_is_refused_in_one_line_naming_the_file(saved
 
 
 @pytest.mark.parametrize("damage", ["unsorted", "twice", "beyond"])
-def test_cells_that_no_map_writes_are_refused(saved, damage):
+def test_a_file_with_impossible_cells_is_refused(saved, damage):
     tensors, metadata = read_tensors(saved)
     if damage == "beyond":
         tensors["cells"][0, 0] = 1 << 22

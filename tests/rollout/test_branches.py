@@ -58,7 +58,7 @@ def counted(monkeypatch, owner, name):
     return calls
 
 
-def test_a_branch_imagines_what_a_rollout_alone_does(start):
+def test_a_branch_imagines_what_a_single_rollout_does(start):
     together = start(seed=5).branches(3).step(WAYS)
     alone = [start(seed=5).step([way])[0] for way in WAYS]
     assert all(alike(one, other) for one, other in zip(together, alone, strict=True))
@@ -66,7 +66,7 @@ def test_a_branch_imagines_what_a_rollout_alone_does(start):
 
 
 @pytest.mark.parametrize("kind", ["voxel", "map2d", "snapshots"])
-def test_a_branch_is_told_by_the_memory_what_a_rollout_alone_is_told_to_the_bit(start, kind):
+def test_a_branch_reads_the_same_tokens_as_a_single_rollout_to_the_bit(start, kind):
     branches = start(kind).branches(3)
     vocabulary = branches.agents[0].info.vocabulary
     cameras = [agent.cameras_after(way) for agent, way in zip(branches.agents, WAYS, strict=True)]
@@ -80,7 +80,7 @@ def test_a_branch_is_told_by_the_memory_what_a_rollout_alone_is_told_to_the_bit(
         assert together.seeds[number] == alone.seeds[0]
 
 
-def test_branches_encode_their_frame_once_and_look_through_the_memory_once(start, backbone, monkeypatch):
+def test_branches_encode_their_shared_frame_once_and_read_the_memory_once(start, backbone, monkeypatch):
     branches = start().branches(3)
     encoded = counted(monkeypatch, backbone.codec, "encode")
     looked = counted(monkeypatch, Views, "visible_distances")
@@ -104,20 +104,20 @@ def test_branches_write_into_memories_of_their_own(start):
     assert all(torch.equal(branches.agents[0].memory.tensors()[name], value) for name, value in held[0].items())
 
 
-def test_branches_that_may_not_write_keep_one_memory(start):
+def test_branches_that_do_not_write_share_one_memory(start):
     branches = start(write=False).branches(2)
     branches.step(WAYS[:2])
     assert branches.agents[0].memory is branches.agents[1].memory
 
 
-def test_branches_of_different_lengths_each_go_as_far_as_asked(start):
+def test_branches_may_have_different_numbers_of_actions(start):
     ways = [["left"] * 3, ["right"] * 12]
     together = start().branches(2).step(ways)
     assert [len(seen) for seen in together] == [3, 12]
     assert all(alike(seen, start().step([way])[0]) for seen, way in zip(together, ways, strict=True))
 
 
-def test_a_branch_can_branch_again_and_the_first_goes_on_as_if_nothing_was(start):
+def test_branching_again_does_not_change_the_first_world_model(start):
     model = start()
     branch = model.branches(1)
     branch.step([["left"] * 8])
@@ -128,7 +128,7 @@ def test_a_branch_can_branch_again_and_the_first_goes_on_as_if_nothing_was(start
     assert alike(model.step([["left"] * 8])[0], expected[:8])
 
 
-def test_what_cannot_branch_is_one_line(start):
+def test_branches_that_cannot_work_are_refused(start):
     model = start()
     with pytest.raises(PersistError, match="0 branches of a rollout; it must be at least 1"):
         model.branches(0)
@@ -138,7 +138,7 @@ def test_what_cannot_branch_is_one_line(start):
         model.branches(2).step([["left"], []])
 
 
-def test_several_actions_leave_a_folder_each_with_what_one_alone_leaves(persist, voxel, walks, tmp_path):
+def test_every_list_of_actions_writes_the_folder_of_a_single_rollout(persist, voxel, walks, tmp_path):
     def roll(out, *options):
         ended = persist("rollout", voxel, "--start", f"{walks}#0:2", "--out", out, "--steps", 1, *options, "--json")
         assert ended.code == 0, ended.err
@@ -155,7 +155,7 @@ def test_several_actions_leave_a_folder_each_with_what_one_alone_leaves(persist,
         assert set(together[number]) == set(alone[number]) | {"together"}
 
 
-def test_rollouts_that_several_would_not_replace_are_not_mixed_with_them(persist, tmp_path, voxel, walks):
+def test_branches_refuse_a_folder_with_a_rollout_that_they_would_not_replace(persist, tmp_path, voxel, walks):
     def roll(*actions):
         options = [part for text in actions for part in ("--actions", text)]
         return persist("rollout", voxel, "--start", f"{walks}#0:2", "--out", tmp_path, "--steps", 1, *options)

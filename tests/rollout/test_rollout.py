@@ -22,7 +22,7 @@ def roll(persist, run, walks, out, *options):
     return persist("rollout", run, "--start", f"{walks}#0:2", "--out", out, "--steps", 2, *options)
 
 
-def test_a_rollout_leaves_videos_maps_poses_and_a_memory(persist, voxel, walks, tmp_path):
+def test_a_rollout_writes_videos_maps_poses_and_a_memory(persist, voxel, walks, tmp_path):
     assert roll(persist, voxel, walks, tmp_path, "--actions", "left*4 forward*6").code == 0
     names = {"rgb.mp4", "depth.mp4", "sheet.png", "map-after.png", "poses.txt", "memory.safetensors", "rollout.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
@@ -40,21 +40,21 @@ def test_a_rollout_is_the_same_for_the_same_seed_and_another_for_another(persist
     assert a != c
 
 
-def test_following_a_trajectory_compares_with_what_is_really_there(persist, voxel, walks, tmp_path):
+def test_following_a_trajectory_compares_with_its_recorded_frames(persist, voxel, walks, tmp_path):
     assert roll(persist, voxel, walks, tmp_path, "--follow", "--frames", 10).code == 0
     figures = json.loads((tmp_path / "rollout.json").read_text())
     assert len(figures["against_ground_truth"]["psnr"]) == 10
     assert (tmp_path / "compare.mp4").is_file()
 
 
-def test_one_frame_that_follows_is_compared_in_depth_too(persist, voxel, walks, tmp_path):
+def test_a_single_followed_frame_is_compared_in_depth_too(persist, voxel, walks, tmp_path):
     assert roll(persist, voxel, walks, tmp_path, "--follow", "--frames", 1).code == 0
     figures = json.loads((tmp_path / "rollout.json").read_text())["against_ground_truth"]
     assert {"psnr", "absrel", "drift"} <= set(figures)
     assert all(len(figure) == 1 and figure[0] is not None for figure in figures.values())
 
 
-def test_a_rollout_into_the_folder_of_another_leaves_nothing_of_it(persist, voxel, stage1, walks, tmp_path):
+def test_a_rollout_into_the_folder_of_an_earlier_one_replaces_all_of_it(persist, voxel, stage1, walks, tmp_path):
     out, memory = tmp_path / "o", tmp_path / "m.safetensors"
     assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
     assert roll(persist, voxel, walks, out, "--follow", "--frames", 1, "--memory", memory).code == 0
@@ -63,7 +63,7 @@ def test_a_rollout_into_the_folder_of_another_leaves_nothing_of_it(persist, voxe
     assert {p.name for p in out.iterdir()} == {"rgb.mp4", "depth.mp4", "sheet.png", "poses.txt", "rollout.json"}
 
 
-def test_a_memory_file_is_read_and_kept_as_it_was_when_nothing_may_be_written(persist, voxel, walks, tmp_path):
+def test_a_memory_file_stays_as_it_was_when_the_rollout_does_not_write(persist, voxel, walks, tmp_path):
     memory = tmp_path / "m.safetensors"
     assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
     assert roll(persist, voxel, walks, tmp_path / "o", "--actions", "left", "--memory", memory, "--no-write").code == 0
@@ -72,12 +72,12 @@ def test_a_memory_file_is_read_and_kept_as_it_was_when_nothing_may_be_written(pe
     assert (tmp_path / "o/map-before.png").is_file()
 
 
-def test_without_an_adapter_it_is_plain_stage_one(persist, stage1, walks, tmp_path):
+def test_a_rollout_without_an_adapter_is_plain_stage_one(persist, stage1, walks, tmp_path):
     assert roll(persist, stage1, walks, tmp_path, "--actions", "left").code == 0
     assert not (tmp_path / "memory.safetensors").exists()
 
 
-def test_what_cannot_be_rolled_out_is_one_line(persist, voxel, stage1, walks, tmp_path):
+def test_rollouts_that_cannot_work_are_refused_in_one_line(persist, voxel, stage1, walks, tmp_path):
     other, patches = tmp_path / "other.safetensors", tmp_path / "patches.safetensors"
     assert persist("memorize", f"{walks}#1:0-4", "--out", other).code == 0
     assert persist("memorize", f"{walks}#0:0-4", "--out", patches, "--set", "encoder.seed=5").code == 0
@@ -135,7 +135,7 @@ def test_quaternions_rotate_as_their_matrices_do():
         assert [x, y, z, w] == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_rollout_of_lower_precision_and_less_memory_says_so(persist, voxel, walks, tmp_path):
+def test_a_rollout_records_its_precision_and_memory_options(persist, voxel, walks, tmp_path):
     options = ["--actions", "forward*3", "--dtype", "bfloat16", "--save-memory", "vae-slicing,vae-tiling"]
     assert roll(persist, voxel, walks, tmp_path, *options).code == 0
     plan = json.loads((tmp_path / "rollout.json").read_text())["plan"]
@@ -143,7 +143,7 @@ def test_a_rollout_of_lower_precision_and_less_memory_says_so(persist, voxel, wa
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is an accelerator")
-def test_a_rollout_that_cannot_save_memory_so_is_one_line(persist, walks, tmp_path):
+def test_memory_options_that_cannot_work_are_refused_in_one_line(persist, walks, tmp_path):
     for options, cause in (
         (["--save-memory", "model-offload"], "for an accelerator, and there is none; leave it out"),
         (["--dtype", "int8"], "unknown --dtype 'int8'; known: float32, bfloat16, float16"),
