@@ -162,12 +162,12 @@ class CacheKeys:
     Args:
         latents: the JSON values that latents depend on besides the clip.
         tokens: the JSON values that memory tokens depend on besides the clip, ``None`` without a memory.
-        whole: whether an entry has the latents of a whole trajectory instead of a clip.
+        whole_trajectories: whether an entry has the latents of a whole trajectory instead of a clip.
     """
 
     latents: dict[str, Any]
     tokens: dict[str, Any] | None
-    whole: bool
+    whole_trajectories: bool
     hashes: dict[Path, str] = field(default_factory=dict)  # of the trajectories' files, each computed once
 
     @staticmethod
@@ -190,7 +190,7 @@ class CacheKeys:
     def of_clip(self, frames: ClipFrames) -> ClipKeys:
         """The keys of a clip."""
         clip = {"trajectory": self._file_hash(frames.file.path), "frames": list(frames.frames)}
-        latents = cache_key((clip | {"frames": "all"} if self.whole else clip) | self.latents)
+        latents = cache_key((clip | {"frames": "all"} if self.whole_trajectories else clip) | self.latents)
         if self.tokens is None:
             return ClipKeys(latents, None)
         return ClipKeys(latents, cache_key(clip | {"context": list(frames.context)} | self.tokens))
@@ -214,18 +214,18 @@ class ClipCache:
     keys: CacheKeys
 
     @property
-    def whole(self) -> bool:
+    def whole_trajectories(self) -> bool:
         """Whether an entry has the latents of a whole trajectory instead of a clip."""
-        return self.keys.whole
+        return self.keys.whole_trajectories
 
     def latents(self, frames: ClipFrames) -> ClipLatents | None:
         """The latents of a clip, ``None`` where the cache has none."""
         tensors = self.cache.get(self.keys.of_clip(frames).latents)
         if tensors is None:
             return None
-        return self.cut(tensors["video"], frames) if self.whole else ClipLatents(**tensors)
+        return self.clip_latents(tensors["video"], frames) if self.whole_trajectories else ClipLatents(**tensors)
 
-    def cut(self, trajectory: Tensor, frames: ClipFrames) -> ClipLatents:
+    def clip_latents(self, trajectory: Tensor, frames: ClipFrames) -> ClipLatents:
         """The latents of a clip out of those of its whole trajectory, in which every frame was encoded alone."""
         video = trajectory[list(frames.frames)]
         return ClipLatents(video, video[:1])
@@ -238,7 +238,7 @@ class ClipCache:
 
     def put_latents(self, frames: ClipFrames, latents: ClipLatents) -> None:
         """Store the latents of a clip, or of its whole trajectory, while there is room."""
-        tensors = {"video": latents.video} | ({} if self.whole else {"image": latents.image})
+        tensors = {"video": latents.video} | ({} if self.whole_trajectories else {"image": latents.image})
         self.cache.put(self.keys.of_clip(frames).latents, tensors)
 
     def put_tokens(self, frames: ClipFrames, tokens: MemoryTokens) -> None:
@@ -283,36 +283,37 @@ class CachedClips(Dataset[CachedSample]):
 
 
 class ClipEncoder:
-    """Completes clips by latents and memory tokens; those that the cache lacks are made of each clip alone, and stored.
+    """Completes clips by latents and memory tokens; those that the cache lacks are made for each clip and stored.
 
     Args:
-        backbone: encodes, on its device.
-        factory: of memories, ``None`` without one.
-        accelerator: gives the precision of training.
-        cache: ``None`` stores nothing.
+        backbone: the backbone, which encodes on its own device.
+        factory: makes the memories, ``None`` without one.
+        accelerator: accelerate for this process, which gives the precision of training.
+        cache: the cache, ``None`` for none.
     """
 
     def __init__(
         self, backbone: Backbone, factory: MemoryFactory | None, accelerator: Accelerator, cache: ClipCache | None
     ) -> None:
         self.backbone, self.factory, self.accelerator, self.cache = backbone, factory, accelerator, cache
-        self.clips, self.cached = 0, 0  # how many there were, and how many of them came with latents
+        self.clips = self.cached_clips = 0  # clips so far, and how many of them came with latents
 
     def figures(self) -> dict[str, float]:
-        """How many of this process's clips came with latents since the start, as a share."""
-        return {"latents_found": round(self.cached / self.clips, 4)} if self.clips else {}
+        """The share of this process's clips that came with latents, empty before the first clip."""
+        return {"latents_found": round(self.cached_clips / self.clips, 4)} if self.clips else {}
 
     def with_latents(self, cached: CachedSample) -> CachedSample:
-        """The clip with its latents, which stand for its images."""
+        """The clip with latents in the place of its images."""
         sample = cached.sample
-        self.clips, self.cached = self.clips + 1, self.cached + (sample.clip.latents is not None)
+        self.clips += 1
+        self.cached_clips += sample.clip.latents is not None
         latents = sample.clip.latents or self._new_latents(sample.clip, cached.frames)
-        seen = sample.clip.observations
-        cameras = Observations(seen.rgb[:0], seen.depth[:0], seen.cameras)
+        images = sample.clip.observations
+        cameras = Observations(images.rgb[:0], images.depth[:0], images.cameras)
         return replace(cached, sample=replace(sample, clip=replace(sample.clip, observations=cameras, latents=latents)))
 
     def with_tokens(self, cached: CachedSample) -> Clip:
-        """The clip with what a memory of its context says to its cameras, if there is a memory."""
+        """The clip with the tokens that a memory of its context gives for its cameras, where there is a memory."""
         if self.factory is None or cached.sample.clip.tokens is not None:
             return cached.sample.clip
         clip = with_memory(cached.sample, self.factory, self.backbone.token_budget)
@@ -323,14 +324,14 @@ class ClipEncoder:
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip
             return self._encode(clip)
-        if not self.cache.whole:
+        if not self.cache.whole_trajectories:
             latents = self._encode(clip)
             self.cache.put_latents(frames, latents)
             return latents
         pieces = Source(frames.file, range(len(frames.file)), str(frames.file.path)).pieces()
         video = torch.cat([self._encode(replace(clip, observations=piece)).video for piece in pieces])
         self.cache.put_latents(frames, ClipLatents(video, video[:1]))
-        return self.cache.cut(video, frames)
+        return self.cache.clip_latents(video, frames)
 
     def _encode(self, clip: Clip) -> ClipLatents:
         """Latents of these frames, on the CPU."""

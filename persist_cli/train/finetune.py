@@ -41,7 +41,6 @@ from persist_cli.train.distributed import (
     use_zero_on_cpus,
     zero_plugin,
 )
-from persist_cli.train.log import StepTimes
 from persist_cli.train.run_folder import RunFolder
 from persist_cli.train.state import load_state
 from persist_cli.train.trainer import StopSignal, Trainer
@@ -133,8 +132,7 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
         warn(f"{run}: {RANDOM_CODEC}")
     trainer = Trainer(recipe, backbone, factory, accelerator, plan.cache)
-    if plan.profile:
-        trainer.times = StepTimes(accelerator.device, recipe.training.batch)
+    trainer.times.enabled = plan.profile
     load_state(run, trainer.state)
     if accelerator.log_with:
         accelerator.init_trackers("persist")
@@ -144,8 +142,7 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
     accelerator.end_training()
     ended_by = ended_by if trainer.state.step < recipe.training.steps else None
     if accelerator.is_main_process:
-        if trainer.times is not None:
-            trainer.times.report(run / "profile.json")
+        trainer.times.report(run / "profile.json")
         report(recipe, run, trainer.state.step, folder.speed.rate())
     return ended_by
 

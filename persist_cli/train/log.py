@@ -6,7 +6,6 @@ import contextlib
 import json
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -100,16 +99,21 @@ class StepTimes:
     Args:
         device: the device that computes.
         batch: samples a step, over all processes.
+        enabled: whether anything is measured.
     """
 
     device: torch.device
     batch: int
+    enabled: bool = True
     steps: list[dict[str, float]] = field(default_factory=list)
     current: dict[str, float] | None = None
 
     @contextlib.contextmanager
     def step(self) -> Iterator[None]:
         """Measure the block as one step."""
+        if not self.enabled:
+            yield
+            return
         since, self.current = self._now(), dict.fromkeys(PARTS, 0.0)
         yield
         self.current[REST] = self._now() - since - sum(self.current.values())
@@ -119,10 +123,12 @@ class StepTimes:
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
         """Add the block's seconds to this part of the step; outside of steps they do not count."""
+        if self.current is None:
+            yield
+            return
         since = self._now()
         yield
-        if self.current is not None:
-            self.current[name] += self._now() - since
+        self.current[name] += self._now() - since
 
     def figures(self) -> dict[str, Any]:
         """Mean seconds and share of each part and samples a second as JSON values, empty before the first step ends."""
@@ -136,7 +142,7 @@ class StepTimes:
         return {"device": str(self.device), "steps": len(steps), **speed, "parts": parts}
 
     def report(self, path: Path) -> None:
-        """Write the figures as JSON and print them as a table."""
+        """Write the figures as JSON and print them as a table, if any step was measured."""
         figures = self.figures()
         if not figures:
             return
@@ -150,11 +156,6 @@ class StepTimes:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return time.perf_counter()
-
-
-def timed(times: StepTimes | None, name: str) -> AbstractContextManager[None]:
-    """Measure the block as a part of a step where times are taken."""
-    return contextlib.nullcontext() if times is None else times.part(name)
 
 
 def _parse_row(line: str) -> dict[str, float] | None:

@@ -24,7 +24,7 @@ from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import Recipe, TrainingSettings
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, CacheSettings, ClipCache, ClipEncoder, TensorCache
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
-from persist_cli.train.log import StepLog, StepTimes, timed
+from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import make_average, make_optimizer, requested_savings, update_average
 from persist_cli.train.state import TrainingState
 from persist_cli.viewing.console import add_task, progress
@@ -74,7 +74,7 @@ class Trainer:
     ) -> None:
         self.recipe, self.backbone, self.accelerator = recipe, backbone, accelerator
         self.factory = factory
-        self.times: StepTimes | None = None
+        self.times = StepTimes(accelerator.device, recipe.training.batch, enabled=False)
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
@@ -143,29 +143,29 @@ class Trainer:
             collate_fn=list,
             generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
         )
-        found = iter(loader)
+        remaining = iter(loader)
         while True:
-            with timed(self.times, "data"):
-                samples = next(found, None)
+            with self.times.part("data"):
+                samples = next(remaining, None)
             if samples is None:
                 return
             yield self.to_batch(samples)
 
     def to_batch(self, samples: list[Any]) -> Clips:
-        """Samples of ``clips`` as a batch with memory tokens, and latents where clips come again."""
+        """Make a batch of samples of ``clips``, with memory tokens in stage 2 and latents where clips come again."""
         if self.encoder is None:
-            with timed(self.times, "memory"):
+            with self.times.part("memory"):
                 clips = [with_memory(sample, self.factory, self.backbone.token_budget) for sample in samples]
         else:
-            with timed(self.times, "encode"):
+            with self.times.part("encode"):
                 encoded = [self.encoder.with_latents(sample) for sample in samples]
-            with timed(self.times, "memory"):
+            with self.times.part("memory"):
                 clips = [self.encoder.with_tokens(sample) for sample in encoded]
         return Clips.stack(clips).to(self.accelerator.device)
 
     def encoded(self, clips: Clips) -> Clips:
-        """The clips with their latents, which the model would make by itself, so that they are timed apart."""
-        if self.times is None or clips.latents is not None or not self.backbone.encodes(self.recipe.stage):
+        """The clips; when times are taken with their latents, which the model would else make in its forward pass."""
+        if not self.times.enabled or clips.latents is not None or not self.backbone.encodes(self.recipe.stage):
             return clips
         with self.times.part("encode"), torch.no_grad(), self.accelerator.autocast():
             return dataclasses.replace(clips, latents=self.backbone.encode(clips))
@@ -174,7 +174,7 @@ class Trainer:
         """Train to the last step; yields the logged values of each optimizer step."""
         batches = self.loader()
         while self.state.step < self.recipe.training.steps:
-            with nullcontext() if self.times is None else self.times.step():
+            with self.times.step():
                 values = self.step(batches)
             self.state.step += 1
             yield values
@@ -185,16 +185,16 @@ class Trainer:
         Raises:
             PersistError: when the loss is not finite; the parameters are then unchanged.
         """
-        settings, accelerator = self.recipe.training, self.accelerator
+        settings, accelerator, times = self.recipe.training, self.accelerator, self.times
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(settings, self.state.step)
         totals: dict[str, torch.Tensor] = {}
         for number in range(1, settings.accumulation + 1):
             clips = self.encoded(next(batches))
             with self.synchronized(last=number == settings.accumulation):
-                with timed(self.times, "forward"), accelerator.autocast():  # accelerate leaves it out when it shards
+                with times.part("forward"), accelerator.autocast():  # accelerate leaves it out when it shards
                     losses = self.model(clips, self.recipe.stage)
-                with timed(self.times, "backward"):  # DeepSpeed divides the loss itself
+                with times.part("backward"):  # DeepSpeed divides the loss itself
                     accelerator.backward(losses["loss"] / (1 if self.zero else settings.accumulation))
             for name, loss in losses.items():
                 totals[name] = totals.get(name, 0) + loss.detach() / settings.accumulation
@@ -204,7 +204,7 @@ class Trainer:
                 f"the loss is {means['loss']} at step {self.state.step}; lower training.learning_rate or train with "
                 "training.precision=no"
             )
-        with timed(self.times, "optimizer"):
+        with times.part("optimizer"):
             accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)

@@ -14,7 +14,7 @@ from accelerate import Accelerator
 from persist_cli.api.backbone import ClipLatents
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.checkpoints.load import load_backbone
+from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.errors import PersistError
 from persist_cli.io.files import ASIDE, read_tensors
