@@ -19,6 +19,7 @@ from persist_cli.errors import DataError, RecipeError
 from persist_cli.plugins import make_simulator
 from persist_cli.simulators.building import build_house
 from persist_cli.simulators.miniworld import MiniWorld
+from persist_cli.simulators.rendering import Renderer
 from tests.support.miniworlds import make_world, put_somewhere
 
 FINGERPRINT = """
@@ -87,7 +88,9 @@ def test_the_depth_of_the_floor_is_exact_to_a_tenth_of_a_millimetre(world: MiniW
 def test_the_depth_of_a_far_wall_is_exact_to_a_millimetre(world: MiniWorld) -> None:
     room = max((room.ground for room in world.house.rooms), key=lambda ground: ground.width)
     eye, forward = (room.low_x + 0.1, 2.6, room.center[1]), (1.0, 0.0, 0.0)
-    _, depth = world._renderer.render(eye, forward, 30.0)
+    renderer = Renderer(64, 64)
+    renderer.load(world.house, world.house.things)
+    _, depth = renderer.render(eye, forward, 30.0)
     assert depth[30:34, 28:36] == pytest.approx(room.high_x - eye[0], abs=1e-3)
 
 
@@ -126,12 +129,12 @@ def test_the_field_of_view_is_that_of_the_intrinsics() -> None:
 
 
 def test_the_sky_has_no_depth(world: MiniWorld) -> None:
-    roofless = next(seed for seed in range(200) if any(not room.ceiling for room in build_house(seed).rooms))
-    world.open_scene(roofless)
-    room = next(room for room in world.house.rooms if room.ceiling is None)
-    world._renderer.load(world.house, [])
+    houses = (build_house(seed) for seed in range(200))
+    house, room = next((house, room) for house in houses for room in house.rooms if room.ceiling is None)
+    renderer = Renderer(64, 64)
+    renderer.load(house, [])
     (x, z), sky = room.ground.center, 25.0
-    _, depth = world._renderer.render((x, 1.2, z), (0.01, 1.0, 0.0), sky)
+    _, depth = renderer.render((x, 1.2, z), (0.01, 1.0, 0.0), sky)
     assert not depth.any()
 
 

@@ -215,7 +215,7 @@ def _causes(better: HypothesisScores) -> list[str]:
 
 
 def _undecided(baseline: Score, scored: HypothesisScores) -> list[str]:
-    """Kinds of which some gross fault, had the data had it, would not have been found."""
+    """Kinds of faults that the data would not show, not even a gross one."""
     kinds = [
         hypothesis.name
         for hypothesis, value in scored
