@@ -40,7 +40,7 @@ Precision = Annotated[  # YAML reads the word no as false
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How long a stage is trained and how.
+    """The settings of the training loop.
 
     Args:
         steps: optimizer steps.

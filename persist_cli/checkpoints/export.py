@@ -153,7 +153,7 @@ def _default_adapter(base: Checkpoint, adapters: dict[str, AdapterSource], reque
 
 
 def _default_sampling(base: Checkpoint, requested: SamplingOverrides) -> dict[str, Any] | None:
-    """How to sample when a command does not say, ``None`` when neither options nor checkpoint say it.
+    """The default sampling of the export, ``None`` when neither the options nor the checkpoint have one.
 
     Raises:
         PersistError: when the backbone cannot sample so.

@@ -1,4 +1,4 @@
-"""What a model came from: the recipes of its stages and the scenes that it was trained on, over all its bases."""
+"""The origin of a model: the recipes of its stages and the scenes that it was trained on, over all its bases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models loaded from checkpoints: the base's backbone, its adapters, and what a training begins with."""
+"""Models loaded from checkpoints: the base's backbone, its adapters, and the backbone that a training begins with."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def reference_checkpoint() -> Path:
 def load_backbone(
     checkpoint: Checkpoint, settings: dict[str, Any] | None = None, adapter: str | None = None
 ) -> Backbone:
-    """The base's backbone, LoRA merged, with one of the checkpoint's adapters in use or none: plain stage 1.
+    """The backbone of the checkpoint's base, with LoRA merged.
 
     Args:
-        checkpoint: that has the base and the adapters.
-        settings: of the backbone that replace those of the base.
-        adapter: the name of the adapter.
+        checkpoint: the checkpoint.
+        settings: settings of the backbone that replace those of the base.
+        adapter: the name of the checkpoint's adapter to use, ``None`` for plain stage 1.
     """
     backbone = empty_backbone(checkpoint, settings)
     backbone.load_base(checkpoint.base_folder)
@@ -45,7 +45,7 @@ def load_backbone(
 
 
 def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
-    """The base's backbone on the meta device: weights come from the files, where they are needed."""
+    """The backbone of the checkpoint's base on the meta device, without weights."""
     import torch
 
     from persist_cli.plugins import make_backbone
@@ -68,21 +68,21 @@ def adapter_memory(checkpoint: Checkpoint, adapter: str) -> MemoryConfig:
     return parse_settings(MemoryConfig, read_json(path), str(path))
 
 
-def start_backbone(choice: BackboneConfig, base: Checkpoint | None) -> Backbone:
-    """The backbone that a training begins with: fresh, or the base's with the choice's settings on top.
+def start_backbone(config: BackboneConfig, base: Checkpoint | None) -> Backbone:
+    """The backbone that a training begins with: a fresh one, or that of the base with the config's settings on top.
 
     Raises:
-        RecipeError: when the base is of another backbone.
+        RecipeError: when the base is of another backbone than the config.
     """
     if base is None:
         from persist_cli.plugins import make_backbone
 
-        return make_backbone(choice.name, choice.settings)
-    if base.backbone != choice.name:
-        raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {choice.name!r}")
-    return load_backbone(base, choice.settings)
+        return make_backbone(config.name, config.settings)
+    if base.backbone != config.name:
+        raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
+    return load_backbone(base, config.settings)
 
 
 def starts_from_random_codec(recipe: Recipe, backbone: Backbone) -> bool:
-    """Whether the video model would be trained on the latents of a codec with random weights."""
+    """Whether a recipe trains the video model on the latents of a codec with random weights."""
     return recipe.stage == "1" and recipe.base is None and not backbone.origin()

@@ -75,7 +75,7 @@ class Doctor:
         return not hopeless and self.examine(strategy).fits
 
     def launch(self, strategy: Strategy) -> Launch:
-        """How the training is spread over processes with these changes."""
+        """The processes that the training is spread over with these changes."""
         sharded, offloaded = self.sharded or strategy.sharded, OFFLOADED in strategy.flags
         return Launch(self.machine.devices, self.machine.kind == "cuda", sharded, offloaded)
 

@@ -1,4 +1,4 @@
-"""How many bytes of memory a process of a training needs, for each purpose."""
+"""Estimates of the memory that a process of a training needs, in bytes for each purpose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOMENTS: Final = {
 
 @dataclass(frozen=True)
 class Launch:
-    """How a training is spread over processes.
+    """The processes that a training is spread over.
 
     Args:
         devices: the number of processes, of which each has a device.

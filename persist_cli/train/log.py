@@ -1,4 +1,4 @@
-"""What a run writes down: its losses, how fast it went, and where the time of a step goes."""
+"""The logs of a run: its losses, its speed, and the time that each part of a step takes."""
 
 from __future__ import annotations
 

@@ -48,8 +48,9 @@ def generated(path, adapter, original=None):
 def test_a_float32_export_generates_bit_for_bit_what_the_runs_do(export, runs, tmp_path):
     export(tmp_path / "m", runs / "voxel", f"fine={runs / 'canvas'}", "--dtype", "float32")
     for run, adapter, name in (("stage1", None, None), ("voxel", "voxel", "voxel"), ("canvas", "voxel", "fine")):
-        for expected, found in zip(generated(runs / run, adapter), generated(tmp_path / "m", name), strict=True):
-            assert torch.equal(expected, found)
+        of_run, of_export = generated(runs / run, adapter), generated(tmp_path / "m", name)
+        for expected, actual in zip(of_run, of_export, strict=True):
+            assert torch.equal(expected, actual)
     rgb = [generated(tmp_path / "m", name)[0] for name in (None, "voxel", "fine")]
     assert not torch.equal(rgb[0], rgb[1])
     assert not torch.equal(rgb[1], rgb[2])
@@ -159,19 +160,19 @@ def test_an_adapter_trained_on_an_export_can_be_exported_with_it(export, persist
     assert (find_checkpoint(tmp_path / "n").fingerprint, find_checkpoint(later).fingerprint) == (model.fingerprint,) * 2
 
 
-def test_recipes_of_all_stages_are_kept_without_places_of_this_machine(persist, codec, stage1, voxel, tmp_path):
+def test_an_export_has_the_recipes_of_all_stages_without_absolute_paths(persist, codec, stage1, voxel, tmp_path):
     assert persist("export", stage1, f"codec={voxel}", "--out", tmp_path / "m").code == 0
     home = tmp_path / "m/recipes"
-    kept = {path.relative_to(home).as_posix(): path.read_text() for path in home.rglob("*.yaml")}
-    assert sorted(kept) == ["adapters/codec.yaml", "codec.yaml", "stage1.yaml"]
-    assert "base: stage1" in kept["adapters/codec.yaml"]
-    assert "stage: codec" in kept["codec.yaml"]
-    assert not any(str(codec.parent) in text for text in kept.values())
+    recipes = {path.relative_to(home).as_posix(): path.read_text() for path in home.rglob("*.yaml")}
+    assert sorted(recipes) == ["adapters/codec.yaml", "codec.yaml", "stage1.yaml"]
+    assert "base: stage1" in recipes["adapters/codec.yaml"]
+    assert "stage: codec" in recipes["codec.yaml"]
+    assert not any(str(codec.parent) in text for text in recipes.values())
     assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
     assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
 
 
-def test_no_configuration_tells_where_it_was_loaded_from(persist, walks, codec, tmp_path):
+def test_no_exported_configuration_says_where_it_was_loaded_from(persist, walks, codec, tmp_path):
     settings = ["training.steps=1", "training.ema=0"]
     assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *settings)).code == 0
     run = tmp_path / "run"

@@ -44,6 +44,6 @@ def write_runs(folder: Path) -> Path:
     write_adapter(backbone, folder / "stage1", folder / "voxel", "voxel")
     write_adapter(backbone, folder / "stage1", folder / "canvas", "voxel", "canvas")
     write_adapter(backbone, folder / "stage1", folder / "none", "none")
-    other = write_base(folder / "other-base", 0.2)
-    write_adapter(other, folder / "other-base", folder / "other", "map2d")
+    backbone = write_base(folder / "other-base", 0.2)
+    write_adapter(backbone, folder / "other-base", folder / "other", "map2d")
     return folder
