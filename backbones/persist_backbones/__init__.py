@@ -11,16 +11,16 @@ if TYPE_CHECKING:
 
 
 def load(folder: Path | str, adapter: str | None = None, dtype: Precision | None = None) -> WorldPipeline:
-    """A checkpoint as a pipeline of diffusers' kind, on the CPU and ready to sample.
+    """Load a checkpoint as a pipeline of diffusers' kind, on the CPU and ready to sample.
 
     ``pipeline = persist_backbones.load("runs/voxel")``, then ``pipeline.to("cuda")`` or
     ``pipeline.enable_model_cpu_offload()``, and ``pipeline(image, depth, cameras, memory_tokens=tokens)``. The
     backbone itself is ``pipeline.backbone``.
 
     Args:
-        folder: of a checkpoint or an export, or of a run, which stands for its newest checkpoint.
-        adapter: of memory; by default the checkpoint's default or only one. ``stage1`` is the base without any.
-        dtype: ``float32`` (by default), ``bfloat16`` or ``float16``.
+        folder: folder of a checkpoint, of an export, or of a run, whose newest checkpoint is loaded.
+        adapter: name of a memory adapter, by default the checkpoint's default or only one; ``stage1`` for no adapter.
+        dtype: precision of the weights: ``float32`` (by default), ``bfloat16`` or ``float16``.
 
     Raises:
         PersistError: one line when there is no such checkpoint or adapter, or it is damaged.
@@ -34,12 +34,12 @@ def write_prompt(prompt: str, pretrained: str, path: Path | str) -> None:
     """Write a prompt's embedding for ``backbone.settings.prompt_embedding``, on a machine that has the text encoder.
 
     Args:
-        prompt: text.
+        prompt: the text.
         pretrained: a diffusers CogVideoX directory with ``text_encoder/`` and ``tokenizer/``.
-        path: a safetensors file to write.
+        path: the safetensors file that is written.
 
     Raises:
-        PersistError: one line when T5 is not there or unusable, and for a prompt that is too long.
+        PersistError: one line when T5 is missing or unusable, or the prompt is too long.
     """
     from persist_backbones.cogvideox.prompt import save_prompt  # transformers takes seconds to import
 

@@ -1,4 +1,4 @@
-"""What model and adapters share: the order of video tokens, frames and patches folded into channels, zero weights."""
+"""Tensor operations that model and adapters share: order of video tokens, folding into channels, zero weights."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor, nn
 
 
 def frames_per_token(config: Any) -> int:
-    """Latent frames that a video token stands for, by the configuration of diffusers' transformer."""
+    """Return the number of latent frames of a video token, from the configuration of diffusers' transformer."""
     return int(config.patch_size_t or 1)
 
 
 def fold_patches(
     latents: Float[Tensor, "batch frame channel height width"], patch: int, frames: int
 ) -> Float[Tensor, "batch token folded"]:
-    """The patch of each video token as channel × frame × row × column, as diffusers' linear embedding has it."""
+    """Fold the patch of each video token as channel × frame × row × column, for diffusers' linear embedding."""
     folded = latents.unflatten(1, (-1, frames)).transpose(2, 3).flatten(2, 3)
     return tokens_of(F.pixel_unshuffle(folded, patch))
 
@@ -26,13 +26,13 @@ def fold_patches(
 def unfold_patches(
     tokens: Float[Tensor, "batch token folded"], size: tuple[int, int, int], patch: int, frames: int
 ) -> Float[Tensor, "batch frame channel height width"]:
-    """The latents that ``fold_patches`` folded.
+    """Undo ``fold_patches``.
 
     Args:
-        tokens: of each patch channel × frame × row × column.
-        size: frames, height and width of the latents.
-        patch: latent pixels along the edge of a token.
-        frames: latent frames of a token.
+        tokens: patches, each folded as channel × frame × row × column.
+        size: number of frames, height and width of the latents.
+        patch: latent pixels along the edge of a video token.
+        frames: latent frames of a video token.
     """
     grid = tokens.unflatten(1, (size[0] // frames, size[1] // patch, size[2] // patch)).movedim(-1, 2)
     latents: Tensor = F.pixel_shuffle(grid, patch).unflatten(2, (-1, frames)).transpose(2, 3).flatten(1, 2)
@@ -49,9 +49,9 @@ def zero_init(*modules: nn.Module) -> None:
 def fold_frames(
     frames: Shaped[Tensor, "batch frame channel *rest"], temporal: int, multiple: int = 1
 ) -> Shaped[Tensor, "batch latent_frame folded *rest"]:
-    """Frames folded into channels, the first one alone in the first latent frame and repeated to fill its channels.
+    """Fold frames into channels; the first latent frame contains the first frame alone, repeated to fill its channels.
 
-    It also fills the latent frames in front of that one that make their number a multiple.
+    The first frame also fills latent frames in front that pad their number to a multiple of ``multiple``.
     """
     missing = -frames.shape[1] % (temporal * multiple)
     first = frames[:, :1].expand(-1, missing, *frames.shape[2:])
@@ -62,6 +62,6 @@ def fold_frames(
 def tokens_of(
     latents: Float[Tensor, "batch frame channel row column"],
 ) -> Float[Tensor, "batch token channel"]:
-    """Values at each place of each frame, in the order of the transformer's video tokens."""
+    """Flatten the places of all frames in the order of the transformer's video tokens."""
     tokens: Tensor = latents.flatten(3).transpose(2, 3).flatten(1, 2)
     return tokens

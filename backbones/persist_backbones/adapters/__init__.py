@@ -1,1 +1,1 @@
-"""Memory adapters: how tokens of a memory reach the video."""
+"""Memory adapters: the modules by which the tokens of a memory change the video."""

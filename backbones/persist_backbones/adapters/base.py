@@ -1,7 +1,7 @@
-"""Memory adapters: how tokens reach the video, one class a form (see ``forms``).
+"""The base class of memory adapters, which change the video by the tokens of a memory (their forms: see ``forms``).
 
-A form prepares the batch's tokens once, changes the hidden states before or after the blocks where it stands, and may
-correct the prediction.
+An adapter prepares the tokens of a batch once, changes the hidden states before or after some transformer blocks, and
+may correct the prediction.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 
-NEAR = 0.05  # metres in front of a camera; a token nearer than that is not in its picture
+NEAR = 0.05  # metres in front of a camera; a token that is nearer is not visible
 
 
 @dataclass(frozen=True)
 class AdapterSettings:
-    """What every form has.
+    """Settings that every form of adapter has.
 
     Args:
         form: one of ``FORMS``.
-        every: a block of the adapter stands at every n-th transformer block.
-        width: channels of the tokens inside the blocks, or of the canvas at a video token.
-        ff_factor: hidden width of the feed-forward over the video's.
-        token_budget: most tokens read for a clip.
-        dropout: part of the training samples that see no memory, for guidance over memory.
+        every: n, where the adapter has a block at every n-th transformer block.
+        width: channels of a memory token inside the blocks, or of the canvas at a video token.
+        ff_factor: hidden width of the feed-forward as a multiple of the video's channels.
+        token_budget: the largest number of tokens that is read from memory for a clip.
+        dropout: share of the training samples that see no memory, for guidance over memory.
     """
 
     form: str
@@ -46,18 +46,18 @@ class AdapterSettings:
 
 @dataclass(frozen=True)
 class VideoShape:
-    """What an adapter must know of the video model.
+    """The sizes of the video model that an adapter is built for.
 
     Args:
-        channels: of the hidden states.
-        camera_channels: of the camera embedding at each token.
-        time_channels: of the time embedding.
-        layers: transformer blocks.
+        channels: channels of the hidden states.
+        camera_channels: channels of the camera embedding at each video token.
+        time_channels: channels of the time embedding.
+        layers: number of transformer blocks.
         patch: latent pixels along the edge of a video token.
         spatial: compression of the codec in height and width.
         temporal: compression of the codec in time.
-        inputs: channels of all that the model sees at a latent pixel.
-        outputs: channels of its prediction.
+        inputs: channels of the model's whole input at a latent pixel.
+        outputs: channels of the prediction at a latent pixel.
         token_frames: latent frames that a video token stands for.
     """
 
@@ -74,29 +74,29 @@ class VideoShape:
 
     @property
     def folded(self) -> int:
-        """Frames that a video token stands for."""
+        """Number of frames of the clip that a video token stands for."""
         return self.temporal * self.token_frames
 
 
 @dataclass(frozen=True)
 class PreparedMemory:
-    """Memory of a batch, embedded once for all blocks and denoising steps.
+    """The memory of a batch, embedded once for all blocks and denoising steps.
 
     Args:
-        tokens: what the form's blocks take.
-        mask: what of it there is; nothing behind it changes the video.
+        tokens: embedded tokens, as the blocks of the form take them.
+        mask: true for tokens that exist; all other tokens change nothing in the video.
     """
 
     tokens: Float[Tensor, "batch *group token width"]
     mask: Bool[Tensor, "batch *group token"]
 
-    def only(self, kept: Bool[Tensor, " batch"]) -> Self:
-        """The same batch in which all other samples see no memory."""
-        kept = kept.reshape(-1, *[1] * (self.mask.ndim - 1))
-        return dataclasses.replace(self, mask=self.mask & kept)
+    def only(self, samples: Bool[Tensor, " batch"]) -> Self:
+        """Return this memory, hidden from all samples but those that are true in ``samples``."""
+        samples = samples.reshape(-1, *[1] * (self.mask.ndim - 1))
+        return dataclasses.replace(self, mask=self.mask & samples)
 
     def emptied(self) -> Self:
-        """The same batch with every token behind the mask."""
+        """Return this memory with all tokens masked out."""
         return dataclasses.replace(self, mask=torch.zeros_like(self.mask))
 
 
@@ -104,20 +104,20 @@ Prepared = TypeVar("Prepared", bound=PreparedMemory)
 
 
 class Adapter(nn.Module, ABC, Generic[Prepared]):
-    """A form of memory adapter.
+    """A memory adapter; each subclass is one form.
 
     Args:
-        channels: of the memory's features.
+        channels: channels of the features of a memory token.
         settings: an instance of ``settings_type``.
-        video: the model it stands in.
+        video: sizes of the video model.
 
     Raises:
-        CheckpointError: when no block would stand anywhere, or sizes do not go together.
+        CheckpointError: when the adapter would have no block, or its sizes do not fit each other.
     """
 
     settings_type: ClassVar[type[AdapterSettings]]
     settings: AdapterSettings
-    blocks: nn.ModuleDict  # by the number of the transformer block at which each stands
+    blocks: nn.ModuleDict  # the key is the number of the transformer block
 
     def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
         super().__init__()
@@ -129,24 +129,24 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
 
     @abstractmethod
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> Prepared:
-        """Embed the tokens of a batch for the clip that the cameras look at."""
+        """Embed the tokens of a batch for the clips that the cameras see."""
 
     def block_at(self, layer: int) -> nn.Module | None:
-        """The adapter's block that stands at transformer block ``layer``, if one does."""
+        """Return the adapter's block at transformer block ``layer``, ``None`` where it has none."""
         name = str(layer)
         return self.blocks[name] if name in self.blocks else None  # noqa: SIM401 (no dictionary)
 
     def dropped(self, memory: Prepared, generators: list[torch.Generator]) -> Prepared:
-        """Hide the memory of some training samples, for guidance over memory."""
+        """Hide the memory from training samples drawn with the generators, for guidance over memory."""
         if self.settings.dropout == 0:
             return memory
-        draws = torch.cat([torch.rand(1, generator=each) for each in generators])
+        draws = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         return memory.only((draws >= self.settings.dropout).to(memory.mask.device))
 
     def before(
         self, block: nn.Module, video: Float[Tensor, "batch token channel"], memory: Prepared
     ) -> Float[Tensor, "batch token channel"]:
-        """The hidden states that the transformer block is given, where a block of the adapter stands at it."""
+        """Return the input of a transformer block at which the adapter has ``block``; by default unchanged."""
         return video
 
     def after(
@@ -157,7 +157,7 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         camera: Float[Tensor, "batch token camera"],
         time: Float[Tensor, "batch time"],
     ) -> Float[Tensor, "batch token channel"]:
-        """The hidden states after the transformer block, where a block of the adapter stands at it."""
+        """Change the output of a transformer block at which the adapter has ``block``; by default it stays."""
         return video
 
     def correct(
@@ -167,23 +167,23 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         memory: Prepared,
         time: Float[Tensor, "batch time"],
     ) -> Float[Tensor, "batch frame out height width"]:
-        """What the adapter makes of the model's prediction; the same by default."""
+        """Correct the model's prediction by the memory; by default it stays."""
         return predicted
 
 
 class MemoryCondition:
-    """What the transformer asks of memory around its blocks; this one is no memory at all and changes nothing."""
+    """The memory as the transformer uses it around its blocks; this base class is no memory and changes nothing."""
 
     def before(self, layer: int, video: Tensor) -> Tensor:
-        """The hidden states that transformer block ``layer`` is given."""
+        """Return the input of transformer block ``layer``."""
         return video
 
     def after(self, layer: int, video: Tensor, camera: Tensor, time: Tensor) -> Tensor:
-        """The hidden states that come after transformer block ``layer``."""
+        """Return the hidden states after transformer block ``layer``."""
         return video
 
     def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
-        """The prediction after the memory has corrected it."""
+        """Return the prediction, corrected by the memory."""
         return predicted
 
 
@@ -192,27 +192,27 @@ class AdapterCondition(MemoryCondition, Generic[Prepared]):
     """An adapter with the memory that it prepared for a batch.
 
     Args:
-        adapter: whose blocks stand at some of the transformer's blocks.
-        memory: of the batch.
+        adapter: the adapter.
+        memory: what ``adapter.prepare`` returned for the batch.
     """
 
     adapter: Adapter[Prepared]
     memory: Prepared
 
     def before(self, layer: int, video: Tensor) -> Tensor:
-        """The hidden states that transformer block ``layer`` is given."""
+        """Return the input of transformer block ``layer``."""
         block = self.adapter.block_at(layer)
         return video if block is None else self.adapter.before(block, video, self.memory)
 
     def after(self, layer: int, video: Tensor, camera: Tensor, time: Tensor) -> Tensor:
-        """The hidden states that come after transformer block ``layer``."""
+        """Return the hidden states after transformer block ``layer``."""
         block = self.adapter.block_at(layer)
         return video if block is None else self.adapter.after(block, video, self.memory, camera, time)
 
     def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
-        """The prediction after the memory has corrected it."""
+        """Return the prediction, corrected by the memory."""
         return self.adapter.correct(predicted, inputs, self.memory, time)
 
     def emptied(self) -> AdapterCondition[Prepared]:
-        """The same adapter with an empty memory, for guidance."""
+        """Return the adapter with an empty memory, for guidance."""
         return dataclasses.replace(self, memory=self.memory.emptied())

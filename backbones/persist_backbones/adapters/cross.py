@@ -1,4 +1,4 @@
-"""``cross``: the paper's form, one set of tokens with positions in metres."""
+"""The adapter ``cross``, the paper's own: every frame attends to one set of tokens with positions in metres."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from persist_cli.api.tokens import MemoryTokens
 
 @dataclass(frozen=True)
 class CrossSettings(AttentionSettings):
-    """The paper's cross-attention to positions in metres.
+    """Settings of the paper's cross-attention to tokens with positions in metres.
 
     Args:
-        positions: ``relative`` to the first camera of the clip, or ``absolute`` as in the paper.
+        positions: ``relative`` to the first camera of the clip, or ``absolute`` in the world, as in the paper.
     """
 
     form: Literal["cross"] = "cross"
@@ -29,7 +29,7 @@ class CrossSettings(AttentionSettings):
 
 
 class CrossAdapter(Adapter[PreparedMemory]):
-    """The paper's form: features with a position code, cross-attended after transformer blocks."""
+    """The paper's form: the video cross-attends, after transformer blocks, to features with a position code."""
 
     settings_type = CrossSettings
     settings: CrossSettings
@@ -52,6 +52,6 @@ class CrossAdapter(Adapter[PreparedMemory]):
     def after(
         self, block: nn.Module, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
-        """The video after the memory block."""
+        """Return the video after the memory block."""
         changed: Tensor = block(video, memory.tokens, memory.mask, camera, time)
         return changed

@@ -1,4 +1,4 @@
-"""The forms of memory adapter by name; a form of one's own is one more entry of ``FORMS``."""
+"""The forms of memory adapter by name, made, saved and loaded here; a new form is one more entry of ``FORMS``."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from persist_cli.io.settings import parse_settings
 
 FORMS: dict[str, type[Adapter[Any]]] = {"cross": CrossAdapter, "projected": ProjectedAdapter, "canvas": CanvasAdapter}
 DEFAULT = "cross"
-# the paper's blocks on CogVideoX-5B, one after every transformer block: it says that all of them together have about
-# 1 B parameters, and no more; a width of a third of the video's, heads of the video's, half its feed-forward
+# the paper's blocks on CogVideoX-5B, one after every transformer block; the paper says only that they have about 1 B
+# parameters together; here a third of the video's width, heads of its size, and a feed-forward of half its width
 PRESETS: dict[str, dict[str, Any]] = {"5b": {"form": "cross", "every": 1, "width": 1024, "heads": 16, "ff_factor": 0.5}}
 
 
 def make_adapter(channels: int, settings: Mapping[str, Any], video: VideoShape, where: str) -> Adapter[Any]:
-    """A fresh adapter.
+    """Make a fresh adapter.
 
     Args:
-        channels: of the memory's features.
-        settings: ``form`` and what that form has, plain values; on top of those of the ``preset`` that they may name.
-        video: the model it stands in.
-        where: what the settings are called in errors.
+        channels: channels of the features of a memory token.
+        settings: ``form`` and that form's settings, plain values; they override those of a ``preset`` that they name.
+        video: sizes of the video model.
+        where: name of the settings in error messages.
 
     Raises:
-        CheckpointError: for an unknown form or preset, and sizes that do not go together.
+        CheckpointError: for an unknown form or preset, and sizes that do not fit each other.
         RecipeError: one line with every setting that the form does not have or allow.
     """
-    settings = _on_preset(settings)
+    settings = _with_preset(settings)
     name = str(settings.get("form", DEFAULT))
     if name not in FORMS:
         raise CheckpointError(f"unknown adapter form {name!r}; known: {', '.join(FORMS)}")
@@ -43,7 +43,7 @@ def make_adapter(channels: int, settings: Mapping[str, Any], video: VideoShape, 
     return form(channels, parse_settings(form.settings_type, settings, where), video)
 
 
-def _on_preset(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _with_preset(settings: Mapping[str, Any]) -> dict[str, Any]:
     own = dict(settings)
     preset = own.pop("preset", None)
     if preset is not None and str(preset) not in PRESETS:
@@ -58,7 +58,7 @@ def save_adapter(adapter: Adapter[Any], folder: Path) -> None:
 
 
 def load_adapter(folder: Path, video: VideoShape) -> Adapter[Any]:
-    """The adapter that ``save_adapter`` wrote.
+    """Load the adapter that ``save_adapter`` wrote.
 
     Raises:
         PersistError: one line naming the file when one is missing, corrupt or does not fit the model.

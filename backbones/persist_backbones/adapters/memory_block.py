@@ -21,11 +21,11 @@ SHORTEST, LONGEST = 0.5, 128.0  # wavelengths of the position code in metres: tw
 
 @dataclass(frozen=True)
 class AttentionSettings(AdapterSettings):
-    """What the forms have whose blocks are memory blocks, each after every n-th transformer block.
+    """Settings of the forms that have a memory block after every n-th transformer block.
 
     Args:
-        heads: attention heads; they divide ``width``.
-        frequencies: of the position code, for each axis.
+        heads: number of attention heads, a divisor of ``width``.
+        frequencies: number of wavelengths of the position code for each axis.
     """
 
     ff_factor: PositiveFloat = 2.0
@@ -34,7 +34,7 @@ class AttentionSettings(AdapterSettings):
 
 
 class Modulation(NamedTuple):
-    """Scale, shift and gate of the expert adaptive layer norm, for video and memory."""
+    """Shift, scale and gate of the expert adaptive layer norm, for video and memory."""
 
     video_shift: Tensor
     video_scale: Tensor
@@ -47,13 +47,13 @@ class Modulation(NamedTuple):
 def position_code(
     positions: Float[Tensor, "*batch axis"], frequencies: int, shortest: float = SHORTEST, longest: float = LONGEST
 ) -> Float[Tensor, "*batch code"]:
-    """Sinusoidal code: sine and cosine of each coordinate at geometric wavelengths, axes × 2 × frequencies.
+    """Encode positions by sine and cosine of each coordinate at geometric wavelengths: axes × 2 × frequencies values.
 
     Args:
         positions: coordinates, by default in metres.
-        frequencies: for each axis.
-        shortest: wavelength, in the unit of the coordinates.
-        longest: wavelength.
+        frequencies: number of wavelengths for each axis.
+        shortest: shortest wavelength, in the unit of the coordinates.
+        longest: longest wavelength, in the same unit.
     """
     steps = torch.linspace(0, 1, frequencies, dtype=torch.float64, device=positions.device)
     rates = 2 * math.pi / (shortest * (longest / shortest) ** steps)
@@ -62,18 +62,18 @@ def position_code(
 
 
 class MemoryBlock(nn.Module):
-    """Cross-attention of the video to memory tokens and a feed-forward, modulated by time (PEWM, memory block).
+    """A block in which the video cross-attends to memory tokens, then a feed-forward; modulated by time (PEWM).
 
     Gates start at one and the two output projections at zero: a fresh block is the identity to the bit, yet every
     parameter has a gradient after the first step. A gate at zero in front of a zero projection would never learn.
 
     Args:
-        video_channels: of the hidden states H.
-        camera_channels: of the camera embedding concatenated to H in the query.
-        width: of the memory tokens M and of the attention.
-        heads: of the attention.
-        ff_factor: hidden width of the feed-forward over ``video_channels``.
-        time_channels: of the time embedding t.
+        video_channels: channels of the hidden states H.
+        camera_channels: channels of the camera embedding, which is concatenated to H in the query.
+        width: channels of the memory tokens M and of the attention.
+        heads: number of attention heads.
+        ff_factor: hidden width of the feed-forward as a multiple of ``video_channels``.
+        time_channels: channels of the time embedding t.
     """
 
     def __init__(
@@ -102,35 +102,35 @@ class MemoryBlock(nn.Module):
         camera: Float[Tensor, "batch token camera"],
         time: Float[Tensor, "batch time"],
     ) -> Float[Tensor, "batch token channel"]:
-        """H + α_M · CrossAttn(H_n, M_n), then H + α_H · FF(norm2(H)); a sample without tokens attends to nothing."""
+        """Return H + α_M · CrossAttn(H_n, M_n), then H + α_H · FF(norm2(H)); nothing is attended to without tokens."""
         parts = Modulation(*self.modulation(F.silu(time))[:, None].split(self.sizes, dim=-1))
         query = self.video_norm(video) * (1 + parts.video_scale) + parts.video_shift
         context = self.memory_norm(memory) * (1 + parts.memory_scale) + parts.memory_shift
-        seen = self.attend(torch.cat([query, camera.to(query.dtype)], dim=-1), context, mask)
-        video = video + (1 + parts.memory_gate) * seen
+        attended = self.attend(torch.cat([query, camera.to(query.dtype)], dim=-1), context, mask)
+        video = video + (1 + parts.memory_gate) * attended
         changed: Tensor = video + (1 + parts.video_gate) * self.ff(self.norm2(video))
         return changed
 
     def attend(self, query: Tensor, context: Tensor, mask: Bool[Tensor, "batch place"]) -> Tensor:
-        """Attention to the tokens before the mask's padding, exactly zero for a sample that has none."""
-        some = mask.any(dim=1)
-        allowed = mask | ~some[:, None]  # an all-masked softmax is NaN; these rows are zeroed below
+        """Attend to the tokens where the mask is true; the result is exactly zero for a sample that has none."""
+        has_tokens = mask.any(dim=1)
+        allowed = mask | ~has_tokens[:, None]  # an all-masked softmax is NaN; these rows are zeroed below
         q, k, v = (
             part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for part in (self.to_query(query), self.to_key(context), self.to_value(context))
         )
         out = F.scaled_dot_product_attention(q, k, v, attn_mask=allowed[:, None, None])
-        seen: Tensor = self.to_out(out.transpose(1, 2).flatten(2))
-        return seen * some[:, None, None]
+        attended: Tensor = self.to_out(out.transpose(1, 2).flatten(2))
+        return attended * has_tokens[:, None, None]
 
 
 def memory_blocks(settings: AttentionSettings, video: VideoShape, query_channels: int) -> nn.ModuleDict:
-    """The paper's memory block after every n-th transformer block, by the layer's number.
+    """Make a memory block for every n-th transformer block, by the number of that block.
 
     Args:
-        settings: sizes.
-        video: the model they stand in.
-        query_channels: of what is concatenated to the hidden states in the query.
+        settings: sizes of the blocks, and n.
+        video: sizes of the video model.
+        query_channels: channels that are concatenated to the hidden states in the query.
 
     Raises:
         CheckpointError: when the heads do not divide the width.

@@ -1,4 +1,4 @@
-"""``projected``: the paper's memory block, told where in each latent frame's own cameras a token lies."""
+"""The adapter ``projected``: the paper's memory block with each token's position in the views of each latent frame."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import pixel_centers, project
 from persist_cli.api.tokens import MemoryTokens
 
-WAVELENGTHS = (1 / 16, 2.0)  # in images; twice an image tells both sides of it and a margin apart
-MARGIN = 0.25  # of the image: a token's cell reaches into view before its middle does
+WAVELENGTHS = (1 / 16, 2.0)  # in images; two images, so that both sides of an image and its margin have different codes
+MARGIN = 0.25  # of the image: part of a token's cell is visible before its middle is
 OCTAVES = 8.0  # 6 cm to 16 m, the depths of rooms, span one unit of log z as the image spans one of u and v
 
 
 @dataclass(frozen=True)
 class ProjectedSettings(AttentionSettings):
-    """The paper's memory block with positions in each latent frame's own cameras."""
+    """Settings of the paper's memory block with positions in each latent frame's own cameras."""
 
     form: Literal["projected"] = "projected"
 
 
 @dataclass(frozen=True)
 class ProjectedMemory(PreparedMemory):
-    """Tokens for each latent frame, and where the video tokens are.
+    """Memory tokens for each latent frame, and the positions of the video tokens.
 
     Args:
         places: position code of each video token of a latent frame.
@@ -40,14 +40,14 @@ class ProjectedMemory(PreparedMemory):
 
 
 class ProjectedAdapter(Adapter[ProjectedMemory]):
-    """Each latent frame attends to the tokens at their projection (u, v, log z) into its own cameras.
+    """The form in which each latent frame attends to tokens with their projection (u, v, log z) into its own cameras.
 
-    A latent frame that folds four frames sees the projections into all four, concatenated as the camera latents are:
-    at large turns a token that one of the four sees lies outside the others, and a mean or the last camera would
-    tell nothing of it; so too for the latent frames that a video token stands for. A frame that does not see the
-    token gives zeros and a zero flag; a latent frame none of whose frames sees it does not attend to it, so that the
-    softmax is shared by what can be in the picture. Queries carry the code of the video token's own (u, v), at the
-    same wavelengths.
+    A latent frame that folds four frames takes the projections into all four, concatenated like the camera latents:
+    in a fast turn only one of the four may see a token, and a mean or the last camera would lose it. The latent
+    frames that a video token stands for are concatenated in the same way. A frame that does not see the token gives
+    zeros and a zero flag. A latent frame attends only to tokens that one of its frames sees, so the softmax is shared
+    by tokens that can be in the picture. Queries carry the code of the video token's own (u, v), at the same
+    wavelengths.
     """
 
     settings_type = ProjectedSettings
@@ -61,7 +61,7 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         self.blocks = memory_blocks(settings, video, video.camera_channels + 4 * settings.frequencies)
 
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> ProjectedMemory:
-        """Features and position codes projected and summed, for each latent frame."""
+        """Embed features and position codes and add them, for each latent frame."""
         frames, dtype = self.video.folded, self.embed.weight.dtype
         places, seen = image_places(tokens, cameras)
         code = torch.cat([self.code(places) * seen[..., None], seen[..., None].float()], dim=-1)
@@ -73,7 +73,7 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
     def after(
         self, block: nn.Module, video: Tensor, memory: ProjectedMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
-        """The video after the memory block, which takes each latent frame by itself."""
+        """Return the video after the memory block, which treats each latent frame by itself."""
         frames = memory.mask.shape[1]
         places = memory.places.expand(len(video) * frames, -1, -1)
         split, views = (part.unflatten(1, (frames, -1)).flatten(0, 1) for part in (video, camera))
@@ -84,11 +84,11 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         return joined
 
     def code(self, places: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch code"]:
-        """Sines and cosines of places in the image."""
+        """Encode positions in the image by sines and cosines."""
         return position_code(places, self.settings.frequencies, *WAVELENGTHS)
 
     def query_places(self, cameras: Cameras) -> Float[Tensor, "video_token code"]:
-        """The code of (u, v) at the middle of each video token of a latent frame."""
+        """Encode (u, v) of the middle of each video token of a latent frame."""
         edge = self.video.spatial * self.video.patch
         rows, columns = cameras.height // edge, cameras.width // edge
         middles = pixel_centers(rows, columns, cameras.world_from_camera.device)
@@ -98,7 +98,7 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
 def image_places(
     tokens: MemoryTokens, cameras: Cameras
 ) -> tuple[Float[Tensor, "batch frame token 3"], Bool[Tensor, "batch frame token"]]:
-    """Where each frame has each token: (u, v) in images, log₂ z over ``OCTAVES``; and whether it sees it at all."""
+    """Return (u, v) in images and log₂ z / ``OCTAVES`` of each token in each frame, and whether the frame sees it."""
     frames = cameras.world_from_camera.shape[1]
     pixels, depth = project(tokens.positions[:, None].expand(-1, frames, -1, -1), cameras)
     image = pixels / pixels.new_tensor([cameras.width, cameras.height])

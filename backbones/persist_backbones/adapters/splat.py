@@ -1,4 +1,4 @@
-"""Map tokens drawn into views with a z-buffer."""
+"""Drawing of map tokens into camera views with a z-buffer."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from persist_backbones.adapters.base import NEAR
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import nearest_at, project
 
-TIE = 1e-4  # of the depth: a wall seen face on is one depth up to rounding, whichever way the world is turned
-SNAP = 1e-6  # pixels: a token on the border of two pixels stays in one of them whatever the rounding
+TIE = 1e-4  # of the depth: a wall seen face on has one depth, up to the rounding of a turned world
+SNAP = 1e-6  # pixels: a token on the border of two pixels falls into the same one despite rounding
 
 
 class Splats(NamedTuple):
-    """Tokens as they fall on pixels, before any hides another; one entry a token and pixel.
+    """The pixels that tokens cover, before any token hides another; one entry for each pair of token and pixel.
 
     Args:
         pixel: flat index of batch, frame, row and column.
         token: flat index of batch and token.
-        depth: metres, float64.
+        depth: depth of the token in metres, float64.
     """
 
     pixel: Int[Tensor, " splat"]
@@ -33,26 +33,26 @@ class Splats(NamedTuple):
 def splat(
     features: Float[Tensor, "batch token channel"], splats: Splats, shape: tuple[int, int, int, int]
 ) -> Float[Tensor, "batch frame channel+2 height width"]:
-    """Features of the nearest token at each pixel, then coverage (0 or 1) and log depth; zeros where no token is.
+    """Draw the features of the nearest token at each pixel, coverage (0 or 1) and log depth; zeros without a token.
 
-    Tokens as near as the nearest are averaged, so their order does not matter.
+    Tokens at the depth of the nearest are averaged, so their order does not matter.
 
     Args:
-        features: of each token.
-        splats: where the tokens fall.
+        features: features of each token.
+        splats: the pixels that the tokens cover.
         shape: batch, frames, height and width of the canvas.
     """
     pixels = shape[0] * shape[1] * shape[2] * shape[3]
     nearest = nearest_at(splats.pixel, splats.depth, pixels)
-    won = splats.depth <= nearest[splats.pixel] * (1 + TIE)
-    pixel, token = splats.pixel[won], splats.token[won]
-    # on CUDA the order of this sum, and so its last bit, is not fixed where three or more tokens are as near
-    drawn = features.new_zeros(pixels, features.shape[-1]).index_add(0, pixel, features.flatten(0, 1)[token])
+    visible = splats.depth <= nearest[splats.pixel] * (1 + TIE)
+    pixel, token = splats.pixel[visible], splats.token[visible]
+    # on CUDA the order of this sum, and so its last bit, is not fixed for three or more tokens at one depth
+    total = features.new_zeros(pixels, features.shape[-1]).index_add(0, pixel, features.flatten(0, 1)[token])
     count = features.new_zeros(pixels).index_add(0, pixel, features.new_ones(len(pixel)))
     covered = count > 0
     logs = torch.where(covered, nearest, torch.ones_like(nearest)).log().to(features.dtype)
     canvas = torch.cat(
-        [drawn / count.clamp_min(1)[:, None], covered[:, None].to(features.dtype), logs[:, None]], dim=-1
+        [total / count.clamp_min(1)[:, None], covered[:, None].to(features.dtype), logs[:, None]], dim=-1
     )
     result: Tensor = canvas.unflatten(0, shape).permute(0, 1, 4, 2, 3)
     return result
@@ -65,29 +65,29 @@ def rasterize(
     token_size: float,
     most: int,
 ) -> Splats:
-    """Where tokens fall in views: on the pixel of their middle, and on the columns and rows their square covers.
+    """Find the pixels that tokens cover: the pixel of their middle, and all that their square covers.
 
     Args:
         positions: world metres.
-        mask: false for tokens that are not there.
-        views: ``[batch, frame]``, of the canvas's size in pixels.
+        mask: false for padding.
+        views: cameras ``[batch, frame]`` of the canvas's size in pixels.
         token_size: edge of the square in metres, facing the camera.
-        most: pixels along the edge of a square at most.
+        most: largest edge of a square in pixels.
     """
     samples, frames = views.world_from_camera.shape[:2]
     pixels = frames * views.height * views.width
     parts = []
-    for sample in range(samples):  # one at a time: what a clip takes stays in the processor's cache
-        own = Cameras(views.world_from_camera[sample], views.intrinsics[sample], views.height, views.width)
+    for sample in range(samples):  # one at a time: the data of one clip fits into the processor's cache
+        cameras = Cameras(views.world_from_camera[sample], views.intrinsics[sample], views.height, views.width)
         present = mask[sample].nonzero()[:, 0]
-        fallen = _rasterize_clip(positions[sample, present], own, token_size, most // 2)
-        token = sample * positions.shape[1] + present[fallen.token]
-        parts.append(Splats(sample * pixels + fallen.pixel, token, fallen.depth))
-    return Splats(*(torch.cat(each) for each in zip(*parts, strict=True)))
+        splats = _rasterize_clip(positions[sample, present], cameras, token_size, most // 2)
+        token = sample * positions.shape[1] + present[splats.token]
+        parts.append(Splats(sample * pixels + splats.pixel, token, splats.depth))
+    return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
 def _rasterize_clip(positions: Float[Tensor, "token 3"], views: Cameras, token_size: float, reach: int) -> Splats:
-    """The splats of one clip's views, of tokens that are all there; a square reaches so far to each side at most."""
+    """Return the splats in one clip's views, with squares of at most ``reach`` pixels to each side of their middle."""
     middles, depth = project(positions.expand(len(views.world_from_camera), -1, -1), views)
     size = middles.new_tensor([views.width, views.height])
     close = ((middles + SNAP >= -reach) & (middles + SNAP < size + reach)).all(-1) & (depth > NEAR)
@@ -95,19 +95,19 @@ def _rasterize_clip(positions: Float[Tensor, "token 3"], views: Cameras, token_s
     middle, depth = middles[frame, token], depth[frame, token]
     focal = views.intrinsics.double().diagonal(dim1=-2, dim2=-1)[frame, :2]
     half = 0.5 * token_size * focal / depth[:, None]
-    own = (middle + SNAP).floor()
-    first = (middle - half - 0.5 + SNAP).ceil().minimum(own).maximum(own - reach).clamp_min(0)
-    last = (middle + half - 0.5 - SNAP).floor().maximum(own).minimum(own + reach).minimum(size - 1)
+    center = (middle + SNAP).floor()
+    first = (middle - half - 0.5 + SNAP).ceil().minimum(center).maximum(center - reach).clamp_min(0)
+    last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).minimum(size - 1)
     entry, column, row = _pixels_between(first.long(), last.long())
     return Splats((frame[entry] * views.height + row) * views.width + column, token[entry], depth[entry])
 
 
 def _pixels_between(first: Int[Tensor, "square 2"], last: Int[Tensor, "square 2"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Every pixel of rectangles, along their rows: whose it is, its column and its row.
+    """List every pixel of some rectangles, row by row: the index of its rectangle, its column and its row.
 
     Args:
-        first: column and row of the first pixel of each.
-        last: those of the last one; before the first for none.
+        first: column and row of each rectangle's first pixel.
+        last: column and row of its last pixel; a rectangle whose last comes before its first is empty.
     """
     width, height = (last - first + 1).clamp_min(0).unbind(-1)
     count = width * height

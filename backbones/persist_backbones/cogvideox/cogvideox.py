@@ -1,6 +1,6 @@
 """The backbone ``cogvideox``: CogVideoX that predicts RGB-D from cameras, interactions and memory.
 
-Read from here: ``forward`` is the training loss, ``sample`` the sampling loop, ``predict`` one look of the transformer.
+Start reading here: ``forward`` is the training loss, ``sample`` the sampling loop, ``predict`` one prediction.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ from persist_cli.errors import CheckpointError, PersistError
 
 @dataclass
 class SamplingStep:
-    """One denoising step that was made; ``on_step`` may change ``latents`` and ``guidance``, or stop.
+    """The result of one denoising step; ``on_step`` may change ``latents`` and ``guidance``, or stop the sampling.
 
     Args:
-        number: from 0.
-        timestep: that it began at.
-        latents: that the next step begins with; of the last step the clean prediction.
-        guidance: weight of guidance over memory of the next step; 1 predicts once only.
-        stop: whether this was the last step.
+        number: number of the step, from 0.
+        timestep: timestep at which the step began.
+        latents: latents with which the next step begins; after the last step the clean prediction.
+        guidance: weight of guidance over memory in the next step; 1 predicts without guidance.
+        stop: true to make no further step.
     """
 
     number: int
@@ -81,7 +81,7 @@ class CogVideoX(Backbone):
     """diffusers' CogVideoX image-to-video, widened to RGB-D, cameras, interactions and memory (PEWM).
 
     Args:
-        settings: preset or pretrained directory, and sizes.
+        settings: the preset or pretrained directory, and sizes.
     """
 
     settings_type = CogVideoXSettings
@@ -99,7 +99,7 @@ class CogVideoX(Backbone):
         self.prompt = starting_prompt(settings, self.prompt)
 
     def set_parts(self, parts: DiffusersParts) -> None:
-        """Build the model around diffusers' parts; what is new starts at zero."""
+        """Build the model from diffusers' parts; the weights that widen them start at zero."""
         self.codec, self.scheduler = Codec(parts.vae), parts.scheduler
         check_fit(parts, self.settings)
         self.shape = clip_shape(parts.transformer, parts.vae, self.settings)
@@ -109,7 +109,7 @@ class CogVideoX(Backbone):
         self.register_buffer("prompt", torch.zeros(1, config.max_text_seq_length, config.text_embed_dim))
 
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
-        """The training loss: that of the codec, or that of denoising RGB and depth latents (stages 1 and 2)."""
+        """Return the training loss: of the codec, or of denoising RGB and depth latents (stages 1 and 2)."""
         generators, clips = sample_generators(clips.seeds), clips.to(self.device)
         if stage == "codec":
             window, kl_weight = self.settings.codec_window, self.settings.kl_weight
@@ -144,14 +144,14 @@ class CogVideoX(Backbone):
         generators: list[torch.Generator] | None = None,
         noise: Tensor | None = None,
     ) -> Float[Tensor, "batch frame channel height width"]:
-        """Latents of clips, denoised from noise; with the frames that ``ClipShape.pad`` puts in front.
+        """Denoise latents of clips from noise, including the frames that ``ClipShape.pad`` puts in front.
 
         Args:
-            first: clips of which the first frame is known, as for ``generate``.
+            first: clips whose first frame is known, as for ``generate``.
             sampling: steps, sampler and guidance.
-            on_step: called after each step.
-            generators: of the noise, one a sample; by default those of the clips' seeds.
-            noise: to begin with; by default drawn from the generators.
+            on_step: function that is called after each step.
+            generators: generators of the noise, one a sample; by default with the clips' seeds.
+            noise: latents to begin with; by default drawn from the generators.
         """
         self.check_sampling(sampling)
         first = first.to(self.device)
@@ -165,8 +165,8 @@ class CogVideoX(Backbone):
         for number, timestep in enumerate(schedule.timesteps):
             self.current_timestep = timestep
             timesteps = timestep.expand(len(latents)).to(self.device)
-            given = dataclasses.replace(conditions, timestep=timesteps)
-            predicted = self.predict_guided(latents, image, given, guidance)
+            conditions = dataclasses.replace(conditions, timestep=timesteps)
+            predicted = self.predict_guided(latents, image, conditions, guidance)
             latents = schedule.step(predicted, timestep, latents)
             if on_step is not None:
                 step = SamplingStep(number, timestep, latents, guidance)
@@ -177,33 +177,33 @@ class CogVideoX(Backbone):
         self.current_timestep = None
         return latents
 
-    def predict_guided(self, noisy: Tensor, image: Tensor, given: Conditions, guidance: float) -> Tensor:
-        """The prediction with classifier-free guidance over memory, in the latents' precision."""
+    def predict_guided(self, noisy: Tensor, image: Tensor, conditions: Conditions, guidance: float) -> Tensor:
+        """Predict with classifier-free guidance over memory, in the latents' precision."""
         precision = self.prompt.dtype
         low, image = noisy.to(precision), image.to(precision)
-        predicted = self.predict(low, image, given).to(noisy.dtype)
-        if guidance == 1.0 or not isinstance(given.memory, AdapterCondition):
+        predicted = self.predict(low, image, conditions).to(noisy.dtype)
+        if guidance == 1.0 or not isinstance(conditions.memory, AdapterCondition):
             return predicted
-        emptied = dataclasses.replace(given, memory=given.memory.emptied())
+        emptied = dataclasses.replace(conditions, memory=conditions.memory.emptied())
         without = self.predict(low, image, emptied, branch="uncond").to(noisy.dtype)
         return without + guidance * (predicted - without)
 
-    def predict(self, noisy: Tensor, image: Tensor, given: Conditions, branch: str = "cond") -> Tensor:
-        """What the transformer says of noisy latents: velocities or clean latents.
+    def predict(self, noisy: Tensor, image: Tensor, conditions: Conditions, branch: str = "cond") -> Tensor:
+        """Predict velocities or clean latents from noisy latents.
 
         Args:
-            noisy: latents of RGB and depth.
-            image: those of the image condition.
-            given: everything else.
-            branch: which of a step's predictions this is, for what is kept from step to step.
+            noisy: noisy latents of RGB and depth.
+            image: latents of the image condition.
+            conditions: all other inputs of the transformer.
+            branch: name of this prediction among those of a step, for caches from step to step.
         """
-        latents = model_input(noisy, image, given.camera, self.settings.depth)
-        camera = camera_tokens(given.camera, self.shape.patch, self.shape.token_frames)
-        predicted: Tensor = self.transformer(latents, dataclasses.replace(given, camera=camera))
+        latents = model_input(noisy, image, conditions.camera, self.settings.depth)
+        camera = camera_tokens(conditions.camera, self.shape.patch, self.shape.token_frames)
+        predicted: Tensor = self.transformer(latents, dataclasses.replace(conditions, camera=camera))
         return predicted
 
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
-        """Clips denoised from each sample's own noise; the first frame is the given one."""
+        """Generate clips from each sample's own noise; the first frame is that of ``first``."""
         colors, depth = self.decode(self.sample(first, sampling), first)
         return to_uint8(colors), depth
 
@@ -211,7 +211,7 @@ class CogVideoX(Backbone):
     def decode(
         self, latents: Float[Tensor, "batch frame channel height width"], first: Clips
     ) -> tuple[Float[Tensor, "batch 3 frame height width"], Float[Tensor, "batch frame height width"]]:
-        """Colours, [-1, 1] and beyond, and depth in metres of sampled latents, the first frame as it was given."""
+        """Decode sampled latents to colours, [-1, 1] and beyond, and depth in metres; frame 0 is that of ``first``."""
         colors, depth = self.codec.decode_images(self.shape.drop_padding(latents), self.settings.depth)
         colors[:, :, 0] = first.rgb[:, 0].movedim(-1, 1).to(colors) / 127.5 - 1
         depth[:, 0] = first.depth[:, 0]
@@ -219,35 +219,35 @@ class CogVideoX(Backbone):
 
     @torch.no_grad()
     def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
-        """RGB and depth after encoding and decoding; no depth (0) from a model without."""
+        """Encode and decode clips; the depth of a model without depth is 0."""
         clips = clips.to(self.device)
         colors, depth = self.codec.decode_images(self.codec.encode(clips.rgb, clips.depth), self.settings.depth)
         return to_uint8(colors), depth
 
     @torch.no_grad()
     def encode(self, clips: Clips) -> ClipLatents:
-        """Latents of the clips, and of their first frames alone."""
+        """Encode the clips, and their first frames alone."""
         clips = clips.to(self.device)
         video = self.codec.encode(clips.rgb, clips.depth)
         return ClipLatents(video, video[:, :1] if self.framewise else self.codec.encode(*clips.first_frames()))
 
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
-        """The image condition of the clips' first frames, float32 whatever precision the model computes in."""
+        """Encode the clips' first frames as the image condition, float32 also for a model in lower precision."""
         return self.image_condition(self.codec.encode(*clips.first_frames()).float())
 
     def image_condition(self, first: Float[Tensor, "batch 1 channel height width"]) -> Tensor:
-        """Latents of the first frame alone as the model takes them, followed by zeros for all other latent frames."""
+        """Scale latents of the first frame alone for the model, and add zeros for all other latent frames."""
         return self.shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
 
     def memory_condition(self, clips: Clips, dropout: list[torch.Generator] | None = None) -> MemoryCondition:
-        """The adapter in use with the batch's tokens embedded; without an adapter no memory.
+        """Embed the batch's tokens with the adapter in use; without an adapter there is no memory.
 
         Args:
-            clips: without tokens, their memory is empty.
-            dropout: generators that draw which samples see no memory, in training.
+            clips: the batch; without tokens its memory is empty.
+            dropout: generators that draw which samples see no memory, for training.
 
         Raises:
-            CheckpointError: when the tokens are of another encoder than the adapter was trained with.
+            CheckpointError: when the tokens do not come from the encoder that the adapter was trained with.
         """
         adapter = self.adapter
         if adapter is None:
@@ -262,7 +262,7 @@ class CogVideoX(Backbone):
         return AdapterCondition(adapter, memory if dropout is None else adapter.dropped(memory, dropout))
 
     def conditions(self, clips: Clips, timesteps: Tensor, memory: MemoryCondition = NO_MEMORY) -> Conditions:
-        """Prompt, interactions, cameras and memory of a batch."""
+        """Collect prompt, interactions, cameras and memory of a batch."""
         printed, steps = self.settings.rays == "printed", self.settings.frames - 1
         rays = (self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
         return Conditions(
@@ -276,26 +276,26 @@ class CogVideoX(Backbone):
 
     @property
     def device(self) -> torch.device:
-        """Where the conditions are and the model computes, wherever weights rest that are not in use."""
+        """The device of the conditions and of all computation; offloaded weights may be elsewhere."""
         return self.prompt.device
 
     @property
     def frames_per_clip(self) -> int:
-        """Frames of a clip, the given first one included."""
+        """Number of frames of a clip, including the given first frame."""
         return self.settings.frames
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
+        """Height and width of the images in pixels."""
         return self.settings.height, self.settings.width
 
     @property
     def samplers(self) -> tuple[str, ...]:
-        """diffusers' samplers that keep to the noise levels of training."""
+        """Names of the diffusers samplers that use the noise levels of training."""
         return tuple(SAMPLERS)
 
     def check_sampling(self, sampling: Sampling) -> None:
-        """Raise ``PersistError`` also for more steps than the training has noise levels."""
+        """Raise ``PersistError`` for an unknown sampler, bad guidance, or more steps than training has noise levels."""
         super().check_sampling(sampling)
         levels = self.scheduler.config.num_train_timesteps
         if sampling.steps > levels:
@@ -303,7 +303,7 @@ class CogVideoX(Backbone):
 
     @property
     def gives_depth(self) -> bool:
-        """Whether clips have depth after their first frame, by the settings."""
+        """Whether generated clips have depth after their first frame."""
         return self.settings.depth
 
     @property
@@ -313,24 +313,24 @@ class CogVideoX(Backbone):
 
     @property
     def adapter(self) -> Adapter[Any] | None:
-        """The memory adapter in use."""
+        """The memory adapter in use, ``None`` without one."""
         return None if self.adapter_name is None else self.adapters[self.adapter_name]  # type: ignore[return-value]
 
     @property
     def token_budget(self) -> int:
-        """Tokens that the adapter in use wants for a clip; none without one."""
+        """Largest number of tokens that the adapter in use takes for a clip; 0 without an adapter."""
         return self.adapter.settings.token_budget if self.adapter else 0
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """VAE, transformer, what widens it, and memory adapters."""
+        """Return the parameters of VAE, transformer, LoRA, widening and each memory adapter, in this order."""
         return group_parameters(self.named_parameters())
 
     def truncate_layers(self, groups: int) -> float:
-        """Keep the first transformer blocks, with the adapter's."""
+        """Keep the first groups of transformer blocks, with the adapter's; return how many groups there were."""
         return truncate_layers(self.transformer.base.transformer_blocks, self.adapter, groups)
 
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
-        """The VAE's, the transformer's, or the adapter's parameters by name, everything else frozen."""
+        """Return the parameters of VAE, transformer or adapter by name, and freeze all others."""
         self.requires_grad_(False)
         modules: dict[Stage, nn.Module | None] = {"codec": self.codec, "1": self.transformer, "2": self.adapter}
         module = modules[stage]
@@ -340,15 +340,15 @@ class CogVideoX(Backbone):
         return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
 
     def encodes(self, stage: Stage) -> bool:
-        """Whether clips can be encoded before a step: in all stages but the codec's own."""
+        """Whether clips can be encoded before a step, which is so in all stages but the codec's own."""
         return stage != "codec"
 
     def encoding(self) -> str:
-        """A fingerprint of the codec."""
+        """Return a fingerprint of the codec."""
         return self.codec.fingerprint()
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
-        """After the codec's stage, measure the scale of its latents on these clips."""
+        """Measure the scale of the latents on these clips, after the codec's stage only."""
         if stage == "codec":
             self.codec.take_scale((batch.rgb.to(self.device), batch.depth.to(self.device)) for batch in clips)
 
@@ -363,17 +363,17 @@ class CogVideoX(Backbone):
         self.adapter_name = name
 
     def checkpoint_settings(self) -> dict[str, Any]:
-        """The settings without where the weights and the prompt once came from, and with what they predict."""
+        """Return the settings without the sources of weights and prompt, and with the type of the prediction."""
         predicts = self.scheduler.config.prediction_type
         return super().checkpoint_settings() | dict.fromkeys(ORIGINS) | {"prediction": predicts}
 
     def save_base(self, folder: Path) -> None:
-        """Write diffusers' parts, each loadable by diffusers alone, and ``world.safetensors`` with what is ours."""
+        """Write diffusers' parts, each loadable by diffusers alone, and all other weights as ``world.safetensors``."""
         save_parts(DiffusersParts(self.transformer.base, self.codec.vae, self.scheduler), folder)
         save_world(self.transformer, self.prompt, folder)
 
     def load_base(self, folder: Path) -> None:
-        """Take what ``save_base`` wrote, or what ``save_lora`` did merged into the weights that it changes."""
+        """Load what ``save_base`` wrote, or merge what ``save_lora`` wrote into the weights that it changes."""
         if self.settings.prompt is not None or self.settings.prompt_embedding is not None:
             raise CheckpointError(
                 f"{folder}: the base was trained with a prompt of its own; leave prompt and prompt_embedding out"
@@ -387,15 +387,15 @@ class CogVideoX(Backbone):
         if self.prompt.is_meta:
             return
         if base is not None:
-            merge_lora(self.transformer.base, folder, check=not isinstance(base, Path))  # a base has a fingerprint
+            merge_lora(self.transformer.base, folder, check=not isinstance(base, Path))  # lora_base verifies a folder
         self.prompt = load_world(self.transformer, folder)
 
     def origin(self) -> dict[str, Any]:
-        """The pretrained directory, wherever one stands."""
+        """Return the setting ``pretrained`` with an absolute path, valid from any working directory."""
         return origin_of(self.settings.pretrained)
 
     def save_adapter(self, folder: Path) -> None:
-        """Write the adapter in use."""
+        """Write the memory adapter in use."""
         if self.adapter is None:
             raise CheckpointError("no memory adapter is in use, so none can be saved")
         save_adapter(self.adapter, folder)
@@ -406,7 +406,7 @@ class CogVideoX(Backbone):
 
     @property
     def video_shape(self) -> VideoShape:
-        """What an adapter must know of the model."""
+        """The sizes of the model that an adapter is built for."""
         return self.transformer.video_shape(self.codec.spatial, self.codec.temporal)
 
     def _take_adapter(self, name: str, adapter: Adapter[Any]) -> None:

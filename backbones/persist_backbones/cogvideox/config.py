@@ -1,4 +1,4 @@
-"""Configurations of diffusers' CogVideoX classes: a tiny one for laptops, and those of the five published models."""
+"""Configurations of diffusers' CogVideoX classes: a tiny model for laptops, and the five published models."""
 
 from __future__ import annotations
 
@@ -95,31 +95,31 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class CogVideoXSettings:
-    """The video model.
+    """Settings of the video model.
 
     Args:
-        preset: sizes of transformer, VAE and scheduler.
+        preset: name of the sizes of transformer, VAE and scheduler.
         pretrained: a plain diffusers CogVideoX directory (``transformer/``, ``vae/``, ``scheduler/``) to start from,
-            or the name of one on the hub (``zai-org/CogVideoX-5b-I2V``), which is downloaded where it is not here;
-            its configuration replaces the preset's. A learned table of positions (5b-I2V) is cut and resampled to
-            the clips' size.
-        prompt: what the model is always asked with, embedded once by the ``text_encoder/`` and ``tokenizer/`` of
-            ``pretrained``, which are never downloaded; without prompt the embedding is zeros.
-        prompt_embedding: instead of it a safetensors file with its embedding, the tensor ``prompt``.
-        height: pixels.
-        width: pixels.
-        frames: frames a clip, at least two; for a VAE that compresses time by c > 1, 2cn + 1: 9, 17, … for CogVideoX's.
-        interactions: actions that change the world; each gets an embedding for each step of a clip.
-        rays: ``correct`` Plücker directions, or as the paper ``printed`` them, with the translation added.
+            or the name of one on the hub (``zai-org/CogVideoX-5b-I2V``), which is downloaded if it is not here; its
+            configuration replaces the preset's. A learned table of positions (5b-I2V) is cut and resampled to the
+            clips' size.
+        prompt: the constant prompt of the model, embedded once by the ``text_encoder/`` and ``tokenizer/`` of
+            ``pretrained``, which are never downloaded; without a prompt the embedding is zeros.
+        prompt_embedding: in place of ``prompt``, a safetensors file with the embedding as tensor ``prompt``.
+        height: height of the images in pixels.
+        width: width of the images in pixels.
+        frames: frames of a clip, at least two; 2cn + 1 for a VAE that compresses time by c > 1: 9, 17, … for CogVideoX.
+        interactions: actions that change the world; each has one embedding for each step of a clip.
+        rays: ``correct`` Plücker directions, or ``printed`` in the paper, with the translation added.
         depth: false holds depth at zero in the input and leaves it out of the loss: a model of RGB alone with as many
             parameters, whose clips have no depth (0) after the given frame.
-        prediction: ``v_prediction`` as CogVideoX, or ``sample``, the clean latents; by default what the preset or the
-            pretrained weights predict, which nothing else can replace.
-        weighting: of errors over noise levels: ``uniform``, ``min-snr`` or ``min-snr-plus-one`` (see ``objective``).
-        snr_gamma: of min-SNR.
-        kl_weight: of the codec's latent prior.
-        codec_window: frames (any number that ``frames`` may be, or 1), height and width of the random windows that the
-            codec is trained on; a quarter of the pixels costs a quarter of the time.
+        prediction: ``v_prediction`` for velocities, like CogVideoX, or ``sample`` for clean latents; by default that of
+            the preset or of the pretrained weights, which cannot be loaded with any other.
+        weighting: weighting of errors: ``uniform``, ``min-snr`` or ``min-snr-plus-one`` (see ``loss_weights``).
+        snr_gamma: γ of min-SNR.
+        kl_weight: weight of the codec's latent prior in its loss.
+        codec_window: frames (a valid number of ``frames``, or 1), height and width of the random windows that the codec
+            is trained on; a quarter of the pixels costs a quarter of the time.
         transformer: changes to the preset's transformer configuration.
         vae: changes to the preset's VAE configuration.
     """

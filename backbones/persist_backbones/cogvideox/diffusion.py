@@ -1,4 +1,4 @@
-"""Diffusion: noise and noise levels, what the transformer is trained to predict, and schedules that sample from it.
+"""Diffusion: noise and its levels, the target and the weights of the training loss, and schedules for sampling.
 
 The training loss and the sampling loop that put these together are ``CogVideoX.forward`` and ``CogVideoX.sample``.
 """
@@ -27,18 +27,18 @@ SAMPLERS = COGVIDEOX | MULTISTEP
 
 
 def sample_generators(seeds: Sequence[int]) -> list[torch.Generator]:
-    """One CPU generator a sample, so that a sample does not depend on its batch or device."""
+    """Make one CPU generator for each sample, so that a sample does not depend on its batch or device."""
     return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
 def noise_like(latents: Tensor, generators: list[torch.Generator]) -> Tensor:
-    """Gaussian noise, each sample from its own generator."""
+    """Draw Gaussian noise, each sample from its own generator."""
     noise = torch.stack([torch.randn(latents.shape[1:], generator=generator) for generator in generators])
     return noise.to(latents)
 
 
 def draw_timesteps(scheduler: CogVideoXDDIMScheduler, generators: list[torch.Generator]) -> Int[Tensor, " batch"]:
-    """Uniform noise levels, each sample from its own generator."""
+    """Draw uniform noise levels, each sample from its own generator."""
     levels = scheduler.config.num_train_timesteps
     return torch.cat([torch.randint(0, levels, (1,), generator=generator) for generator in generators])
 
@@ -46,7 +46,7 @@ def draw_timesteps(scheduler: CogVideoXDDIMScheduler, generators: list[torch.Gen
 def prediction_target(
     scheduler: CogVideoXDDIMScheduler, latents: Tensor, noise: Tensor, timesteps: Int[Tensor, " batch"]
 ) -> Tensor:
-    """The velocity or the clean latents, as the scheduler's ``prediction_type`` says."""
+    """Return the velocity or the clean latents, according to the scheduler's ``prediction_type``."""
     if scheduler.config.prediction_type == "sample":
         return latents
     velocity: Tensor = scheduler.get_velocity(latents, noise, timesteps)
@@ -56,13 +56,13 @@ def prediction_target(
 def loss_weights(
     scheduler: CogVideoXDDIMScheduler, timesteps: Int[Tensor, " batch"], weighting: Weighting, gamma: float
 ) -> Float[Tensor, " batch"]:
-    """Weights of the squared error at each noise level.
+    """Return the weight of the squared error at each noise level.
 
-    The squared error of the velocity is that of the clean latents times SNR + 1, so what is minimised does not depend
-    on ``prediction_type``. Errors of the clean latents count SNR + 1 (``uniform`` over velocities, Salimans & Ho,
-    2202.00512), min(SNR, γ) (``min-snr``, Hang et al., 2303.09556), or min(SNR + 1, γ) (``min-snr-plus-one``: the
-    first capped as the second is, a variant of our own), which unlike the second does not vanish at the pure noise
-    that sampling begins with.
+    The squared error of the velocity is SNR + 1 times that of the clean latents, so the loss does not depend on
+    ``prediction_type``. The error of the clean latents has the weight SNR + 1 (``uniform`` over velocities, Salimans &
+    Ho, 2202.00512), min(SNR, γ) (``min-snr``, Hang et al., 2303.09556), or min(SNR + 1, γ) (``min-snr-plus-one``, a
+    variant of our own). The last one caps the first like the second does, but is not zero at the pure noise with which
+    sampling begins.
     """
     signal = scheduler.alphas_cumprod.to(timesteps.device)[timesteps].float()
     noise = (1 - signal).clamp_min(1e-8)
@@ -78,8 +78,8 @@ class SamplingSchedule:
     Args:
         config: configuration of the CogVideoX scheduler that the model was trained with.
         sampler: a key of ``SAMPLERS``.
-        steps: denoising steps, each one prediction of the model, at most as many as the training has noise levels.
-        generators: one a sample, for samplers that add noise.
+        steps: number of denoising steps, each with one prediction, at most the noise levels of training.
+        generators: one generator a sample, for samplers that add noise.
     """
 
     def __init__(self, config: Any, sampler: str, steps: int, generators: list[torch.Generator]) -> None:
@@ -89,12 +89,12 @@ class SamplingSchedule:
         self.previous: tuple[Tensor | None, Tensor | None] = (None, None)  # last clean prediction and its timestep
 
     def step(self, predicted: Tensor, timestep: Tensor, latents: Tensor) -> Tensor:
-        """The latents of the next noise level; after the last step the clean prediction.
+        """Return the latents of the next noise level; after the last step the clean prediction.
 
         Args:
-            predicted: what the configuration's ``prediction_type`` says of ``latents``.
-            timestep: one of ``timesteps``, in their order.
-            latents: at the noise level of ``timestep``.
+            predicted: the model's prediction for ``latents``, of the configuration's ``prediction_type``.
+            timestep: the next of ``timesteps``.
+            latents: latents at the noise level of ``timestep``.
         """
         if isinstance(self.scheduler, CogVideoXDPMScheduler):
             clean, before = self.previous
@@ -105,24 +105,24 @@ class SamplingSchedule:
         else:
             stepped, *clean_now = self.scheduler.step(predicted, timestep, latents, return_dict=False)
         last = bool(timestep == self.timesteps[-1])
-        # CogVideoX's leave noise when steps do not divide the training's levels
+        # CogVideoX's schedulers leave noise when the steps do not divide the levels of training
         latents = clean_now[0] if last and clean_now else stepped
         return latents
 
 
 def make_scheduler(config: Any, sampler: str, steps: int) -> Any:
-    """diffusers' scheduler for a sampler, with so many timesteps; see ``SamplingSchedule``."""
+    """Make diffusers' scheduler for a sampler, with ``steps`` timesteps; see ``SamplingSchedule``."""
     trained = CogVideoXDDIMScheduler.from_config(config)
     scheduler = COGVIDEOX[sampler].from_config(config) if sampler in COGVIDEOX else _multistep(sampler, trained)
     scheduler.set_timesteps(steps)
-    scheduler.timesteps = scheduler.timesteps[:steps]  # rounding gives some numbers, as 61, one timestep more: -1
+    scheduler.timesteps = scheduler.timesteps[:steps]  # for some numbers, like 61, rounding adds a timestep: -1
     if sampler in MULTISTEP:
         scheduler.sigmas = torch.cat([scheduler.sigmas[:steps], torch.zeros(1)])
     return scheduler
 
 
 def _multistep(sampler: str, trained: CogVideoXDDIMScheduler) -> Any:
-    """A scheduler of ``MULTISTEP`` with CogVideoX's noise levels, whose shift of the SNR it does not know itself."""
+    """Make a scheduler of ``MULTISTEP`` with CogVideoX's noise levels, because it has no shift of the SNR itself."""
     signal = trained.alphas_cumprod.double()
     betas = 1 - signal / torch.cat([signal.new_ones(1), signal[:-1]])
     return MULTISTEP[sampler](

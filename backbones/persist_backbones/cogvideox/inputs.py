@@ -1,4 +1,4 @@
-"""What the transformer is given besides noisy latents: the shape of clips, cameras, interactions and positions."""
+"""The transformer's inputs besides noisy latents: the shape of clips, cameras, interactions and positions."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from persist_cli.errors import CheckpointError, DataError
 
 @dataclass(frozen=True)
 class ClipShape:
-    """How a clip is divided.
+    """The shape of a clip in latent pixels and video tokens.
 
     Args:
-        frames: latent frames of a clip, without padding.
-        height: latent pixels.
-        width: latent pixels.
+        frames: number of latent frames of a clip, without padding.
+        height: height in latent pixels.
+        width: width in latent pixels.
         patch: latent pixels along the edge of a video token.
-        token_frames: latent frames that a video token stands for.
+        token_frames: number of latent frames that a video token stands for.
     """
 
     frames: int
@@ -45,37 +45,37 @@ class ClipShape:
 
     @property
     def padded_frames(self) -> int:
-        """Latent frames that the model takes."""
+        """Number of latent frames that the model takes, including padding."""
         return self.frames + -self.frames % self.token_frames
 
     @property
     def tokens(self) -> tuple[int, int, int]:
-        """Frames, rows and columns of video tokens."""
+        """Number of frames, rows and columns of video tokens."""
         return self.padded_frames // self.token_frames, self.height // self.patch, self.width // self.patch
 
     def pad(
         self, latents: Float[Tensor, "batch frame channel height width"]
     ) -> Float[Tensor, "batch padded_frame channel height width"]:
-        """Latents with the first frame repeated in front."""
+        """Repeat the first frame in front, up to ``padded_frames``."""
         missing = self.padded_frames - self.frames
         return torch.cat([latents[:, :1].expand(-1, missing, -1, -1, -1), latents], dim=1) if missing else latents
 
     def drop_padding(
         self, latents: Float[Tensor, "batch padded_frame channel height width"]
     ) -> Float[Tensor, "batch frame channel height width"]:
-        """The latents without what ``pad`` put in front."""
+        """Undo ``pad``."""
         return latents[:, self.padded_frames - self.frames :]
 
     def image_condition(
         self, first: Float[Tensor, "batch 1 channel height width"]
     ) -> Float[Tensor, "batch padded_frame channel height width"]:
-        """The latents of the first frame alone at the very first place, zeros at all others."""
+        """Put latents of the first frame alone at the first of ``padded_frames`` places, zeros at all others."""
         zeros = first.new_zeros(first.shape[0], self.padded_frames - 1, *first.shape[2:])
         return torch.cat([first, zeros], dim=1)
 
 
 def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
-    """Raise ``CheckpointError`` when the parts do not work together at the settings' size."""
+    """Raise ``CheckpointError`` when the parts do not fit each other or the settings' size."""
     check_prediction(parts.scheduler, settings.prediction)
     check_frames(int(parts.vae.config.temporal_compression_ratio), settings)
     config, vae = parts.transformer.config, parts.vae.config
@@ -97,7 +97,7 @@ def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
 
 
 def check_prediction(scheduler: CogVideoXDDIMScheduler, wanted: Prediction | None) -> None:
-    """Raise ``CheckpointError`` for a scheduler of another prediction than wanted, or of one that cannot be trained."""
+    """Raise ``CheckpointError`` if the scheduler's prediction is not the wanted one, or cannot be trained."""
     kind = scheduler.config.prediction_type
     if kind not in get_args(Prediction):
         raise CheckpointError(f"the scheduler predicts {kind!r}; known: {', '.join(get_args(Prediction))}")
@@ -106,8 +106,8 @@ def check_prediction(scheduler: CogVideoXDDIMScheduler, wanted: Prediction | Non
 
 
 def check_frames(temporal: int, settings: CogVideoXSettings) -> None:
-    """Raise ``CheckpointError`` when the codec, of this compression in time, cannot code the settings' frames."""
-    # diffusers' decoder doubles time in halves and tells a first frame from an odd number of latent frames
+    """Raise ``CheckpointError`` when a codec of this compression in time cannot code the settings' frames."""
+    # diffusers' decoder doubles time in halves, and takes an odd number of latent frames as a sign of a first frame
     step = 2 * temporal if temporal > 1 else 1
     rule, window = f"{step}n + 1, " if step > 1 else "", (settings.codec_window or (1,))[0]
     if settings.frames < 2 or (settings.frames - 1) % step:
@@ -117,7 +117,7 @@ def check_frames(temporal: int, settings: CogVideoXSettings) -> None:
 
 
 def clip_shape(transformer: Any, vae: Any, settings: CogVideoXSettings) -> ClipShape:
-    """The shape of the settings' clips for diffusers' transformer and VAE."""
+    """Return the shape of the settings' clips for diffusers' transformer and VAE."""
     spatial, config = spatial_compression(vae), transformer.config
     return ClipShape(
         frames=(settings.frames - 1) // int(vae.config.temporal_compression_ratio) + 1,
@@ -134,18 +134,18 @@ RAY_CHANNELS = 6
 def camera_latents(
     cameras: Cameras, spatial: int, temporal: int, printed: bool, multiple: int = 1
 ) -> Float[Tensor, "batch latent_frame channel height width"]:
-    """Plücker rays relative to each clip's first camera, at the VAE's compression.
+    """Return Plücker rays relative to each clip's first camera, at the VAE's compression.
 
-    Mean-pooled in space, which for rays is the ray through the middle; in time frames are folded into channels
-    (unpixelshuffle). As for the VAE, the first frame stands alone in the first latent frame, here repeated to fill
-    its channels: 9×512×512×6 → 3×64×64×24.
+    In space the rays are mean-pooled, which gives the ray through the middle; in time frames are folded into channels
+    (unpixelshuffle). Like in the VAE, the first latent frame contains the first frame alone, here repeated to fill its
+    channels. For example 9×512×512×6 becomes 3×64×64×24.
 
     Args:
-        cameras: ``[batch, frame]``, one frame and a multiple of ``temporal``.
-        spatial: compression in height and width.
-        temporal: compression in time.
-        printed: directions as the paper prints them.
-        multiple: what the number of latent frames is padded to in front, like the latents (see ``clip_shape``).
+        cameras: cameras ``[batch, frame]``; the number of frames is 1 plus a multiple of ``temporal``.
+        spatial: factor of the compression in height and width.
+        temporal: factor of the compression in time.
+        printed: whether directions are those printed in the paper.
+        multiple: the number of latent frames is padded in front to a multiple of this, like the latents.
     """
     first = invert_rigid(cameras.world_from_camera[:, :1].double())
     local = Cameras(first @ cameras.world_from_camera.double(), cameras.intrinsics, cameras.height, cameras.width)
@@ -156,16 +156,16 @@ def camera_latents(
 def camera_tokens(
     latents: Float[Tensor, "batch frame channel height width"], patch: int, frames: int = 1
 ) -> Float[Tensor, "batch token folded"]:
-    """The camera embedding at each video token: the mean over its patch, its latent frames folded into channels."""
+    """Return the camera embedding at each video token: the mean over its patch, latent frames folded into channels."""
     means = F.avg_pool2d(latents.flatten(0, 1), patch).unflatten(0, (len(latents), -1, frames))
     return tokens_of(means.flatten(2, 3))
 
 
 def interaction_rows(clips: Sequence[Interactions], names: Sequence[str], steps: int) -> Int[Tensor, "batch step"]:
-    """Rows of the interaction embedding for each step of each clip, 0 where nothing but motion happens.
+    """Return the row of the interaction embedding for each step of each clip, 0 for a step without interaction.
 
     Raises:
-        DataError: for an interaction that the model has no embedding for.
+        DataError: for an interaction without an embedding in the model.
     """
     rows = torch.zeros(len(clips), steps, dtype=torch.long)
     for sample, interactions in enumerate(clips):
@@ -179,13 +179,13 @@ def interaction_rows(clips: Sequence[Interactions], names: Sequence[str], steps:
 
 
 def model_input(noisy: Tensor, image: Tensor, camera: Tensor, depth: bool) -> Tensor:
-    """All channels that the transformer sees: noisy RGB, RGB image, noisy depth, depth image and camera.
+    """Concatenate the transformer's input channels: noisy RGB, RGB image, noisy depth, depth image and camera.
 
     Args:
-        noisy: latents ``[batch, frame, channel, height, width]`` of RGB and depth.
-        image: those of the image condition.
+        noisy: noisy latents ``[batch, frame, channel, height, width]`` of RGB and depth.
+        image: latents of the image condition, of the same shape.
         camera: camera latents.
-        depth: false gives zeros for both parts of depth.
+        depth: whether the model has depth; false puts zeros in place of both depth parts.
     """
     (color, metres), (color_image, metres_image) = noisy.chunk(2, dim=2), image.chunk(2, dim=2)
     if not depth:
@@ -193,36 +193,37 @@ def model_input(noisy: Tensor, image: Tensor, camera: Tensor, depth: bool) -> Te
     return torch.cat([color, color_image, metres, metres_image, camera.to(noisy.dtype)], dim=2)
 
 
-Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the first place, and one past those of the last
+Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the first place, and one past the last
 
 
 def rotary_positions(config: Any, grid: tuple[int, int, int], device: torch.device) -> tuple[Tensor, Tensor] | None:
-    """Cosines and sines for every video token, ``None`` for models with absolute positions only.
+    """Return cosines and sines for every video token, ``None`` for models with absolute positions only.
 
-    CogVideoX 1.0 fits a clip's grid into the middle of the one it was trained on; 1.5 counts its rows and columns.
+    CogVideoX 1.0 fits a clip's grid into the middle of the training grid; 1.5 counts its rows and columns.
 
     Args:
-        config: of diffusers' transformer; its sample size is the one it was trained on.
-        grid: frames, rows and columns of video tokens.
-        device: where they are wanted.
+        config: configuration of diffusers' transformer, with the sample size of its training.
+        grid: number of frames, rows and columns of video tokens.
+        device: device of the result.
     """
     if not config.use_rotary_positional_embeddings:
         return None
     if config.patch_size_t is not None:
-        return _kept(_counted, config.attention_head_dim, grid, str(device))
+        return _cached(_counted_positions, config.attention_head_dim, grid, str(device))
     trained = (config.sample_height // config.patch_size, config.sample_width // config.patch_size)
-    return _kept(_fitted, config.attention_head_dim, grid, middle_region(grid[1:], trained), str(device))
+    region = middle_region(grid[1:], trained)
+    return _cached(_fitted_positions, config.attention_head_dim, grid, region, str(device))
 
 
-def _kept(positions: Any, *given: Any) -> tuple[Tensor, Tensor]:
-    """What the cached function gives; not from nor into its cache while tensors have no values, to count memory."""
+def _cached(function: Any, *arguments: Any) -> tuple[Tensor, Tensor]:
+    """Call a cached function, past its cache while tensors have no values (when memory is estimated)."""
     real = type(torch.empty(0)) is torch.Tensor
-    found: tuple[Tensor, Tensor] = positions(*given) if real else positions.__wrapped__(*given)
-    return found
+    positions: tuple[Tensor, Tensor] = function(*arguments) if real else function.__wrapped__(*arguments)
+    return positions
 
 
 def middle_region(shape: tuple[int, int], trained: tuple[int, int]) -> Region:
-    """The largest region with the aspect of ``shape`` in the middle of a trained grid, both in rows and columns."""
+    """Return the largest region of the aspect of ``shape`` in the middle of a training grid, both rows × columns."""
     rows, columns = trained
     if shape[0] / shape[1] > rows / columns:
         columns = round(trained[0] / shape[0] * shape[1])
@@ -233,7 +234,7 @@ def middle_region(shape: tuple[int, int], trained: tuple[int, int]) -> Region:
 
 
 @lru_cache(maxsize=4)
-def _fitted(channels: int, grid: tuple[int, int, int], region: Region, device: str) -> tuple[Tensor, Tensor]:
+def _fitted_positions(channels: int, grid: tuple[int, int, int], region: Region, device: str) -> tuple[Tensor, Tensor]:
     cosines, sines = get_3d_rotary_pos_embed(
         embed_dim=channels,
         crops_coords=region,
@@ -245,55 +246,55 @@ def _fitted(channels: int, grid: tuple[int, int, int], region: Region, device: s
 
 
 @lru_cache(maxsize=4)
-def _counted(channels: int, grid: tuple[int, int, int], device: str) -> tuple[Tensor, Tensor]:
+def _counted_positions(channels: int, grid: tuple[int, int, int], device: str) -> tuple[Tensor, Tensor]:
     cosines, sines = get_3d_rotary_pos_embed(
         embed_dim=channels,
         crops_coords=None,
         grid_size=grid[1:],
         temporal_size=grid[0],
         grid_type="slice",
-        max_size=grid[1:],  # what is sliced away does not change the rest
+        max_size=grid[1:],  # a larger table would give the same values
         device=torch.device(device),
     )
     return cosines, sines
 
 
 def fit_positions(transformer: CogVideoXTransformer3DModel, size: tuple[int, int, int]) -> None:
-    """Make the table of a transformer one for clips of this size, where it has a table of another.
+    """Fit a transformer's table of absolute positions to clips of this size, in place.
 
-    diffusers computes a sinusoidal table again at every call; here it is computed once. It refuses a learned table
-    for images of another size (CogVideoX-5b-I2V) and leaves it out for clips of another length: here its first frames
-    are taken, and of each the middle of the images' shape, resampled. The configuration then has the new size.
+    A sinusoidal table is computed once, while diffusers computes it again at every call. A learned table
+    (CogVideoX-5b-I2V) is cut to its first frames and to the middle of the images' shape, resampled, and its
+    configuration gets the new size; diffusers refuses images of another size and ignores the table for other lengths.
 
     Args:
-        transformer: diffusers'.
-        size: frames, rows and columns of the latents.
+        transformer: diffusers' transformer.
+        size: number of frames, rows and columns of the latents.
 
     Raises:
-        CheckpointError: for clips longer than a learned table.
+        CheckpointError: for clips that are longer than a learned table.
     """
     table = transformer.patch_embed
-    shown = dict(zip(("sample_frames", "sample_height", "sample_width"), size, strict=True))
-    shown["sample_frames"] = (size[0] - 1) * table.temporal_compression_ratio + 1
-    if all(getattr(table, name) == value for name, value in shown.items()):
+    sample_size = dict(zip(("sample_frames", "sample_height", "sample_width"), size, strict=True))
+    sample_size["sample_frames"] = (size[0] - 1) * table.temporal_compression_ratio + 1
+    if all(getattr(table, name) == value for name, value in sample_size.items()):
         return
     if table.use_learned_positional_embeddings:
         table.pos_embedding = _resampled(transformer, size)
-        transformer.register_to_config(**shown)
+        transformer.register_to_config(**sample_size)
     elif table.use_positional_embeddings:
-        rows, columns, frames = size[1], size[2], shown["sample_frames"]
+        rows, columns, frames = size[1], size[2], sample_size["sample_frames"]
         device = table.pos_embedding.device
         table.pos_embedding = table._get_positional_embeddings(rows, columns, frames, device=device)
     else:
         return
-    for name, value in shown.items():
+    for name, value in sample_size.items():
         setattr(table, name, value)
 
 
 def _resampled(
     transformer: CogVideoXTransformer3DModel, size: tuple[int, int, int]
 ) -> Float[Tensor, "1 word+token channel"]:
-    """The learned table for latents of this size."""
+    """Return the learned table, cut and resampled for latents of this size."""
     table, patch = transformer.patch_embed, transformer.config.patch_size
     words, frames, rows, columns = table.max_text_seq_length, size[0], size[1] // patch, size[2] // patch
     trained = (table.sample_height // patch, table.sample_width // patch)

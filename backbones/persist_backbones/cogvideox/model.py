@@ -1,8 +1,8 @@
-"""CogVideoX's transformer widened for depth, image condition, cameras, interactions and memory.
+"""CogVideoX's transformer, widened for depth, image condition, cameras, interactions and memory.
 
-The published weights stay in their own module, untouched and loadable by diffusers; what is new stands beside them,
-zero-initialised: a second patch embedding added to the first, more output channels, an embedding added to the time
-embedding. Sums with exact zeros keep the widened model equal to the original to the bit.
+The published weights stay in their own module, unchanged and loadable by diffusers. The new modules are beside it and
+zero-initialised: a second patch embedding added to the first, more output channels, and an embedding added to the time
+embedding. Because exact zeros are added, the widened model equals the original to the bit.
 """
 
 from __future__ import annotations
@@ -19,19 +19,17 @@ from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
 from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches
 
-OFFSET = 2.0  # what CogVideoX 1.5 image-to-video was trained with as ``ofs``
-
-
+OFFSET = 2.0  # the value of ``ofs`` in the training of CogVideoX 1.5 image-to-video
 NO_MEMORY = MemoryCondition()
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the transformer sees beside the noisy latents.
+    """The transformer's inputs besides the noisy latents.
 
     Args:
-        text: prompt embedding.
-        timestep: noise levels.
+        text: the prompt's embedding.
+        timestep: noise level of each sample.
         interactions: rows of the interaction embedding, 0 for none.
         camera: camera embedding at each video token, for the queries of memory blocks.
         rotary: cosines and sines, for models with rotary positions.
@@ -47,14 +45,14 @@ class Conditions:
 
 
 class WorldTransformer(nn.Module):
-    """Predicts of RGB and depth latents what the objective asks for (see ``diffusion``).
+    """The widened transformer, which predicts velocities or clean latents of RGB and depth (see ``diffusion``).
 
     Args:
         base: diffusers' transformer.
-        latent_channels: of RGB, and of depth.
-        temporal: compression of the codec in time.
-        shape: of a clip.
-        interactions: rows of the interaction embedding without the first, which is none.
+        latent_channels: number of latent channels of RGB, and as many of depth.
+        temporal: factor of the codec's compression in time.
+        shape: shape of a clip.
+        interactions: rows of the interaction embedding without the first, which means none.
     """
 
     def __init__(
@@ -87,7 +85,7 @@ class WorldTransformer(nn.Module):
                 nn.init.zeros_(parameter)
 
     def video_shape(self, spatial: int, temporal: int) -> VideoShape:
-        """What an adapter must know of the model, with the compression of its codec in space and time."""
+        """Return the sizes of the model, with the codec's compression in space and time, for an adapter."""
         config = self.base.config
         return VideoShape(
             channels=config.num_attention_heads * config.attention_head_dim,
@@ -103,41 +101,41 @@ class WorldTransformer(nn.Module):
         )
 
     def forward(
-        self, latents: Float[Tensor, "batch frame channel height width"], given: Conditions
+        self, latents: Float[Tensor, "batch frame channel height width"], conditions: Conditions
     ) -> Float[Tensor, "batch frame out height width"]:
-        """Predictions of RGB and depth latents, concatenated on channels."""
-        time = self.embed_time(given, latents.dtype)
-        text, video = self.embed_patches(latents, given.text.to(latents.dtype))
+        """Predict RGB and depth latents, concatenated on channels."""
+        time = self.embed_time(conditions, latents.dtype)
+        text, video = self.embed_patches(latents, conditions.text.to(latents.dtype))
         for layer, block in enumerate(self.base.transformer_blocks):
-            video = given.memory.before(layer, video)
+            video = conditions.memory.before(layer, video)
             video, text = block(
-                hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=given.rotary
+                hidden_states=video, encoder_hidden_states=text, temb=time, image_rotary_emb=conditions.rotary
             )
-            video = given.memory.after(layer, video, given.camera, time)
+            video = conditions.memory.after(layer, video, conditions.camera, time)
         video = self.base.norm_out(self.base.norm_final(video), temb=time)
         outputs = (self.base.proj_out(video), self.extra_out(video))
         predicted = torch.cat([self.unpatchify(tokens, latents) for tokens in outputs], dim=2)
-        return given.memory.correct(predicted, latents, time)
+        return conditions.memory.correct(predicted, latents, time)
 
-    def embed_time(self, given: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
-        """The time embedding, for CogVideoX 1.5 image-to-video with ``ofs``, and the interactions of the clip added."""
-        time: Tensor = self.base.time_embedding(self.base.time_proj(given.timestep).to(dtype))
+    def embed_time(self, conditions: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
+        """Return the sum of time embedding, ``ofs`` embedding (CogVideoX 1.5 image-to-video) and interactions."""
+        time: Tensor = self.base.time_embedding(self.base.time_proj(conditions.timestep).to(dtype))
         if self.base.ofs_embedding is not None:
             offset = torch.full((1,), OFFSET, device=time.device)
             time = time + self.base.ofs_embedding(self.base.ofs_proj(offset).to(dtype))
-        done: Tensor = self.interactions(given.interactions).sum(dim=1)
-        return time + done.to(time.dtype)
+        interactions: Tensor = self.interactions(conditions.interactions).sum(dim=1)
+        return time + interactions.to(time.dtype)
 
     def embed_patches(self, latents: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
-        """Text and video tokens: diffusers' patch embedding of its own channels plus that of the new ones."""
-        known = self.base.config.in_channels
-        tokens: Tensor = self.base.patch_embed(text, latents[:, :, :known])
+        """Embed text and video: diffusers' patch embedding of the published channels plus that of the new ones."""
+        published = self.base.config.in_channels
+        tokens: Tensor = self.base.patch_embed(text, latents[:, :, :published])
         words = text.shape[1]
-        video = tokens[:, words:] + self.embed_new(latents[:, :, known:])
+        video = tokens[:, words:] + self.embed_new(latents[:, :, published:])
         return tokens[:, :words], self.base.embedding_dropout(video)
 
     def embed_new(self, latents: Tensor) -> Float[Tensor, "batch token channel"]:
-        """The patch embedding of the channels that the published model does not know."""
+        """Return the patch embedding of the channels that the published model does not have."""
         config = self.base.config
         if config.patch_size_t is not None:
             embedded: Tensor = self.extra_in(fold_patches(latents, config.patch_size, config.patch_size_t))
@@ -145,7 +143,7 @@ class WorldTransformer(nn.Module):
         return tokens_of(self.extra_in(latents.flatten(0, 1)).unflatten(0, latents.shape[:2]))
 
     def unpatchify(self, tokens: Tensor, like: Tensor) -> Tensor:
-        """Tokens of patches back to frames of the latents' size."""
+        """Turn patches back into frames of the size of ``like``."""
         config = self.base.config
         size = (like.shape[1], like.shape[3], like.shape[4])
         return unfold_patches(tokens, size, config.patch_size, frames_per_token(config))
@@ -154,7 +152,7 @@ class WorldTransformer(nn.Module):
 def widen(
     base: CogVideoXTransformer3DModel, vae: AutoencoderKLCogVideoX, settings: CogVideoXSettings, shape: ClipShape
 ) -> WorldTransformer:
-    """diffusers' transformer with zero-initialised inputs and outputs for RGB-D, cameras and interactions."""
+    """Add zero-initialised inputs and outputs for RGB-D, cameras and interactions to diffusers' transformer."""
     interactions = (settings.frames - 1) * len(settings.interactions)
     temporal = int(vae.config.temporal_compression_ratio)
     return WorldTransformer(base, vae.config.latent_channels, temporal, shape, interactions)

@@ -1,4 +1,4 @@
-"""What a CogVideoX world model is made of: its parameters by part."""
+"""The parameters of a CogVideoX world model by part, and the truncation of its layers."""
 
 from __future__ import annotations
 
@@ -10,29 +10,28 @@ from torch import nn
 from persist_backbones.adapters.base import Adapter
 from persist_cli.api.stages import ParameterGroup
 
-LORA = ".lora_"  # in the names that PEFT gives to what it adds
-
+LORA = ".lora_"  # in the names that PEFT gives to its parameters
 ADAPTER = "memory adapter "
 
 
 def group_parameters(parameters: Iterable[tuple[str, nn.Parameter]]) -> list[ParameterGroup]:
-    """The VAE, diffusers' transformer, LoRA, what widens the transformer, and each memory adapter; empty ones left out.
+    """Group parameters by part: VAE, transformer, LoRA, widening and each memory adapter; empty groups are left out.
 
     Args:
-        parameters: all of the backbone by name.
+        parameters: all parameters of the backbone by name.
     """
-    found: dict[str, dict[str, nn.Parameter]] = {}
-    fresh: set[str] = set()
+    parts: dict[str, dict[str, nn.Parameter]] = {}
+    new_parts: set[str] = set()
     for name, parameter in parameters:
         part, new = _part_of(name)
-        found.setdefault(part, {})[name] = parameter
-        fresh |= {part} if new else set()
-    order = sorted(found, key=lambda part: part.startswith(ADAPTER))  # adapters stand last
-    return [ParameterGroup(part, found[part], part in fresh) for part in order]
+        parts.setdefault(part, {})[name] = parameter
+        new_parts |= {part} if new else set()
+    order = sorted(parts, key=lambda part: part.startswith(ADAPTER))  # adapters come last
+    return [ParameterGroup(part, parts[part], part in new_parts) for part in order]
 
 
 def _part_of(name: str) -> tuple[str, bool]:
-    """The part that a parameter belongs to, and whether it is new."""
+    """Return the part of a parameter, and whether that part is new."""
     if name.startswith("codec."):
         return "codec", False
     if LORA in name:
@@ -45,15 +44,15 @@ def _part_of(name: str) -> tuple[str, bool]:
 
 
 def truncate_layers(blocks: nn.ModuleList, adapter: Adapter[Any] | None, groups: int) -> float:
-    """Drop all but the first groups of transformer blocks, a group being as many as one block of the adapter stands at.
+    """Drop all but the first groups of transformer blocks, where each group has one block of the adapter.
 
     Returns:
-        How many groups there were.
+        The number of groups before.
     """
     every = adapter.settings.every if adapter else 1
     before = len(blocks) / every
     del blocks[groups * every :]
     if adapter is not None:
-        for layer in [each for each in adapter.blocks if int(each) >= groups * every]:
+        for layer in [name for name in adapter.blocks if int(name) >= groups * every]:
             del adapter.blocks[layer]
     return before

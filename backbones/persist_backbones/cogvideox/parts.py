@@ -1,6 +1,6 @@
-"""What a model is made around: diffusers' transformer, VAE and scheduler, fresh or pretrained, and whether they fit.
+"""diffusers' transformer, VAE and scheduler, from which a model is built, and the files of a trained model.
 
-Pretrained ones lie in a local directory of diffusers' layout or in a repository of the hub.
+Pretrained parts are in a local directory of diffusers' layout or in a repository of the hub.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ SUBFOLDERS = {
     "vae": AutoencoderKLCogVideoX,
     "scheduler": CogVideoXDDIMScheduler,
 }
-WEIGHTS = "diffusion_pytorch_model.safetensors"  # of a part that is not split into several files
+WEIGHTS = "diffusion_pytorch_model.safetensors"  # the weights of a part in a single file
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-PUBLISHED = {  # what the repositories of THUDM, now zai-org, hold
+PUBLISHED = {  # preset of each repository of THUDM, now zai-org
     "CogVideoX-2b": "2b",
     "CogVideoX-5b": "5b",
     "CogVideoX-5b-I2V": "5b-i2v",
     "CogVideoX1.5-5B": "1.5-5b",
     "CogVideoX1.5-5B-I2V": "1.5-5b-i2v",
 }
-INITIAL_LOG_VARIANCE = -6.0  # of fresh latents: noise that does not drown what has not been learnt yet
+INITIAL_LOG_VARIANCE = -6.0  # of fresh latents, whose noise must not hide them
 PREFIX = "transformer."  # of the names in a pipeline's LoRA file
 DOWN, UP = ".lora_A.weight", ".lora_B.weight"
-SAMPLED = 256  # values of a tensor that its digest looks at
+SAMPLED = 256  # values of a tensor that enter its digest
 MAY_BE_ZERO = {"dropout", "freq_shift", "ofs_embed_dim", "norm_eps", "shift_factor"}  # of numbers in configurations
 
 
 @dataclass(frozen=True)
 class DiffusersParts:
-    """What diffusers brings: transformer, autoencoder and scheduler."""
+    """diffusers' transformer, autoencoder and scheduler of one model."""
 
     transformer: CogVideoXTransformer3DModel
     vae: AutoencoderKLCogVideoX
@@ -58,9 +58,9 @@ class DiffusersParts:
 
 
 def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
-    """The parts that a model of these settings begins with.
+    """Return the parts that a model of these settings begins with.
 
-    A plan asks no network: of weights that are not here it takes the sizes that their name tells, else the preset's.
+    On the meta device nothing is downloaded: missing weights get the sizes of their published name, else the preset's.
     """
     if settings.pretrained is None:
         return make_parts(settings)
@@ -75,10 +75,10 @@ def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
 
 
 def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
-    """Freshly initialised parts of the settings' preset and sizes."""
+    """Make freshly initialised parts of the settings' preset and sizes."""
     preset = PRESETS[settings.preset]
-    shown = {"sample_height": settings.height, "sample_width": settings.width}
-    vae = make_part("vae", preset["vae"] | shown | settings.vae)
+    image_size = {"sample_height": settings.height, "sample_width": settings.width}
+    vae = make_part("vae", preset["vae"] | image_size | settings.vae)
     initialize(vae)
     spatial = spatial_compression(vae)
     size = {
@@ -92,7 +92,7 @@ def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
 
 
 def initialize(vae: AutoencoderKLCogVideoX) -> None:
-    """Begin a fresh VAE with residual blocks that are the identity and latents with little noise."""
+    """Initialise a fresh VAE: residual blocks are the identity and latents have little noise."""
     with torch.no_grad():
         vae.encoder.conv_out.conv.bias[vae.config.latent_channels :] = INITIAL_LOG_VARIANCE
         for module in vae.modules():
@@ -102,7 +102,7 @@ def initialize(vae: AutoencoderKLCogVideoX) -> None:
 
 
 def load_parts(folder: Path) -> DiffusersParts:
-    """The parts of a diffusers directory with ``transformer/``, ``vae/`` and ``scheduler/``; of a plan, their shapes.
+    """Load the parts of a diffusers directory with ``transformer/``, ``vae/`` and ``scheduler/``, or only their shapes.
 
     Raises:
         CheckpointError: one line when a part is missing, corrupt or does not fit its configuration.
@@ -111,24 +111,24 @@ def load_parts(folder: Path) -> DiffusersParts:
 
 
 def on_meta_device() -> bool:
-    """Whether what is made now is a plan: torch's default device is the meta device, so no weights are read."""
+    """Whether torch's default device is the meta device, so that models have shapes only and no weights are read."""
     return torch.empty(0).is_meta
 
 
 def make_part(name: str, config: dict[str, Any]) -> Any:
-    """A fresh part of this configuration; of a plan, its shapes.
+    """Make a fresh part of this configuration; on the meta device only its shapes.
 
     Args:
         name: a key of ``SUBFOLDERS``.
-        config: what its class takes.
+        config: keyword arguments of the part's class.
 
     Raises:
-        CheckpointError: one line for what diffusers cannot make, and for sizes below 1.
+        CheckpointError: one line for a configuration that diffusers refuses, and for sizes below 1.
     """
-    values = name == "scheduler"  # its tables are values and no weights, also of a plan
+    on_cpu = name == "scheduler"  # its tables are no weights, and needed on the meta device too
     _check_sizes(name, config)
     try:
-        with torch.device("cpu") if values else contextlib.nullcontext():
+        with torch.device("cpu") if on_cpu else contextlib.nullcontext():
             return SUBFOLDERS[name](**config)
     except (TypeError, ValueError, IndexError, ArithmeticError) as error:
         raise CheckpointError(f"diffusers cannot make a {name} of these settings ({_cause(error)})") from error
@@ -143,33 +143,33 @@ def save_parts(parts: DiffusersParts, folder: Path) -> None:
 
 def save_world(transformer: nn.Module, prompt: Tensor, folder: Path) -> None:
     """Write ``world.safetensors``: widening, interactions and the prompt's embedding."""
-    own = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
-    write_tensors(folder / "world.safetensors", own | {"prompt": prompt})
+    widening = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
+    write_tensors(folder / "world.safetensors", widening | {"prompt": prompt})
 
 
 def load_world(transformer: nn.Module, folder: Path) -> Tensor:
-    """Take what ``save_world`` wrote, in whatever precision; returns the prompt's embedding in the transformer's."""
+    """Load what ``save_world`` wrote, and return the prompt's embedding in the transformer's precision."""
     path = folder / "world.safetensors"
     tensors, _ = read_tensors(path)
     prompt = tensors.pop("prompt", None)
     if prompt is None:
         raise CheckpointError(f"{path}: no prompt embedding in it")
-    own = {name for name in transformer.state_dict() if not name.startswith("base.")}
-    load_exactly(transformer, tensors, own, path)
+    widening = {name for name in transformer.state_dict() if not name.startswith("base.")}
+    load_exactly(transformer, tensors, widening, path)
     return prompt.to(next(transformer.parameters()).dtype)
 
 
 @torch.no_grad()
 def merge_lora(transformer: CogVideoXTransformer3DModel, folder: Path, check: bool) -> None:
-    """Add what ``save_lora`` wrote to the weights that it was trained on.
+    """Add the LoRA that ``save_lora`` wrote to the weights on which it was trained.
 
     Args:
-        transformer: with those weights.
-        folder: that was written into.
-        check: whether these are those weights.
+        transformer: diffusers' transformer with those weights.
+        folder: folder of the LoRA file.
+        check: whether to verify by a digest that these are the weights of its training.
 
     Raises:
-        CheckpointError: when the file is missing or corrupt, or these are other weights.
+        CheckpointError: when the file is missing or corrupt, or does not fit these weights.
     """
     path = folder / LORA_WEIGHT_NAME_SAFE
     tensors, metadata = read_tensors(path)
@@ -187,22 +187,22 @@ def merge_lora(transformer: CogVideoXTransformer3DModel, folder: Path, check: bo
 
 
 def weights_digest(transformer: CogVideoXTransformer3DModel) -> str:
-    """A hash of names, shapes and some values of each weight: tells models apart without reading all of them."""
+    """Return a hash of names, shapes and some values of each weight, which differs between models."""
     digest = hashlib.sha256()
     for name, tensor in sorted(transformer.state_dict().items()):  # tables of positions too
         values = tensor.detach().flatten()
-        some = values[:: max(1, len(values) // SAMPLED)].float().cpu().contiguous()
-        digest.update(f"{name} {tuple(tensor.shape)}".encode() + some.numpy().tobytes())
+        sample = values[:: max(1, len(values) // SAMPLED)].float().cpu().contiguous()
+        digest.update(f"{name} {tuple(tensor.shape)}".encode() + sample.numpy().tobytes())
     return digest.hexdigest()
 
 
 def pretrained_folder(name: str) -> Path:
-    """The local directory of this name, else that of a repository of the hub in its cache.
+    """Return the local directory of this name, else the directory of the hub's repository in its cache.
 
-    What the cache lacks of transformer, VAE and scheduler is downloaded; a text encoder never is.
+    Missing files of transformer, VAE and scheduler are downloaded; a text encoder never is.
 
     Raises:
-        CheckpointError: one line when there is no such directory, and the repository cannot be had either.
+        CheckpointError: one line when there is no such directory, and the repository cannot be downloaded.
     """
     folder = folder_here(name)
     if folder is not None and (not _of_the_hub(name) or not any(missing_files(folder / part) for part in SUBFOLDERS)):
@@ -219,9 +219,9 @@ def pretrained_folder(name: str) -> Path:
 
 
 def folder_here(name: str) -> Path | None:
-    """The local directory of this name, else what the hub's cache has of a repository; ``None`` when there is neither.
+    """Return the local directory of this name, else the repository in the hub's cache, else ``None``.
 
-    The network is not asked.
+    The network is not used.
     """
     from huggingface_hub import errors, snapshot_download
 
@@ -237,7 +237,7 @@ def folder_here(name: str) -> Path | None:
 
 
 def missing_files(part: Path) -> list[str]:
-    """Names of the configuration and of the weights that a part's folder ought to have and has not."""
+    """Return the names of the files of configuration and weights that a part's folder lacks."""
     if part.name == "scheduler":
         wanted = ["scheduler_config.json"]
     else:
@@ -248,20 +248,20 @@ def missing_files(part: Path) -> list[str]:
 
 
 def published_preset(name: str) -> str | None:
-    """The preset that has the sizes of a published model's repository, ``None`` for any other name."""
+    """Return the preset with the sizes of a published model's repository, ``None`` for any other name."""
     owner, _, model = name.partition("/")
     return PUBLISHED.get(model) if owner in ("THUDM", "zai-org") else None
 
 
 def origin_of(pretrained: str | None) -> dict[str, str]:
-    """The setting that finds pretrained weights from wherever one stands; none for none."""
+    """Return the setting ``pretrained`` with an absolute path, or no setting without pretrained weights."""
     if not pretrained:
         return {}
     return {"pretrained": str(Path(pretrained).resolve()) if Path(pretrained).is_dir() else pretrained}
 
 
 def check_name(name: str) -> None:
-    """Raise ``CheckpointError`` for what is no local directory and cannot be a repository of the hub either."""
+    """Raise ``CheckpointError`` for a name that cannot be a repository of the hub (and is no local directory)."""
     if not REPOSITORY.fullmatch(name):
         raise CheckpointError(f"{name}: no such directory, and not the name of a repository on the hub (owner/model)")
 
@@ -281,14 +281,14 @@ def _load_part(folder: Path, name: str) -> Any:
     try:
         if name == "scheduler":
             return SUBFOLDERS[name].from_pretrained(folder, **options)
-        with silent("diffusers.models.modeling_utils"):  # what it warns of is refused below
-            part, found = SUBFOLDERS[name].from_pretrained(
+        with silent("diffusers.models.modeling_utils"):  # its warnings become errors below
+            part, report = SUBFOLDERS[name].from_pretrained(
                 folder, use_safetensors=True, low_cpu_mem_usage=False, output_loading_info=True, **options
             )
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
         raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
     computed = () if config.get("use_learned_positional_embeddings") else ("patch_embed.pos_embedding",)
-    _check_all_loaded(folder / name, found, computed)
+    _check_all_loaded(folder / name, report, computed)
     reallocate(part)
     return part
 
@@ -303,15 +303,15 @@ def _read_config(folder: Path, name: str) -> dict[str, Any]:
     return {key: value for key, value in config.items() if not key.startswith("_")}
 
 
-def _check_all_loaded(folder: Path, found: dict[str, Any], computed: Sequence[str]) -> None:
-    """Raise ``CheckpointError`` where weights and configuration differ, of which diffusers leaves the rest random.
+def _check_all_loaded(folder: Path, report: dict[str, Any], computed: Sequence[str]) -> None:
+    """Raise ``CheckpointError`` if weights and configuration differ; diffusers leaves missing weights random.
 
     Args:
-        folder: of both.
-        found: what diffusers says of loading them.
-        computed: tensors that may stand in the weights or not.
+        folder: folder of weights and configuration.
+        report: diffusers' report on the loading.
+        computed: tensors that may be missing or not.
     """
-    for problem, names in (("lack", found["missing_keys"]), ("have besides", found["unexpected_keys"])):
+    for problem, names in (("lack", report["missing_keys"]), ("have besides", report["unexpected_keys"])):
         names = sorted(set(names) - set(computed))
         if names:
             raise CheckpointError(
@@ -321,11 +321,11 @@ def _check_all_loaded(folder: Path, found: dict[str, Any], computed: Sequence[st
 
 
 def _check_sizes(name: str, config: dict[str, Any]) -> None:
-    """Raise ``CheckpointError`` for sizes below 1, which torch takes and nobody can compute with."""
+    """Raise ``CheckpointError`` for sizes below 1, which torch accepts although such a model cannot run."""
     empty = [key for key, value in config.items() if type(value) is int and value < 1 and key not in MAY_BE_ZERO]
     if empty and name != "scheduler":
-        given = ", ".join(f"{key} {config[key]}" for key in empty)
-        raise CheckpointError(f"diffusers cannot make a {name} of these settings ({given}: at least 1)")
+        sizes = ", ".join(f"{key} {config[key]}" for key in empty)
+        raise CheckpointError(f"diffusers cannot make a {name} of these settings ({sizes}: at least 1)")
 
 
 def _of_the_hub(name: str) -> bool:

@@ -1,6 +1,6 @@
-"""The prompt's embedding: computed once with T5 where its weights are, read from a file, or zeros.
+"""The prompt's embedding: computed once by T5, read from a file, or zeros.
 
-A world model is asked with one prompt, so its embedding is stored with the checkpoint and nobody else needs T5.
+A world model has one constant prompt. Its embedding is stored with the checkpoint, so that its users do not need T5.
 """
 
 from __future__ import annotations
@@ -17,15 +17,13 @@ from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, read_tensors, reallocate, write_tensors
 from persist_cli.io.hub import without_bars
 
-ORIGINS = ("pretrained", "prompt", "prompt_embedding")  # settings of a model's beginning: a checkpoint holds the rest
-
+ORIGINS = ("pretrained", "prompt", "prompt_embedding")  # settings that a checkpoint replaces by weights
 NAME = "prompt"  # of the tensor in files
-
 OTHERWISE = "give backbone.settings.prompt_embedding a file, or leave the prompt out: zeros"
 
 
 def check_choice(settings: CogVideoXSettings) -> None:
-    """Raise ``CheckpointError`` when the settings name two prompts, or one that nothing can embed."""
+    """Raise ``CheckpointError`` for settings with two prompts, or with a prompt but no text encoder."""
     if settings.prompt is not None and settings.prompt_embedding is not None:
         raise CheckpointError("give prompt or prompt_embedding, not both")
     if settings.prompt is not None and settings.pretrained is None:
@@ -35,34 +33,33 @@ def check_choice(settings: CogVideoXSettings) -> None:
 def starting_prompt(
     settings: CogVideoXSettings, zeros: Float[Tensor, "1 word channel"]
 ) -> Float[Tensor, "1 word channel"]:
-    """The embedding that the settings choose.
+    """Return the embedding of the prompt that the settings choose.
 
     Args:
-        settings: with a prompt, a file, or neither.
-        zeros: what it is without either; a plan's is that in any case.
+        settings: settings with a prompt, an embedding's file, or neither.
+        zeros: the embedding without either, and in any case on the meta device.
 
     Raises:
-        CheckpointError: one line when T5 is not here, or an embedding is not of the transformer's size.
+        CheckpointError: one line when T5 is missing, or the embedding does not have the transformer's size.
     """
     check_choice(settings)
     if zeros.is_meta or (settings.prompt is None and settings.prompt_embedding is None):
         return zeros
     if settings.prompt_embedding is not None:
-        source, found = settings.prompt_embedding, read_prompt(Path(settings.prompt_embedding))
+        source, embedding = settings.prompt_embedding, read_prompt(Path(settings.prompt_embedding))
     else:
         source = str(settings.pretrained)
-        found = embed_prompt(str(settings.prompt), pretrained_folder(source), zeros.shape[1])
-    if found.shape != zeros.shape:
-        raise CheckpointError(
-            f"{source}: a prompt's embedding of {tuple(found.shape)}, but the transformer takes {tuple(zeros.shape)}"
-        )
-    if not found.isfinite().all():
+        embedding = embed_prompt(str(settings.prompt), pretrained_folder(source), zeros.shape[1])
+    size, wanted = tuple(embedding.shape), tuple(zeros.shape)
+    if size != wanted:
+        raise CheckpointError(f"{source}: a prompt's embedding of {size}, but the transformer takes {wanted}")
+    if not embedding.isfinite().all():
         raise CheckpointError(f"{source}: a prompt's embedding with values that are no numbers; make it again")
-    return found.to(zeros)
+    return embedding.to(zeros)
 
 
 def read_prompt(path: Path) -> Float[Tensor, "1 word channel"]:
-    """The tensor ``prompt`` of a safetensors file: one of ``write_prompt``, or a checkpoint's ``world.safetensors``."""
+    """Read the tensor ``prompt`` of a file of ``write_prompt``, or of a checkpoint's ``world.safetensors``."""
     tensors, _ = read_tensors(path)
     if NAME not in tensors:
         raise CheckpointError(f"{path}: no tensor {NAME!r} in it; persist_backbones.write_prompt makes one")
@@ -70,7 +67,7 @@ def read_prompt(path: Path) -> Float[Tensor, "1 word channel"]:
 
 
 def save_prompt(prompt: str, pretrained: str, path: Path) -> None:
-    """See ``persist_backbones.write_prompt``."""
+    """Write a prompt's embedding into a safetensors file; see ``persist_backbones.write_prompt``."""
     folder = pretrained_folder(pretrained)
     words = read_json(folder / "transformer" / "config.json")["max_text_seq_length"]
     write_tensors(path, {NAME: embed_prompt(prompt, folder, words)})
@@ -78,15 +75,15 @@ def save_prompt(prompt: str, pretrained: str, path: Path) -> None:
 
 @torch.no_grad()
 def embed_prompt(prompt: str, folder: Path, words: int) -> Float[Tensor, "1 word channel"]:
-    """T5's last hidden states of a prompt, padded as CogVideoX was trained, float32.
+    """Return T5's last hidden states of a prompt, padded like in CogVideoX's training, float32.
 
     Args:
-        prompt: text; the empty one is a prompt too.
-        folder: with ``text_encoder/`` and ``tokenizer/`` in safetensors; nothing is downloaded.
-        words: tokens that the transformer takes.
+        prompt: the text, which may be empty.
+        folder: folder with ``text_encoder/`` and ``tokenizer/``, weights as safetensors; nothing is downloaded.
+        words: number of text tokens that the transformer takes.
 
     Raises:
-        CheckpointError: one line when one of them is missing or unusable, and for a longer prompt.
+        CheckpointError: one line when encoder or tokenizer is missing or unusable, and for a prompt that is too long.
     """
     from transformers import T5EncoderModel, T5Tokenizer
 
@@ -112,7 +109,7 @@ def embed_prompt(prompt: str, folder: Path, words: int) -> Float[Tensor, "1 word
 
 
 def _check_tokenizer(folder: Path) -> None:
-    """Say which packages a tokenizer needs that is a SentencePiece model alone, as the published ones are."""
+    """Raise ``CheckpointError`` if packages are missing that read a tokenizer which is only a SentencePiece model."""
     from transformers.utils import is_protobuf_available, is_sentencepiece_available
 
     readable = is_sentencepiece_available() and is_protobuf_available()

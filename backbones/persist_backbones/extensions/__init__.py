@@ -1,1 +1,1 @@
-"""What is optional: LoRA, caches over denoising steps, offloading, memory savings."""
+"""Optional extensions of the backbone: LoRA, caches over denoising steps, offloading, memory savings."""

@@ -1,7 +1,7 @@
 """diffusers' caches over the denoising steps of a clip, with memory blocks between the cached blocks.
 
-diffusers hangs hooks on the blocks of its transformer (``enable_cache``). What these do not know of is ours: the
-memory's blocks between, the second output layer, and that a step may predict twice, with memory and without.
+diffusers puts hooks on the blocks of its transformer (``enable_cache``). The hooks do not know three things that this
+module adds: memory blocks between the blocks, a second output layer, and steps that predict with and without memory.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ ATTENTION = r"transformer_blocks\.\d+\.attn1"
 
 
 def enable_cache(transformer: WorldTransformer, config: Any) -> None:
-    """Skip work that changes little between denoising steps, by one of diffusers' caches.
+    """Skip work that changes little between denoising steps, with one of diffusers' caches.
 
     For example ``enable_cache(backbone.transformer, FirstBlockCacheConfig(threshold=0.1))``;
-    ``transformer.base.disable_cache()`` computes everything again. Where a cache wants the timestep
-    (``current_timestep_callback``) and none is given, it is that of sampling.
+    ``transformer.base.disable_cache()`` computes everything again. A cache that needs the timestep
+    (``current_timestep_callback``) and has no callback gets the timestep of the sampling.
 
     Raises:
-        PersistError: for a cache that does not work here.
+        PersistError: for a cache that does not work with this transformer.
     """
     check_cache(config)
     if getattr(config, "current_timestep_callback", transformer) is None:
@@ -63,7 +63,7 @@ def check_cache(config: Any) -> None:
 
 
 def _with_layers(config: Any) -> Any:
-    """A cache's configuration that names the layers: what TaylorSeer takes by default fits none of CogVideoX."""
+    """Name CogVideoX's layers in a configuration of TaylorSeer, whose default names fit none of them."""
     if not isinstance(config, TaylorSeerCacheConfig) or config.use_lite_mode:
         return config
     if config.cache_identifiers or config.skip_predict_identifiers:
@@ -72,19 +72,19 @@ def _with_layers(config: Any) -> Any:
 
 
 class ClipCaches:
-    """The caches over one clip: they begin empty, and the predictions of a step do not see each other's.
+    """The caches while one clip is sampled: empty at first, and separate for the predictions of one step.
 
     Args:
-        transformer: whose base may have a cache enabled.
+        transformer: the transformer; its base may have a cache enabled.
 
     Raises:
-        PersistError: when that cache does not work here.
+        PersistError: when that cache does not work with this transformer.
     """
 
     def __init__(self, transformer: WorldTransformer) -> None:
         self.transformer = transformer
         self.hooks = [hook for module in transformer.modules() for hook in _hooks_of(module)]
-        self.states: dict[tuple[Any, str], Any] = {}  # of caches that know no contexts
+        self.states: dict[tuple[Any, str], Any] = {}  # of caches without contexts
         config = transformer.base._cache_config
         if config is not None:
             check_cache(config)
@@ -97,33 +97,34 @@ class ClipCaches:
         base, second = self.transformer.base, HookRegistry.check_if_exists_or_initialize(self.transformer.extra_out)
         second.remove_hook(_TAYLORSEER_CACHE_HOOK)
         if any(_TAYLORSEER_CACHE_HOOK in registry.hooks for registry in _registries_of(base.proj_out)):
-            alike = {"use_lite_mode": False, "cache_identifiers": ["extra_out"], "skip_predict_identifiers": None}
-            apply_taylorseer_cache(self.transformer, dataclasses.replace(config, **alike))
+            changes = {"use_lite_mode": False, "cache_identifiers": ["extra_out"], "skip_predict_identifiers": None}
+            apply_taylorseer_cache(self.transformer, dataclasses.replace(config, **changes))
         self.transformer.__dict__.pop("_diffusers_hook", None)  # it remembers which parts had hooks
         self.forget()
 
     def forget(self) -> None:
-        """Forget what was kept of the last steps."""
+        """Empty the caches."""
         CacheMixin._reset_stateful_cache(self.transformer)
 
-    def around(self, given: Conditions) -> Conditions:
-        """The conditions, their memory left out where a cache stands for the blocks between which it would be read."""
+    def around(self, conditions: Conditions) -> Conditions:
+        """Return conditions whose memory is skipped between blocks that a cache replaces."""
         if not self.hooks:
-            return given
-        return dataclasses.replace(given, memory=SkippedMemory(given.memory, self.transformer.base.transformer_blocks))
+            return conditions
+        blocks = self.transformer.base.transformer_blocks
+        return dataclasses.replace(conditions, memory=SkippedMemory(conditions.memory, blocks))
 
     @contextlib.contextmanager
-    def prediction(self, name: str, given: Conditions) -> Iterator[None]:
-        """Within it the transformer predicts under this name.
+    def prediction(self, name: str, conditions: Conditions) -> Iterator[None]:
+        """Within the block, the transformer uses the caches of the prediction ``name``.
 
         Args:
-            name: of one of the predictions that every step makes.
-            given: at the timestep of the step.
+            name: name of one of the predictions that every step makes.
+            conditions: conditions with the timestep of the step.
         """
         if not self.hooks:
             yield
             return
-        self.transformer.timestep = int(given.timestep[0])  # type: ignore[assignment]
+        self.transformer.timestep = int(conditions.timestep[0])  # type: ignore[assignment]
         for hook in self.hooks:
             if hasattr(hook, "state"):
                 hook.state = self.states.setdefault((hook, name), type(hook.state)())
@@ -132,47 +133,47 @@ class ClipCaches:
 
 
 def _hooks_of(module: nn.Module) -> list[Any]:
-    """The hooks that diffusers hung on a module itself."""
+    """Return the hooks that diffusers put on the module itself."""
     return [hook for registry in _registries_of(module) for hook in registry.hooks.values()]
 
 
 def _registries_of(module: nn.Module) -> list[Any]:
-    """The registry of a module's hooks, if it has one."""
+    """Return the registry of the module's hooks in a list, or an empty list."""
     registry = getattr(module, "_diffusers_hook", None)
     return [] if registry is None else [registry]
 
 
 @dataclasses.dataclass(frozen=True)
 class SkippedMemory(MemoryCondition):
-    """A memory that is not read between blocks whose output a cache gives.
+    """A memory that is not used between blocks whose output comes from a cache.
 
     Args:
-        memory: that is read where blocks are computed.
-        blocks: of diffusers' transformer.
+        memory: the memory, used where blocks are computed.
+        blocks: the blocks of diffusers' transformer.
     """
 
     memory: MemoryCondition
     blocks: nn.ModuleList
 
     def before(self, layer: int, video: Tensor) -> Tensor:
-        """The hidden states that transformer block ``layer`` is given."""
+        """Return the input of transformer block ``layer``."""
         if layer and _rest_is_cached(self.blocks[0]):
             return video
         return self.memory.before(layer, video)
 
     def after(self, layer: int, video: Tensor, camera: Tensor, time: Tensor) -> Tensor:
-        """The hidden states that come after transformer block ``layer``."""
+        """Return the hidden states after transformer block ``layer``."""
         if layer < len(self.blocks) - 1 and _rest_is_cached(self.blocks[0]):
             return video
         return self.memory.after(layer, video, camera, time)
 
     def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
-        """The prediction after the memory has corrected it."""
+        """Return the prediction, corrected by the memory."""
         return self.memory.correct(predicted, inputs, time)
 
 
 def _rest_is_cached(block: nn.Module) -> bool:
-    """Whether a cache put into the output of the first block what the others and the memory between them would add."""
+    """Whether the first block's output, from a cache, contains the change by all other blocks and their memory."""
     registry = getattr(block, "_diffusers_hook", None)
     hooks = registry.hooks.values() if registry is not None else ()
     return any(_skips(hook.state_manager.get_state()) for hook in hooks if hasattr(hook, "state_manager"))

@@ -1,4 +1,4 @@
-"""The plugin ``cogvideox``: the model with everything optional around it."""
+"""The plugin ``cogvideox``: the model with all optional extensions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ExtendedCogVideoX(CogVideoX):
     """CogVideoX with LoRA, memory savings in training, and CPU offload and caches in sampling.
 
     Args:
-        settings: preset or pretrained directory, and sizes.
+        settings: the preset or pretrained directory, and sizes.
     """
 
     def __init__(self, settings: CogVideoXSettings) -> None:
@@ -35,7 +35,7 @@ class ExtendedCogVideoX(CogVideoX):
         self.caches: ClipCaches | None = None  # while a clip is sampled
 
     def set_parts(self, parts: DiffusersParts) -> None:
-        """Build the model around diffusers' parts, which may be offloaded."""
+        """Build the model from diffusers' parts, which may be offloaded."""
         super().set_parts(parts)
         bring_when_run(self.transformer)
 
@@ -47,7 +47,7 @@ class ExtendedCogVideoX(CogVideoX):
         generators: list[torch.Generator] | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Latents of clips, denoised from noise with the caches that are enabled; see ``CogVideoX.sample``."""
+        """Denoise latents of clips from noise, with the caches that are enabled; see ``CogVideoX.sample``."""
         self.check_sampling(sampling)
         self.caches = ClipCaches(self.transformer)
         try:
@@ -56,45 +56,45 @@ class ExtendedCogVideoX(CogVideoX):
             self.caches.forget()
             self.caches = None
 
-    def predict(self, noisy: Tensor, image: Tensor, given: Conditions, branch: str = "cond") -> Tensor:
-        """What the transformer says of noisy latents; a cache may stand for some of its blocks."""
+    def predict(self, noisy: Tensor, image: Tensor, conditions: Conditions, branch: str = "cond") -> Tensor:
+        """Predict from noisy latents; a cache may replace some blocks of the transformer."""
         if self.caches is None:
-            return super().predict(noisy, image, given, branch)
-        with self.caches.prediction(branch, given):
-            return super().predict(noisy, image, self.caches.around(given), branch)
+            return super().predict(noisy, image, conditions, branch)
+        with self.caches.prediction(branch, conditions):
+            return super().predict(noisy, image, self.caches.around(conditions), branch)
 
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
-        """Clips denoised from each sample's own noise; offloaded weights rest on the CPU again afterwards."""
+        """Generate clips from each sample's own noise; offloaded weights are on the CPU again afterwards."""
         clips = super().generate(first, sampling)
         if self.offloaded is not None:
             self.offloaded.maybe_free_model_hooks()
         return clips
 
     def prepare_inference(self, options: InferenceOptions) -> None:
-        """Get ready to sample; weights that are offloaded rest on the CPU between clips."""
+        """Get ready to sample; offloaded weights are on the CPU between clips."""
         self.offloaded = prepare_inference(self, self.offloaded, options, options.device())
 
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
-        """The stage's parameters by name, in stage 1 with LoRA those of LoRA and of what is new."""
+        """Freeze all that the stage does not train and return the rest by name; with LoRA stage 1 freezes the base."""
         parameters = super().trained_parameters(stage)
         if stage == "1":
             train_lora(self.transformer.base)
         return {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
 
     def apply_memory_savings(self, stage: Stage, savings: MemorySavings) -> None:
-        """Make steps cheaper; exact values of frozen weights are kept where the stage saves them."""
+        """Make training steps cheaper; exact values of frozen weights are kept if the stage saves them."""
         self.frozen = apply_memory_savings(self, stage, savings)
 
     def add_lora(self, lora: Lora) -> None:
-        """Put PEFT's layers into the transformer; what of it is new trains whole."""
+        """Put PEFT's layers into diffusers' transformer; the widening is trained whole."""
         add_lora(self.transformer.base, lora)
 
     def save_base(self, folder: Path) -> None:
-        """Write diffusers' parts and ours, frozen weights in their exact values."""
+        """Write diffusers' parts and ``world.safetensors``, frozen weights in their exact values."""
         with self.frozen.restored():
             super().save_base(folder)
 
     def save_lora(self, folder: Path) -> None:
-        """Write LoRA as diffusers' pipelines load it, and ``world.safetensors`` with what is ours."""
+        """Write a LoRA file that diffusers' pipelines load, and ``world.safetensors``."""
         save_lora(self.transformer.base, folder)
         save_world(self.transformer, self.prompt, folder)

@@ -1,4 +1,4 @@
-"""LoRA on diffusers' transformer: PEFT's layers while it trains, a file that diffusers' pipelines load, and merging."""
+"""LoRA on diffusers' transformer: PEFT's layers in training, and a file that diffusers' pipelines load."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from persist_cli.io.files import write_tensors
 
 
 def add_lora(transformer: CogVideoXTransformer3DModel, lora: Lora) -> None:
-    """Put PEFT's layers around the targets; the first output is that without them, to the bit.
+    """Put PEFT's layers around the targets; before training the output stays equal to the bit.
 
     Raises:
-        PersistError: when PEFT is not installed, or a target is no linear layer of the transformer.
+        PersistError: when PEFT is not installed, or a target is not a linear layer of the transformer.
     """
     try:
         from peft import LoraConfig
     except ImportError as error:
         raise PersistError("lora needs the package peft: pip install 'persist-cli[lora]'") from error
-    linear = {name for name, each in transformer.named_modules() if isinstance(each, torch.nn.Linear)}
+    linear = {name for name, module in transformer.named_modules() if isinstance(module, torch.nn.Linear)}
     for target in lora.targets:
         if not any(name == target or name.endswith(f".{target}") for name in linear):
             known = sorted({name.split(".", 2)[-1] for name in linear if name.startswith("transformer_blocks.")})
@@ -37,23 +37,23 @@ def add_lora(transformer: CogVideoXTransformer3DModel, lora: Lora) -> None:
 
 
 def has_lora(transformer: CogVideoXTransformer3DModel) -> bool:
-    """Whether it has layers of LoRA, which train instead of it."""
+    """Whether the transformer has layers of LoRA, which are trained in place of its weights."""
     return bool(getattr(transformer, "peft_config", None))
 
 
 def train_lora(transformer: CogVideoXTransformer3DModel) -> None:
-    """Where there is LoRA, freeze all else."""
+    """Freeze all weights but those of LoRA, if the transformer has LoRA."""
     if has_lora(transformer):
         for name, parameter in transformer.named_parameters():
             parameter.requires_grad_(LORA in name)
 
 
 def save_lora(transformer: CogVideoXTransformer3DModel, folder: Path) -> None:
-    """Write ``pytorch_lora_weights.safetensors``, as diffusers' pipelines load it by ``load_lora_weights(folder)``."""
+    """Write ``pytorch_lora_weights.safetensors``, which diffusers' pipelines load by ``load_lora_weights(folder)``."""
     from peft import get_peft_model_state_dict
 
     config = transformer.peft_config["default"].to_dict()
-    plain = {PREFIX + key: sorted(each) if isinstance(each, set) else each for key, each in config.items()}
+    plain = {PREFIX + key: sorted(value) if isinstance(value, set) else value for key, value in config.items()}
     tensors = {PREFIX + name: tensor for name, tensor in get_peft_model_state_dict(transformer).items()}
     metadata = {"format": "pt", LORA_ADAPTER_METADATA_KEY: json.dumps(plain, sort_keys=True)}
     write_tensors(folder / LORA_WEIGHT_NAME_SAFE, tensors, metadata | {"digest": transformer.weights_before_lora})

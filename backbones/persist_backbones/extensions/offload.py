@@ -1,4 +1,4 @@
-"""Where a backbone samples: precision, CPU offload, slices and tiles of its codec."""
+"""Preparation of a backbone for sampling: precision, CPU offload, slices and tiles of its codec."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ OVERLAP = 1 / 6  # of a tile, diffusers' own
 
 
 class OffloadingPipeline(DiffusionPipeline):  # type: ignore[misc]
-    """diffusers' CPU offload for a world model: what stands between the transformer's blocks goes with them."""
+    """diffusers' CPU offload for a world model, which also moves the modules between the transformer's blocks."""
 
     model_cpu_offload_seq = "transformer->vae"
 
     def enable_sequential_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
-        """As diffusers' own: every layer of every component is on the accelerator while it runs."""
+        """Keep each layer of each component on the accelerator only while it runs, as in diffusers."""
         self._exclude_from_cpu_offload: list[str] = []
         super().enable_sequential_cpu_offload(gpu_id, device)
 
     def enable_model_cpu_offload(self, gpu_id: int | None = None, device: Any = None) -> None:
-        """As diffusers' own; what runs between the transformer's blocks stays on the accelerator."""
+        """Keep each whole component on the accelerator only while it runs; ``world`` and ``adapter`` stay there."""
         self._exclude_from_cpu_offload = ["world", "adapter"]
         super().enable_model_cpu_offload(gpu_id, device)
 
 
 class OffloadedModule(ModelMixin):  # type: ignore[misc]
-    """Modules of ours, shared, with what diffusers' offload wants to know of a model.
+    """Modules of the backbone, shared with it, as a model that diffusers can offload.
 
     Args:
-        modules: by name.
+        modules: the modules by name.
     """
 
     def __init__(self, modules: Mapping[str, nn.Module]) -> None:
@@ -49,13 +49,13 @@ class OffloadedModule(ModelMixin):  # type: ignore[misc]
 
 
 class OffloadedParts(OffloadingPipeline):
-    """The parts of a backbone that is offloaded; it samples by itself.
+    """The parts of an offloaded backbone; this pipeline only moves them, sampling is done by the backbone.
 
     Args:
-        transformer: diffusers' own.
-        vae: diffusers' own.
-        world: what makes the transformer a world model, with the prompt's embedding.
-        adapter: of memory, if one is in use.
+        transformer: diffusers' transformer.
+        vae: diffusers' VAE.
+        world: the modules that widen the transformer, with the prompt's embedding.
+        adapter: the memory adapter, if one is in use.
     """
 
     _optional_components: ClassVar = ["adapter"]
@@ -72,9 +72,9 @@ class OffloadedParts(OffloadingPipeline):
 
 
 def bring_when_run(transformer: WorldTransformer) -> None:
-    """Let diffusers' transformer come to the accelerator whenever ours runs, whose blocks are run one by one.
+    """Bring diffusers' transformer to the accelerator whenever the world transformer runs its blocks one by one.
 
-    accelerate brings an offloaded module only when its own ``forward`` runs.
+    accelerate brings an offloaded module only when the module's own ``forward`` runs.
     """
 
     def bring(module: nn.Module, _: Any) -> None:
@@ -91,13 +91,13 @@ def prepare_inference(
     """Get a backbone ready to sample.
 
     Args:
-        backbone: with the adapter to use, if any.
-        offloaded: what this gave for the backbone before, if it did.
+        backbone: the backbone, with the adapter in use, if any.
+        offloaded: what the last call returned for this backbone, ``None`` at first.
         options: precision, offload, slices and tiles.
-        device: where it computes.
+        device: the device that computes.
 
     Returns:
-        The parts that rest on the CPU between clips, if any do.
+        The offloaded parts, which are on the CPU between clips, ``None`` without offload.
     """
     if offloaded is not None:
         offloaded.remove_all_hooks()  # weights that were on no device come back to the CPU
@@ -128,14 +128,14 @@ def prepare_inference(
 
 
 def enable_tiling(vae: AutoencoderKLCogVideoX, height: int, width: int) -> None:
-    """Code in tiles of half the image's height and width, which overlap by a whole number of latent pixels.
+    """Let the VAE work in tiles of half the image's height and width, which overlap by whole latent pixels.
 
-    With an overlap that is not, diffusers' tiles do not make up the image.
+    With any other overlap, diffusers' tiles do not fit together to the image.
 
     Args:
         vae: diffusers' autoencoder.
-        height: of what it is given.
-        width: likewise.
+        height: height of the VAE's input in its pixels.
+        width: width of the VAE's input in its pixels.
 
     Raises:
         CheckpointError: when the image is too small to be tiled.
@@ -147,11 +147,11 @@ def enable_tiling(vae: AutoencoderKLCogVideoX, height: int, width: int) -> None:
 
 
 def tile_overlap(tile: int, scale: int) -> float:
-    """The share of a tile of latent pixels that diffusers' arithmetic makes whole pixels, nearest to its own.
+    """Return the overlap, as a share of a tile, that gives whole pixels in diffusers' arithmetic, near its default.
 
     Args:
-        tile: latent pixels along an edge.
-        scale: pixels of a latent pixel.
+        tile: latent pixels along the edge of a tile.
+        scale: pixels along the edge of a latent pixel.
     """
     for pixels in sorted(range(1, tile), key=lambda count: abs(count - OVERLAP * tile)):
         share = pixels / tile

@@ -16,12 +16,12 @@ from persist_cli.api.stages import MemorySavings, Stage
 
 
 class FrozenWeights:
-    """Weights that are not trained, held in another precision.
+    """The weights of a module that are not trained, held in another precision.
 
     Args:
-        module: whose frozen parameters are converted in place.
-        dtype: the precision; ``None`` leaves them as they are.
-        saved: whether they will be saved; their exact values are then kept in the memory of the CPU.
+        module: the module, whose frozen parameters are converted in place.
+        dtype: the precision; ``None`` converts nothing.
+        saved: whether the weights will be saved; their exact values then stay in the memory of the CPU.
     """
 
     def __init__(self, module: nn.Module, dtype: torch.dtype | None, saved: bool = True) -> None:
@@ -35,19 +35,19 @@ class FrozenWeights:
 
     @contextlib.contextmanager
     def restored(self) -> Iterator[None]:
-        """Within the block the weights are what they were, on the CPU."""
-        held = [parameter.data for parameter, _ in self.exact]
+        """Within the block, the weights have their exact values, on the CPU."""
+        converted = [parameter.data for parameter, _ in self.exact]
         try:
             for parameter, exact in self.exact:
                 parameter.data = exact
             yield
         finally:
-            for (parameter, _), low in zip(self.exact, held, strict=True):
+            for (parameter, _), low in zip(self.exact, converted, strict=True):
                 parameter.data = low
 
 
 def apply_memory_savings(backbone: CogVideoX, stage: Stage, savings: MemorySavings) -> FrozenWeights:
-    """Make training steps cheaper; exact values of frozen weights are kept where the stage saves them."""
+    """Make training steps cheaper; exact values of frozen weights are kept if the stage saves them."""
     transformer, adapter = backbone.transformer.base, backbone.adapter
     blocks = [*transformer.transformer_blocks, *(adapter.blocks.values() if adapter else ())]
     for block in blocks:
@@ -61,7 +61,7 @@ def apply_memory_savings(backbone: CogVideoX, stage: Stage, savings: MemorySavin
 
 
 def recompute_in_backward(block: nn.Module) -> None:
-    """Let a block keep only what it is given; what is inside is computed again in the backward pass."""
+    """Let a block keep only its inputs for the backward pass, in which everything inside is computed again."""
     forward = block.forward
 
     def recomputed(*inputs: Any, **named: Any) -> Any:

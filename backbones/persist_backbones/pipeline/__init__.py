@@ -1,1 +1,1 @@
-"""A backbone as a pipeline of diffusers' kind."""
+"""The interface of diffusers' pipelines for a backbone."""

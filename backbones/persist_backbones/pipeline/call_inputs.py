@@ -1,4 +1,4 @@
-"""What a pipeline is called with, as diffusers' users have it, made a batch of clips."""
+"""Conversion of a pipeline's inputs, in the types of diffusers' users, to a batch of clips."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def make_clips(
     tokens: MemoryTokens | Sequence[MemoryTokens] | None,
     frames: int,
 ) -> Clips:
-    """The batch that begins with these images.
+    """Make the batch of clips that begin with these images.
 
     Args:
         images: uint8 ``[batch, height, width, 3]``.
-        depth: metres ``[height, width]``, a batch or a list of it; ``None`` where nothing is known.
-        cameras: of every frame of a clip, the image's first; a batch of them or a list.
-        interactions: one sequence a sample; ``None`` for none.
-        tokens: what ``Memory.read`` gave, of one sample, a batch or a list.
-        frames: of a clip.
+        depth: metres ``[height, width]``, a batch or a list of them; ``None`` if it is unknown.
+        cameras: cameras of every frame of a clip, the image's first; a batch or a list of them.
+        interactions: one sequence a sample; ``None`` for no interactions.
+        tokens: tokens from ``Memory.read``, of one sample, a batch or a list of samples.
+        frames: number of frames of a clip.
 
     Raises:
-        DataError: one line when they do not go together.
+        DataError: one line when their sizes or numbers do not fit each other.
     """
     batch, height, width = images.shape[:3]
     path = batch_of_cameras(cameras)
@@ -57,16 +57,16 @@ def make_clips(
 
 
 def batch_of_images(images: Any) -> Tensor:
-    """uint8 ``[batch, height, width, 3]`` of a PIL image, an array or a tensor, or of a list of them.
+    """Convert a PIL image, an array, a tensor, or a list of them, to uint8 ``[batch, height, width, 3]``.
 
-    Integers are uint8 ``[height, width, 3]``; what is not an integer is diffusers' ``pt``, ``[3, height, width]`` in
-    [0, 1]; both may have a batch axis.
+    Integers must be uint8 ``[height, width, 3]``; floating point values are diffusers' ``pt``, ``[3, height, width]``
+    in [0, 1]; both may have a batch axis.
     """
     if isinstance(images, (list, tuple)):
-        return torch.cat([batch_of_images(each) for each in images])
+        return torch.cat([batch_of_images(image) for image in images])
     if not isinstance(images, Tensor):
-        whole = images.convert("RGB") if hasattr(images, "convert") else images
-        images = torch.from_numpy(np.array(whole))
+        pixels = images.convert("RGB") if hasattr(images, "convert") else images
+        images = torch.from_numpy(np.array(pixels))
     if images.is_floating_point():
         images = (images.movedim(-3, -1) * 255).round().clamp(0, 255).to(torch.uint8)
     if images.ndim not in (3, 4) or images.shape[-1] != 3 or images.dtype != torch.uint8:
@@ -76,17 +76,17 @@ def batch_of_images(images: Any) -> Tensor:
 
 
 def batch_of_depth(depth: Any) -> Tensor:
-    """Metres ``[batch, height, width]``."""
+    """Convert depth of one sample, a batch or a list to metres ``[batch, height, width]``."""
     if isinstance(depth, (list, tuple)):
-        return torch.cat([batch_of_depth(each) for each in depth])
+        return torch.cat([batch_of_depth(sample) for sample in depth])
     metres = torch.as_tensor(depth).float()
     return metres.reshape(-1, *metres.shape[-2:])
 
 
 def batch_of_cameras(cameras: Cameras | Sequence[Cameras]) -> Cameras:
-    """Cameras ``[batch, frame]``."""
+    """Convert cameras of one sample, a batch or a list to cameras ``[batch, frame]``."""
     if not isinstance(cameras, Cameras):
-        return Cameras.concatenate([batch_of_cameras(each) for each in cameras])
+        return Cameras.concatenate([batch_of_cameras(sample) for sample in cameras])
     poses, matrices = cameras.world_from_camera, cameras.intrinsics
     frames = poses.shape[-3]
     return Cameras(
@@ -95,7 +95,7 @@ def batch_of_cameras(cameras: Cameras | Sequence[Cameras]) -> Cameras:
 
 
 def batch_of_tokens(tokens: MemoryTokens | Sequence[MemoryTokens]) -> MemoryTokens:
-    """Tokens with a batch axis."""
+    """Convert tokens of one sample, a batch or a list to tokens with a batch axis."""
     if not isinstance(tokens, MemoryTokens):
         return MemoryTokens.stack(list(tokens))
     return tokens if tokens.mask.ndim == 2 else MemoryTokens.stack([tokens])

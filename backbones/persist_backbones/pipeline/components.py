@@ -1,4 +1,4 @@
-"""What is ours of a model as diffusers' pipelines keep it: components that save, load and move as its own do."""
+"""The parts of a model besides diffusers' own, as components that diffusers' pipelines can save, load and move."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ BASE = "base"  # diffusers' transformer inside ours, a component of its own
 
 
 class WorldModules(ModelMixin, ConfigMixin):  # type: ignore[misc]
-    """What makes diffusers' transformer a world model: widening, interactions and the prompt's embedding.
+    """The modules that make diffusers' transformer a world model: widening, interactions and the prompt's embedding.
 
     Args:
-        settings: of the backbone, plain values.
+        settings: settings of the backbone, plain values.
         transformer: configuration of diffusers' transformer.
         vae: configuration of the VAE.
     """
@@ -36,39 +36,39 @@ class WorldModules(ModelMixin, ConfigMixin):  # type: ignore[misc]
     def __init__(self, settings: dict[str, Any], transformer: dict[str, Any], vae: dict[str, Any]) -> None:
         super().__init__()
         with torch.device("meta"):
-            theirs = CogVideoXTransformer3DModel.from_config(transformer)
+            base = CogVideoXTransformer3DModel.from_config(transformer)
             codec = AutoencoderKLCogVideoX.from_config(vae)
-        own = self.backbone_settings()
-        for name, module in widen(theirs, codec, own, clip_shape(theirs, codec, own)).named_children():
+        backbone = self.backbone_settings()
+        for name, module in widen(base, codec, backbone, clip_shape(base, codec, backbone)).named_children():
             if name != BASE:
                 self.add_module(name, module)
-        words = theirs.config.max_text_seq_length, theirs.config.text_embed_dim
+        words = base.config.max_text_seq_length, base.config.text_embed_dim
         self.register_buffer("prompt", torch.zeros(1, *words))
 
     def backbone_settings(self) -> CogVideoXSettings:
-        """The settings of the backbone."""
+        """Return the settings of the backbone."""
         return parse_settings(CogVideoXSettings, self.config.settings, "world/config.json")
 
     @staticmethod
     def of(backbone: CogVideoX) -> WorldModules:
-        """The modules of a backbone, shared with it."""
-        theirs = (backbone.transformer.base.config, backbone.codec.vae.config)
-        plain = [{key: each for key, each in config.items() if not key.startswith("_")} for config in theirs]
-        with torch.device("meta"):  # what begins with _ is where they were read, as a path
-            made = WorldModules(backbone.checkpoint_settings(), *plain)
-        for name in dict(made.named_children()):
-            setattr(made, name, getattr(backbone.transformer, name))
-        made.prompt = backbone.prompt
-        return made.train(backbone.training)  # type: ignore[no-any-return]
+        """Return the modules of a backbone, shared with it."""
+        configs = (backbone.transformer.base.config, backbone.codec.vae.config)
+        plain = [{key: value for key, value in config.items() if not key.startswith("_")} for config in configs]
+        with torch.device("meta"):  # keys that begin with _ are paths from which the configurations were read
+            world = WorldModules(backbone.checkpoint_settings(), *plain)
+        for name in dict(world.named_children()):
+            setattr(world, name, getattr(backbone.transformer, name))
+        world.prompt = backbone.prompt
+        return world.train(backbone.training)  # type: ignore[no-any-return]
 
 
 class MemoryAdapter(ModelMixin, ConfigMixin):  # type: ignore[misc]
-    """A memory adapter.
+    """A memory adapter as a component of diffusers' pipelines.
 
     Args:
-        channels: of the memory's features.
-        settings: of the adapter's form, plain values.
-        video: what ``VideoShape`` holds.
+        channels: channels of the features of a memory token.
+        settings: settings of the adapter's form, plain values.
+        video: the values of ``VideoShape``.
     """
 
     @register_to_config  # type: ignore[untyped-decorator]
@@ -78,19 +78,19 @@ class MemoryAdapter(ModelMixin, ConfigMixin):  # type: ignore[misc]
 
     @staticmethod
     def of(adapter: Adapter[Any]) -> MemoryAdapter:
-        """An adapter, shared with its backbone."""
+        """Return a component of a backbone's adapter, shared with the backbone."""
         with torch.device("meta"):
             shape = (dataclasses.asdict(adapter.settings), dataclasses.asdict(adapter.video))
-            made = MemoryAdapter(adapter.channels, *shape)
-        made.adapter = adapter
-        return made.train(adapter.training)  # type: ignore[no-any-return]
+            component = MemoryAdapter(adapter.channels, *shape)
+        component.adapter = adapter
+        return component.train(adapter.training)  # type: ignore[no-any-return]
 
 
 def assemble(parts: DiffusersParts, world: WorldModules, memory: MemoryAdapter | None) -> ExtendedCogVideoX:
-    """The backbone made of these components, which it shares.
+    """Build a backbone that shares these components.
 
     Raises:
-        CheckpointError: when they do not fit together.
+        CheckpointError: when the components do not fit each other.
     """
     with torch.device("meta"):
         backbone = ExtendedCogVideoX(world.backbone_settings())

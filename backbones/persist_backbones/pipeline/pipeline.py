@@ -1,4 +1,4 @@
-"""A world model as a pipeline of diffusers' kind."""
+"""The pipeline of diffusers' kind for a world model."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ OUTPUTS = ("pil", "np", "pt", "latent")
 
 @dataclass
 class WorldPipelineOutput(BaseOutput):  # type: ignore[misc]
-    """What a call gives.
+    """The result of a call of the pipeline.
 
     Args:
-        frames: videos that begin with the given images, in the form asked for; latents for ``latent``.
-        depth: metres, 0 after the first frame where the model gives none; ``None`` with latents.
+        frames: videos that begin with the given images, of the call's ``output_type``; latents for ``latent``.
+        depth: metres, 0 after the first frame for a model without depth; ``None`` with latents.
     """
 
     frames: Any
@@ -52,18 +52,18 @@ class WorldPipelineOutput(BaseOutput):  # type: ignore[misc]
 
 
 class WorldPipeline(OffloadingPipeline):
-    """From an image, its depth and a path of cameras to the RGB-D clip that is seen along it.
+    """A pipeline that generates, from an image, its depth and a path of cameras, the RGB-D clip seen along the path.
 
-    What a pipeline of diffusers can do, this one can: ``to``, CPU offload, ``vae.enable_slicing()`` and
-    ``vae.enable_tiling()``, ``transformer.enable_cache(config)``, another scheduler of those that ``SAMPLERS`` has,
-    callbacks and ``interrupt``, saving and loading (safetensors only). Guidance is that over memory.
+    It has the usual features of diffusers' pipelines: ``to``, CPU offload, ``vae.enable_slicing()`` and
+    ``vae.enable_tiling()``, ``transformer.enable_cache(config)``, another scheduler of ``SAMPLERS``, callbacks and
+    ``interrupt``, saving and loading (safetensors only). Guidance is guidance over memory.
 
     Args:
-        transformer: diffusers' own.
-        vae: diffusers' own.
-        scheduler: one of ``SAMPLERS``.
-        world: what makes the transformer a world model.
-        adapter: a memory adapter; ``None`` is plain stage 1.
+        transformer: diffusers' transformer.
+        vae: diffusers' VAE.
+        scheduler: a scheduler of ``SAMPLERS``.
+        world: the modules that make the transformer a world model.
+        adapter: a memory adapter; ``None`` for the model of stage 1.
     """
 
     _optional_components: ClassVar = ["adapter"]
@@ -86,7 +86,7 @@ class WorldPipeline(OffloadingPipeline):
 
     @classmethod
     def of(cls, backbone: ExtendedCogVideoX) -> Self:
-        """The pipeline of a backbone with the adapter in use, which shares its weights."""
+        """Make the pipeline of a backbone with its adapter in use, sharing their weights."""
         adapter = None if backbone.adapter is None else MemoryAdapter.of(backbone.adapter)
         parts = (backbone.transformer.base, backbone.codec.vae, backbone.scheduler)
         pipeline = cls(*parts, WorldModules.of(backbone), adapter)
@@ -95,14 +95,14 @@ class WorldPipeline(OffloadingPipeline):
 
     @property
     def backbone(self) -> ExtendedCogVideoX:
-        """The backbone of the present components, for all that a ``Backbone`` can do."""
+        """The backbone made of the present components, as a ``Backbone``."""
         parts = self._parts()
         if self._assembled is None or any(a is not b for a, b in zip(self._assembled[1], parts, strict=True)):
             transformer, vae, scheduler, world, adapter = parts
             trained = CogVideoXDDIMScheduler.from_config(scheduler.config)
             self._assembled = assemble(DiffusersParts(transformer, vae, trained), world, adapter), parts
         backbone = self._assembled[0]
-        backbone.prompt = self.world.prompt  # moved as a component, not as the backbone's
+        backbone.prompt = self.world.prompt  # a move of the components replaces this tensor
         return backbone
 
     def _parts(self) -> tuple[Any, ...]:
@@ -110,12 +110,12 @@ class WorldPipeline(OffloadingPipeline):
 
     @property
     def guidance_scale(self) -> float:
-        """Weight of guidance over memory at the present step."""
+        """Weight of guidance over memory in the present step."""
         return self._guidance_scale
 
     @property
     def num_timesteps(self) -> int:
-        """Denoising steps of the present call."""
+        """Number of denoising steps of the present call."""
         return self._num_timesteps
 
     @property
@@ -125,18 +125,18 @@ class WorldPipeline(OffloadingPipeline):
 
     @property
     def interrupt(self) -> bool:
-        """Whether the present call shall make no further step."""
+        """Whether the present call will make no further step."""
         return self._interrupt
 
     def save_pretrained(self, save_directory: str | Path, safe_serialization: bool = True, **options: Any) -> None:
-        """As diffusers' own, safetensors only."""
+        """Save the pipeline like diffusers, as safetensors only."""
         if not safe_serialization:
             raise CheckpointError(f"{save_directory}: weights are saved as safetensors only")
         super().save_pretrained(save_directory, **options)
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> Self:
-        """As diffusers' own, safetensors only."""
+        """Load the pipeline like diffusers, from safetensors only."""
         pipeline: Self = super().from_pretrained(pretrained_model_name_or_path, **options | {"use_safetensors": True})
         for part in pipeline.components.values():
             if isinstance(part, nn.Module):
@@ -160,26 +160,26 @@ class WorldPipeline(OffloadingPipeline):
         callback_on_step_end: Callback | None = None,
         callback_on_step_end_tensor_inputs: Sequence[str] = ("latents",),
     ) -> WorldPipelineOutput | tuple[Any, ...]:
-        """The clips that begin with the given images.
+        """Generate clips that begin with the given images.
 
         Args:
             image: PIL image, uint8 ``[height, width, 3]`` or diffusers' ``pt``; a list or batch of them.
-            depth: its planar depth in metres, 0 = missing; ``None`` where nothing is known.
-            cameras: of every frame of the clip, the image's first.
-            interactions: what the agent does to the world at each step, one sequence a sample.
-            memory_tokens: what a memory says to these cameras, as ``Memory.read`` gives it.
-            num_inference_steps: denoising steps.
-            guidance_scale: weight of classifier-free guidance over memory; 1 means none.
-            generator: of the noise, on the CPU; one, or one a sample.
-            latents: the noise itself.
+            depth: planar depth of the image in metres, 0 = missing; ``None`` if it is unknown.
+            cameras: cameras of every frame of the clip, the image's first.
+            interactions: actions of the agent that change the world, one for each step, one sequence a sample.
+            memory_tokens: tokens that ``Memory.read`` returned for these cameras.
+            num_inference_steps: number of denoising steps.
+            guidance_scale: weight of classifier-free guidance over memory; 1 means no guidance.
+            generator: generator of the noise, on the CPU; one for all samples, or a list of one a sample.
+            latents: the noise; by default drawn from ``generator``.
             output_type: ``pil``, ``np``, ``pt`` or ``latent``.
-            return_dict: false gives a plain tuple.
-            callback_on_step_end: called with the pipeline, the step's number, its timestep and the tensors asked for;
-                what it returns of them replaces them.
-            callback_on_step_end_tensor_inputs: tensors that it is given.
+            return_dict: whether to return a ``WorldPipelineOutput``, else a plain tuple.
+            callback_on_step_end: function of the pipeline, the step's number, its timestep and a dictionary of tensors;
+                latents in the dictionary that it returns replace those of the step.
+            callback_on_step_end_tensor_inputs: names of the tensors in that dictionary.
 
         Raises:
-            PersistError: one line for inputs that do not go together or do not fit the model.
+            PersistError: one line for inputs that do not fit each other or the model.
         """
         sampling, backbone = Sampling(num_inference_steps, self._sampler(), guidance_scale), self.backbone
         self._check(sampling, output_type, callback_on_step_end_tensor_inputs)
@@ -195,18 +195,18 @@ class WorldPipeline(OffloadingPipeline):
         return output if return_dict else output.to_tuple()
 
     def _end_step(self, bar: Any, callback: Callback | None, names: Sequence[str], step: SamplingStep) -> None:
-        """Let the callback see and change a step; stop when the call is interrupted."""
+        """Call the callback, which may change the step's latents; stop when the call is interrupted."""
         if callback is not None:
             tensors = {name: step.latents for name in names}
             step.latents = callback(self, step.number, step.timestep, tensors).pop("latents", step.latents)
         step.guidance, step.stop = self._guidance_scale, self._interrupt
         bar.update()
 
-    def _images(self, given: Any) -> Tensor:
-        """The images as one batch, of the model's size."""
-        images = batch_of_images(given)
+    def _images(self, image: Any) -> Tensor:
+        """Return the images as one batch of the model's size."""
+        images = batch_of_images(image)
         if images.shape[1:3] != self.backbone.image_size:
-            size, wanted = ("x".join(map(str, each)) for each in (images.shape[1:3], self.backbone.image_size))
+            size, wanted = ("x".join(map(str, sides)) for sides in (images.shape[1:3], self.backbone.image_size))
             raise DataError(f"an image of {size} pixels; this model takes {wanted}, depth and cameras alike")
         return images
 
@@ -235,21 +235,21 @@ class WorldPipeline(OffloadingPipeline):
         return WorldPipelineOutput(VideoProcessor().postprocess_video(colors, output_type), metres)
 
 
-def generators_for(given: torch.Generator | list[torch.Generator] | None, batch: int) -> list[torch.Generator]:
-    """One generator a sample; a single one is drawn from in turn, without any torch's own.
+def generators_for(generator: torch.Generator | list[torch.Generator] | None, batch: int) -> list[torch.Generator]:
+    """Return one generator a sample; a single one serves all samples in turn, ``None`` means torch's default one.
 
     Raises:
-        PersistError: when a list has not one for each sample.
+        PersistError: when a list does not have one generator for each sample.
     """
-    if isinstance(given, list):
-        if len(given) != batch:
-            raise PersistError(f"{len(given)} generators for {batch} images; give one, or one for each")
-        return given
-    return [given or torch.default_generator] * batch
+    if isinstance(generator, list):
+        if len(generator) != batch:
+            raise PersistError(f"{len(generator)} generators for {batch} images; give one, or one for each")
+        return generator
+    return [generator or torch.default_generator] * batch
 
 
 def load_pipeline(folder: Path, adapter: str | None, dtype: Precision | None) -> WorldPipeline:
-    """A checkpoint as a pipeline, without the tool; see ``persist_backbones.load``."""
+    """Load a checkpoint as a pipeline; see ``persist_backbones.load``."""
     if dtype is not None and dtype not in get_args(Precision):
         raise CheckpointError(f"unknown dtype {dtype!r}; {hint(dtype, get_args(Precision))}")
     checkpoint = find_checkpoint(folder)
