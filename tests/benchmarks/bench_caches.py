@@ -30,6 +30,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
+from persist_backbones.extensions.caches import enable_cache
 from persist_cli.api.backbone import Backbone, Clip, Clips, Sampling
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import InferenceOptions
@@ -79,11 +80,11 @@ def make_clips(backbone: Backbone, factory: MemoryFactory | None) -> tuple[Clips
 
 def calibrate(backbone: Any, draw: Callable[[], Any], steps: int) -> list[float]:
     """MagCache's magnitude ratios of these clips, read from what it prints."""
-    backbone.transformer.enable_cache(MagCacheConfig(num_inference_steps=steps, calibrate=True))
+    enable_cache(backbone.transformer, MagCacheConfig(num_inference_steps=steps, calibrate=True))
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
         draw()
-    backbone.transformer.disable_cache()
+    backbone.transformer.base.disable_cache()
     ratios = next(line for line in output.getvalue().splitlines() if line.startswith("[") and "," in line)
     return [float(ratio) for ratio in ast.literal_eval(ratios)]
 
@@ -92,9 +93,9 @@ def with_cache(backbone: Any, config: Any, draw: Callable[[], Any]) -> Any:
     """The clips drawn with a cache; ``None`` is no cache."""
     if config is None:
         return draw()
-    backbone.transformer.enable_cache(config)
+    enable_cache(backbone.transformer, config)
     clips = draw()
-    backbone.transformer.disable_cache()
+    backbone.transformer.base.disable_cache()
     return clips
 
 
