@@ -1,4 +1,5 @@
-"""The words shared by the tool and its plugins: cameras, actions, observations, memories, backbones.
+"""The types shared by the tool and its plugins: cameras, actions, observations, memories, backbones and others.
 
-Plugins import this package and nothing else of the tool.
+A plugin subclasses ``Backbone``, ``Memory``, ``Encoder``, ``Simulator`` or ``Importer``. Beside this package it uses
+``persist_cli.errors`` and ``persist_cli.io``, and nothing else of the tool.
 """

@@ -14,10 +14,8 @@ from torch import Tensor
 
 from persist_cli.errors import DataError, hint
 
-FREE = "free"  # a motion that no named action describes; the poses say what it was
-
+FREE = "free"  # a motion that no named action describes; only the poses of the trajectory describe it
 STAY = "stay"
-
 WORD = re.compile(r"^(?P<name>[a-z_]+)(?:\*(?P<count>\d+))?$")
 
 
@@ -26,11 +24,11 @@ class Action:
     """One action of an agent that walks on the ground.
 
     Args:
-        name: lower case, as in ``"forward"``.
-        forward: metres along the heading.
-        turn: degrees to the left, about the world's up axis.
-        reverse: the name of the action that undoes it, if one does.
-        interaction: changes the world rather than the camera (pick up, drop, toggle).
+        name: lower-case letters and underscores, as in ``"pick_up"``.
+        forward: metres along the camera's heading on the ground; negative values go backward.
+        turn: degrees about the world's up axis; positive values turn left.
+        reverse: name of the action that undoes it, ``None`` when there is none.
+        interaction: whether it changes the world rather than the camera (pick up, drop, toggle).
     """
 
     name: str
@@ -42,7 +40,7 @@ class Action:
 
 @dataclass(frozen=True)
 class ActionVocabulary:
-    """The actions of one data set or agent, in a fixed order."""
+    """The actions of one data set or agent, in a fixed order; ``vocabulary[name]`` raises ``DataError`` if unknown."""
 
     actions: tuple[Action, ...]
 
@@ -53,7 +51,7 @@ class ActionVocabulary:
         raise DataError(f"unknown action {name!r}; {hint(name, (action.name for action in self.actions))}")
 
     def parse(self, text: str) -> tuple[str, ...]:
-        """Action names of the text form ``"forward*4 left*2"``."""
+        """Return the action names of a text such as ``"forward*4 left"``; ``DataError`` when it cannot be read."""
         names: list[str] = []
         for word in text.split():
             match = WORD.match(word)
@@ -65,22 +63,27 @@ class ActionVocabulary:
         return tuple(names)
 
     def reversed(self, names: Sequence[str]) -> tuple[str, ...]:
-        """The actions that lead back: each one's reverse, last first."""
-        back = []
+        """Return the actions that lead back, the last one's reverse first; ``DataError`` when one has no reverse."""
+        reverses = []
         for name in reversed(names):
             reverse = self[name].reverse
             if reverse is None:
                 raise DataError(f"action {name!r} has no reverse")
-            back.append(reverse)
-        return tuple(back)
+            reverses.append(reverse)
+        return tuple(reverses)
 
     def move(
         self, world_from_camera: Float[Tensor, "4 4"], name: str, world_up: Float[Tensor, " 3"]
     ) -> Float[Tensor, "4 4"]:
-        """The camera's pose after the action: walk along the heading, turn about the up axis, float64.
+        """Return the camera's pose after an action: it walks along its heading, then turns about the up axis.
+
+        Args:
+            world_from_camera: pose before the action, metres, OpenCV axes; the returned pose is float64.
+            name: name of the action.
+            world_up: vector of any length that points up in the world.
 
         Raises:
-            DataError: for an unknown action and for ``free``, whose motion only the data knows.
+            DataError: for an unknown action and for ``free``, which has no motion of its own.
         """
         if name == FREE:
             raise DataError("the action 'free' has no motion of its own; follow the trajectory's poses instead")
@@ -96,7 +99,7 @@ class ActionVocabulary:
     def follow(
         self, world_from_camera: Float[Tensor, "4 4"], names: Sequence[str], world_up: Float[Tensor, " 3"]
     ) -> Float[Tensor, "frame 4 4"]:
-        """Poses after each of the actions, the start not included."""
+        """Return the pose after each of the actions, the start not included; arguments and errors as in ``move``."""
         poses = []
         for name in names:
             world_from_camera = self.move(world_from_camera, name, world_up)
@@ -104,17 +107,17 @@ class ActionVocabulary:
         return torch.stack(poses)
 
     def to_json(self) -> list[dict[str, Any]]:
-        """A form that ``from_json`` reads back."""
+        """Return a list of JSON objects that ``from_json`` reads back."""
         return [vars(action).copy() for action in self.actions]
 
     @staticmethod
     def from_json(rows: list[dict[str, Any]]) -> ActionVocabulary:
-        """The vocabulary that ``to_json`` wrote."""
+        """Return the vocabulary that ``to_json`` wrote."""
         return ActionVocabulary(tuple(Action(**row) for row in rows))
 
 
 def format_actions(names: Sequence[str]) -> str:
-    """The text form of action names: runs are counted, as in ``"forward*4 left*2"``."""
+    """Return action names as the text that ``ActionVocabulary.parse`` reads, as in ``"forward*4 left*2"``."""
     runs: list[list[Any]] = []
     for name in names:
         if runs and runs[-1][0] == name:
@@ -125,7 +128,7 @@ def format_actions(names: Sequence[str]) -> str:
 
 
 def walking_actions(step: float = 0.25, turn: float = 15.0) -> ActionVocabulary:
-    """The usual vocabulary of an embodied agent: steps of ``step`` metres, turns of ``turn`` degrees."""
+    """Return the usual vocabulary of an embodied agent: steps of ``step`` metres, turns of ``turn`` degrees."""
     return ActionVocabulary(
         (
             Action(STAY, reverse=STAY),
@@ -141,12 +144,12 @@ def walking_actions(step: float = 0.25, turn: float = 15.0) -> ActionVocabulary:
 
 
 def free_motion() -> ActionVocabulary:
-    """The vocabulary of captures whose motion has no names."""
+    """Return the vocabulary of captures whose motion has no names: ``free`` alone."""
     return ActionVocabulary((Action(FREE),))
 
 
 def rotation_about(axis: Float[Tensor, " 3"], angle: float) -> Float[Tensor, "3 3"]:
-    """Rotation by ``angle`` radians about a unit axis, right-handed (Rodrigues)."""
+    """Return the right-handed rotation by ``angle`` radians about a unit axis, float64 (Rodrigues' formula)."""
     x, y, z = (float(value) for value in axis)
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross

@@ -1,4 +1,4 @@
-"""The abstract backbone: a video model that predicts RGB-D clips, trained in stages."""
+"""The abstract backbone: a video model that predicts RGB-D clips and is trained in stages."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PersistError
 from persist_cli.io.settings import NoSettings
 
-Interactions = tuple[str | None, ...]  # one for each step between two frames of a clip
+Interactions = tuple[str | None, ...]  # for each step between two frames the interaction's name, if there is one
 
 
 @dataclass(frozen=True)
 class ClipLatents:
-    """What a backbone's codec makes of clips.
+    """Latents of clips, as a backbone's codec encodes them.
 
     Args:
-        video: latents of the whole clips.
-        image: latents of their first frames alone.
+        video: latents of the whole clips; the frame, height and width axes are those of the codec's latents.
+        image: latents of the first frames, each encoded alone.
     """
 
     video: Float[Tensor, "*batch frame channel height width"]
@@ -41,27 +41,26 @@ class ClipLatents:
         return ClipLatents(self.video[sample], self.image[sample])
 
     def to(self, device: torch.device | str) -> ClipLatents:
-        """The same latents on ``device``."""
+        """Return these latents on ``device``."""
         return ClipLatents(self.video.to(device), self.image.to(device))
 
     @staticmethod
     def stack(samples: Sequence[ClipLatents]) -> ClipLatents:
-        """A batch of the latents of single clips."""
+        """Return a batch of the latents of single clips."""
         videos, images = [sample.video for sample in samples], [sample.image for sample in samples]
         return ClipLatents(torch.stack(videos), torch.stack(images))
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One RGB-D clip with what conditions it.
+    """One RGB-D clip with its conditions.
 
     Args:
-        observations: its frames with their cameras. To be predicted: the first frame alone, with the cameras of all.
-        interactions: what the agent did to the world between the frames.
-        seed: everything random about the clip is drawn from this.
-        tokens: what a memory says to the cameras, ``None`` without a memory.
-        latents: what ``Backbone.encode`` gave of this clip, if it was encoded before; the observations may then have no
-            images.
+        observations: frames with their cameras; for a clip to predict, the first frame alone with all cameras.
+        interactions: interaction of the agent with the world between each two frames.
+        seed: seed of all random numbers of the clip.
+        tokens: memory tokens read for the cameras, ``None`` without a memory.
+        latents: result of ``Backbone.encode``, ``None`` when it was not called; with it, observations may lack images.
     """
 
     observations: Observations
@@ -73,16 +72,16 @@ class Clip:
 
 @dataclass(frozen=True)
 class Clips:
-    """A batch of RGB-D clips with what conditions them; see ``Clip``.
+    """A batch of RGB-D clips with their conditions; see ``Clip``.
 
     Args:
         rgb: uint8.
         depth: float32 metres, planar z, 0 = missing.
-        cameras: in each sample's world.
-        interactions: for each sample, what the agent did to the world between the frames.
+        cameras: axes ``batch frame``, metres in each sample's world.
+        interactions: for each sample the interactions between its frames.
         tokens: memory tokens of the batch, ``None`` without a memory.
-        seeds: one for each sample; everything random about it is drawn from this.
-        latents: of the batch, where it was encoded before; rgb and depth may then have no frames.
+        seeds: for each sample the seed of all its random numbers.
+        latents: result of ``Backbone.encode``, ``None`` when it was not called; with it, rgb and depth may be empty.
     """
 
     rgb: UInt8[Tensor, "batch frame height width 3"]
@@ -95,7 +94,7 @@ class Clips:
 
     @staticmethod
     def stack(clips: Sequence[Clip]) -> Clips:
-        """A batch of clips of one size, of which all or none have tokens, and all or none latents."""
+        """Return a batch of clips of one size, of which all or none have tokens, and all or none have latents."""
         tokens = [clip.tokens for clip in clips if clip.tokens is not None]
         latents = [clip.latents for clip in clips if clip.latents is not None]
         return Clips(
@@ -109,11 +108,11 @@ class Clips:
         )
 
     def first_frames(self) -> tuple[UInt8[Tensor, "batch 1 height width 3"], Float[Tensor, "batch 1 height width"]]:
-        """RGB and depth of the first frames."""
+        """Return RGB and depth of the first frames, uint8 and float32 metres."""
         return self.rgb[:, :1], self.depth[:, :1]
 
     def to(self, device: torch.device | str) -> Clips:
-        """The same clips on ``device``."""
+        """Return these clips on ``device``."""
         return dataclasses.replace(
             self,
             rgb=self.rgb.to(device),
@@ -126,12 +125,12 @@ class Clips:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a clip is drawn.
+    """Settings by which clips are sampled.
 
     Args:
-        steps: denoising steps.
-        sampler: one of the backbone's samplers.
-        memory_guidance: weight of classifier-free guidance over memory; 1 means none.
+        steps: number of denoising steps, at least 1.
+        sampler: name of one of the backbone's samplers.
+        memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
     """
 
     steps: int = 50
@@ -142,14 +141,14 @@ class Sampling:
 class Backbone(nn.Module, ABC):
     """A video diffusion model over RGB-D clips; ``forward`` is the training loss of a stage.
 
-    Made on torch's meta device it is a plan: it has the shapes of its configuration and reads no weights.
+    On torch's meta device it has the shapes of its configuration but reads no weights; estimates use that.
 
     Args:
-        settings: an instance of ``settings_type``.
+        settings: an instance of ``settings_type``, a dataclass of the recipe's settings.
     """
 
     settings_type: ClassVar[type] = NoSettings
-    sharded_blocks: ClassVar[tuple[str, ...]] = ()  # classes of blocks that a sharded model puts together one by one
+    sharded_blocks: ClassVar[tuple[str, ...]] = ()  # class names of blocks that a sharded model gathers one by one
     never_sharded: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
     name: str = ""  # set by the registry
 
@@ -159,26 +158,26 @@ class Backbone(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where it computes."""
+        """The device of its parameters, on which it computes."""
         return next(self.parameters()).device
 
     @property
     @abstractmethod
     def frames_per_clip(self) -> int:
-        """Frames of a clip, the given first one included."""
+        """The number of frames of a clip, the first one included, which is an input."""
 
     @property
     @abstractmethod
     def image_size(self) -> tuple[int, int]:
-        """Height and width in pixels of the images it takes."""
+        """Height and width in pixels of the images that it takes and generates."""
 
     @property
     @abstractmethod
     def samplers(self) -> tuple[str, ...]:
-        """Names that ``Sampling.sampler`` may have."""
+        """The names that ``Sampling.sampler`` may have."""
 
     def check_sampling(self, sampling: Sampling) -> None:
-        """Raise ``PersistError``, one line, when ``generate`` cannot draw a clip like that."""
+        """Raise ``PersistError`` with one line when ``generate`` cannot sample with these settings."""
         if sampling.sampler not in self.samplers:
             raise PersistError(f"unknown sampler {sampling.sampler!r}; known: {', '.join(self.samplers)}")
         if sampling.steps < 1:
@@ -188,14 +187,14 @@ class Backbone(nn.Module, ABC):
 
     @property
     def gives_depth(self) -> bool:
-        """Whether clips have depth after their first frame."""
+        """Whether generated frames have depth; else their depth is 0."""
         return True
 
     def prepare_inference(self, placement: InferenceOptions) -> None:
-        """Get ready to sample, on the accelerator where there is one; it may be placed again, also with other adapters.
+        """Get ready to sample, on the accelerator if there is one; a second call, also with other adapters, is allowed.
 
         Raises:
-            PersistError: when memory cannot be saved so.
+            PersistError: when this backbone has no such way to save memory, or there is no accelerator for it.
         """
         device = placement.device()
         if placement.offload != "none" or placement.slicing or placement.tiling:
@@ -205,129 +204,129 @@ class Backbone(nn.Module, ABC):
         self.to(device).eval()
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """Every parameter, each in one part, in the order in which people think of them."""
+        """Return every parameter in exactly one group, in the order of a table for people."""
         return [ParameterGroup(self.name, dict(self.named_parameters()))]
 
     def never_sharded_parameters(self) -> list[nn.Parameter]:
-        """Those of the submodules that are never sharded."""
-        return [each for name in self.never_sharded for each in self.get_submodule(name).parameters()]
+        """Return the parameters of the submodules that are never sharded."""
+        return [parameter for name in self.never_sharded for parameter in self.get_submodule(name).parameters()]
 
     def truncate_layers(self, groups: int) -> float:
-        """Keep so many groups of like layers of what is trained in depth, for estimates; returns how many there were.
+        """Keep the first ``groups`` groups of like layers, for estimates, and return how many there were.
 
-        What a step takes must grow linearly with the groups. By default there is one and it stays.
+        Memory and time of a step must grow linearly with the groups. By default there is one group, which stays.
         """
         return float(groups)
 
     @abstractmethod
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
-        """Freeze all that the stage does not train and return the rest by name."""
+        """Freeze all parameters that the stage does not train, and return the others by name."""
 
     def apply_memory_savings(self, stage: Stage, savings: MemorySavings) -> None:
-        """Make the steps of a stage cheaper, once ``trained_parameters`` has frozen what it does not train.
+        """Make the steps of a stage cheaper; ``trained_parameters`` of the stage is called before.
 
         Raises:
-            PersistError: when this backbone cannot.
+            PersistError: when this backbone does not support one of the savings.
         """
         if savings != MemorySavings():
             raise PersistError(f"backbone {self.name!r} has no cheaper steps; leave out what training.* asks of it")
 
     @abstractmethod
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
-        """Scalars of one training step; ``"loss"`` is minimised, the others are logged."""
+        """Return scalar tensors of one training step by name; ``"loss"`` is minimised, the others are logged."""
 
     def encodes(self, stage: Stage) -> bool:
-        """Whether clips can be encoded before a step of this stage, which then does not train what encodes them."""
+        """Return whether clips can be encoded before a step of this stage, because it does not train the codec."""
         return False
 
     def encoding(self) -> str:
-        """A fingerprint of what ``encode`` depends on besides the clips."""
+        """Return a hash of everything but the clips that ``encode`` depends on; ``NotImplementedError`` without it."""
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
     def encode(self, clips: Clips) -> ClipLatents:
-        """What of the clips can be kept between steps; ``forward`` takes it as ``Clips.latents``."""
+        """Return the clips' latents, which ``forward`` takes as ``Clips.latents``; needed where ``encodes`` is true."""
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
     @property
     def framewise(self) -> bool:
-        """Whether ``encode`` gives one latent frame a frame, each of its frame alone.
+        """Whether ``encode`` makes one latent frame of each frame, independent of the other frames.
 
-        The latents of a whole trajectory then serve all clips of it, and those of the first frame stand in the video's.
+        The latents of a trajectory are then computed once for all its clips, and ``image`` is the start of ``video``.
         """
         return False
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
-        """Last act of a stage: measure on some clips what training cannot learn; nothing by default."""
+        """End a stage by measuring on some clips what training does not learn, such as a scale; nothing by default."""
 
     @abstractmethod
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
-        """Clips that begin with the given frames.
+        """Generate clips from their first frames.
 
         Args:
-            first: clips whose rgb and depth hold the first frame only, whose cameras hold all frames. One that all
-                clips begin with may be given once, as a batch of one, and is then encoded once.
-            sampling: steps, sampler and guidance.
+            first: clips whose rgb and depth hold the first frame only and whose cameras hold all frames. When all clips
+                share their first frame, its rgb and depth may be a batch of one, which is encoded once.
+            sampling: steps, sampler and guidance, which ``check_sampling`` accepts.
 
         Returns:
-            rgb uint8 ``[batch, frame, height, width, 3]`` and depth float32 metres, the first frame as given; where
-            the backbone does not give depth, 0 after it.
+            rgb uint8 ``[batch, frame, height, width, 3]`` and depth float32 ``[batch, frame, height, width]``, planar z
+            in metres; the first frame is that of ``first``. Other frames have depth 0 unless ``gives_depth``.
         """
 
     @abstractmethod
     def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
-        """RGB and depth after the codec alone: the ceiling of what can be generated; 0 depth where none is given."""
+        """Return the clips encoded and decoded, in the form of ``generate``'s result: the limit of its quality."""
 
     @abstractmethod
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
-        """Add a fresh memory adapter for tokens of ``channels`` channels and use it."""
+        """Add a fresh memory adapter for tokens of ``channels`` channels, with settings of the recipe, and use it."""
 
     @abstractmethod
     def use_adapter(self, name: str | None) -> None:
-        """Use one of the adapters, or none: plain stage 1."""
+        """Use the adapter of this name, or none, as in stage 1; ``CheckpointError`` for an unknown name."""
 
     @property
     @abstractmethod
     def token_budget(self) -> int:
-        """How many memory tokens the adapter in use asks for."""
+        """The number of memory tokens that the adapter in use reads at most."""
 
     def checkpoint_settings(self) -> dict[str, Any]:
-        """Plain settings to make this backbone again and then ``load_base`` into it."""
+        """Return the settings, as JSON values, of a backbone into which ``load_base`` loads this one's weights."""
         return dataclasses.asdict(self.settings)
 
     @abstractmethod
     def save_base(self, folder: Path) -> None:
-        """Write all but the adapters into an existing folder, safetensors and JSON only."""
+        """Write all but the adapters into an existing folder, as safetensors and JSON files only."""
 
     @abstractmethod
     def save_adapter(self, folder: Path) -> None:
         """Write the adapter in use into an existing folder."""
 
     def origin(self) -> dict[str, Any]:
-        """Those of its settings that bring the pretrained weights it began with; none when it began fresh."""
+        """Return the settings that name the pretrained weights it started from; empty when there are none."""
         return {}
 
     def add_lora(self, lora: Lora) -> None:
-        """Let stage 1 train a change of low rank of the weights that are there, and what beside them is new.
+        """Let stage 1 train a low-rank change of the pretrained weights, and the new parameters in full.
 
         Raises:
-            PersistError: when this backbone or this installation cannot.
+            PersistError: when this backbone or this installation has no LoRA.
         """
         raise PersistError(f"backbone {self.name!r} has no LoRA; leave lora out")
 
     def save_lora(self, folder: Path) -> None:
-        """Write what stage 1 trains with LoRA, and nothing of the weights that it changes, into an existing folder."""
+        """Write the parameters that stage 1 trains with LoRA, not the pretrained ones, into an existing folder."""
         raise NotImplementedError(f"backbone {self.name!r} has no LoRA")
 
     @abstractmethod
     def load_base(self, folder: Path) -> None:
-        """Take the weights that ``save_base`` wrote; under torch's meta device only their shapes.
+        """Load the weights that ``save_base`` wrote, or merge those of ``save_lora`` into the weights that they change.
 
-        In a folder that ``save_lora`` wrote, they are those that it changes, changed.
+        Under torch's meta device only shapes are loaded.
 
         Raises:
-            CheckpointError: when a file is missing, corrupt or of another shape.
+            CheckpointError: when a file is missing or corrupt, or a tensor has another shape.
         """
 
     @abstractmethod
     def load_adapter(self, name: str, folder: Path) -> None:
-        """Add the adapter that ``save_adapter`` wrote, and use it."""
+        """Add the adapter that ``save_adapter`` wrote and use it; ``CheckpointError`` when its files do not fit."""

@@ -21,11 +21,11 @@ RIGID_TOLERANCE = 1e-2  # real captures store poses with three to four digits
 
 @dataclass(frozen=True)
 class Cameras:
-    """Posed pinhole cameras of one image size; any leading axes, usually one: the frame.
+    """Posed pinhole cameras of one image size; they have any leading axes, usually the frame alone.
 
     Args:
-        world_from_camera: rigid transforms in metres.
-        intrinsics: pixels, top-left pixel centre at (0.5, 0.5).
+        world_from_camera: rigid transforms in metres, OpenCV axes, usually float64.
+        intrinsics: pinhole matrices in pixels, top-left pixel centre at (0.5, 0.5).
         height: image height in pixels.
         width: image width in pixels.
     """
@@ -37,7 +37,7 @@ class Cameras:
 
     @property
     def centers(self) -> Float[Tensor, "*batch 3"]:
-        """Camera centres in world metres."""
+        """The camera centres in world metres."""
         return self.world_from_camera[..., :3, 3]
 
     def __len__(self) -> int:
@@ -47,7 +47,7 @@ class Cameras:
         return replace(self, world_from_camera=self.world_from_camera[index], intrinsics=self.intrinsics[index])
 
     def to(self, device: torch.device | str) -> Cameras:
-        """The same cameras on ``device``."""
+        """Return these cameras on ``device``."""
         return replace(
             self,
             world_from_camera=self.world_from_camera.to(device),
@@ -55,16 +55,16 @@ class Cameras:
         )
 
     def relative_to(self, reference: Float[Tensor, "4 4"]) -> Cameras:
-        """The same cameras in a world whose origin is the camera ``reference`` (world_from_camera)."""
+        """Return these cameras in the frame of the camera ``reference``, a world_from_camera in metres."""
         return replace(self, world_from_camera=invert_rigid(reference) @ self.world_from_camera)
 
     def resized(self, height: int, width: int) -> Cameras:
-        """The same views sampled at another size: intrinsics scaled with the pixels."""
+        """Return cameras with these views at another image size in pixels; intrinsics scale with it."""
         scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(self, intrinsics=self.intrinsics * scale[:, None], height=height, width=width)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Cameras:
-        """The window of ``height`` × ``width`` pixels at (``top``, ``left``): only the principal point moves."""
+        """Return cameras of a window of ``height`` × ``width`` pixels whose first pixel is (``top``, ``left``)."""
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, 2] -= left
         intrinsics[..., 1, 2] -= top
@@ -72,7 +72,7 @@ class Cameras:
 
     @staticmethod
     def stack(paths: Sequence[Cameras]) -> Cameras:
-        """A batch of camera paths of one length and image size."""
+        """Return a batch of camera paths, which have one length and one image size."""
         return replace(
             paths[0],
             world_from_camera=torch.stack([path.world_from_camera for path in paths]),
@@ -81,7 +81,7 @@ class Cameras:
 
     @staticmethod
     def concatenate(parts: Sequence[Cameras]) -> Cameras:
-        """One camera path of several, all of one image size."""
+        """Join camera paths of one image size along their frames."""
         return replace(
             parts[0],
             world_from_camera=torch.cat([part.world_from_camera for part in parts]),
@@ -90,7 +90,7 @@ class Cameras:
 
 
 def invert_rigid(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The inverse of a rigid transform, by transposing its rotation."""
+    """Return the inverses of rigid transforms, by transposing their rotations."""
     rotation = transform[..., :3, :3].transpose(-1, -2)
     inverse = torch.zeros_like(transform)
     inverse[..., :3, :3] = rotation
@@ -100,7 +100,7 @@ def invert_rigid(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batc
 
 
 def check_poses(poses: Float[Tensor, "frame 4 4"], where: str) -> None:
-    """Raise ``DataError`` naming ``where`` when a pose is not a finite rigid transform."""
+    """Raise ``DataError``, which begins with ``where``, when a pose is not a finite rigid transform (within 1 %)."""
     if not torch.isfinite(poses).all():
         frame = int((~torch.isfinite(poses).all(-1).all(-1)).nonzero()[0])
         raise DataError(f"{where}: the pose of frame {frame} is not finite")
@@ -117,7 +117,7 @@ def check_poses(poses: Float[Tensor, "frame 4 4"], where: str) -> None:
 
 
 def check_intrinsics(intrinsics: Float[Tensor, "3 3"], where: str) -> None:
-    """Raise ``DataError`` naming ``where`` when the matrix is no invertible pinhole matrix."""
+    """Raise ``DataError``, which begins with ``where``, when the matrix is no invertible pinhole matrix."""
     finite = bool(torch.isfinite(intrinsics).all())
     if not finite or intrinsics[0, 0] <= 0 or intrinsics[1, 1] <= 0 or abs(float(intrinsics[2, 2]) - 1) > 1e-6:
         values = [round(float(value), 3) for value in intrinsics.flatten()]

@@ -1,8 +1,8 @@
 """Checkpoints on disk: one base, and small memory adapters that load onto it by name.
 
-A checkpoint's folder holds the card ``persist.json``, the backbone's own files and ``adapters/NAME/``. That of a
-stage-2 run holds adapters only, and its card says where the base is. That of a LoRA run holds the change of low rank,
-and its card says what it changes. A run's folder stands for its newest checkpoint.
+A checkpoint's folder holds the card ``persist.json``, the backbone's own files and ``adapters/NAME/``. The folder of a
+stage-2 run holds adapters only, and its card says where the base is. The folder of a LoRA run holds the low-rank
+change, and its card says which weights it changes. A run's folder stands for its newest checkpoint.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 CARD: Final = "persist.json"
 VERSION: Final = 1
-STEP: Final = "step-"  # what the folders of a run's checkpoints begin with
-PLAIN: Final = "stage1"  # what the base without any adapter is called
+STEP: Final = "step-"  # start of the names of the folders of a run's checkpoints
+PLAIN: Final = "stage1"  # name of the base without any adapter
 SAMPLING_TYPES: Final = {"steps": (int,), "sampler": (str,), "memory_guidance": (int, float)}  # a bool is no int here
 NUMBERED: Final = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)", re.DOTALL)
 
@@ -42,7 +42,7 @@ class Checkpoint:
         fingerprint: a hash of the base's weights.
         adapters: folders of the memory adapters by name.
         default: the name of the adapter to use when a command names none.
-        sampling: how to sample when a command does not say; ``None`` when the card does not say either.
+        sampling: the default sampling settings of its card; ``None`` when the card has none.
         training_scenes: the scenes that base and adapters were trained on; ``None`` for cards of earlier versions.
     """
 
@@ -58,10 +58,10 @@ class Checkpoint:
     training_scenes: TrainingScenes | None = None
 
     def adapter_folder(self, adapter: str) -> Path:
-        """The adapter's folder.
+        """Return the folder of an adapter.
 
         Raises:
-            CheckpointError: when there is no such adapter, naming those that there are.
+            CheckpointError: when there is no such adapter; the message names those that there are.
         """
         if adapter not in self.adapters:
             known = ", ".join(self.adapters) or "none"
@@ -69,13 +69,13 @@ class Checkpoint:
         return self.adapters[adapter]
 
     def sampling_with(self, overrides: SamplingOverrides) -> Sampling:
-        """The overrides on top of the checkpoint's default, which else is 50 steps of DDIM without guidance."""
+        """Return the card's sampling settings, or else 50 steps of DDIM without guidance, with these overrides."""
         from persist_cli.api.backbone import Sampling
 
         return dataclasses.replace(self.sampling or Sampling(), **overrides.requested())
 
     def default_adapter(self) -> str | None:
-        """The card's default or only adapter, ``None`` when there is no adapter.
+        """Return the name of the card's default or only adapter, ``None`` when there is no adapter.
 
         Raises:
             CheckpointError: when there are several adapters and no default.
@@ -88,10 +88,10 @@ class Checkpoint:
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
-    """The checkpoint in a folder, or the newest of a run.
+    """Return the checkpoint in a folder, or the newest one of a run.
 
     Raises:
-        CheckpointError: when there is none, it is damaged, or its base is gone or another.
+        CheckpointError: when there is none, its card is damaged, or its base is missing or has other weights.
     """
     folder = model_folder(path)
     card = read_card(folder)
@@ -111,13 +111,13 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
 
 def lora_base(folder: Path) -> Path | dict[str, Any] | None:
-    """What the LoRA in a base's folder changes, ``None`` for a base that is whole.
+    """Return where the weights are that the LoRA in a base's folder changes, ``None`` for a base without LoRA.
 
     Returns:
-        The folder of another base, or those settings of the backbone that bring pretrained weights.
+        The folder of another base, or the settings of the backbone that name its pretrained weights.
 
     Raises:
-        CheckpointError: when that base is gone or another.
+        CheckpointError: when that base is missing or has other weights.
     """
     changes = read_card(folder).get("changes") if (folder / CARD).is_file() else None
     if changes is None:
@@ -128,17 +128,17 @@ def lora_base(folder: Path) -> Path | dict[str, Any] | None:
 
 
 def step_folders(run: Path) -> list[Path]:
-    """Whole checkpoints of a run, the newest last."""
+    """Return the folders of a run's complete checkpoints, the newest last."""
     return sorted(folder for folder in run.glob(f"{STEP}*") if folder.is_dir())
 
 
 def run_folder(folder: Path) -> Path:
-    """The run whose checkpoint a folder is, else the folder itself."""
+    """Return the folder of the run that a checkpoint's folder belongs to, else the folder itself."""
     return folder.parent.parent if folder.parent.name.startswith(STEP) else folder
 
 
 def model_folder(path: Path) -> Path:
-    """The folder itself, or that of the newest checkpoint of a run."""
+    """Return the folder if it has a card, else that of the newest checkpoint in it, or raise ``CheckpointError``."""
     if (path / CARD).is_file():
         return path
     steps = step_folders(path)
@@ -148,7 +148,7 @@ def model_folder(path: Path) -> Path:
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """A checkpoint's card, whole and of the version that this ``persist`` reads."""
+    """Return a checkpoint's card; ``CheckpointError`` when it is missing, incomplete or of another version."""
     path = folder / CARD
     card = read_json(path)
     if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
@@ -165,8 +165,8 @@ class TrainingScenes:
     """Names of the scenes that a model was trained on.
 
     Args:
-        names: as trajectories give them.
-        complete: whether these are known to be all.
+        names: values of ``TrajectoryInfo.scene``.
+        complete: whether the model is known to have seen no other scene.
     """
 
     names: frozenset[str] = frozenset()
@@ -176,12 +176,12 @@ class TrainingScenes:
         return TrainingScenes(self.names | other.names, self.complete and other.complete)
 
     def to_json(self) -> dict[str, Any]:
-        """JSON values, with the names as ``name_ranges`` writes them."""
+        """Return JSON values, with the names as ``name_ranges`` returns them."""
         return {"complete": self.complete, "names": name_ranges(self.names)}
 
     @staticmethod
     def from_json(values: Any) -> TrainingScenes:
-        """The scenes that ``to_json`` wrote.
+        """Return the scenes that ``to_json`` wrote.
 
         Raises:
             ValueError: when the values are anything else.
@@ -193,7 +193,7 @@ class TrainingScenes:
 
 
 def name_ranges(names: Iterable[str]) -> list[str | list[str]]:
-    """The names in order, consecutive numbers as first and last: a1, a2, a3, b becomes ["a1", "a3"], "b".
+    """Return names in order, with consecutive numbers as first and last: a1, a2, a3, b becomes ["a1", "a3"], "b".
 
     Only numbers of equally many digits make a range: 8, 9, 10 becomes ["8", "9"], "10".
     """
@@ -207,7 +207,7 @@ def name_ranges(names: Iterable[str]) -> list[str | list[str]]:
 
 
 def _open_base(folder: Path, pointer: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
-    """The folder and the card of the base that a checkpoint points to, if it is still the one it was trained on."""
+    """Return folder and card of the base that a card points to; ``CheckpointError`` when its weights are others."""
     base = model_folder((folder / pointer["base"]).resolve())
     card = read_card(base)
     if card["fingerprint"] != str(pointer.get("fingerprint", "")):
@@ -216,7 +216,7 @@ def _open_base(folder: Path, pointer: Mapping[str, Any]) -> tuple[Path, dict[str
 
 
 def _sampling(card: dict[str, Any], path: Path) -> Sampling | None:
-    """The default sampling of a checkpoint's card, ``None`` when it has none."""
+    """Return the default sampling settings of a checkpoint's card, ``None`` when it has none."""
     from persist_cli.api.backbone import Sampling
 
     value = card.get("sampling")
@@ -241,7 +241,7 @@ def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:
 
 
 def _split_number(name: str) -> tuple[str, int, int]:
-    """The text before the final digits of a name, how many digits there are, and their number; -1 without any."""
+    """Return the text before a name's final digits, their count and their value; the value is -1 without digits."""
     match = NUMBERED.fullmatch(name)
     return (match["prefix"], len(match["number"]), int(match["number"])) if match else (name, 0, -1)
 

@@ -1,4 +1,4 @@
-"""The abstract encoder: images to feature maps, what memories are made of."""
+"""The abstract encoder, which turns images into the feature maps that memories store."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from persist_cli.io.settings import NoSettings
 
 
 class Encoder(ABC):
-    """Turns RGB images into a coarse grid of features, the same for the same image.
+    """Turns RGB images into coarse grids of features; equal images give equal features.
 
     Args:
-        settings: an instance of ``settings_type``.
+        settings: an instance of ``settings_type``, a dataclass of the recipe's settings.
     """
 
     settings_type: ClassVar[type] = NoSettings
@@ -28,17 +28,17 @@ class Encoder(ABC):
     @property
     @abstractmethod
     def channels(self) -> int:
-        """Number of feature channels."""
+        """The number of feature channels."""
 
     @property
     def channels_by_name(self) -> int:
-        """The same for a plan, without the weights where their width is known by their name."""
+        """The number of feature channels for estimates, without loading weights where their name tells it."""
         return self.channels
 
     @abstractmethod
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
-        """Features on a grid that covers the image evenly, float32."""
+        """Return float32 features on a grid that covers the image evenly, on the encoder's device."""
 
     def to(self, device: torch.device | str) -> Encoder:
-        """The encoder on ``device``; those without weights of their own stay as they are."""
+        """Return the encoder on ``device``; by default, without weights of its own, it stays as it is."""
         return self

@@ -10,7 +10,7 @@ from persist_cli.api.cameras import Cameras, invert_rigid
 
 
 def pixel_centers(height: int, width: int, device: torch.device | None = None) -> Float[Tensor, "height width 2"]:
-    """Pixel centres (u, v) in pixels, the top-left one at (0.5, 0.5), float64."""
+    """Return the pixel centres (u, v) of an image in pixels, the top-left one at (0.5, 0.5), float64."""
     rows = torch.arange(height, dtype=torch.float64, device=device) + 0.5
     columns = torch.arange(width, dtype=torch.float64, device=device) + 0.5
     v, u = torch.meshgrid(rows, columns, indexing="ij")
@@ -18,7 +18,7 @@ def pixel_centers(height: int, width: int, device: torch.device | None = None) -
 
 
 def camera_rays(cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
-    """K⁻¹ (u, v, 1)ᵀ of every pixel: rays in the camera's frame with z = 1."""
+    """Return the ray K⁻¹ (u, v, 1)ᵀ of every pixel in its camera's frame, with z = 1, float64."""
     pixels = pixel_centers(cameras.height, cameras.width, cameras.intrinsics.device)
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
     inverse = torch.linalg.inv(cameras.intrinsics.double())
@@ -26,14 +26,14 @@ def camera_rays(cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
 
 
 def transform(matrix: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Points moved by rigid transforms; the leading axes of ``matrix`` match the first of ``points``."""
+    """Move points by rigid transforms; the leading axes of ``matrix`` match the first axes of ``points``."""
     extra = points.ndim - 1 - (matrix.ndim - 2)
     matrix = matrix.reshape(*matrix.shape[:-2], *([1] * extra), 4, 4)
     return (matrix[..., :3, :3] @ points[..., None])[..., 0] + matrix[..., :3, 3]
 
 
 def unproject(depth: Float[Tensor, "*batch height width"], cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
-    """World points of every pixel, float64 metres.
+    """Return the world point of every pixel, float64 metres.
 
     Args:
         depth: planar z in metres; where it is 0 (missing) the point is the camera centre.
@@ -47,9 +47,9 @@ def unproject(depth: Float[Tensor, "*batch height width"], cameras: Cameras) -> 
 def project(
     points: Float[Tensor, "*batch point 3"], cameras: Cameras
 ) -> tuple[Float[Tensor, "*batch point 2"], Float[Tensor, "*batch point"]]:
-    """Pixels (u, v) and planar depth z in metres of world points, float64.
+    """Return pixels (u, v) and planar depths z in metres of world points, which are in metres; both are float64.
 
-    Points behind a camera have z ≤ 0; their pixels mean nothing.
+    Points behind a camera have z ≤ 0; their pixels have no meaning.
     """
     local = transform(invert_rigid(cameras.world_from_camera.double()), points.double())
     depth = local[..., 2]
@@ -59,14 +59,14 @@ def project(
 
 
 def nearest_at(places: Int64[Tensor, " point"], depth: Float[Tensor, " point"], count: int) -> Float[Tensor, " place"]:
-    """A z-buffer: the least depth that falls on each of ``count`` places, infinite where none does."""
+    """Return a z-buffer: the least depth at each of ``count`` places, numbered from 0; infinity where there is none."""
     return depth.new_full((count,), torch.inf).scatter_reduce(0, places, depth, "amin")
 
 
 def pose_differences(
     first: Float[Tensor, "*pose 4 4"], second: Float[Tensor, "*pose 4 4"]
 ) -> tuple[Float[Tensor, "*pose"], Float[Tensor, "*pose"]]:
-    """Metres between the origins of poses, and degrees of the turn from one to the other."""
+    """Return the distance in metres between the origins of poses, and the angle between them in 0…180 degrees."""
     metres = (first[..., :3, 3] - second[..., :3, 3]).norm(dim=-1)
     relative = first[..., :3, :3].transpose(-1, -2) @ second[..., :3, :3]
     cosine = (relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
@@ -74,11 +74,11 @@ def pose_differences(
 
 
 def plucker(cameras: Cameras, printed: bool = False) -> Float[Tensor, "*batch height width 6"]:
-    """Plücker embedding (o × d, d) of every pixel's ray, d = R K⁻¹ (u, v, 1)ᵀ (PEWM, camera condition).
+    """Return the Plücker embedding (o × d, d) of each pixel's ray, d = R K⁻¹ (u, v, 1)ᵀ (PEWM, camera condition).
 
     Args:
-        cameras: in the frame in which the rays are wanted.
-        printed: add the translation to the direction as the paper prints it; a direction must not contain it.
+        cameras: cameras in the frame of the returned rays; o is in metres.
+        printed: whether d includes the translation, as the paper prints it, although a direction has none.
     """
     rotation = cameras.world_from_camera.double()[..., :3, :3]
     origin = cameras.centers.double()[..., None, None, :]
@@ -92,7 +92,13 @@ def plucker(cameras: Cameras, printed: bool = False) -> Float[Tensor, "*batch he
 def in_view(
     points: Float[Tensor, "point 3"], camera: Cameras, near: float = 0.0
 ) -> tuple[Tensor, Float[Tensor, "point 2"], Float[Tensor, " point"]]:
-    """Which points fall into the image of one camera, with their pixels and planar depths."""
+    """Return whether each point is in the image of one camera, with its pixel (u, v) and its planar depth in metres.
+
+    Args:
+        points: world metres.
+        camera: one camera without leading axes.
+        near: metres; a point that is not deeper than this is not in view.
+    """
     pixels, depth = project(points, camera)
     u, v = pixels.unbind(-1)
     visible = (depth > near) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)

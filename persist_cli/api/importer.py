@@ -12,12 +12,12 @@ from persist_cli.api.observations import Frame, TrajectoryInfo
 
 @dataclass(frozen=True)
 class ForeignTrajectory:
-    """One trajectory of a foreign data set, its frames read only when asked for.
+    """One trajectory of a foreign data set; a frame is read when the iterator comes to it.
 
     Args:
-        name: unique within the data set, fit for a file name.
-        info: what holds for every frame.
-        frames: every frame in order, already in the project's convention.
+        name: unique within the data set and fit for a file name.
+        info: scene, camera and vocabulary, which all frames share.
+        frames: every frame in order, converted to OpenCV axes, metres and planar z.
         length: number of frames, for the progress bar.
     """
 
@@ -28,14 +28,14 @@ class ForeignTrajectory:
 
 
 class Importer(ABC):
-    """Reads one foreign format; OpenCV axes, metres and planar z leave it, whatever came in."""
+    """Reads one foreign format and converts it to OpenCV axes, metres and planar z."""
 
     name: str = ""  # set by the registry
 
     @abstractmethod
     def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
-        """Every trajectory under ``source``.
+        """Yield every trajectory under the file or folder ``source``.
 
         Raises:
-            DataError: naming the file that is missing, truncated or wrong.
+            DataError: when a file is missing, truncated or wrong; the message names the file.
         """

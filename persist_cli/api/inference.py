@@ -1,4 +1,4 @@
-"""How clips are sampled: where and how precisely, and which steps, sampler and guidance a command wants."""
+"""Options of sampling: device and precision on one side; steps, sampler and guidance on the other."""
 
 from __future__ import annotations
 
@@ -12,22 +12,20 @@ if TYPE_CHECKING:
     import torch
 
 Precision = Literal["float32", "bfloat16", "float16"]
-
 Offload = Literal["none", "model", "sequential"]
-
 SAVINGS = ("model-offload", "sequential-offload", "vae-slicing", "vae-tiling")
 
 
 @dataclass(frozen=True)
 class InferenceOptions:
-    """How a backbone is placed for sampling.
+    """Precision and memory savings of a backbone that samples.
 
     Args:
-        dtype: of weights and activations; ``None`` leaves the checkpoint's.
-        offload: weights rest on the CPU: ``model`` brings a whole part to the accelerator when its turn comes,
-            ``sequential`` one layer at a time, for far less memory and far slower.
-        slicing: the codec takes one video at a time.
-        tiling: the codec takes a large image in overlapping tiles; where they meet, results differ slightly.
+        dtype: precision of weights and activations; ``None`` keeps the checkpoint's.
+        offload: ``model`` keeps weights on the CPU and moves one part, such as the codec, to the accelerator when it
+            is needed; ``sequential`` moves one layer at a time, with far less memory and far slower.
+        slicing: whether the codec takes one video at a time.
+        tiling: whether the codec takes large images in overlapping tiles, whose seams change results slightly.
     """
 
     dtype: Precision | None = None
@@ -37,37 +35,37 @@ class InferenceOptions:
 
     @classmethod
     def of(cls, dtype: str | None, save_memory: str | None) -> Self:
-        """What the options ``--dtype`` and ``--save-memory`` ask for.
+        """Return what the texts of ``--dtype`` and ``--save-memory`` mean.
 
         Args:
-            dtype: a ``Precision`` by name.
-            save_memory: some of ``SAVINGS``, separated by commas.
+            dtype: name of a ``Precision``.
+            save_memory: names of ``SAVINGS``, separated by commas.
 
         Raises:
-            PersistError: for an unknown word, and for both ways of offloading at once.
+            PersistError: for an unknown name, and for both kinds of offloading at once.
         """
         words = [word.strip() for word in (save_memory or "").split(",") if word.strip()]
         known = {"dtype": ([dtype] if dtype else [], get_args(Precision)), "save-memory": (words, SAVINGS)}
-        for option, (given, allowed) in known.items():
-            for word in given:
+        for option, (names, allowed) in known.items():
+            for word in names:
                 if word not in allowed:
                     raise PersistError(f"unknown --{option} {word!r}; {hint(word, allowed)}")
         if {"model-offload", "sequential-offload"} <= set(words):
             raise PersistError("--save-memory has model-offload and sequential-offload; give one of them")
-        ways: dict[str, Offload] = {"model-offload": "model", "sequential-offload": "sequential"}
-        offload = next((way for word, way in ways.items() if word in words), "none")
+        offloads: dict[str, Offload] = {"model-offload": "model", "sequential-offload": "sequential"}
+        offload = next((offload for word, offload in offloads.items() if word in words), "none")
         return cls(dtype, offload, "vae-slicing" in words, "vae-tiling" in words)  # type: ignore[arg-type]
 
     def changes(self) -> dict[str, Any]:
-        """What of it changes results, JSON values; empty for a checkpoint as it is."""
-        asked = {"dtype": self.dtype, "tiling": self.tiling}
-        return {name: value for name, value in asked.items() if value}
+        """Return the options that change results as JSON values; empty for a checkpoint as it is."""
+        options = {"dtype": self.dtype, "tiling": self.tiling}
+        return {name: value for name, value in options.items() if value}
 
     def device(self) -> torch.device:
-        """The accelerator of this process, else the CPU.
+        """Return the accelerator of this process, or the CPU when there is none.
 
         Raises:
-            PersistError: when there is no accelerator that weights could be brought to.
+            PersistError: when there is no accelerator, but ``offload`` needs one.
         """
         import torch
 
@@ -83,12 +81,12 @@ class InferenceOptions:
 
 @dataclass(frozen=True)
 class SamplingOverrides:
-    """The options of a command that say how to sample; ``None`` leaves a choice to the checkpoint.
+    """The options of a command that say how to sample; ``None`` keeps the checkpoint's.
 
     Args:
-        steps: denoising steps.
-        sampler: the name of one of the backbone's samplers.
-        memory_guidance: weight of classifier-free guidance over memory; 1 means none.
+        steps: number of denoising steps, at least 1.
+        sampler: name of one of the backbone's samplers.
+        memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
     """
 
     steps: int | None = None
@@ -96,5 +94,5 @@ class SamplingOverrides:
     memory_guidance: float | None = None
 
     def requested(self) -> dict[str, Any]:
-        """The options that are not left to the checkpoint, by name."""
+        """Return the options that are not ``None`` by name."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}

@@ -1,4 +1,4 @@
-"""The abstract memory of a scene: written from posed RGB-D, read by the cameras that will look."""
+"""The abstract memory of a scene, which is written from posed RGB-D frames and read for cameras to come."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class FrameOfReference:
-    """Which world a memory's metres belong to.
+    """The world in which a memory's positions are given.
 
     Args:
-        name: the scene; memories of one name share their origin.
-        world_up: unit vector.
+        name: name of the scene; memories with one name share the world's origin.
+        world_up: unit vector that points up in the world.
     """
 
     name: str
@@ -40,12 +40,12 @@ class FrameOfReference:
 
 @dataclass(frozen=True)
 class MemoryFigures:
-    """Figures of a memory about itself.
+    """The size of a memory.
 
     Args:
-        cells: stored places (cells, snapshots, …).
-        bytes: size of what is stored.
-        bounds: lowest and highest corner in world metres, ``None`` when empty.
+        cells: number of stored items (cells, snapshots, …).
+        bytes: size of the stored tensors in bytes.
+        bounds: lowest and highest corner in world metres, ``None`` without points.
     """
 
     cells: int
@@ -55,12 +55,12 @@ class MemoryFigures:
 
 @dataclass(frozen=True)
 class MapPoints:
-    """What a memory looks like: coloured points for drawing, never for the model.
+    """Coloured points that draw a memory; the model does not use them.
 
     Args:
         positions: world metres, float64.
         colors: uint8 RGB.
-        spread: metres across of what each point stands for.
+        spread: side in metres of the square that is drawn for each point.
     """
 
     positions: Float[Tensor, "point 3"]
@@ -72,9 +72,9 @@ class Memory(ABC):
     """A memory of one scene.
 
     Args:
-        settings: an instance of ``settings_type``.
-        encoder: what turns images into features.
-        reference: the world that positions belong to.
+        settings: an instance of ``settings_type``, a dataclass of the recipe's settings.
+        encoder: turns images into the features that are stored.
+        reference: the world in which positions are given.
     """
 
     settings_type: ClassVar[type] = NoSettings
@@ -87,61 +87,74 @@ class Memory(ABC):
 
     @abstractmethod
     def write(self, observations: Observations) -> None:
-        """Take in posed frames; those without valid depth leave out what cannot be placed."""
+        """Add posed frames, in metres of the reference's world; pixels without depth (0) have no place in it.
+
+        Raises:
+            DataError: when a pose is not finite and rigid, or sizes differ; then nothing is written.
+        """
 
     @abstractmethod
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
-        """At most ``budget`` tokens of what the cameras will look at, the most relevant first."""
+        """Return the tokens that matter most to a path of cameras, the most relevant first, as an unbatched sample.
+
+        Args:
+            cameras: posed cameras with the frame axis alone, in the reference's world.
+            budget: largest number of tokens, at least 0.
+        """
 
     def read_batch(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
-        """What ``read`` gives each of several askers, each with the whole budget of its own.
+        """Return for each camera path what ``read`` returns for it with the whole budget.
 
-        A memory that can look once for all of them overrides this; every asker gets what it would get alone.
+        A memory overrides this when it can search once for all paths; the results must be those of ``read``.
         """
-        return [self.read(each, budget) for each in cameras]
+        return [self.read(path, budget) for path in cameras]
 
     def copy(self) -> Self:
-        """Another memory that holds the same; what is written into one of both does not change the other."""
-        twin = type(self)(self.settings, self.encoder, self.reference)
-        twin.restore({name: tensor.clone() for name, tensor in self.tensors().items()})
-        return twin
+        """Return a memory with the same content; writing into one of the two does not change the other."""
+        copy = type(self)(self.settings, self.encoder, self.reference)
+        copy.restore({name: tensor.clone() for name, tensor in self.tensors().items()})
+        return copy
 
     @abstractmethod
     def tensors(self) -> dict[str, Tensor]:
-        """Everything stored, in an order that does not depend on how it was written."""
+        """Return the stored tensors by name, in an order that does not depend on the order of writing."""
 
     @abstractmethod
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Replace what is stored by what ``tensors()`` gave; an empty dictionary empties the memory."""
+        """Replace the content by tensors that ``tensors()`` returned; an empty dictionary empties the memory.
+
+        Raises:
+            CheckpointError: when they are not tensors of this memory; then the content stays as it was.
+        """
 
     def to(self, device: torch.device | str) -> Self:
-        """This memory, encoding and holding what it holds on ``device``; an empty one goes where it is written from."""
+        """Move this memory and its encoder to ``device`` and return it; an empty one follows the frames written."""
         self.encoder = self.encoder.to(device)
         self.restore({name: tensor.to(device) for name, tensor in self.tensors().items()})
         return self
 
     def merge(self, other: Memory) -> None:
-        """Take in another memory of the same kind and frame of reference."""
+        """Add the content of another memory, of one kind and reference; ``CheckpointError`` when they do not match."""
         raise CheckpointError(f"a memory of kind {self.name!r} cannot be merged")
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Empty the memory."""
         self.restore({})
 
     def points(self) -> MapPoints:
-        """Coloured points for drawing the memory; none unless the memory has some."""
+        """Return coloured points for drawing the memory; by default there are none."""
         return MapPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8))
 
     def figures(self) -> MemoryFigures:
-        """Cells, bytes and bounds."""
+        """Return the number of stored items, their bytes and their bounds."""
         tensors = self.tensors()
         positions = self.points().positions
-        low_high = (tuple(positions.amin(0).tolist()), tuple(positions.amax(0).tolist())) if len(positions) else None
+        bounds = (tuple(positions.amin(0).tolist()), tuple(positions.amax(0).tolist())) if len(positions) else None
         size = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
-        return MemoryFigures(max((len(tensor) for tensor in tensors.values()), default=0), size, low_high)
+        return MemoryFigures(max((len(tensor) for tensor in tensors.values()), default=0), size, bounds)
 
     def header(self) -> dict[str, Any]:
-        """What a memory file says about itself, JSON values."""
+        """Return the JSON values that a memory file holds beside its tensors: kind, settings, encoder, reference."""
         return {
             "format": "persist-memory",
             "version": FORMAT_VERSION,
@@ -156,5 +169,5 @@ class Memory(ABC):
         }
 
     def save(self, path: Path) -> None:
-        """Write a memory file: safetensors with a versioned header, written aside and renamed."""
+        """Write a memory file, whole or not at all: safetensors with ``header()``; ``OSError`` when it cannot be."""
         write_tensors(path, self.tensors(), {"persist": json.dumps(self.header())})

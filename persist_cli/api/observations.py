@@ -1,4 +1,4 @@
-"""Observations and trajectories: posed RGB-D frames, the actions between them, where they came from."""
+"""Observations and trajectories: posed RGB-D frames, the actions between them, and their source."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from persist_cli.api.cameras import Cameras
 
 @dataclass(frozen=True)
 class Frame:
-    """One posed RGB-D image as a simulator or importer gives it.
+    """One posed RGB-D image of a simulator or importer.
 
     Args:
         rgb: ``[height, width, 3]`` uint8.
         depth: ``[height, width]`` float32 metres, planar z, 0 = missing.
         world_from_camera: ``[4, 4]`` float64, OpenCV axes, metres.
-        action: what the agent does at this frame, leading to the next; ``None`` at the last.
-        timestamp: seconds.
+        action: name of the agent's action that leads to the next frame; ``None`` at the last.
+        timestamp: seconds since any fixed time.
     """
 
     rgb: np.ndarray[Any, Any]
@@ -36,16 +36,16 @@ class Frame:
 
 @dataclass(frozen=True)
 class TrajectoryInfo:
-    """What holds for every frame of a trajectory.
+    """Properties that all frames of a trajectory share.
 
     Args:
-        scene: names the frame of reference; trajectories of one scene share the world's origin.
+        scene: name of the frame of reference; trajectories of one scene share the world's origin.
         intrinsics: ``[3, 3]`` float64, pixels, top-left pixel centre at (0.5, 0.5).
-        height: pixels.
-        width: pixels.
-        world_up: unit vector in the world.
+        height: image height in pixels.
+        width: image width in pixels.
+        world_up: unit vector that points up in the world.
         vocabulary: the agent's actions with their units.
-        source: where it came from, JSON values.
+        source: JSON values about the origin of the data.
     """
 
     scene: str
@@ -64,7 +64,7 @@ class Observations:
     Args:
         rgb: uint8.
         depth: float32 metres, planar z, 0 = missing.
-        cameras: one for each frame.
+        cameras: one camera for each frame, of the images' size.
     """
 
     rgb: UInt8[Tensor, "frame height width 3"]
@@ -78,12 +78,12 @@ class Observations:
         return replace(self, rgb=self.rgb[index], depth=self.depth[index], cameras=self.cameras[index])
 
     def to(self, device: torch.device | str) -> Observations:
-        """The same frames on ``device``."""
+        """Return these frames on ``device``."""
         return Observations(self.rgb.to(device), self.depth.to(device), self.cameras.to(device))
 
     @staticmethod
     def concatenate(parts: Sequence[Observations]) -> Observations:
-        """One sequence of several, all of one image size."""
+        """Join sequences of frames of one image size."""
         return Observations(
             torch.cat([part.rgb for part in parts]),
             torch.cat([part.depth for part in parts]),
@@ -98,9 +98,9 @@ class Trajectory:
     Args:
         name: unique within its data set.
         observations: the frames.
-        actions: one for each frame; ``actions[i]`` leads from frame i to i + 1, the last may be ``None``.
-        info: what holds for every frame.
-        first: number of the first of these frames in the whole trajectory.
+        actions: one name for each frame; ``actions[i]`` leads from frame i to i + 1, the last may be ``None``.
+        info: properties that all frames share.
+        first: number of the first of these frames in the whole trajectory, counted from 0.
     """
 
     name: str
@@ -111,7 +111,7 @@ class Trajectory:
 
     @property
     def world_up(self) -> Float[Tensor, " 3"]:
-        """Unit vector, float64."""
+        """The unit vector that points up in the world, float64."""
         return torch.tensor(self.info.world_up, dtype=torch.float64)
 
     def __len__(self) -> int:

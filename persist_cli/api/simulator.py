@@ -13,13 +13,13 @@ from persist_cli.api.observations import Frame, TrajectoryInfo
 
 @dataclass(frozen=True)
 class AgentSettings:
-    """The agent's camera and gait.
+    """The image size and the step lengths of the agent.
 
     Args:
         height: image height in pixels.
         width: image width in pixels.
-        step: metres of a step.
-        turn: degrees of a turn.
+        step: length of a step in metres.
+        turn: angle of a turn in degrees.
     """
 
     height: int = 64
@@ -29,7 +29,7 @@ class AgentSettings:
 
 
 class Simulator(ABC):
-    """Scenes numbered by seed, each the same every time, with one walking agent.
+    """Scenes numbered by seed, with one walking agent; a seed always gives the same scene.
 
     Args:
         settings: an instance of ``settings_type``.
@@ -43,46 +43,54 @@ class Simulator(ABC):
 
     @abstractmethod
     def open_scene(self, scene: int) -> None:
-        """Generate the scene of this seed."""
+        """Generate the scene of this seed, at least 0; ``place`` then puts the agent into it."""
 
     @abstractmethod
     def place(self, ground: tuple[float, float], heading: float) -> None:
-        """Put the agent at a free ground position (metres) with a heading in radians, left turns positive."""
+        """Put the agent at a ground position in metres, with a heading in radians that left turns increase.
+
+        Raises:
+            DataError: when the position is not free.
+        """
 
     @abstractmethod
     def observe(self) -> Frame:
-        """What the agent sees now."""
+        """Return the image, depth and pose of the agent's camera now."""
 
     @abstractmethod
     def act(self, action: str) -> bool:
-        """Do an action; false, and nothing changed, where the world does not allow it."""
+        """Do an action and return true; return false and change nothing where the scene does not allow it.
+
+        Raises:
+            DataError: for an action that is not in the vocabulary.
+        """
 
     @property
     @abstractmethod
     def agent(self) -> tuple[tuple[float, float], float]:
-        """Ground position in metres and heading in radians."""
+        """The agent's ground position in metres and its heading in radians."""
 
     @abstractmethod
     def is_free(self, ground: tuple[float, float]) -> bool:
-        """Whether the agent could stand there."""
+        """Return whether the agent could stand at this ground position in metres."""
 
     @abstractmethod
     def ahead(self, heading: float) -> tuple[float, float]:
-        """Unit ground direction of a heading."""
+        """Return the unit vector on the ground that a heading in radians points along."""
 
     @property
     @abstractmethod
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Lowest and highest ground corner of the scene in metres."""
+        """The lowest and the highest ground corner of the scene in metres."""
 
     @property
     @abstractmethod
     def info(self) -> TrajectoryInfo:
-        """Camera, up axis, vocabulary and provenance of the open scene."""
+        """The camera, up axis, vocabulary and source of the open scene."""
 
 
 def random_ground(simulator: Simulator, random: np.random.Generator, tries: int = 500) -> tuple[float, float] | None:
-    """A free ground position, or ``None`` when none was found in so many tries."""
+    """Return a random free ground position in metres, or ``None`` when ``tries`` draws gave no free one."""
     low, high = simulator.bounds
     for _ in range(tries):
         x, y = random.uniform(low, high)

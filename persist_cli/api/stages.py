@@ -1,4 +1,4 @@
-"""The stages of training a backbone, and what is said of them: its parts, cheaper steps, a change of low rank."""
+"""The stages of training a backbone and their options: parameter groups, memory savings and LoRA."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from pydantic import Field
 from torch import nn
 
 Stage = Literal["codec", "1", "2"]
-
 STAGES: tuple[Stage, ...] = ("codec", "1", "2")
 
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Some of a backbone's parameters under a name that people know.
+    """Some of a backbone's parameters under a name for people.
 
     Args:
-        name: of the part.
-        parameters: by their names in the backbone.
-        new: whether they begin fresh even where the rest is pretrained.
+        name: name of the group, as in tables.
+        parameters: parameters by their names in the backbone.
+        new: whether they are initialised at random although others are pretrained.
     """
 
     name: str
@@ -32,13 +31,13 @@ class ParameterGroup:
 
 @dataclass(frozen=True)
 class MemorySavings:
-    """What makes a training step cheaper and changes nothing but rounding.
+    """Options that make a training step cheaper and change its result by rounding only.
 
     Args:
-        gradient_checkpointing: compute hidden states between blocks again in the backward pass.
-        compile: the blocks, by ``torch.compile``.
-        frozen: precision of the weights that the stage does not train; ``None`` leaves them theirs.
-        vae_slicing: encode clips one by one.
+        gradient_checkpointing: whether the backward pass computes hidden states of blocks again.
+        compile: whether ``torch.compile`` compiles the blocks.
+        frozen: precision of the weights that the stage does not train; ``None`` keeps theirs.
+        vae_slicing: whether clips are encoded one by one.
     """
 
     gradient_checkpointing: bool = False
@@ -49,12 +48,12 @@ class MemorySavings:
 
 @dataclass(frozen=True)
 class Lora:
-    """A change of low rank that stage 1 trains instead of all weights (LoRA).
+    """A low-rank change that stage 1 trains instead of all weights (LoRA, Hu et al. 2021).
 
     Args:
-        rank: of the change of each layer.
-        alpha: the change counts alpha / rank; by default as much as the rank.
-        targets: ends of the names of the linear layers that are changed.
+        rank: rank of the change of each layer, at least 1.
+        alpha: positive; the change is scaled by alpha / rank. ``None`` means alpha = rank.
+        targets: final parts of the names of the linear layers that are changed.
     """
 
     rank: Annotated[int, Field(ge=1)] = 64

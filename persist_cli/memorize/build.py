@@ -1,4 +1,4 @@
-"""``persist memorize``: posed RGB-D into a memory file, or several memory files into one."""
+"""``persist memorize``: write posed RGB-D into a memory file, or merge several memory files."""
 
 from __future__ import annotations
 
@@ -21,32 +21,33 @@ from persist_cli.viewing.map import draw_map
 
 
 def run_memorize(data: list[str], plan: MemorizePlan, out: Path, json: bool) -> None:
-    """Write the memory of some frames and its map from above, and say what is in it.
+    """Write the memory of some frames and its map from above, and print its size.
 
     Args:
-        data: references to frames of one scene.
-        plan: which memory, and what it is made of.
-        out: memory file; the map is written beside it as PNG.
-        json: print JSON instead of a table.
+        data: references to frames of one scene, as in ``runs/houses#0:0-48``.
+        plan: name and settings of the memory and its encoder.
+        out: memory file to write; the map is written beside it as PNG.
+        json: whether JSON is printed instead of a table.
     """
     _check_out(out)
-    chosen, origin = resolve_memory_config(plan)
+    config, origin = resolve_memory_config(plan)
     sources = find_sources(data)
-    encoder = make_encoder(chosen.encoder, chosen.encoder_settings)
-    made = make_memory(chosen.name, chosen.settings, encoder, common_reference(sources))
-    seconds = write_sources(made, sources)
+    encoder = make_encoder(config.encoder, config.encoder_settings)
+    memory = make_memory(config.name, config.settings, encoder, common_reference(sources))
+    seconds = write_sources(memory, sources)
     frames = sum(len(source.frames) for source in sources)
     paths = {source.file.name: source.file.poses()[source.frames.start : source.frames.stop] for source in sources}
-    _finish(made, paths, out, json, {"frames": frames, "frames_per_second": frames / seconds, "settings_of": origin})
+    rate = frames / seconds
+    _save_and_print(memory, paths, out, json, {"frames": frames, "frames_per_second": rate, "settings_of": origin})
 
 
 def run_merge(paths: list[Path], out: Path, json: bool) -> None:
-    """Write what several memory files of one frame of reference hold together, with its map from above.
+    """Write the union of several memory files of one scene and its map from above, and print its size.
 
     Args:
-        paths: memory files.
-        out: memory file to write.
-        json: print JSON instead of a table.
+        paths: memory files, at least two.
+        out: memory file to write; the map is written beside it as PNG.
+        json: whether JSON is printed instead of a table.
     """
     if len(paths) < 2:
         raise CheckpointError("nothing to merge; name two memory files or more, as in --merge A B")
@@ -57,11 +58,11 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
             merged.merge(load_memory(path))
         except CheckpointError as error:
             raise CheckpointError(f"{paths[0]} and {path}: {error}") from error
-    _finish(merged, {}, out, json, {"merged": len(paths)})
+    _save_and_print(merged, {}, out, json, {"merged": len(paths)})
 
 
 def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
-    """Write all frames into the memory, a few at a time, and return the seconds that it took."""
+    """Write all frames into the memory, a few at a time, and return the duration in seconds."""
     start = time.perf_counter()
     with progress() as bar:
         task = add_task(bar, "memorizing", sum(len(source.frames) for source in sources), "frames")
@@ -73,16 +74,16 @@ def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
     return time.perf_counter() - start
 
 
-def _finish(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, extra: dict[str, Any]) -> None:
-    picture = out.with_suffix(".png")
-    for path in (out, picture):
+def _save_and_print(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, extra: dict[str, Any]) -> None:
+    map_file = out.with_suffix(".png")
+    for path in (out, map_file):
         remove_leftovers(path.parent, path.name)
     memory.save(out)
-    draw_map(memory.points(), memory.reference.world_up, paths, picture)
+    draw_map(memory.points(), memory.reference.world_up, paths, map_file)
     figures = memory.figures()
     result = {
         "file": str(out),
-        "map": str(picture),
+        "map": str(map_file),
         "memory": memory.name,
         "encoder": memory.encoder.name,
         "channels": memory.encoder.channels,
@@ -95,26 +96,25 @@ def _finish(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, 
     if json:
         print_json(result)
     else:
-        print_table(f"memory of {memory.reference.name}", ["", "value"], _rows(result))
+        print_table(f"memory of {memory.reference.name}", ["", "value"], _table_rows(result))
         if extra.get("settings_of"):
             say(f"settings and encoder: those of {extra['settings_of']}")
-        say(f"memory: {out}\nmap: {picture}")
+        say(f"memory: {out}\nmap: {map_file}")
 
 
-def _rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The result for people: large numbers grouped, bounds as ranges, paths left for a line of their own."""
-    shown = {name: value for name, value in result.items() if name not in ("file", "map", "settings_of")}
-    shown["bytes"] = f"{result['bytes']:,}"
-    shown["cells"] = f"{result['cells']:,}"
+def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return names and values for people, without paths: digits of large numbers in groups, bounds as ranges."""
+    texts = {name: value for name, value in result.items() if name not in ("file", "map", "settings_of")}
+    texts["bytes"] = f"{result['bytes']:,}"
+    texts["cells"] = f"{result['cells']:,}"
     if result["bounds"] is None:
-        shown["bounds"] = "empty"
+        texts["bounds"] = "empty"
     else:
-        shown["bounds"] = (
-            " × ".join(f"{low:.2f}…{high:.2f}" for low, high in zip(*result["bounds"], strict=True)) + " m"
-        )
+        ranges = [f"{low:.2f}…{high:.2f}" for low, high in zip(*result["bounds"], strict=True)]
+        texts["bounds"] = " × ".join(ranges) + " m"
     if "frames_per_second" in result:
-        shown["frames_per_second"] = f"{result['frames_per_second']:.3g}"
-    return [(name.replace("_per_second", "/s"), str(value)) for name, value in shown.items()]
+        texts["frames_per_second"] = f"{result['frames_per_second']:.3g}"
+    return [(name.replace("_per_second", "/s"), str(value)) for name, value in texts.items()]
 
 
 def _check_out(out: Path) -> None:

@@ -1,4 +1,4 @@
-"""From the configuration of a memory to memories, and from training clips to clips with their tokens."""
+"""Makes empty memories of a configuration, and adds memory tokens to training clips."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MemoryFactory:
-    """Makes empty memories of one choice; plugin, settings and encoder are loaded once.
+    """Makes empty memories of one configuration; plugin, settings and encoder are loaded once.
 
     Args:
-        kind: the memory's class.
-        settings: an instance of its settings type.
-        encoder: that all of them share.
-        device: where encoder and memories compute.
+        kind: class of the memories.
+        settings: an instance of the class's settings type.
+        encoder: the encoder that all memories share.
+        device: device on which encoder and memories compute.
     """
 
     kind: type[Memory]
@@ -35,20 +35,20 @@ class MemoryFactory:
     device: torch.device | str = "cpu"
 
     @staticmethod
-    def of(choice: MemoryConfig, device: torch.device | str = "cpu") -> MemoryFactory:
-        """The maker of this choice, computing there."""
-        kind = load_plugin("memory", choice.name)
-        settings = parse_settings(kind.settings_type, choice.settings, f"memory {choice.name!r}")
-        encoder = make_encoder(choice.encoder, choice.encoder_settings).to(device)
+    def of(config: MemoryConfig, device: torch.device | str = "cpu") -> MemoryFactory:
+        """Return the factory of a configuration, whose encoder and memories compute on ``device``."""
+        kind = load_plugin("memory", config.name)
+        settings = parse_settings(kind.settings_type, config.settings, f"memory {config.name!r}")
+        encoder = make_encoder(config.encoder, config.encoder_settings).to(device)
         return MemoryFactory(kind, settings, encoder, device)
 
     def empty(self, info: TrajectoryInfo) -> Memory:
-        """An empty memory in the frame of reference of a trajectory."""
+        """Return an empty memory in the world of a trajectory."""
         return self.kind(self.settings, self.encoder, FrameOfReference(info.scene, info.world_up))
 
 
 def with_memory(sample: ClipSample, factory: MemoryFactory | None, budget: int) -> Clip:
-    """A training clip with what a memory of its context says to its cameras; as it is without a factory."""
+    """Return a training clip with at most ``budget`` tokens of a memory of its context; none without a factory."""
     if factory is None:
         return sample.clip
     memory = factory.empty(sample.info)

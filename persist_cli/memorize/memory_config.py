@@ -1,4 +1,4 @@
-"""What a new memory is made of: settings of its own, or those of the adapter that shall read it."""
+"""The configuration of a new memory: settings of the command line, or those of the adapter that shall read it."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from persist_cli.checkpoints.load import adapter_memory, reference_checkpoint
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from persist_cli.recipe import MemoryConfig
 
-USUAL = "voxel"  # the memory that is meant when neither a user nor a checkpoint names one
+USUAL = "voxel"  # the memory when neither the user nor a checkpoint names one
 
 
 @dataclass(frozen=True)
 class MemorizePlan:
-    """The options of ``persist memorize`` that say which memory.
+    """The options of ``persist memorize`` about the memory.
 
     Args:
         memory: name of the memory, ``None`` when none is named.
         encoder: name of its encoder, ``None`` when none is named.
-        settings: ``memory.KEY=VALUE`` and ``encoder.KEY=VALUE``, values as in YAML.
-        checkpoint: whose adapter shall read it, ``None`` when none is named.
+        settings: texts ``memory.KEY=VALUE`` and ``encoder.KEY=VALUE``, values as in YAML.
+        checkpoint: folder of the checkpoint whose adapter shall read the memory, ``None`` when none is named.
     """
 
     memory: str | None = None
@@ -35,58 +35,58 @@ class MemorizePlan:
 
 
 def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
-    """The memory's kind, settings and encoder, and whose adapter they are of; ``None`` where they are the plan's own.
+    """Return the memory's configuration and the adapter that it is taken from, ``None`` if it is the plan's own.
 
     Raises:
-        PersistError: when a checkpoint and settings are named together, or the checkpoint has no such adapter.
+        PersistError: when the plan has both a checkpoint and settings, or the checkpoint has no such adapter.
     """
     own = plan.encoder is not None or bool(plan.settings)
     if own and plan.checkpoint is not None:
         raise PersistError("--checkpoint brings memory settings and encoder along; leave out --encoder and --set")
     if plan.checkpoint is not None:
         return adapter_of(find_checkpoint(plan.checkpoint), plan.memory)
-    reference = None if own else _reference()
-    memories = set(_memories(reference).values()) if reference else set()
+    reference = None if own else _find_reference_checkpoint()
+    memories = set(_memory_names(reference).values()) if reference else set()
     if reference and memories and (plan.memory is None or plan.memory in memories):
         return adapter_of(reference, plan.memory)
-    chosen = plugin_settings(plan.settings)
-    return MemoryConfig(plan.memory or USUAL, chosen["memory"], plan.encoder or "patches", chosen["encoder"]), None
+    settings = plugin_settings(plan.settings)
+    return MemoryConfig(plan.memory or USUAL, settings["memory"], plan.encoder or "patches", settings["encoder"]), None
 
 
 def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig, str]:
-    """What the adapter for a memory reads, and that adapter in words.
+    """Return the memory configuration of an adapter, and the adapter's name in words.
 
     Args:
-        checkpoint: that has the adapter.
-        memory: that the adapter reads; of several the one of its name goes before the default one. ``None`` is what
-            the default or the only adapter reads.
+        checkpoint: the checkpoint with the adapter.
+        memory: name of the memory that the adapter reads; ``None`` stands for the default or the only adapter. Of
+            several adapters, one with the memory's own name is preferred to the default one.
 
     Raises:
-        CheckpointError: when there is no such adapter, or one must be chosen.
+        CheckpointError: when there is no such adapter, or the user must choose one.
     """
-    memories = _memories(checkpoint)
+    memories = _memory_names(checkpoint)
     if memory is None and checkpoint.default is None and len(memories) > 1:
         known = ", ".join(dict.fromkeys(memories.values()))
         raise CheckpointError(f"{checkpoint.folder}: choose a memory of {known} with --memory")
-    wanted = [name for name, each in memories.items() if memory in (None, each)]
-    first = [name for name in (memory, checkpoint.default) if name in wanted]
-    if not wanted:
-        asked = "a memory" if memory is None else f"a memory {memory!r}"
-        raise CheckpointError(f"{checkpoint.folder}: no adapter reads {asked}; it has {', '.join(memories) or 'none'}")
-    name = str([*first, *wanted][0])
-    return adapter_memory(checkpoint, name), f"adapter {name!r} of {checkpoint.folder}"
+    readers = [adapter for adapter, name in memories.items() if memory in (None, name)]
+    preferred = [name for name in (memory, checkpoint.default) if name in readers]
+    if not readers:
+        text = "a memory" if memory is None else f"a memory {memory!r}"
+        raise CheckpointError(f"{checkpoint.folder}: no adapter reads {text}; it has {', '.join(memories) or 'none'}")
+    adapter = str([*preferred, *readers][0])
+    return adapter_memory(checkpoint, adapter), f"adapter {adapter!r} of {checkpoint.folder}"
 
 
-def _memories(checkpoint: Checkpoint) -> dict[str, str]:
-    """The memory that each adapter reads."""
+def _memory_names(checkpoint: Checkpoint) -> dict[str, str]:
+    """Return for each adapter the name of the memory that it reads."""
     return {name: adapter_memory(checkpoint, name).name for name in checkpoint.adapters}
 
 
 def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Settings of the memory and of the encoder, from texts like ``memory.cell=[0.25,1,0.25]``.
+    """Return the settings of ``memory`` and ``encoder`` in texts such as ``memory.cell=[0.25,1,0.25]``.
 
     Raises:
-        RecipeError: when a text is not of this form.
+        RecipeError: when a text does not have this form.
     """
     settings: dict[str, dict[str, Any]] = {"memory": {}, "encoder": {}}
     for text in texts:
@@ -101,9 +101,9 @@ def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     return settings
 
 
-def _reference() -> Checkpoint | None:
+def _find_reference_checkpoint() -> Checkpoint | None:
     try:
         folder = reference_checkpoint()
     except CheckpointError:
-        return None  # an installation without it: memories have their own settings
+        return None  # this installation has no reference model, so that no adapter brings settings
     return find_checkpoint(folder)

@@ -1,4 +1,4 @@
-"""Memory files: a safetensors file whose header says which memory and encoder made it."""
+"""Memory files: safetensors files whose header names the memory, its encoder and their settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from persist_cli.io.files import read_tensors
 from persist_cli.plugins import make_encoder, make_memory
 
 FORMAT = "persist-memory"
-
 FIELDS: dict[str, type | tuple[type, ...]] = {
     "memory": str,
     "settings": dict,
@@ -26,11 +25,10 @@ FIELDS: dict[str, type | tuple[type, ...]] = {
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """What a memory file says about itself, without reading its tensors.
+    """Return the header of a memory file, as ``Memory.header`` made it, without reading its tensors.
 
     Raises:
-        CheckpointError: when the file is missing, truncated, of something else, of a newer version, or its header
-            is damaged.
+        CheckpointError: when the file is missing, truncated, no memory, of a newer version, or its header is damaged.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -45,11 +43,11 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def load_memory(path: Path) -> Memory:
-    """The memory that ``Memory.save`` wrote, with its encoder, on the CPU.
+    """Return the memory that ``Memory.save`` wrote, with its encoder, on the CPU.
 
     Raises:
-        CheckpointError: one line naming the file and why it cannot be used.
-        PluginError: when its memory or encoder is not installed.
+        CheckpointError: when the file cannot be used; one line names the file and the cause.
+        PluginError: when the plugin of its memory or encoder is not installed.
     """
     header = read_header(path)
     tensors, _ = read_tensors(path)

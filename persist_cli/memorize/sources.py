@@ -1,4 +1,4 @@
-"""What is to be memorized: frames of trajectories that share one scene, read piece by piece."""
+"""The frames to memorize: parts of trajectories of one scene, which are read piece by piece."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import DataError
 
 PIXELS_AT_ONCE = 1 << 22
-
 FRAMES_AT_ONCE = 256
 
 
@@ -22,8 +21,8 @@ class Source:
 
     Args:
         file: the trajectory.
-        frames: their numbers.
-        text: how the user named it.
+        frames: numbers of the frames.
+        text: the user's reference to them.
     """
 
     file: TrajectoryFile
@@ -31,7 +30,7 @@ class Source:
     text: str
 
     def pieces(self) -> Iterator[Observations]:
-        """The frames in order, a few megabytes at a time."""
+        """Yield the frames in order, a few megabytes at a time."""
         pixels = self.file.info.height * self.file.info.width
         step = max(1, min(FRAMES_AT_ONCE, PIXELS_AT_ONCE // pixels))
         for begin in range(self.frames.start, self.frames.stop, step):
@@ -40,10 +39,10 @@ class Source:
 
 
 def find_sources(data: Sequence[str]) -> list[Source]:
-    """The trajectories of references ``DATA``, ``DATA#trajectory`` or ``DATA#trajectory:frames``.
+    """Return the frames of references ``DATA``, ``DATA#trajectory`` or ``DATA#trajectory:frames``.
 
     Raises:
-        DataError: when one is missing or frames lie outside it.
+        DataError: when there is no reference, a trajectory is missing, or frames lie outside it.
     """
     if not data:
         raise DataError("nothing to memorize; name the data, as in runs/houses#0:0-48")
@@ -51,18 +50,18 @@ def find_sources(data: Sequence[str]) -> list[Source]:
     for text in data:
         reference = parse_reference(text)
         for file in reference.trajectories():
-            wanted = reference.frames or slice(0, file.length)
-            if wanted.stop > file.length:
+            frames = reference.frames or slice(0, file.length)
+            if frames.stop > file.length:
                 raise DataError(f"{text}: {file.path} has {file.length} frames (0-{file.length - 1}) only")
-            sources.append(Source(file, range(wanted.start, wanted.stop), text))
+            sources.append(Source(file, range(frames.start, frames.stop), text))
     return sources
 
 
 def common_reference(sources: Sequence[Source]) -> FrameOfReference:
-    """The one world that all the trajectories are of.
+    """Return the world that all these trajectories share.
 
     Raises:
-        DataError: when they are of several.
+        DataError: when their scenes or up axes differ.
     """
     first = sources[0].file.info
     for source in sources[1:]:

@@ -56,7 +56,7 @@ class DreamSim(FrameMetric):
 
 
 def tensor_shapes() -> dict[str, tuple[int, ...]]:
-    """Shapes of the tensors of ``model.safetensors`` by name."""
+    """Return the shapes of the tensors of ``model.safetensors`` by name."""
     shapes: dict[str, tuple[int, ...]] = {
         "cls_token": (1, 1, WIDTH),
         "pos_embed": (1, (SIZE // PATCH) ** 2 + 1, WIDTH),
@@ -86,14 +86,14 @@ def resize(rgb: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame 2
 def distance(
     weights: Mapping[str, Tensor], rgb: UInt8[Tensor, "frame 224 224 3"], truth: UInt8[Tensor, "frame 224 224 3"]
 ) -> Float[Tensor, " frame"]:
-    """One minus the cosine similarity of class tokens less their means, for each frame."""
+    """Return for each frame one minus the cosine similarity of the class tokens less their means."""
     tokens = [class_token(weights, frames).double() for frames in (rgb, truth)]
     centred, true_centred = (token - token.mean(-1, keepdim=True) for token in tokens)
     return 1 - torch.cosine_similarity(centred, true_centred, dim=-1)
 
 
 def class_token(weights: Mapping[str, Tensor], rgb: UInt8[Tensor, "frame 224 224 3"]) -> Float[Tensor, "frame channel"]:
-    """The class token after the last block, without the final norm."""
+    """Return the class token of each frame after the last block, without the final norm."""
     image = rgb.permute(0, 3, 1, 2).float() / 255
     mean, std = (image.new_tensor(values)[:, None, None] for values in (MEAN, STD))
     kernel, bias = weights["patch_embed.proj.weight"], weights["patch_embed.proj.bias"]

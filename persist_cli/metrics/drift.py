@@ -44,7 +44,7 @@ class Drift(DepthMetric):
 
 
 def in_own_frame(observations: Observations) -> Observations:
-    """Move frames to the CPU and to a world whose origin is their first camera, so that the old origin is no matter."""
+    """Return frames on the CPU in a world whose origin is their first camera, so that the old origin has no effect."""
     observations = observations.to("cpu")
     cameras = observations.cameras
     return Observations(
@@ -53,13 +53,13 @@ def in_own_frame(observations: Observations) -> Observations:
 
 
 def on_grid(images: Float[Tensor, "frame height width *rest"], most: int) -> Tensor:
-    """Every n-th row and column, n the least that leaves at most ``most`` of each."""
+    """Return every n-th row and column, with the least n that leaves at most ``most`` of each."""
     step = math.ceil(max(images.shape[1:3]) / most)
     return images[:, step // 2 :: step, step // 2 :: step]
 
 
 def fuse(observations: Observations) -> Float[Tensor, "point 3"]:
-    """World points of all frames, fused to one for each voxel: the mean of the points in it."""
+    """Return the world points of all frames, fused to one for each voxel: the mean of the points in it."""
     depth = on_grid(observations.depth, TRUE_GRID)
     points = on_grid(unproject(observations.depth, observations.cameras), TRUE_GRID)[depth > 0]
     cells = (points / VOXEL).floor().long()

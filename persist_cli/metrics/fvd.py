@@ -20,11 +20,8 @@ from persist_cli.metrics.metric import SetMetric, Setup
 from persist_cli.metrics.networks import missing_weights, network_weights, run_network
 
 WEIGHTS = "i3d-kinetics-400"
-
 LEAST_FRAMES = 16
-
 LEAST_VIDEOS = 5  # four have only 35 different resamples, too few for a 95 % interval
-
 SIZE = 224  # pixels
 
 

@@ -36,7 +36,7 @@ Weights = Mapping[str, Tensor]
 
 
 def tensor_shapes() -> dict[str, tuple[int, ...]]:
-    """Shapes of the tensors of ``model.safetensors`` by name."""
+    """Return the shapes of the tensors of ``model.safetensors`` by name."""
     units = dict(STEM)
     for block, (inputs, zero, one, one_out, two, two_out, three) in MIXED.items():
         units[f"{block}.Branch_0/Conv3d_0a_1x1"] = (inputs, zero, 1)
@@ -55,10 +55,10 @@ def tensor_shapes() -> dict[str, tuple[int, ...]]:
 
 
 def logits(weights: Weights, video: Float[Tensor, "video 3 frame 224 224"]) -> Float[Tensor, "video 400"]:
-    """Logits of the 400 classes, averaged over time.
+    """Return the logits of the 400 classes, averaged over time.
 
     Args:
-        weights: as ``tensor_shapes`` names them.
+        weights: tensors with the names and shapes of ``tensor_shapes``.
         video: RGB in [-1, 1], at least nine frames.
     """
     state = _unit(weights, "Conv3d_1a_7x7", video, stride=2)
@@ -75,7 +75,7 @@ def logits(weights: Weights, video: Float[Tensor, "video 3 frame 224 224"]) -> F
 
 
 def _mixed(weights: Weights, block: str, state: Tensor) -> Tensor:
-    """Four branches side by side."""
+    """Join the outputs of a block's four branches along the channels."""
 
     def unit(name: str, inputs: Tensor) -> Tensor:
         return _unit(weights, f"{block}.{name}", inputs)
@@ -92,7 +92,7 @@ def _mixed(weights: Weights, block: str, state: Tensor) -> Tensor:
 
 
 def _unit(weights: Weights, unit: str, state: Tensor, stride: int = 1) -> Tensor:
-    """Convolution without bias, batch normalisation without scale, ReLU."""
+    """Apply a convolution without bias, a batch normalisation without scale, and ReLU."""
     kernel = weights[f"params.{unit}.Conv_0.weight"]
     state = functional.conv3d(_same(state, kernel.shape[2:], (stride,) * 3, 0.0), kernel, stride=stride)
     mean, variance = (weights[f"batch_stats.{unit}.BatchNorm_0.{name}"].flatten() for name in ("mean", "var"))
@@ -105,7 +105,7 @@ def _pool(state: Tensor, window: tuple[int, ...], stride: tuple[int, ...]) -> Te
 
 
 def _same(state: Tensor, window: tuple[int, ...] | torch.Size, stride: tuple[int, ...], value: float) -> Tensor:
-    """TensorFlow's "same" padding, whose odd pixel comes at the end."""
+    """Apply TensorFlow's "same" padding, whose odd pixel comes at the end."""
     padding: list[int] = []
     for size, length, step in zip(state.shape[2:], window, stride, strict=True):
         extra = max((-(-size // step) - 1) * step + length - size, 0)

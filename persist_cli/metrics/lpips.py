@@ -114,7 +114,7 @@ class LpipsVgg(Lpips):
 
 
 def tensor_shapes(network: tuple[Convolution, ...]) -> dict[str, tuple[int, ...]]:
-    """Shapes of the tensors of ``model.safetensors`` by name."""
+    """Return the shapes of the tensors of ``model.safetensors`` by name."""
     shapes: dict[str, tuple[int, ...]] = {}
     for number, layer in enumerate(network):
         inputs, outputs = layer.channels
@@ -130,11 +130,11 @@ def perceptual_distance(
     rgb: UInt8[Tensor, "frame height width 3"],
     truth: UInt8[Tensor, "frame height width 3"],
 ) -> Float[Tensor, " frame"]:
-    """Sum over taps of the mean over pixels of head · (unit feature − unit feature)² (Zhang et al., equation 1)."""
+    """Return the sum over taps of the mean over pixels of head · (difference of unit features)² (Zhang et al., (1))."""
     pairs = zip(features(weights, network, rgb), features(weights, network, truth), strict=True)
     distances = [
-        functional.conv2d((one - other).square(), weights[f"head{number}.weight"]).mean((1, 2, 3))
-        for number, (one, other) in enumerate(pairs)
+        functional.conv2d((generated - true).square(), weights[f"head{number}.weight"]).mean((1, 2, 3))
+        for number, (generated, true) in enumerate(pairs)
     ]
     return torch.stack(distances).sum(0)
 
@@ -142,7 +142,7 @@ def perceptual_distance(
 def features(
     weights: Mapping[str, Tensor], network: tuple[Convolution, ...], rgb: UInt8[Tensor, "frame height width 3"]
 ) -> list[Float[Tensor, "frame channel rows columns"]]:
-    """Outputs of the taps, the channels of each pixel normalised to unit length."""
+    """Return the outputs of the taps, with the channels of each pixel normalised to unit length."""
     image = rgb.permute(0, 3, 1, 2).float() / 127.5 - 1
     shift, scale = (image.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
     state, taps = (image - shift) / scale, []

@@ -19,7 +19,7 @@ class Prediction:
     """A generated video beside the true frames from the same cameras.
 
     Args:
-        rgb: generated frames; the first one is the given frame.
+        rgb: generated frames; the first one is the input frame.
         depth: generated depth in metres, 0 where it is missing.
         truth: true frames, with the cameras of both videos.
         first_visits: for each frame the number of the earlier frame whose pose it returns to, -1 for none.
@@ -52,7 +52,7 @@ class Setup:
 
     Args:
         clips: number of clips.
-        frames: predicted frames of a clip, without the given first one.
+        frames: predicted frames of a clip, without the first one, which is an input.
         height: height of the images in pixels.
         width: width of the images in pixels.
         depth: whether the data has true depth.
@@ -72,9 +72,8 @@ class Setup:
 class Metric(ABC):
     """A measure of generated videos.
 
-    ``definition`` is printed beside its figures. ``better`` says whether a higher or a lower figure is good, ``None``
-    that neither is. ``guards`` are the names of metrics without which its figures could be misread; they are measured
-    with it.
+    ``definition`` is printed beside its figures. ``better`` is ``None`` when neither higher nor lower figures are good.
+    ``guards`` are the names of metrics that are measured with it, because its figures alone could be misread.
     """
 
     name: ClassVar[str]
@@ -93,7 +92,7 @@ class Metric(ABC):
         return ()
 
     def obstacle(self, setup: Setup) -> str | None:
-        """The reason why it cannot be measured, ``None`` when it can."""
+        """Return the reason why it cannot be measured, ``None`` when it can."""
         return None
 
 
@@ -102,7 +101,7 @@ class FrameMetric(Metric):
 
     @abstractmethod
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """The figure of every frame, the given first one included, float64; NaN where it is not defined."""
+        """Return the figure of every frame, the first one included, float64; NaN where it is not defined."""
 
 
 class SetMetric(Metric):
@@ -110,10 +109,10 @@ class SetMetric(Metric):
 
     @abstractmethod
     def features(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, " channel"]:
-        """Features of one video."""
+        """Return the features of one video."""
 
     @abstractmethod
     def distance(
         self, features: Float[Tensor, "video channel"], true_features: Float[Tensor, "video channel"]
     ) -> float:
-        """The distance between generated and true videos."""
+        """Return the distance between generated and true videos."""

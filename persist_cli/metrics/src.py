@@ -112,19 +112,19 @@ class SrcAway(ReturnSimilarity):
 
 
 def returns(first_visits: Int64[Tensor, " frame"]) -> list[tuple[int, int]]:
-    """Each frame that returns, with the frame of its first visit."""
+    """Return each frame that returns to a pose, with the frame of its first visit."""
     return [(frame, first) for frame, first in enumerate(first_visits.tolist()) if first >= 0]
 
 
 def farthest(cameras: Cameras, first: int, last: int) -> int:
-    """The number of the camera from ``first`` to ``last`` that is farthest from ``first``, in metres + radians."""
+    """Return the number of the camera from ``first`` to ``last`` farthest from ``first``, in metres + radians."""
     poses = cameras.world_from_camera[first : last + 1].double().cpu()
     metres, degrees = pose_differences(poses, poses[:1].expand_as(poses))
     return first + int((metres + torch.deg2rad(degrees)).argmax())
 
 
 def chosen_encoder() -> EncoderWeights:
-    """The first encoder whose weights are cached, else the first of all."""
+    """Return the first encoder whose weights are cached, else the first of all."""
     return next((encoder for encoder in ENCODERS if cached_weight(encoder.name)), ENCODERS[0])
 
 
@@ -140,7 +140,7 @@ class VideoFeatures:
         self.features: dict[int, Float[Tensor, " channel"]] = {}
 
     def encode(self, frame: int) -> Float[Tensor, " channel"]:
-        """Mean patch features of a frame, of unit length, float64 on the CPU."""
+        """Return the mean patch features of a frame, of unit length, float64 on the CPU."""
         if frame not in self.features:
             weights = chosen_encoder()
             with exact_inference():

@@ -1,1 +1,1 @@
-"""The world model loop: recall, denoise, observe, memorize."""
+"""Rollouts of the world model, whose loop is: recall, denoise, observe, memorize."""

@@ -1,4 +1,4 @@
-"""Where a rollout goes and what comes of it."""
+"""The plan of a rollout, its camera paths and its result."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class RolloutPlan:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Where a rollout goes.
+    """The start frame of a rollout and the cameras along which it goes.
 
     Args:
-        start: the first frame, observed.
-        cameras: of the frames to imagine.
-        interactions: one for each of them.
-        actions: in text form.
-        truth: what is really seen there, when the trajectory is followed.
-        info: of the trajectory.
+        start: the observed first frame.
+        cameras: cameras of the frames to imagine.
+        interactions: interaction before each of these frames, ``None`` for none.
+        actions: the actions as text, as in ``"forward*4 left*2"``.
+        truth: true frames of these cameras when the path follows a trajectory, else ``None``.
+        info: scene, up axis and vocabulary of the start frame's trajectory.
     """
 
     start: Observations
@@ -57,15 +57,15 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class Rollout:
-    """What a rollout gave.
+    """The frames and memories of a rollout.
 
     Args:
-        path: where it went.
-        seen: the frames imagined.
-        before: the memory as it was, ``None`` without one.
-        memory: the memory as it is now.
-        seconds: that it took, without loading; all branches together.
-        gives_depth: whether the depth of the imagined frames is one.
+        path: start frame and cameras.
+        seen: the imagined frames.
+        before: the memory before the rollout, ``None`` without one.
+        memory: the memory after the rollout, ``None`` without one.
+        seconds: duration of all branches together, without loading.
+        gives_depth: whether the imagined frames have depth.
     """
 
     path: CameraPath
@@ -77,7 +77,7 @@ class Rollout:
 
 
 def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:
-    """The start frame and the cameras to come: by each of the texts of actions, or by the trajectory's own poses."""
+    """Return a camera path for each text of actions, or the one of the trajectory's own poses."""
     reference = parse_reference(plan.start)
     file = reference.single()
     if plan.follow:
@@ -87,7 +87,7 @@ def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:
 
 
 def path_along_actions(start: Trajectory, text: str) -> CameraPath:
-    """The way from a single frame along actions."""
+    """Return the camera path from a single frame along actions in text form."""
     names = start.info.vocabulary.parse(text)
     cameras = cameras_along(start.observations.cameras, start.info, names)
     interactions = interactions_of(names, start.info.vocabulary)
@@ -95,17 +95,17 @@ def path_along_actions(start: Trajectory, text: str) -> CameraPath:
 
 
 def path_of_trajectory(file: TrajectoryFile, first: int, frames: int) -> CameraPath:
-    """The trajectory's own way from a frame on, with what is really seen there."""
+    """Return a trajectory's own path from frame ``first`` on, of at most ``frames`` frames (0: all) and their truth."""
     last = min(len(file), first + 1 + frames) if frames else len(file)
     if last - first < 2:
         raise DataError(f"{file.name}: frame {first} is the last; there is nothing to follow")
-    span = file.read(slice(first, last))
-    names = tuple(name or "stay" for name in span.actions[:-1])
+    frames_read = file.read(slice(first, last))
+    names = tuple(name or "stay" for name in frames_read.actions[:-1])
     return CameraPath(
-        start=span.observations[:1],
-        cameras=span.observations.cameras[1:],
-        interactions=interactions_of(span.actions[:-1], file.info.vocabulary),
+        start=frames_read.observations[:1],
+        cameras=frames_read.observations.cameras[1:],
+        interactions=interactions_of(frames_read.actions[:-1], file.info.vocabulary),
         actions=format_actions(names),
-        truth=span.observations[1:],
+        truth=frames_read.observations[1:],
         info=file.info,
     )

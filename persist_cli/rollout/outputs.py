@@ -1,4 +1,4 @@
-"""Poses as TUM files: a line ``t tx ty tz qx qy qz qw`` for each frame, world_from_camera, OpenCV axes."""
+"""The files of a rollout: videos, a contact sheet, poses, maps, the memory and ``rollout.json``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from persist_cli.viewing.video import beside, color_depth, write_video
 
 
 def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
-    """(qx, qy, qz, qw) with qw ≥ 0: the eigenvector of Bar-Itzhack's symmetric matrix of the largest eigenvalue."""
+    """Return a rotation as (qx, qy, qz, qw) with qw ≥ 0, by Bar-Itzhack's symmetric matrix and its last eigenvector."""
     r = rotation.double()
     k = torch.stack(
         [
@@ -40,7 +40,7 @@ def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
 
 
 def write_poses(path: Path, timestamps: Sequence[float], poses: Float[Tensor, "frame 4 4"]) -> None:
-    """A TUM trajectory file, readable by evo."""
+    """Write lines ``t tx ty tz qx qy qz qw`` (TUM), seconds and metres, from world_from_camera poses in OpenCV axes."""
     lines = []
     for timestamp, pose in zip(timestamps, poses, strict=True):
         values = [*pose[:3, 3].tolist(), *quaternion(pose[:3, :3]).tolist()]
@@ -48,15 +48,15 @@ def write_poses(path: Path, timestamps: Sequence[float], poses: Float[Tensor, "f
     write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
 
 
-SOMETIMES = ("compare.mp4", "map-before.png", "map-after.png", "memory.safetensors")  # what not every rollout leaves
+SOMETIMES = ("compare.mp4", "map-before.png", "map-after.png", "memory.safetensors")  # files of some rollouts
 
 
 def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
-    """What is needed to roll out again, JSON values."""
+    """Return JSON values that suffice to repeat the rollout, with its figures."""
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
     options |= {"sampling": plan.sampling.requested(), "placement": dataclasses.asdict(plan.placement)}
     memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
-    together = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
+    branches = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
     return {
         "checkpoint": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
@@ -64,11 +64,11 @@ def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rol
         "frames": len(rollout.seen),
         "seconds": rollout.seconds,
         "memory": memory,
-    } | together
+    } | branches
 
 
 def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[str, Any]:
-    """Write everything into ``out`` in the place of an earlier rollout; gives the figures with those against truth."""
+    """Write all files over those of an earlier rollout; return the figures with those against the true frames."""
     for name in SOMETIMES:
         (out / name).unlink(missing_ok=True)
     start, seen, truth = rollout.path.start, rollout.seen, rollout.path.truth
@@ -92,13 +92,13 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
 def compare(
     start: Observations, seen: Observations, truth: Observations, gives_depth: bool = True
 ) -> dict[str, list[float]]:
-    """Every metric of single frames that can be measured here, for each imagined frame.
+    """Return the figures of each imagined frame for every metric of single frames that can be measured.
 
     Args:
-        start: the given frame.
+        start: the observed first frame.
         seen: the frames imagined after it.
-        truth: what is really seen there.
-        gives_depth: whether the depth of the imagined frames is one.
+        truth: the true frames of the same cameras.
+        gives_depth: whether the imagined frames have depth.
     """
     known = Observations.concatenate([start, truth])
     frames, height, width = known.depth.shape
@@ -115,12 +115,12 @@ def compare(
 
 
 def path_of(rollout: Rollout) -> torch.Tensor:
-    """Poses of the start and every imagined frame."""
+    """Return world_from_camera of the start frame and every imagined frame."""
     return Cameras.concatenate([rollout.path.start.cameras, rollout.seen.cameras]).world_from_camera
 
 
 def write_maps(rollout: Rollout, out: Path) -> None:
-    """The memory as a file, and as it was and is from above, for memories that have something to draw."""
+    """Write the memory, and maps of it before and after the rollout when it has points to draw."""
     memories: dict[str, Memory | None] = {"map-before": rollout.before, "map-after": rollout.memory}
     for name, memory in memories.items():
         if memory is not None and len(memory.points().positions):

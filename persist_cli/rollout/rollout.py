@@ -1,4 +1,4 @@
-"""``persist rollout``: from a start frame along actions, to videos, maps, poses and a memory."""
+"""``persist rollout``: imagine frames along actions and write videos, maps, poses and a memory."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from persist_cli.viewing.console import add_task, print_json, progress, say
 
 
 def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> None:
-    """Roll out a checkpoint, or else the reference model, and leave a folder for each branch; see its help."""
+    """Roll out a checkpoint, or the reference model without a path, and write a folder for each branch."""
     if bool(plan.actions) == plan.follow:
         raise PersistError("give either --actions TEXT or --follow")
-    plan.placement.device()  # what cannot be is told before anything is loaded
+    plan.placement.device()  # a missing accelerator is an error before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = plan.adapter or checkpoint.default_adapter()
     paths = plan_camera_paths(plan)
@@ -57,30 +57,29 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
 
 
 def check_folders(out: Path, branches: int) -> list[Path]:
-    """Where the branches go: ``out`` for one, 0, 1, … in it for several.
+    """Return the folder of each branch: ``out`` for a single one, or the folders 0, 1, … in it.
 
     Raises:
-        PersistError: when no folder can be made there, or several find rollouts there that they would not replace.
+        PersistError: when ``out`` cannot be a folder, or would still hold another rollout beside several branches.
     """
     check_folder(out)
     if branches == 1:
         return [out]
     folders = [out / str(number) for number in range(branches)]
-    found = [path.parent for path in (*out.glob("rollout.json"), *out.glob("*/rollout.json"))]
-    left = sorted(each for each in found if each not in folders and (each == out or each.name.isdigit()))
-    if left:
-        raise PersistError(f"{left[0]}: holds a rollout that these {branches} would not replace; take another --out")
+    earlier = [path.parent for path in (*out.glob("rollout.json"), *out.glob("*/rollout.json"))]
+    stale = sorted(path for path in earlier if path not in folders and (path == out or path.name.isdigit()))
+    if stale:
+        raise PersistError(f"{stale[0]}: holds a rollout that these {branches} would not replace; take another --out")
     return folders
 
 
 def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
-    """The memory file given, or an empty memory of the adapter's kind; none without adapter."""
+    """Return the memory of the plan's file, else an empty one of the adapter's kind, ``None`` without an adapter."""
     if adapter is None:
         if plan.memory is not None:
             raise CheckpointError(f"{checkpoint.folder}: has no memory adapter that could read {plan.memory}")
         return None
-    maker = MemoryFactory.of(adapter_memory(checkpoint, adapter))
-    empty = maker.empty(info)
+    empty = MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
     if plan.memory is None:
         return empty
     memory = load_memory(plan.memory)
@@ -89,25 +88,26 @@ def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, 
 
 
 def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
-    """Raise ``CheckpointError`` when a memory file is not what the adapter was trained to read here."""
-    has, wants = memory.header(), wanted.header()
+    """Raise ``CheckpointError`` when the memory of a file differs from the kind or scene that the adapter reads."""
+    header, expected = memory.header(), wanted.header()
     for key in ("memory", "encoder", "encoder_settings", "channels", "reference"):
-        if has[key] != wants[key]:
-            raise CheckpointError(f"{path}: its {key.replace('_', ' ')} is {has[key]!r}, wanted here is {wants[key]!r}")
+        if header[key] != expected[key]:
+            name = key.replace("_", " ")
+            raise CheckpointError(f"{path}: its {name} is {header[key]!r}, wanted here is {expected[key]!r}")
 
 
 def roll(model: WorldModel, paths: Sequence[CameraPath]) -> list[Rollout]:
-    """Imagine paths from one start together, clip by clip, with a progress bar."""
+    """Imagine several paths from one start frame clip by clip, with a progress bar."""
     memory = model.agents[0].memory
     before, began = None if memory is None else memory.copy(), time.monotonic()
     model.reset([paths[0].start], [paths[0].info])
     branches = model.branches(len(paths)) if len(paths) > 1 else model
     cameras, clips = [path.cameras for path in paths], []
     with progress() as bar:
-        task = add_task(bar, "rollout", sum(len(way) for way in cameras), "frame")
+        task = add_task(bar, "rollout", sum(len(path) for path in cameras), "frame")
         for frames in branches.imagine(cameras, [path.interactions for path in paths]):
             clips.append(frames)
-            bar.advance(task, sum(len(seen) for seen in frames))
+            bar.advance(task, sum(map(len, frames)))
     seconds, depth = time.monotonic() - began, model.backbone.gives_depth
     videos = [Observations.concatenate(parts) for parts in zip(*clips, strict=True)]
     return [

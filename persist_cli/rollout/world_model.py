@@ -1,7 +1,7 @@
-"""The world model: what agents will see when they act, imagined clip by clip and remembered.
+"""The world model, which imagines clip by clip what agents will see when they act, and remembers it.
 
-``WorldModel.imagine`` is the one loop of the tool: recall, denoise, observe, memorize. Rollouts, evaluations and all
-that acts inside the model stand on it; a single agent is its batch of one.
+``WorldModel.imagine`` is the one loop of the tool: recall, denoise, observe, memorize. Rollouts and evaluations use it;
+a single agent is a batch of one.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from persist_cli.errors import PersistError
 
 
 def unchanged(seen: Observations) -> Observations:
-    """The same frames."""
+    """Return the frames unchanged."""
     return seen
 
 
 @dataclass
 class Agent:
-    """Where one rollout stands: its memory, its present frame and how many clips it has imagined.
+    """The state of one rollout: its memory, its present frame and the number of its imagined clips.
 
     Args:
-        memory: that the adapter reads; ``None`` without adapter.
-        seed: of the sampling noise.
-        write: whether what is seen and imagined goes into the memory.
+        memory: the memory that the adapter reads; ``None`` without an adapter.
+        seed: seed of the sampling noise.
+        write: whether observed and imagined frames are written into the memory.
         disturb: changes frames before they are written, as an evaluation with noisy poses does.
         shared: whether other agents read this memory too, so that it is copied before it is written.
     """
@@ -50,15 +50,15 @@ class Agent:
     clips: int = field(default=0, init=False)
 
     def cameras_after(self, actions: Sequence[str]) -> Cameras:
-        """The cameras after each of the actions."""
+        """Return the cameras after each of the actions, starting at the present frame."""
         return cameras_along(self.now.cameras, self.info, actions)
 
     def observe(self, seen: Observations) -> None:
-        """Go to the last of the frames."""
+        """Make the last of the frames the present one, and count their clip."""
         self.now, self.clips = seen[-1:], self.clips + 1
 
     def memorize(self, seen: Observations, device: torch.device) -> None:
-        """Write frames into the memory, which is made where the backbone computes."""
+        """Write frames into the memory on ``device``, unless there is no memory or it is not written."""
         if self.memory is None or not self.write:
             return
         if self.shared:
@@ -67,32 +67,32 @@ class Agent:
 
 
 class WorldModel:
-    """Predicts what agents will see, clip by clip, and remembers it; each clip of all agents is denoised as one batch.
+    """Predicts clip by clip what agents will see, and remembers it; the clips of all agents are denoised as a batch.
 
     Args:
-        backbone: with the adapter to use, if any, already in use.
-        agents: one for each rollout.
-        sampling: how clips are drawn.
+        backbone: the backbone, which already uses the adapter, if any.
+        agents: one agent for each rollout.
+        sampling: steps, sampler and guidance of each clip.
     """
 
     def __init__(self, backbone: Backbone, agents: Sequence[Agent], sampling: Sampling) -> None:
         self.backbone, self.agents, self.sampling = backbone, list(agents), sampling
 
     def reset(self, observations: Sequence[Observations], infos: Sequence[TrajectoryInfo]) -> None:
-        """Let each agent begin at one observed frame of the world that its info describes."""
+        """Let each agent begin at one observed frame; its info has the frame's scene, up axis and vocabulary."""
         for agent, observation, info in zip(self.agents, observations, infos, strict=True):
             agent.now, agent.info, agent.clips = observation, info, 0
             agent.memorize(observation, self.backbone.device)
 
     def step(self, actions: Sequence[Sequence[str]]) -> list[Observations]:
-        """The frames that each agent sees after each of its actions.
+        """Return for each agent the frames that it sees after each of its actions.
 
         Raises:
-            PersistError: when there is not a list of actions for each agent, or no action in one.
+            PersistError: when there is not one list of actions for each agent, or a list is empty.
         """
         if not self.agents or len(self.agents) != len(actions) or not all(actions):
             raise PersistError(
-                f"{len(self.agents)} branches were given {len(actions)} lists of {[len(each) for each in actions]} "
+                f"{len(self.agents)} branches were given {len(actions)} lists of {[*map(len, actions)]} "
                 "actions; each needs one of at least one action"
             )
         pairs = list(zip(self.agents, actions, strict=True))
@@ -101,13 +101,13 @@ class WorldModel:
         return [Observations.concatenate(parts) for parts in zip(*clips, strict=True)]
 
     def branches(self, count: int) -> WorldModel:
-        """So many agents that go on from where the first one is, each on its own, with the same sampling noise.
+        """Return a world model with ``count`` agents in the state of the first agent, with the same sampling noise.
 
-        Each imagines what the first agent would. They hold one present frame and one memory until they go on, each of
-        them copying the memory when it first writes; this world model is not changed.
+        Each imagines what the first agent would. They share its present frame and a copy of its memory, which each
+        copies again when it first writes; this world model is not changed.
 
         Raises:
-            PersistError: when none are asked for.
+            PersistError: when ``count`` is less than 1.
         """
         if count < 1:
             raise PersistError(f"{count} branches of a rollout; it must be at least 1")
@@ -119,22 +119,20 @@ class WorldModel:
         return WorldModel(self.backbone, agents, self.sampling)
 
     def imagine(self, cameras: Sequence[Cameras], interactions: Sequence[Interactions]) -> Iterator[list[Observations]]:
-        """The next frames of every agent, one clip of all of them after the other.
+        """Yield for each clip the frames of every agent, which are none for an agent at the end of its path.
 
-        As long as agents stand at one present frame and read one memory, as those of ``branches`` do at first, the
-        frame is encoded once and the memory is looked through once. An agent that has reached the end of its way sees
-        no more frames, and its clips are no longer imagined.
+        As long as all agents have one present frame and one memory, as those of ``branches`` do at first, the frame is
+        encoded once and the memory is read once.
 
         Args:
-            cameras: of the frames to come, for each agent.
-            interactions: one for each of them.
+            cameras: for each agent the cameras of the frames to come.
+            interactions: for each agent the interaction before each of these frames.
         """
         length = self.backbone.frames_per_clip - 1
-        for first in range(0, max(len(way) for way in cameras), length):
+        for first in range(0, max(map(len, cameras)), length):
             clip = slice(first, first + length)
-            moving = [number for number, way in enumerate(cameras) if len(way) > first]
+            moving = [number for number, path in enumerate(cameras) if len(path) > first]
             ways = [cameras[number][clip] for number in moving]
-
             clips = self.recall(moving, ways, [interactions[number][clip] for number in moving])
             rgb, depth = self.denoise(clips)
             frames = [agent.now[:0] for agent in self.agents]
@@ -146,20 +144,20 @@ class WorldModel:
             yield frames
 
     def recall(self, moving: Sequence[int], ways: Sequence[Cameras], interactions: Sequence[Interactions]) -> Clips:
-        """The clips that the backbone shall predict: the present frames, and what the memories say to the cameras.
+        """Return the clips that the backbone shall predict: present frames, cameras to come and memory tokens.
 
         Args:
             moving: numbers of the agents that go on.
-            ways: their next cameras, a clip's at most.
-            interactions: one for each of these.
+            ways: their next cameras, at most those of one clip.
+            interactions: for each of these agents the interaction before each frame.
         """
         agents = [self.agents[number] for number in moving]
         paths = [self.clip_path(agent, way) for agent, way in zip(agents, ways, strict=True)]
         tokens = self.read_memories(agents, paths)
         clips = Clips.stack(
             [
-                Clip(Observations(agent.now.rgb, agent.now.depth, path), done, clip_seed(agent.seed, agent.clips), read)
-                for agent, path, done, read in zip(agents, paths, interactions, tokens, strict=True)
+                Clip(Observations(agent.now.rgb, agent.now.depth, path), acts, clip_seed(agent.seed, agent.clips), read)
+                for agent, path, acts, read in zip(agents, paths, interactions, tokens, strict=True)
             ]
         )
         if all(agent.now is agents[0].now for agent in agents):  # one frame for all is encoded once
@@ -169,34 +167,34 @@ class WorldModel:
     def denoise(
         self, clips: Clips
     ) -> tuple[UInt8[Tensor, "agent frame height width 3"], Float[Tensor, "agent frame height width"]]:
-        """RGB and depth of the clips, the present frames first, on the CPU."""
+        """Return RGB and depth in metres of the clips on the CPU, their first frames the present ones."""
         rgb, depth = self.backbone.generate(clips, self.sampling)
         return rgb.cpu(), depth.cpu()
 
     def clip_path(self, agent: Agent, way: Cameras) -> Cameras:
-        """The present camera and the next ones, the last repeated to fill a clip."""
+        """Return the present camera and the next ones, the last of them repeated to fill a clip."""
         missing = self.backbone.frames_per_clip - 1 - len(way)
         return Cameras.concatenate([agent.now.cameras, way, *[way[-1:]] * missing])
 
     def read_memories(self, agents: Sequence[Agent], paths: Sequence[Cameras]) -> list[MemoryTokens | None]:
-        """What each agent's memory says to its path; a memory that several agents read is looked through once."""
+        """Return the tokens of each agent's path, ``None`` without memory; a memory of several agents is read once."""
         tokens: list[MemoryTokens | None] = [None] * len(agents)
         for memory in {id(agent.memory): agent.memory for agent in agents}.values():
             if memory is None:
                 continue
             readers = [number for number, agent in enumerate(agents) if agent.memory is memory]
-            reads = memory.read_batch([paths[number] for number in readers], self.backbone.token_budget)
-            for number, read in zip(readers, reads, strict=True):
-                tokens[number] = read
+            batch = memory.read_batch([paths[number] for number in readers], self.backbone.token_budget)
+            for number, sample in zip(readers, batch, strict=True):
+                tokens[number] = sample
         return tokens
 
 
 def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str]) -> Cameras:
-    """The cameras after each of the actions.
+    """Return the cameras after each of the actions.
 
     Args:
-        camera: one, where the way begins.
-        info: of the world, with the vocabulary of its actions.
+        camera: the camera before the first action, with a frame axis of one.
+        info: up axis and vocabulary of the trajectory.
         actions: names in the vocabulary.
     """
     world_up = torch.tensor(info.world_up, dtype=torch.float64)
@@ -205,7 +203,7 @@ def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str])
 
 
 def clip_seed(seed: int, clip: int) -> int:
-    """A seed for each clip of a rollout, distinct over seeds below 2^31 and a million clips."""
+    """Return the seed of a clip of a rollout, distinct for all seeds below 2^31 and a million clips."""
     if seed < 0 or clip >= 1_000_000:
         raise PersistError(f"seed {seed} must not be negative, and a rollout has at most a million clips")
     return seed * 1_000_000 + clip

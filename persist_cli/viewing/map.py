@@ -18,10 +18,10 @@ PATH_COLORS = ("#d81b60", "#1e88e5", "#ffb300", "#004d40", "#8e24aa")
 UNSEEN = (0.94, 0.94, 0.95, 1.0)
 MARGIN = 0.5  # metres around what is drawn
 ABOVE_CAMERA = 0.1  # metres over the cameras at which the ceiling is cut away
-DOTS_ACROSS = 5  # of the square that stands for a point
-MOST_DOTS = 900  # across the picture
+DOTS_ACROSS = 5  # dots along the side of the square that stands for a point
+MOST_DOTS = 900  # dots along the longer side of the picture
 LONG_SIDE = 8.0  # inches
-ARROW = 0.06  # of the long side
+ARROW = 0.06  # length as a share of the long side
 Array = np.ndarray[Any, Any]
 
 
@@ -66,7 +66,7 @@ def draw_map(
 
 
 def ground_axes(world_up: Sequence[float]) -> Float[Tensor, "3 3"]:
-    """A float64 rotation with the rows right and up in the picture, and height: seen from above, never mirrored.
+    """Return a float64 rotation whose rows are right and up in the picture, and height; it never mirrors the map.
 
     Right is the world axis farthest from up, projected onto the ground.
     """
@@ -79,7 +79,7 @@ def ground_axes(world_up: Sequence[float]) -> Float[Tensor, "3 3"]:
 def paint(
     points: MapPoints, ground: Float[Tensor, "3 3"], ceiling: float | None
 ) -> tuple[Array | None, tuple[float, float, float, float] | None]:
-    """The picture of some points, each square in the colour of the highest point under the ceiling.
+    """Return the picture of some points, each square in the colour of the highest point under the ceiling.
 
     Args:
         points: points to draw.
@@ -134,7 +134,7 @@ def _limits(extent: tuple[float, float, float, float] | None, places: Mapping[st
 
 
 def _draw_path(axes: Any, place: Array, look: Array, color: str, name: str) -> None:
-    """A line with white rims, a dot at the start, an arrow ``look`` along the last view at the end."""
+    """Draw a line with white rims, a dot at the start, and at the end an arrow ``look`` along the last view."""
     axes.plot(*place.T, color="white", linewidth=4.0, solid_capstyle="round", zorder=2)
     axes.plot(*place.T, color=color, linewidth=2.0, solid_capstyle="round", zorder=3, label=name)
     axes.scatter(*place[0], s=90, color="white", edgecolor=color, linewidth=2.5, zorder=5)

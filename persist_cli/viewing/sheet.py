@@ -50,16 +50,14 @@ def write_sheet(
 
 
 def label_font() -> ImageFont.FreeTypeFont:
-    """The font of labels in pictures, with Greek letters and signs, which Pillow's own font lacks."""
+    """Return the font of labels in pictures, with Greek letters and signs, which Pillow's own font lacks."""
     import matplotlib
 
     return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", 12)
 
 
 def _cells(video: Tensor, most: int) -> list[Image.Image]:
-    """At most ``most`` frames, evenly chosen, as images of the cell's height."""
-    chosen = np.unique(np.linspace(0, len(video) - 1, min(most, len(video))).round().astype(int))
-    width = round(CELL * video.shape[2] / video.shape[1])
-    return [
-        Image.fromarray(video[int(number)].numpy()).resize((width, CELL), Image.Resampling.NEAREST) for number in chosen
-    ]
+    """Return at most ``most`` frames, evenly chosen, as images of the cell's height."""
+    numbers = np.unique(np.linspace(0, len(video) - 1, min(most, len(video))).round().astype(int))
+    size = round(CELL * video.shape[2] / video.shape[1]), CELL
+    return [Image.fromarray(video[int(number)].numpy()).resize(size, Image.Resampling.NEAREST) for number in numbers]

@@ -21,7 +21,7 @@ STRIP = 20  # pixels of the height of the strip with a label
 def color_depth(
     depth: Float[Tensor, "frame height width"], farthest: float | None = None
 ) -> UInt8[Tensor, "frame height width 3"]:
-    """Depth as colours from near (dark red) to far (dark blue), missing black.
+    """Return depth as colours from near (dark red) to far (dark blue), with missing depth in black.
 
     Args:
         depth: metres, 0 = missing.
@@ -39,7 +39,7 @@ def color_depth(
 def beside(
     videos: Sequence[UInt8[Tensor, "frame height width 3"]], gap: int = 2
 ) -> UInt8[Tensor, "frame height all 3"]:
-    """Videos of equal length and height side by side, with a white gap of ``gap`` pixels."""
+    """Join videos of equal length and height side by side, with a white gap of ``gap`` pixels."""
     parts: list[Tensor] = []
     for number, video in enumerate(videos):
         if number:
@@ -49,13 +49,13 @@ def beside(
 
 
 def below(videos: Sequence[UInt8[Tensor, "frame height width 3"]], gap: int = 2) -> UInt8[Tensor, "frame all width 3"]:
-    """Videos of equal length and width one below the other, with a white gap of ``gap`` pixels."""
+    """Join videos of equal length and width one below the other, with a white gap of ``gap`` pixels."""
     transposed = beside([video.transpose(1, 2) for video in videos], gap)
     return transposed.transpose(1, 2).contiguous()
 
 
 def labelled(video: UInt8[Tensor, "frame height width 3"], label: str) -> UInt8[Tensor, "frame taller width 3"]:
-    """The video under a white strip with a label."""
+    """Return the video under a white strip with a label."""
     from PIL import Image, ImageDraw
 
     from persist_cli.viewing.sheet import label_font
@@ -67,7 +67,7 @@ def labelled(video: UInt8[Tensor, "frame height width 3"], label: str) -> UInt8[
 
 
 def enlarge(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame height width 3"]:
-    """The video with its pixels repeated until the shorter side has at least 256."""
+    """Return the video with its pixels repeated until the shorter side has at least 256."""
     factor = max(1, -(-SMALLEST // min(video.shape[1:3])))
     return video.repeat_interleave(factor, dim=1).repeat_interleave(factor, dim=2)
 
@@ -97,7 +97,7 @@ def write_gif(path: Path, video: UInt8[Tensor, "frame height width 3"], frames_p
 
 
 def read_video(path: Path, height: int, width: int) -> UInt8[Tensor, "frame height width 3"]:
-    """The frames of a video file, scaled to this height and width in pixels.
+    """Return the frames of a video file, scaled to this height and width in pixels.
 
     Raises:
         DataError: when it is missing or no video.
