@@ -18,7 +18,7 @@ table1-reference: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.table1 runs/table1-reference --reference
 
 test: $(STAMP) lint
-	$(VENV)/bin/python -m pytest -m "not slow and not gpu"
+	$(VENV)/bin/python -m pytest --durations=20 -m "not slow and not gpu"
 
 test-slow: $(STAMP)
 	$(VENV)/bin/python -m pytest -m slow

@@ -198,6 +198,7 @@ class Trainer:
                     accelerator.backward(losses["loss"] / (1 if self.zero else settings.accumulation))
             for name, loss in losses.items():
                 totals[name] = totals.get(name, 0) + loss.detach() / settings.accumulation
+            del clips, losses  # nothing of a batch stays on the device while the optimizer works
         means = {name: float(accelerator.reduce(total, "mean")) for name, total in totals.items()}
         if not math.isfinite(means["loss"]):
             raise PersistError(
