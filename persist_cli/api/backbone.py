@@ -75,7 +75,7 @@ class Clips:
     """A batch of RGB-D clips with their conditions; see ``Clip``.
 
     Args:
-        rgb: uint8.
+        rgb: uint8, 0…255.
         depth: float32 metres, planar z, 0 = missing.
         cameras: axes ``batch frame``, metres in each sample's world.
         interactions: for each sample the interactions between its frames.

@@ -48,11 +48,7 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> Cameras:
         """Return these cameras on ``device``."""
-        return replace(
-            self,
-            world_from_camera=self.world_from_camera.to(device),
-            intrinsics=self.intrinsics.to(device),
-        )
+        return replace(self, world_from_camera=self.world_from_camera.to(device), intrinsics=self.intrinsics.to(device))
 
     def relative_to(self, reference: Float[Tensor, "4 4"]) -> Cameras:
         """Return these cameras in the frame of the camera ``reference``, a world_from_camera in metres."""

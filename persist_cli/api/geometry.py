@@ -37,7 +37,7 @@ def unproject(depth: Float[Tensor, "*batch height width"], cameras: Cameras) -> 
 
     Args:
         depth: planar z in metres; where it is 0 (missing) the point is the camera centre.
-        cameras: one for each depth image.
+        cameras: one camera for each depth image, of its size.
     """
     points = camera_rays(cameras) * depth.double()[..., None]
     rotation = cameras.world_from_camera.double()[..., :3, :3]

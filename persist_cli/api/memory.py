@@ -59,7 +59,7 @@ class MapPoints:
 
     Args:
         positions: world metres, float64.
-        colors: uint8 RGB.
+        colors: uint8 RGB, 0…255.
         spread: side in metres of the square that is drawn for each point.
     """
 
@@ -87,7 +87,7 @@ class Memory(ABC):
 
     @abstractmethod
     def write(self, observations: Observations) -> None:
-        """Add posed frames, in metres of the reference's world; pixels without depth (0) have no place in it.
+        """Add posed frames in metres of the reference's world; pixels without depth (0) get no position.
 
         Raises:
             DataError: when a pose is not finite and rigid, or sizes differ; then nothing is written.

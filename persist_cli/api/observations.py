@@ -20,7 +20,7 @@ class Frame:
     """One posed RGB-D image of a simulator or importer.
 
     Args:
-        rgb: ``[height, width, 3]`` uint8.
+        rgb: ``[height, width, 3]`` uint8, 0…255.
         depth: ``[height, width]`` float32 metres, planar z, 0 = missing.
         world_from_camera: ``[4, 4]`` float64, OpenCV axes, metres.
         action: name of the agent's action that leads to the next frame; ``None`` at the last.
@@ -62,7 +62,7 @@ class Observations:
     """Posed RGB-D frames as tensors.
 
     Args:
-        rgb: uint8.
+        rgb: uint8, 0…255.
         depth: float32 metres, planar z, 0 = missing.
         cameras: one camera for each frame, of the images' size.
     """

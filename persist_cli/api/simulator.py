@@ -47,11 +47,7 @@ class Simulator(ABC):
 
     @abstractmethod
     def place(self, ground: tuple[float, float], heading: float) -> None:
-        """Put the agent at a ground position in metres, with a heading in radians that left turns increase.
-
-        Raises:
-            DataError: when the position is not free.
-        """
+        """Put the agent at a ground position in metres, heading in radians to the left; ``DataError`` if not free."""
 
     @abstractmethod
     def observe(self) -> Frame:
@@ -59,11 +55,7 @@ class Simulator(ABC):
 
     @abstractmethod
     def act(self, action: str) -> bool:
-        """Do an action and return true; return false and change nothing where the scene does not allow it.
-
-        Raises:
-            DataError: for an action that is not in the vocabulary.
-        """
+        """Do an action; return false and change nothing if the scene forbids it. An unknown one is a ``DataError``."""
 
     @property
     @abstractmethod

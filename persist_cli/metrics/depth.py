@@ -68,5 +68,5 @@ def _depths(prediction: Prediction) -> tuple[Tensor, Tensor, Bool[Tensor, "frame
 
 
 def _mean(values: Float[Tensor, "frame height width"], known: Bool[Tensor, "frame height width"]) -> Tensor:
-    """Mean of each frame over its known pixels; the others may hold any value."""
+    """Return the mean of each frame over its known pixels; the others may hold any value."""
     return values.masked_fill(~known, 0.0).sum((1, 2)) / known.sum((1, 2))

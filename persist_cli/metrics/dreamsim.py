@@ -105,7 +105,7 @@ def class_token(weights: Mapping[str, Tensor], rgb: UInt8[Tensor, "frame 224 224
 
 
 def _block(weights: Mapping[str, Tensor], name: str, tokens: Tensor) -> Tensor:
-    """Attention and a layer of width 4, each after a layer norm and added to its input."""
+    """Apply attention and a two-layer network, each after a layer norm and added to its input."""
 
     def linear(part: str, inputs: Tensor) -> Tensor:
         return functional.linear(inputs, weights[f"{name}.{part}.weight"], weights[f"{name}.{part}.bias"])

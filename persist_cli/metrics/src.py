@@ -27,7 +27,7 @@ class EncoderWeights:
     """Weights of an encoder whose features are compared.
 
     Args:
-        name: their name in the cache.
+        name: name of the weights in the cache.
         title: name of encoder and layer in the metric's definition.
         layer: block whose output is used, ``None`` for the last.
     """
@@ -50,7 +50,7 @@ class ReturnSimilarity(FrameMetric):
 
     @abstractmethod
     def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
-        """For each frame that returns the two frames that are compared."""
+        """Return for each frame that returns to a pose the two frames to compare."""
 
     @property
     def definition(self) -> str:
@@ -90,7 +90,7 @@ class Src(ReturnSimilarity):
     pairing = "each frame that returns to an earlier pose against what the video shows at its first visit there"
 
     def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
-        """For each frame that returns the first visit and the frame itself."""
+        """Return for each frame that returns to a pose its first visit and the frame itself."""
         return {frame: (first, frame) for frame, first in returns(prediction.first_visits)}
 
 
@@ -106,7 +106,7 @@ class SrcAway(ReturnSimilarity):
     )
 
     def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:
-        """For each frame that returns the first visit and the farthest frame in between."""
+        """Return for each frame that returns to a pose its first visit and the farthest frame in between."""
         cameras = prediction.truth.cameras
         return {frame: (first, farthest(cameras, first, frame)) for frame, first in returns(prediction.first_visits)}
 

@@ -51,9 +51,8 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
         print_json(figures if len(figures) > 1 else figures[0])
         return
     for rollout, folder in pairs:
-        say(
-            f"{len(rollout.seen)} frames in {rollout.seconds:.1f} s along {rollout.path.actions!r}; written to {folder}"
-        )
+        frames, actions = len(rollout.seen), rollout.path.actions
+        say(f"{frames} frames in {rollout.seconds:.1f} s along {actions!r}; written to {folder}")
 
 
 def check_folders(out: Path, branches: int) -> list[Path]:

@@ -111,7 +111,7 @@ def warn(text: str) -> None:
 
 
 def _columns_by_table(least_widths: Sequence[int], terminal_width: int) -> Iterator[list[int]]:
-    """For each table the numbers of the columns that fit beside the first one.
+    """Yield for each table the numbers of the columns that fit beside the first one.
 
     Args:
         least_widths: smallest width of each column, in characters.
@@ -127,7 +127,7 @@ def _columns_by_table(least_widths: Sequence[int], terminal_width: int) -> Itera
 
 
 def _fit_widths(full_widths: Sequence[int], least_widths: Sequence[int], terminal_width: int) -> list[int]:
-    """Widths of columns that fit a terminal: the widest is made narrower first, none below its least width."""
+    """Return widths of columns that fit a terminal: the widest is made narrower first, none below its least width."""
     widths = list(full_widths)
     while sum(widths) + BORDER * len(widths) + 1 > terminal_width:
         wide = [number for number, width in enumerate(widths) if width > least_widths[number]]

@@ -1,4 +1,4 @@
-"""tests.api.test_actions."""
+"""Actions move the camera of a walking agent, and are written and read as text and JSON."""
 
 from __future__ import annotations
 
@@ -48,6 +48,6 @@ def test_unknown_actions_are_refused(text, cause):
     assert "\n" not in str(error.value)
 
 
-def test_free_motion_cannot_be_replayed_without_poses():
+def test_a_free_motion_cannot_be_replayed_without_poses():
     with pytest.raises(DataError, match="follow the trajectory"):
         free_motion().move(torch.eye(4), "free", UP)

@@ -1,4 +1,4 @@
-"""tests.api.test_geometry."""
+"""Points, pixels and rays of posed cameras agree with each other; broken cameras are errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def cameras(count: int = 3) -> Cameras:
     return Cameras(torch.stack([rigid(seed) for seed in range(count)]), K.expand(count, 3, 3), 40, 64)
 
 
-def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_back():
+def test_projecting_unprojected_pixels_gives_the_pixels_and_depths_back():
     views = cameras()
     depth = torch.rand(3, 40, 64, dtype=torch.float64) * 10 + 0.1
     pixels, z = project(unproject(depth, views).flatten(1, 2), views)
@@ -50,7 +50,7 @@ def test_plucker_rays_of_a_moved_origin_transform_as_lines_do():
     assert torch.allclose(plucker(moved), torch.cat([lifted, turned], -1), atol=1e-9)
 
 
-def test_a_direction_contains_no_translation_unless_printed_as_in_the_paper():
+def test_a_plucker_direction_contains_no_translation_unless_printed_as_in_the_paper():
     views = cameras(1)
     difference = plucker(views, printed=True)[..., 3:] - plucker(views)[..., 3:]
     assert torch.allclose(difference, views.centers[:, None, None].expand_as(difference))
@@ -85,7 +85,7 @@ def test_an_error_names_singular_intrinsics():
         check_intrinsics(torch.zeros(3, 3), "kitchen")
 
 
-def test_a_z_buffer_has_the_nearest_depth_of_each_place_and_nothing_elsewhere():
+def test_a_z_buffer_has_the_nearest_depth_of_each_place_and_infinity_elsewhere():
     places, depth = torch.tensor([0, 2, 0, 2, 2]), torch.tensor([3.0, 1.0, 2.0, 4.0, 1.5])
     assert nearest_at(places, depth, 4).tolist() == [2.0, math.inf, 1.0, math.inf]
     assert nearest_at(places[:0], depth[:0], 2).tolist() == [math.inf] * 2

@@ -1,4 +1,4 @@
-"""What --dtype and --save-memory ask for."""
+"""The texts of --dtype and --save-memory become inference options, or errors of one line."""
 
 from __future__ import annotations
 
@@ -45,9 +45,8 @@ def test_changes_of_inference_options_are_only_those_that_change_results():
 @NO_GPU
 @pytest.mark.parametrize("offload", ["model", "sequential"])
 def test_offloading_without_an_accelerator_is_refused(offload):
-    with pytest.raises(
-        PersistError, match=rf"^--save-memory {offload}-offload keeps weights .* there is none; leave it"
-    ):
+    cause = rf"^--save-memory {offload}-offload keeps weights .* there is none; leave it"
+    with pytest.raises(PersistError, match=cause):
         micro().prepare_inference(InferenceOptions(offload=offload))
 
 

@@ -1,4 +1,4 @@
-"""Names of training scenes come back from JSON, and numbered ones take little room in it."""
+"""Names of training scenes are read back from JSON, which stores numbered names as ranges."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ NAMES = [[], ["kitchen"], HOUSES, ["scene0000_00", "scene0000_01", "scene0001_00
 
 @pytest.mark.parametrize("names", NAMES)
 @pytest.mark.parametrize("complete", [True, False])
-def test_scenes_come_back_from_json(names, complete):
+def test_scenes_are_read_back_from_json(names, complete):
     scenes = TrainingScenes(frozenset(names), complete)
     assert TrainingScenes.from_json(json.loads(json.dumps(scenes.to_json()))) == scenes
 
 
-def test_numbered_scenes_take_a_line_for_each_number_of_digits():
+def test_numbered_scenes_become_one_range_for_each_number_of_digits():
     ends = [[0, 9], [10, 99], [100, 999], [1000, 2399]]
     assert name_ranges(HOUSES) == [[f"miniworld/house-{number}" for number in pair] for pair in ends]
 
 
-def test_the_scenes_of_two_models_are_complete_only_when_both_are():
+def test_the_scenes_of_two_models_are_complete_only_when_those_of_both_are():
     a, b, unknown = TrainingScenes(frozenset("a")), TrainingScenes(frozenset("b")), TrainingScenes(complete=False)
     assert a | b == TrainingScenes(frozenset("ab"))
     assert a | unknown == TrainingScenes(frozenset("a"), complete=False)
@@ -37,6 +37,6 @@ def test_the_scenes_of_two_models_are_complete_only_when_both_are():
     [None, [], {}, {"complete": 1, "names": []}, {"complete": True, "names": [3]},
      {"complete": True, "names": [["a1"]]}, {"complete": True, "names": [["a1", "b2"]]}],
 )  # fmt: skip
-def test_json_that_is_no_list_of_scenes_is_refused(value):
+def test_json_that_is_no_list_of_scenes_is_an_error(value):
     with pytest.raises(ValueError, match="scene"):
         TrainingScenes.from_json(value)

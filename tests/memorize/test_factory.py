@@ -1,4 +1,4 @@
-"""Memories of training clips: made on the device that they are told."""
+"""Memories of training clips are made on the factory's device and give the clips their tokens."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ def test_an_encoder_computes_on_the_device_of_its_factory(tmp_path):
 
     sizes = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 56, "patch_size": 14}
     Dinov2Model(Dinov2Config(**sizes)).save_pretrained(tmp_path)
-    choice = MemoryConfig("voxel", {}, "dinov2", {"weights": str(tmp_path)})
-    seen = torch.zeros(2, 28, 28, 3, dtype=torch.uint8)
-    assert MemoryFactory.of(choice, torch.device("meta")).encoder.encode(seen).is_meta
-    assert not MemoryFactory.of(choice).encoder.encode(seen).is_meta
+    config = MemoryConfig("voxel", {}, "dinov2", {"weights": str(tmp_path)})
+    images = torch.zeros(2, 28, 28, 3, dtype=torch.uint8)
+    assert MemoryFactory.of(config, torch.device("meta")).encoder.encode(images).is_meta
+    assert not MemoryFactory.of(config).encoder.encode(images).is_meta
 
 
-def test_a_batch_may_mix_tokens_of_a_written_and_of_an_empty_memory(walks):
+def test_a_clip_has_tokens_only_when_its_memory_has_a_context(walks):
     clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
-    aware = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))
+    with_context = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))
     factory = MemoryFactory.of(MemoryConfig("voxel"), torch.device("cpu"))
-    nothing, something = (with_memory(sample, factory, 64).tokens for sample in (clips[5], aware[5]))
+    nothing, something = (with_memory(sample, factory, 64).tokens for sample in (clips[5], with_context[5]))
     assert len(nothing) == 0 < len(something) <= 64

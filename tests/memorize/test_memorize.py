@@ -1,4 +1,4 @@
-"""tests.memorize.test_memorize."""
+"""``persist memorize`` writes memory files from trajectories and merges them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def data(tmp_path_factory):
 
 
 def memorize(capsys, *arguments) -> dict:
-    """What ``persist memorize --json`` prints."""
+    """Run ``persist memorize --json`` in this process and return the JSON that it prints."""
     capsys.readouterr()
     succeed("--json", *arguments)
     return json.loads(capsys.readouterr().out)
@@ -76,13 +76,12 @@ def test_settings_reach_memory_and_encoder(data, tmp_path, capsys):
     assert load_memory(out).settings.cell == (0.5, 2.0, 0.5)
 
 
-def test_several_trajectories_of_one_scene_make_one_memory(data, tmp_path, capsys):
+def test_a_memory_of_several_trajectories_equals_their_merged_memories(data, tmp_path, capsys):
     both = memorize(capsys, f"{data}#a", f"{data}#b", "--out", tmp_path / "both.safetensors")
-    for name in "ab":
-        memorize(capsys, f"{data}#{name}", "--out", tmp_path / f"{name}.safetensors")
-    merged = memorize(
-        capsys, "--merge", tmp_path / "a.safetensors", tmp_path / "b.safetensors", "--out", tmp_path / "m.safetensors"
-    )
+    parts = {name: tmp_path / f"{name}.safetensors" for name in "ab"}
+    for name, part in parts.items():
+        memorize(capsys, f"{data}#{name}", "--out", part)
+    merged = memorize(capsys, "--merge", *parts.values(), "--out", tmp_path / "m.safetensors")
     assert merged["cells"] == both["cells"]
     assert (tmp_path / "m.safetensors").read_bytes() == (tmp_path / "both.safetensors").read_bytes()
 

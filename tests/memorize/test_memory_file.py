@@ -1,4 +1,4 @@
-"""tests.memorize.test_memory_file."""
+"""Memory files are read back to the bit; files that are damaged or do not fit are errors of one line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def saved(tmp_path):
 
 
 def with_header(path, **changes):
-    """The same file with another header."""
+    """Change entries of a file's header and return the file's path."""
     tensors, metadata = read_tensors(path)
     header = json.loads(metadata["persist"]) | changes
     save_file(tensors, path, {"persist": json.dumps(header)})
@@ -40,7 +40,7 @@ def test_a_memory_survives_save_and_load_bit_for_bit(tmp_path, name):
     assert torch.equal(memory.read(cameras, 99).features, loaded.read(cameras, 99).features)
 
 
-def test_the_file_does_not_depend_on_the_order_of_writing(tmp_path):
+def test_a_memory_file_does_not_depend_on_the_order_of_writing(tmp_path):
     forward, backward = room_walk(4), room_walk(4)[[3, 2, 1, 0]]
     for name, observations in (("a", forward), ("b", backward)):
         written_memory("voxel", observations).save(tmp_path / name)
@@ -55,7 +55,7 @@ def test_the_header_is_read_without_the_tensors(saved):
     assert header["settings"]["cell"] == [0.5, 1.0, 0.5]
 
 
-def test_settings_come_back_from_the_file(saved):
+def test_settings_are_read_back_from_a_memory_file(saved):
     assert load_memory(saved).settings.cell == (0.5, 1.0, 0.5)
 
 

@@ -32,7 +32,7 @@ def test_a_rollout_writes_videos_maps_poses_and_a_memory(persist, voxel, walks, 
     assert load_memory(tmp_path / "memory.safetensors").figures().cells > 0
 
 
-def test_a_rollout_is_the_same_for_the_same_seed_and_another_for_another(persist, voxel, walks, tmp_path):
+def test_rollouts_are_equal_for_one_seed_and_differ_for_two_seeds(persist, voxel, walks, tmp_path):
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
         assert roll(persist, voxel, walks, tmp_path / name, "--actions", "forward*9", "--seed", seed).code == 0
     a, b, c = ((tmp_path / name / "rgb.mp4").read_bytes() for name in "abc")
@@ -78,28 +78,28 @@ def test_a_rollout_without_an_adapter_is_plain_stage_one(persist, stage1, walks,
 
 
 def test_rollouts_that_cannot_work_are_refused_in_one_line(persist, voxel, stage1, walks, tmp_path):
-    other, patches = tmp_path / "other.safetensors", tmp_path / "patches.safetensors"
-    assert persist("memorize", f"{walks}#1:0-4", "--out", other).code == 0
+    foreign, patches = tmp_path / "other.safetensors", tmp_path / "patches.safetensors"
+    assert persist("memorize", f"{walks}#1:0-4", "--out", foreign).code == 0
     assert persist("memorize", f"{walks}#0:0-4", "--out", patches, "--set", "encoder.seed=5").code == 0
     left = ("--actions", "left")
     for run, options, cause in (
         (voxel, (), "either --actions TEXT or --follow"),
         (voxel, ("--actions", "lft"), "did you mean 'left'"),
         (voxel, (*left, "--memory", tmp_path / "no.safetensors"), "no.safetensors"),
-        (voxel, (*left, "--memory", other), "its reference is 'room-1', wanted here is 'room-0'"),
+        (voxel, (*left, "--memory", foreign), "its reference is 'room-1', wanted here is 'room-0'"),
         (voxel, (*left, "--memory", patches), "its encoder settings"),
-        (stage1, (*left, "--memory", other), "no memory adapter that could read"),
+        (stage1, (*left, "--memory", foreign), "no memory adapter that could read"),
         (voxel, (*left, "--adapter", "map2d"), "no memory adapter 'map2d' in it; it has voxel"),
         (voxel, (*left, "--sampler", "euler"), "unknown sampler 'euler'"),
         (voxel, (*left, "--steps", 1001), "1001 denoising steps; it must be 1 to 1000"),
         (tmp_path / "gone", left, "no checkpoint there"),
     ):
-        ended = roll(persist, run, walks, tmp_path / "o", *options)
-        assert (ended.code, cause in ended.err) == (1, True), ended.err
-        assert len(ended.err.strip().splitlines()) == 1
+        result = roll(persist, run, walks, tmp_path / "o", *options)
+        assert (result.code, cause in result.err) == (1, True), result.err
+        assert len(result.err.strip().splitlines()) == 1
     assert not (tmp_path / "o").exists()
-    ended = persist("rollout", voxel, "--start", f"{walks}#0:99", *left, "--out", tmp_path / "o")
-    assert (ended.code, "99" in ended.err) == (1, True)
+    result = persist("rollout", voxel, "--start", f"{walks}#0:99", *left, "--out", tmp_path / "o")
+    assert (result.code, "99" in result.err) == (1, True)
 
 
 def test_a_run_that_moved_with_its_base_still_loads(persist, voxel, walks, tmp_path):
@@ -107,7 +107,7 @@ def test_a_run_that_moved_with_its_base_still_loads(persist, voxel, walks, tmp_p
     assert roll(persist, tmp_path / "elsewhere/voxel", walks, tmp_path / "o", "--actions", "left").code == 0
 
 
-def test_the_loop_memorizes_what_it_imagines(walks):
+def test_the_world_model_writes_imagined_frames_into_the_memory(walks):
     from tests.support.micro_model import micro
 
     trajectory = Store(walks)[0].read([0])
@@ -148,6 +148,6 @@ def test_memory_options_that_cannot_work_are_refused_in_one_line(persist, walks,
         (["--save-memory", "model-offload"], "for an accelerator, and there is none; leave it out"),
         (["--dtype", "int8"], "unknown --dtype 'int8'; known: float32, bfloat16, float16"),
     ):
-        ended = roll(persist, tmp_path, walks, tmp_path / "o", "--actions", "forward", *options)
-        assert ended.code == 1
-        assert ended.err.strip().endswith(cause)
+        result = roll(persist, tmp_path, walks, tmp_path / "o", "--actions", "forward", *options)
+        assert result.code == 1
+        assert result.err.strip().endswith(cause)

@@ -22,7 +22,7 @@ def test_json_has_null_where_a_figure_is_not_defined(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("width", [60, 80, 100, 160])
-def test_no_table_cuts_a_number_or_a_name_whatever_the_terminal(width, capsys, monkeypatch):
+def test_a_table_cuts_no_number_or_name_in_a_terminal_of_any_width(width, capsys, monkeypatch):
     monkeypatch.setattr(console, "OUT", Console(width=width))
     columns = ["strategy", *(f"column {number}" for number in range(9)), "what it is"]
     rows = [["gradient checkpointing", *(f"{number}570479680" for number in range(9)), "some words that may wrap"]]

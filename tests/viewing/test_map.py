@@ -32,7 +32,7 @@ def test_the_highest_point_under_the_ceiling_is_drawn():
     assert {tuple(color) for color in image[image[..., 3] > 0][:, :3]} == {(0.0, 1.0, 0.0)}
 
 
-def test_a_place_without_a_point_is_transparent():
+def test_the_map_is_transparent_where_there_is_no_point():
     image, extent = paint(points(((0, 0, 0), RED), ((3, 0, 0), BLUE)), ground_axes(UP), None)
     assert np.isclose(extent[0], -0.25)
     assert (image[..., 3] == 0).mean() > 0.5

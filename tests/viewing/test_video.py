@@ -1,4 +1,4 @@
-"""Videos and GIFs come back as they were written."""
+"""Videos and GIFs are read back nearly as they were written."""
 
 import torch
 from PIL import Image
@@ -11,11 +11,11 @@ RAMP = (torch.linspace(0, 255, 64)[None, None, :, None] * torch.linspace(0.5, 1,
 VIDEO = RAMP.round().to(torch.uint8)
 
 
-def test_a_video_comes_back_as_it_was_but_for_losses_of_the_codec(tmp_path):
+def test_a_video_is_read_back_with_the_codecs_losses_only(tmp_path):
     write_video(tmp_path / "a.mp4", VIDEO)
-    back = read_video(tmp_path / "a.mp4", 64, 64)
-    assert back.shape == VIDEO.shape
-    assert (back.int() - VIDEO.int()).abs().float().mean() < 4
+    frames = read_video(tmp_path / "a.mp4", 64, 64)
+    assert frames.shape == VIDEO.shape
+    assert (frames.int() - VIDEO.int()).abs().float().mean() < 4
 
 
 def test_a_gif_is_endless_and_has_every_frame_in_nearly_its_colours(tmp_path):
