@@ -1,4 +1,4 @@
-"""Settings of adapters: each form has its own, and what cannot work is one line."""
+"""Settings of adapters: each form has its own, and settings that cannot work are refused in one line."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import pytest
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from tests.support.micro_model import CHANNELS, micro, with_adapter
 
-OWN = {
+FORM_KEYS = {
     "cross": {"heads", "frequencies", "positions"},
     "projected": {"heads", "frequencies"},
     "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
 }
-SHARED = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dropout"}
+SHARED_KEYS = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dropout"}
 
 
-@pytest.mark.parametrize("form", OWN)
+@pytest.mark.parametrize("form", FORM_KEYS)
 def test_every_adapter_form_has_exactly_the_settings_that_it_uses(form: str, tmp_path: Path) -> None:
     with_adapter(micro(), form=form).save_adapter(tmp_path)
-    assert set(json.loads((tmp_path / "adapter.json").read_text())) == SHARED | OWN[form]
+    assert set(json.loads((tmp_path / "adapter.json").read_text())) == SHARED_KEYS | FORM_KEYS[form]
 
 
 @pytest.mark.parametrize(
-    ("form", "key"), [(form, key) for form in OWN for key in set().union(*OWN.values()) - OWN[form]]
+    ("form", "key"), [(form, key) for form in FORM_KEYS for key in set().union(*FORM_KEYS.values()) - FORM_KEYS[form]]
 )
 def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Path) -> None:
     backbone = with_adapter(micro(), form=form)

@@ -1,4 +1,4 @@
-"""diffusers' caches with memory blocks between the cached ones, two outputs and two predictions a step."""
+"""diffusers' caches with memory blocks between the cached blocks, two outputs and two predictions a step."""
 
 import dataclasses
 
@@ -48,7 +48,7 @@ BUSY = {
     "pyramid attention": lambda: PyramidAttentionBroadcastConfig(spatial_attention_block_skip_range=2),
     "FasterCache": lambda: FasterCacheConfig(is_guidance_distilled=True),
 }
-EVERY = pytest.mark.parametrize("name", BUSY)
+EVERY_CACHE = pytest.mark.parametrize("name", BUSY)
 
 
 @pytest.mark.parametrize("name", IDLE)
@@ -59,14 +59,14 @@ def test_a_cache_that_skips_nothing_changes_nothing(name):
     assert equal(backbone.generate(CLIPS, SAMPLING), plain)
 
 
-@EVERY
+@EVERY_CACHE
 def test_a_cache_changes_a_clip_and_not_the_next_one(name):
     backbone = trained()
     plain = backbone.generate(CLIPS, SAMPLING)
     enable_cache(backbone.transformer, BUSY[name]())
     cached = backbone.generate(CLIPS, SAMPLING)
     assert not equal(cached, plain)
-    assert all(torch.isfinite(each.float()).all() for each in cached)
+    assert all(torch.isfinite(output.float()).all() for output in cached)
     assert equal(backbone.generate(CLIPS, SAMPLING), cached)
     batch = random_clips(2, random_tokens(2, 5))
     assert torch.isfinite(backbone.generate(batch, SAMPLING)[1]).all()  # of another size
@@ -74,25 +74,25 @@ def test_a_cache_changes_a_clip_and_not_the_next_one(name):
     assert equal(backbone.generate(CLIPS, SAMPLING), plain)
 
 
-@EVERY
+@EVERY_CACHE
 def test_an_interrupted_clip_leaves_nothing_in_the_cache(name):
-    backbone, left = trained(), [None] * 7  # two predictions a step
+    backbone, remaining_calls = trained(), [None] * 7  # two predictions a step
     enable_cache(backbone.transformer, BUSY[name]())
     whole = backbone.generate(CLIPS, SAMPLING)
-    breaking = backbone.transformer.register_forward_pre_hook(lambda *_: left.pop())
+    breaking = backbone.transformer.register_forward_pre_hook(lambda *_: remaining_calls.pop())
     with pytest.raises(IndexError):
         backbone.generate(CLIPS, SAMPLING)
     breaking.remove()
     assert equal(backbone.generate(CLIPS, SAMPLING), whole)
 
 
-@EVERY
+@EVERY_CACHE
 def test_predictions_with_and_without_memory_have_caches_of_their_own(name):
     backbone = trained()
     enable_cache(backbone.transformer, BUSY[name]())
-    nothing = dataclasses.replace(CLIPS, tokens=MemoryTokens.stack([MemoryTokens.empty(CHANNELS)]))
-    blind = backbone.generate(nothing, Sampling(STEPS))
-    assert equal(backbone.generate(CLIPS, Sampling(STEPS, memory_guidance=0.0)), blind)
+    without_tokens = dataclasses.replace(CLIPS, tokens=MemoryTokens.stack([MemoryTokens.empty(CHANNELS)]))
+    unguided = backbone.generate(without_tokens, Sampling(STEPS))
+    assert equal(backbone.generate(CLIPS, Sampling(STEPS, memory_guidance=0.0)), unguided)
 
 
 @pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
@@ -102,17 +102,17 @@ def test_skipped_blocks_add_their_memory_once(name, form):
     shaken(backbone)
     config = MagCacheConfig(threshold=9.0, retention_ratio=0.0, **RATIOS) if name == "MagCache" else BUSY[name]()
     enable_cache(backbone.transformer, config)
-    noisy, at = torch.randn(1, 3, 8, 8, 8, generator=torch.Generator().manual_seed(0)), torch.tensor([500])
-    given = backbone.conditions(CLIPS, at, backbone.memory_condition(CLIPS))
-    image, caches, ran = backbone.encode_first(CLIPS), ClipCaches(backbone.transformer), []
-    backbone.transformer.base.transformer_blocks[2].attn1.register_forward_hook(lambda *_: ran.append(1))
-    with torch.no_grad(), caches.prediction("cond", given):
-        computed, cached = (backbone.predict(noisy, image, caches.around(given)) for _ in range(2))
-    assert len(ran) == 1
+    noisy, timesteps = torch.randn(1, 3, 8, 8, 8, generator=torch.Generator().manual_seed(0)), torch.tensor([500])
+    conditions = backbone.conditions(CLIPS, timesteps, backbone.memory_condition(CLIPS))
+    image, caches, block_runs = backbone.encode_first(CLIPS), ClipCaches(backbone.transformer), []
+    backbone.transformer.base.transformer_blocks[2].attn1.register_forward_hook(lambda *_: block_runs.append(1))
+    with torch.no_grad(), caches.prediction("cond", conditions):
+        computed, cached = (backbone.predict(noisy, image, caches.around(conditions)) for _ in range(2))
+    assert len(block_runs) == 1
     assert torch.allclose(cached, computed, atol=1e-4)
 
 
-@EVERY
+@EVERY_CACHE
 def test_a_cache_is_enabled_on_a_pipeline_as_on_one_of_diffusers(name):
     backbone = trained()
     enable_cache(backbone.transformer, BUSY[name]())
@@ -124,11 +124,11 @@ def test_a_cache_is_enabled_on_a_pipeline_as_on_one_of_diffusers(name):
     if isinstance(config, TaylorSeerCacheConfig) and not config.use_lite_mode:
         config.cache_identifiers = [r"transformer_blocks\.\d+\.attn1"]
     pipeline.transformer.enable_cache(config)
-    found = pipeline(
+    output = pipeline(
         CLIPS.rgb[:, 0], CLIPS.depth[:, 0], CLIPS.cameras, memory_tokens=CLIPS.tokens, num_inference_steps=STEPS,
         guidance_scale=1.5, generator=torch.Generator().manual_seed(0), output_type="pt",
     )  # fmt: skip
-    assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    assert torch.equal((output.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
 
 
 def test_a_cache_that_cannot_work_is_refused():

@@ -1,4 +1,4 @@
-"""The canvas form: what is drawn reaches the video token it falls on, and nothing else does."""
+"""The canvas form: a drawn memory token reaches the video tokens on which it falls, and no others."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ def test_the_head_corrects_only_video_tokens_on_which_a_memory_token_fell() -> N
     assert adapter.head is not None
     shaken(adapter.head)
     changed = (predicted(backbone, clips, tokens) - bare).ne(0).any(dim=2)
-    fell = adapter.prepare(tokens, clips.cameras).mask.reshape(2, 3, 4, 4)
-    assert 0 < fell.sum() < fell.numel()
-    assert torch.equal(changed, fell.repeat_interleave(2, -1).repeat_interleave(2, -2))
+    covered = adapter.prepare(tokens, clips.cameras).mask.reshape(2, 3, 4, 4)
+    assert 0 < covered.sum() < covered.numel()
+    assert torch.equal(changed, covered.repeat_interleave(2, -1).repeat_interleave(2, -2))
 
 
 def test_the_head_distinguishes_memory_tokens_within_one_video_token() -> None:
@@ -83,12 +83,12 @@ def test_the_head_distinguishes_memory_tokens_within_one_video_token() -> None:
     assert adapter.head is not None
     place = clips.cameras.intrinsics[0, 0].inverse() @ torch.tensor([SIZE / 2 + 1, SIZE / 2 + 1, 1.0]).double() * 2
     beside = clips.cameras.intrinsics[0, 0].inverse() @ torch.tensor([SIZE / 2 + 5, SIZE / 2 + 1, 1.0]).double() * 2
-    seen = []
+    prepared_memories = []
     for position in (place, beside):
         token = MemoryTokens(torch.ones(2, 1, CHANNELS), position.expand(2, 1, 3), torch.ones(2, 1, dtype=torch.bool))
         prepared = adapter.prepare(token, clips.cameras)
         assert prepared.seen is not None
-        seen.append((prepared.mask[:, :16], prepared.seen[:, 0]))
-    (first_mask, first), (second_mask, second) = seen
+        prepared_memories.append((prepared.mask[:, :16], prepared.seen[:, 0]))
+    (first_mask, first), (second_mask, second) = prepared_memories
     assert torch.equal(first_mask, second_mask)  # the same video token of the first frame
     assert not torch.equal(first, second)

@@ -1,4 +1,4 @@
-"""The codec: frames coded alone, pixels folded into channels, and how it begins."""
+"""The codec: framewise coding, pixels folded into channels, fresh weights, and VAEs that are refused."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX
 
-from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.codec import batch_to_frames, fold_pixels, frames_to_batch, to_uint8, unfold_pixels
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.backbone import Sampling
 from persist_cli.doctor.tracing import fake_tensors
 from persist_cli.errors import CheckpointError
 from persist_cli.plugins import make_backbone
 from tests.support.micro_model import micro, random_clips, shaken
 
-STILL = {
+FRAMEWISE = {
     "vae": {
         "in_channels": 48,
         "out_channels": 48,
@@ -33,53 +33,53 @@ STILL = {
 
 
 @pytest.fixture
-def still() -> CogVideoX:
-    backbone = micro(**STILL)
+def framewise() -> CogVideoX:
+    backbone = micro(**FRAMEWISE)
     shaken(backbone.codec)
     return backbone.eval()
 
 
-def test_a_frame_coded_alone_does_not_depend_on_the_others(still: CogVideoX) -> None:
+def test_a_frame_coded_alone_does_not_depend_on_the_others(framewise: CogVideoX) -> None:
     clips = random_clips(2)
-    whole = still.codec.encode(clips.rgb, clips.depth)
+    whole = framewise.codec.encode(clips.rgb, clips.depth)
     assert whole.shape[:2] == (2, 9)
     for frame in (0, 4, 8):
-        alone = still.codec.encode(clips.rgb[:, frame : frame + 1], clips.depth[:, frame : frame + 1])
+        alone = framewise.codec.encode(clips.rgb[:, frame : frame + 1], clips.depth[:, frame : frame + 1])
         assert torch.allclose(alone[:, 0], whole[:, frame], atol=1e-5)
-    latents = still.encode(clips)
+    latents = framewise.encode(clips)
     assert torch.equal(latents.video, whole)
     assert torch.equal(latents.image, whole[:, :1])
 
 
-def test_the_fast_convolution_equals_that_of_diffusers_for_videos_of_one_frame(still: CogVideoX) -> None:
-    plain = AutoencoderKLCogVideoX(**{k: v for k, v in still.codec.vae.config.items() if not k.startswith("_")})
-    plain.load_state_dict(still.codec.vae.state_dict())
+def test_the_fast_convolution_equals_that_of_diffusers_for_videos_of_one_frame(framewise: CogVideoX) -> None:
+    plain = AutoencoderKLCogVideoX(**{k: v for k, v in framewise.codec.vae.config.items() if not k.startswith("_")})
+    plain.load_state_dict(framewise.codec.vae.state_dict())
     image = torch.randn(3, 48, 1, 8, 8, generator=torch.Generator().manual_seed(0))
     latents = plain.encode(image).latent_dist.mode()
-    assert torch.allclose(still.codec.vae.encode(image).latent_dist.mode(), latents, atol=1e-4)
-    assert torch.allclose(still.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
+    assert torch.allclose(framewise.codec.vae.encode(image).latent_dist.mode(), latents, atol=1e-4)
+    assert torch.allclose(framewise.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
 
 
-def test_the_fast_convolution_continues_a_video_as_diffusers_does(still: CogVideoX) -> None:
-    plain = AutoencoderKLCogVideoX(**{k: v for k, v in still.codec.vae.config.items() if not k.startswith("_")})
-    plain.load_state_dict(still.codec.vae.state_dict())
-    for vae in (plain, still.codec.vae):
+def test_the_fast_convolution_continues_a_video_as_diffusers_does(framewise: CogVideoX) -> None:
+    plain = AutoencoderKLCogVideoX(**{k: v for k, v in framewise.codec.vae.config.items() if not k.startswith("_")})
+    plain.load_state_dict(framewise.codec.vae.state_dict())
+    for vae in (plain, framewise.codec.vae):
         vae.num_latent_frames_batch_size = vae.num_sample_frames_batch_size = 1
     video = torch.randn(2, 48, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     latents = plain.encode(video).latent_dist.mode()
-    assert torch.allclose(still.codec.vae.encode(video).latent_dist.mode(), latents, atol=1e-4)
-    assert torch.allclose(still.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
+    assert torch.allclose(framewise.codec.vae.encode(video).latent_dist.mode(), latents, atol=1e-4)
+    assert torch.allclose(framewise.codec.vae.decode(latents).sample, plain.decode(latents).sample, atol=1e-4)
 
 
-def test_the_fast_convolution_has_the_gradients_of_diffusers(still: CogVideoX) -> None:
-    plain = AutoencoderKLCogVideoX(**{k: v for k, v in still.codec.vae.config.items() if not k.startswith("_")})
-    plain.load_state_dict(still.codec.vae.state_dict())
+def test_the_fast_convolution_has_the_gradients_of_diffusers(framewise: CogVideoX) -> None:
+    plain = AutoencoderKLCogVideoX(**{k: v for k, v in framewise.codec.vae.config.items() if not k.startswith("_")})
+    plain.load_state_dict(framewise.codec.vae.state_dict())
     image = torch.randn(1, 48, 1, 8, 8, generator=torch.Generator().manual_seed(0))
-    for vae in (plain, still.codec.vae):
+    for vae in (plain, framewise.codec.vae):
         vae.encode(image).latent_dist.mode().square().sum().backward()
-    for (name, one), two in zip(plain.named_parameters(), still.codec.vae.parameters(), strict=True):
-        if one.grad is not None:
-            assert torch.allclose(one.grad, two.grad, rtol=1e-3, atol=1e-2), name
+    for (name, slow), fast in zip(plain.named_parameters(), framewise.codec.vae.parameters(), strict=True):
+        if slow.grad is not None:
+            assert torch.allclose(slow.grad, fast.grad, rtol=1e-3, atol=1e-2), name
 
 
 @torch.no_grad()
@@ -113,8 +113,8 @@ def test_unfolding_undoes_folding() -> None:
     assert fold_pixels(videos, 4).shape == (2, 48, 5, 2, 3)
 
 
-@pytest.mark.parametrize("settings", [{}, STILL])
-def test_a_fresh_codec_hardly_adds_noise_and_its_residual_blocks_do_nothing(settings: dict) -> None:
+@pytest.mark.parametrize("settings", [{}, FRAMEWISE])
+def test_a_fresh_codec_adds_little_noise_and_its_residual_blocks_are_the_identity(settings: dict) -> None:
     codec, clips = micro(**settings).codec, random_clips(1)
     assert float(codec.posterior(codec.images(clips.rgb, clips.depth)).std.detach().mean()) < 0.1
     block = codec.vae.encoder.mid_block.resnets[0]
@@ -122,39 +122,39 @@ def test_a_fresh_codec_hardly_adds_noise_and_its_residual_blocks_do_nothing(sett
     assert torch.equal(block(hidden)[0], hidden)
 
 
-def test_a_model_with_a_framewise_codec_trains_and_generates(still: CogVideoX) -> None:
+def test_a_model_with_a_framewise_codec_trains_and_generates(framewise: CogVideoX) -> None:
     clips = random_clips(1)
-    assert all(bool(still(clips, stage)["loss"].isfinite()) for stage in ("codec", "1"))
-    rgb, depth = still.generate(clips, Sampling(2))
+    assert all(bool(framewise(clips, stage)["loss"].isfinite()) for stage in ("codec", "1"))
+    rgb, depth = framewise.generate(clips, Sampling(2))
     assert rgb.shape == clips.rgb.shape
     assert depth.shape == clips.depth.shape
 
 
-@pytest.mark.parametrize("settings", [{}, STILL], ids=["video", "frames alone"])
+@pytest.mark.parametrize("settings", [{}, FRAMEWISE], ids=["video", "frames alone"])
 def test_training_on_encoded_latents_equals_training_on_their_images(settings: dict) -> None:
     backbone, clips = micro(**settings), random_clips(2)
     shaken(backbone)
-    kept = dataclasses.replace(clips, latents=backbone.encode(clips), rgb=clips.rgb[:, :0], depth=clips.depth[:, :0])
-    losses, again = backbone(clips, "1"), backbone(kept, "1")
-    assert all(torch.equal(value, again[name]) for name, value in losses.items())
+    cached = dataclasses.replace(clips, latents=backbone.encode(clips), rgb=clips.rgb[:, :0], depth=clips.depth[:, :0])
+    losses, cached_losses = backbone(clips, "1"), backbone(cached, "1")
+    assert all(torch.equal(value, cached_losses[name]) for name, value in losses.items())
 
 
-def test_a_fingerprint_depends_on_the_weights_and_their_scale_only(still: CogVideoX) -> None:
-    first = still.encoding()
-    shaken(still.transformer)
-    assert still.encoding() == first
-    shaken(still.codec)
-    second = still.encoding()
-    still.finish_stage("codec", [random_clips(1)])
-    third = still.encoding()
-    still.to(torch.bfloat16)
-    assert len({first, second, third, still.encoding()}) == 4
+def test_a_fingerprint_depends_on_the_weights_and_their_scale_only(framewise: CogVideoX) -> None:
+    first = framewise.encoding()
+    shaken(framewise.transformer)
+    assert framewise.encoding() == first
+    shaken(framewise.codec)
+    second = framewise.encoding()
+    framewise.finish_stage("codec", [random_clips(1)])
+    third = framewise.encoding()
+    framewise.to(torch.bfloat16)
+    assert len({first, second, third, framewise.encoding()}) == 4
 
 
-def test_unchanged_weights_are_hashed_once(still: CogVideoX, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = still.encoding()
+def test_unchanged_weights_are_hashed_once(framewise: CogVideoX, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = framewise.encoding()
     monkeypatch.setattr(hashlib, "sha256", None)
-    assert still.encoding() == first
+    assert framewise.encoding() == first
 
 
 @pytest.mark.parametrize(
@@ -178,10 +178,10 @@ def test_a_vae_that_cannot_work_is_refused(change: dict, cause: str) -> None:
 
 
 @pytest.mark.parametrize("frames", [2, 3, 4, 9])
-def test_a_codec_of_single_frames_takes_any_number_of_them(frames: int) -> None:
-    still = micro(**STILL, frames=frames, codec_window=[frames - 1, 32, 32])
-    assert still.frames_per_clip == frames
+def test_a_framewise_codec_takes_clips_of_any_number_of_frames(frames: int) -> None:
+    framewise = micro(**FRAMEWISE, frames=frames, codec_window=[frames - 1, 32, 32])
+    assert framewise.frames_per_clip == frames
     with pytest.raises(CheckpointError, match="frames must be at least 2, not 1"):
-        micro(**STILL, frames=1)
+        micro(**FRAMEWISE, frames=1)
     with pytest.raises(CheckpointError, match="codec_window's frames must be at least 1, not 0"):
-        micro(**STILL, codec_window=[0, 32, 32])
+        micro(**FRAMEWISE, codec_window=[0, 32, 32])

@@ -2,16 +2,16 @@
 
 They live in diffusers' repository and not in its wheel: ``DIFFUSERS_CHECKOUT`` names a checkout of v0.40 or later.
 
-The class under test writes safetensors where a test asks for pickled weights, which we neither write nor read. What
-else of them does not apply, and why:
+The class under test writes safetensors where a test asks for pickled weights, which we neither write nor read. These
+tests do not apply either:
 
 - FasterCache's denoiser: it skips a guidance whose two predictions are one batch, and hooks the forward of diffusers'
-  transformer; ours asks twice and runs the blocks itself. Its attention is cached, see ``test_caches``.
-- Group offload: it hooks the forward of diffusers' transformer for what stands outside the blocks, which ours does not
-  run; CPU offload of whole models and of layers works.
+  transformer; ours predicts twice and runs the blocks itself. Its attention is cached, see ``test_caches``.
+- Group offload: it hooks the forward of diffusers' transformer for modules outside the blocks, but ours does not run
+  it; CPU offload of whole models and of layers works.
 - ``encode_prompt`` and ``num_images_per_prompt``: the prompt is constant and stored; every clip has its own cameras.
 - LoRA, IP adapters, quantization: diffusers' mixins for pipelines that load them; ours has no such loader.
-- What wants an accelerator skips itself without one: half precision, offloading, device maps, layerwise casting.
+- Tests for an accelerator skip themselves without one: half precision, offloading, device maps, layerwise casting.
 """
 
 from __future__ import annotations
@@ -31,38 +31,38 @@ from tests.support.micro_model import micro, random_clips, random_tokens, shaken
 from tests.support.micro_runs import MICRO
 
 CHECKOUT = os.environ.get("DIFFUSERS_CHECKOUT")
-NAME = "diffusers_tests"  # their package is called as ours is
+NAME = "diffusers_tests"  # not ``tests``, which our package is called too
 
 if not CHECKOUT:
     pytest.skip("DIFFUSERS_CHECKOUT names no checkout of diffusers' repository", allow_module_level=True)
 
 
-def theirs(module: str) -> Any:
-    """A module of diffusers' tests, under a package name that is not ours."""
+def import_diffusers_tests(module: str) -> Any:
+    """Import a module of diffusers' tests under the package name ``NAME``."""
     folder = Path(CHECKOUT or "") / "tests"
     if NAME not in sys.modules:
-        found = importlib.util.spec_from_file_location(
+        spec = importlib.util.spec_from_file_location(
             NAME, folder / "__init__.py", submodule_search_locations=[str(folder)]
         )
-        if found is None or found.loader is None or not (folder / "pipelines/testing_utils").is_dir():
+        if spec is None or spec.loader is None or not (folder / "pipelines/testing_utils").is_dir():
             pytest.skip(f"{folder}: no diffusers v0.40 or later there", allow_module_level=True)
-        sys.modules[NAME] = importlib.util.module_from_spec(found)
-        found.loader.exec_module(sys.modules[NAME])
+        sys.modules[NAME] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[NAME])
     return importlib.import_module(f"{NAME}.{module}")
 
 
-mixins = theirs("pipelines.testing_utils")
+mixins = import_diffusers_tests("pipelines.testing_utils")
 
 
 class SafePipeline(WorldPipeline):
-    """The pipeline that writes safetensors whatever it is asked for."""
+    """The pipeline, but it writes safetensors also when pickled weights are requested."""
 
     def save_pretrained(self, save_directory: Any, safe_serialization: bool = True, **options: Any) -> None:
         super().save_pretrained(save_directory, **options)
 
 
 class MicroConfig(mixins.BasePipelineTesterConfig):  # type: ignore[misc,name-defined]
-    """What diffusers' mixins must know of the pipeline."""
+    """The description of the pipeline for diffusers' mixins."""
 
     pipeline_class = SafePipeline
     required_input_params_in_call_signature = frozenset(["image", "depth", "cameras"])
@@ -90,8 +90,8 @@ class MicroConfig(mixins.BasePipelineTesterConfig):  # type: ignore[misc,name-de
         }
 
 
-class AlonePrediction(MicroConfig):
-    """Without guidance: tests of caches count one prediction a step."""
+class UnguidedConfig(MicroConfig):
+    """The pipeline without guidance, for tests of caches that expect one prediction a step."""
 
     def get_dummy_inputs(self) -> dict[str, Any]:
         return super().get_dummy_inputs() | {"guidance_scale": 1.0}
@@ -121,11 +121,11 @@ class TestMagCache(MicroConfig, mixins.MagCacheTesterMixin):  # type: ignore[mis
     """MagCache."""
 
 
-class TestPyramidAttention(AlonePrediction, mixins.PyramidAttentionBroadcastTesterMixin):  # type: ignore[misc,name-defined]
+class TestPyramidAttention(UnguidedConfig, mixins.PyramidAttentionBroadcastTesterMixin):  # type: ignore[misc,name-defined]
     """Pyramid attention broadcast."""
 
 
-class TestFasterCache(AlonePrediction, mixins.FasterCacheTesterMixin):  # type: ignore[misc,name-defined]
+class TestFasterCache(UnguidedConfig, mixins.FasterCacheTesterMixin):  # type: ignore[misc,name-defined]
     """FasterCache's attention."""
 
     FASTER_CACHE_CONFIG = {  # noqa: RUF012
@@ -134,4 +134,4 @@ class TestFasterCache(AlonePrediction, mixins.FasterCacheTesterMixin):  # type: 
     }
 
     def test_faster_cache_state(self) -> None:
-        pytest.skip("the denoiser that it looks at is not run: blocks are, with memory between")
+        pytest.skip("the hooked forward of diffusers' transformer is not run: its blocks are, with memory between")

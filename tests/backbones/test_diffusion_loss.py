@@ -1,4 +1,4 @@
-"""Objectives: clean latents or velocities, and what an error counts."""
+"""The training loss: clean latents or velocities as targets, and the weights of errors."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def test_the_loss_of_an_error_is_the_same_for_velocities_and_clean_latents(weigh
         signal = scheduler.alphas_cumprod[STEPS][:, None, None, None, None]
         target = prediction_target(scheduler, latents, noise, STEPS)
         noisy = scheduler.add_noise(latents, noise, STEPS)
-        said = wrong if kind == "sample" else (signal.sqrt() * noisy - wrong) / (1 - signal).sqrt()
+        prediction = wrong if kind == "sample" else (signal.sqrt() * noisy - wrong) / (1 - signal).sqrt()
         weights = loss_weights(scheduler, STEPS, weighting, 5.0)
-        losses[kind] = weights * (said - target).square().mean((1, 2, 3, 4))
+        losses[kind] = weights * (prediction - target).square().mean((1, 2, 3, 4))
     assert torch.allclose(losses["sample"].double(), losses["v_prediction"].double(), rtol=1e-3)
 
 
@@ -35,19 +35,19 @@ def test_the_prediction_of_clean_latents_survives_saving_and_loading(tmp_path: P
     backbone, clips = micro(prediction="sample"), random_clips(1)
     shaken(backbone)
     backbone.save_base(tmp_path)
-    other = micro()
-    other.load_base(tmp_path)
-    assert torch.equal(backbone.generate(clips, Sampling(2))[0], other.generate(clips, Sampling(2))[0])
+    loaded = micro()
+    loaded.load_base(tmp_path)
+    assert torch.equal(backbone.generate(clips, Sampling(2))[0], loaded.generate(clips, Sampling(2))[0])
 
 
 def test_the_model_card_states_what_the_weights_predict(tmp_path: Path) -> None:
-    kinds = {kind: micro(prediction=kind).checkpoint_settings()["prediction"] for kind in ("v_prediction", "sample")}
-    assert all(kind == said for kind, said in kinds.items())
+    for kind in ("v_prediction", "sample"):
+        assert micro(prediction=kind).checkpoint_settings()["prediction"] == kind
     micro(prediction="sample").save_base(tmp_path)
-    other = micro()
-    assert other.checkpoint_settings()["prediction"] == "v_prediction"
-    other.load_base(tmp_path)
-    assert other.checkpoint_settings()["prediction"] == "sample"
+    loaded = micro()
+    assert loaded.checkpoint_settings()["prediction"] == "v_prediction"
+    loaded.load_base(tmp_path)
+    assert loaded.checkpoint_settings()["prediction"] == "sample"
     assert micro(pretrained=str(tmp_path)).checkpoint_settings()["prediction"] == "sample"
 
 

@@ -36,9 +36,9 @@ def test_a_clip_depends_on_its_seed_and_not_on_its_batch(sampler):
     backbone, clips, sampling = micro(), random_clips(2), Sampling(3, sampler)
     shaken(backbone)
     rgb, depth = backbone.generate(clips, sampling)
-    again = backbone.generate(clips, sampling)
-    assert torch.equal(rgb, again[0])
-    assert torch.equal(depth, again[1])
+    repeated = backbone.generate(clips, sampling)
+    assert torch.equal(rgb, repeated[0])
+    assert torch.equal(depth, repeated[1])
     second = dataclasses.replace(random_clips(2), rgb=clips.rgb[1:], depth=clips.depth[1:], seeds=[1])
     second = dataclasses.replace(
         second, cameras=dataclasses.replace(clips.cameras, world_from_camera=clips.cameras.world_from_camera[1:],
@@ -46,8 +46,8 @@ def test_a_clip_depends_on_its_seed_and_not_on_its_batch(sampler):
     )  # fmt: skip
     alone = backbone.generate(second, sampling)
     assert (alone[0][0].int() - rgb[1].int()).abs().max() <= 1
-    other = backbone.generate(dataclasses.replace(clips, seeds=[7, 8]), sampling)
-    assert not torch.equal(rgb, other[0])
+    reseeded = backbone.generate(dataclasses.replace(clips, seeds=[7, 8]), sampling)
+    assert not torch.equal(rgb, reseeded[0])
 
 
 def test_a_clip_begins_with_the_given_frame():
@@ -62,13 +62,13 @@ def test_a_model_survives_saving_to_the_bit(tmp_path):
     backbone, clips = micro(), random_clips(1)
     shaken(backbone)
     backbone.save_base(tmp_path)
-    other = micro()
-    other.load_base(tmp_path)
-    for one, two in zip(backbone.generate(clips, Sampling(2)), other.generate(clips, Sampling(2)), strict=True):
-        assert torch.equal(one, two)
+    loaded = micro()
+    loaded.load_base(tmp_path)
+    outputs = zip(backbone.generate(clips, Sampling(2)), loaded.generate(clips, Sampling(2)), strict=True)
+    assert all(torch.equal(before, after) for before, after in outputs)
 
 
-def test_interactions_change_nothing_at_first_and_something_once_learned():
+def test_interactions_change_the_loss_only_once_their_embedding_is_trained():
     backbone = micro()
     shaken(backbone.transformer.base)
     picked = random_clips(1, interactions=[(None, "pick_up", *[None] * 6)])
@@ -92,8 +92,8 @@ def test_a_loss_depends_on_the_seeds_alone():
     backbone, clips = micro(), random_clips(2)
     for stage in ("codec", "1"):
         assert torch.equal(backbone(clips, stage)["loss"], backbone(clips, stage)["loss"])
-        other = dataclasses.replace(clips, seeds=[5, 6])
-        assert not torch.equal(backbone(clips, stage)["loss"], backbone(other, stage)["loss"])
+        reseeded = dataclasses.replace(clips, seeds=[5, 6])
+        assert not torch.equal(backbone(clips, stage)["loss"], backbone(reseeded, stage)["loss"])
 
 
 def test_min_snr_lowers_the_weight_of_clean_samples_and_never_exceeds_one():

@@ -1,4 +1,4 @@
-"""A placed backbone gives the clips that it gave before, wherever its weights rest."""
+"""A backbone prepared for inference generates the same clips, wherever its weights are between clips."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def test_a_backbone_in_lower_precision_stays_so_and_samples_nearly_the_same():
     backbone = trained()
     rgb, _ = backbone.generate(CLIPS, SAMPLING)
     backbone.prepare_inference(InferenceOptions("bfloat16"))
-    assert {each.dtype for each in backbone.parameters()} == {torch.bfloat16}
-    found, depth = backbone.generate(CLIPS, SAMPLING)
-    assert (found.dtype, depth.dtype) == (torch.uint8, torch.float32)
-    assert 0 < (found.float() - rgb.float()).abs().mean() < 0.05 * 255
+    assert {parameter.dtype for parameter in backbone.parameters()} == {torch.bfloat16}
+    coarse, depth = backbone.generate(CLIPS, SAMPLING)
+    assert (coarse.dtype, depth.dtype) == (torch.uint8, torch.float32)
+    assert 0 < (coarse.float() - rgb.float()).abs().mean() < 0.05 * 255
     assert backbone.reconstruct(CLIPS)[0].dtype == torch.uint8
 
 
@@ -55,7 +55,7 @@ def test_offloading_whole_parts_changes_no_clip_even_after_another_adapter():
     backbone.use_adapter("voxel")
     backbone.prepare_inference(InferenceOptions())
     assert backbone.offloaded is None
-    assert not any(hasattr(each, "_hf_hook") for each in backbone.modules())
+    assert not any(hasattr(module, "_hf_hook") for module in backbone.modules())
 
 
 @pytest.mark.gpu
@@ -66,8 +66,8 @@ def test_an_offloaded_backbone_leaves_the_gpu_empty_between_clips(offload):
     rgb, _ = backbone.generate(CLIPS, SAMPLING)
     for _ in range(2):
         backbone.prepare_inference(InferenceOptions(offload=offload))
-        found, _ = backbone.generate(CLIPS, SAMPLING)
-        assert (found.int() - rgb.int()).abs().max() <= 2
+        offloaded, _ = backbone.generate(CLIPS, SAMPLING)
+        assert (offloaded.int() - rgb.int()).abs().max() <= 2
     assert backbone.transformer.base.device.type != "cuda"
     backbone.prepare_inference(InferenceOptions())
     assert backbone.transformer.base.device.type == "cuda"

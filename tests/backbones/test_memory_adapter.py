@@ -1,4 +1,4 @@
-"""Every form of memory adapter: nothing before it is trained, and after that no more than its tokens say."""
+"""Every form of memory adapter: a fresh one changes nothing, and a trained one depends on its tokens alone."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ every_form = pytest.mark.parametrize("form", FORMS)
 
 
 def padded(tokens: MemoryTokens, extra: int) -> MemoryTokens:
-    """The same tokens with rubbish behind the mask, in view and nearer than they are."""
+    """Append rubbish tokens that are masked out, in view and nearer than the others."""
     batch = len(tokens.features)
     near = torch.tensor([0.1, 0.1, 0.6], dtype=torch.float64).expand(batch, extra, 3)
     return MemoryTokens(
@@ -69,12 +69,12 @@ def test_masked_padding_tokens_change_nothing(form):
 def test_a_batch_may_hold_a_sample_without_any_token(form):
     backbone, clips = with_adapter(micro(), form=form), random_clips()
     shaken(backbone)
-    some = random_tokens(2, 9)
-    mixed = dataclasses.replace(some, mask=some.mask & torch.tensor([[True], [False]]))
+    tokens = random_tokens(2, 9)
+    mixed = dataclasses.replace(tokens, mask=tokens.mask & torch.tensor([[True], [False]]))
     result = predicted(backbone, clips, mixed)
     assert result.isfinite().all()
     assert torch.allclose(result[1], predicted(backbone, clips, None)[1], atol=1e-5)
-    assert torch.allclose(result[0], predicted(backbone, clips, some)[0], atol=1e-5)
+    assert torch.allclose(result[0], predicted(backbone, clips, tokens)[0], atol=1e-5)
 
 
 @every_form
@@ -84,14 +84,14 @@ def test_every_parameter_of_an_adapter_has_a_gradient_within_two_steps(form):
     clips = random_clips(tokens=random_tokens(2, 9))
     parameters = backbone.trained_parameters("2")
     optimizer = torch.optim.AdamW(parameters.values(), lr=1e-2)
-    moved = dict.fromkeys(parameters, False)
+    with_gradient = set()
     for _ in range(2):
         optimizer.zero_grad()
         backbone(clips, "2")["loss"].backward()
-        moved = {name: moved[name] or bool(each.grad.any()) for name, each in parameters.items()}
+        with_gradient |= {name for name, parameter in parameters.items() if parameter.grad.any()}
         optimizer.step()
-    # a softmax does not see a constant added to every key
-    assert [name for name, done in moved.items() if not done and not name.endswith("to_key.bias")] == []
+    # a constant added to every key does not change a softmax
+    assert [name for name in parameters.keys() - with_gradient if not name.endswith("to_key.bias")] == []
 
 
 @every_form
@@ -100,7 +100,7 @@ def test_stage_two_trains_the_adapter_and_nothing_else(form):
     names = set(backbone.trained_parameters("2"))
     assert names
     assert all(name.startswith("adapters.voxel.") for name in names)
-    assert {name for name, each in backbone.named_parameters() if each.requires_grad} == names
+    assert {name for name, parameter in backbone.named_parameters() if parameter.requires_grad} == names
 
 
 @every_form
@@ -112,9 +112,9 @@ def test_moving_the_whole_world_changes_no_prediction(form):
     motion[:3, 3] = torch.tensor([40.0, -3.0, 12.0])
     moved_cameras = Cameras(motion @ clips.cameras.world_from_camera, clips.cameras.intrinsics, 32, 32)
     moved_tokens = dataclasses.replace(tokens, positions=tokens.positions @ motion[:3, :3].T + motion[:3, 3])
-    here = predicted(backbone, clips, tokens)
-    there = predicted(backbone, dataclasses.replace(clips, cameras=moved_cameras), moved_tokens)
-    assert torch.allclose(here, there, atol=1e-4)
+    original = predicted(backbone, clips, tokens)
+    moved = predicted(backbone, dataclasses.replace(clips, cameras=moved_cameras), moved_tokens)
+    assert torch.allclose(original, moved, atol=1e-4)
 
 
 def test_absolute_positions_depend_on_the_origin_of_the_world():
@@ -149,10 +149,10 @@ def test_an_adapter_survives_saving_to_the_bit(form, tmp_path):
     backbone = with_adapter(micro(), form=form)
     shaken(backbone.adapters)
     backbone.save_adapter(tmp_path)
-    other = micro()
-    other.load_adapter("voxel", tmp_path)
+    loaded = micro()
+    loaded.load_adapter("voxel", tmp_path)
     assert all(
-        torch.equal(value, other.adapters.state_dict()[name]) for name, value in backbone.adapters.state_dict().items()
+        torch.equal(value, loaded.adapters.state_dict()[name]) for name, value in backbone.adapters.state_dict().items()
     )
 
 
@@ -169,7 +169,7 @@ def test_adapters_and_tokens_that_do_not_fit_are_refused(tmp_path):
         backbone.use_adapter("map2d")
 
 
-def test_the_position_code_tells_cells_apart_and_is_bounded():
+def test_the_position_code_is_bounded_and_differs_between_cells():
     code = position_code(torch.tensor([[0.0, 0, 0], [0.25, 0, 0], [60.0, 0, 0]]), 10)
     assert code.abs().max() <= 1
     assert torch.pdist(code).min() > 0.5

@@ -1,4 +1,4 @@
-"""Tokens and what each form makes of them: order, neighbours, visibility, precision."""
+"""Tokens in each form of adapter: order, other samples, visibility, precision."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ from tests.support.micro_model import (
 
 FINE = {"form": "canvas", "canvas_scale": 2, "ff_factor": 0}  # drawn larger than the latents, without feed-forward
 every_variant = pytest.mark.parametrize("form", [*FORMS, "fine canvas"])
-told_by_cameras = pytest.mark.parametrize("form", ["projected", "canvas"])
+forms_of_visible_tokens = pytest.mark.parametrize("form", ["projected", "canvas"])
 
 
 def trained(form, **settings):
@@ -33,7 +33,7 @@ def trained(form, **settings):
 
 
 def token_at(*position):
-    """One token, the same in two samples."""
+    """One token at a position, the same in two samples."""
     place = torch.tensor(position, dtype=torch.float64).expand(2, 1, 3)
     return MemoryTokens(torch.full((2, 1, CHANNELS), 0.7), place, torch.ones(2, 1, dtype=torch.bool))
 
@@ -47,11 +47,11 @@ def test_the_order_of_tokens_changes_nothing(form):
 
 
 @every_variant
-def test_equal_tokens_at_one_place_do_not_depend_on_their_order(form):
+def test_the_order_of_tokens_at_one_place_changes_nothing(form):
     backbone, clips, twice = trained(form), random_clips(), random_tokens(2, 8)
     twice.positions[:, 4:] = twice.positions[:, :4]
-    turned = dataclasses.replace(twice, features=twice.features.roll(4, dims=1))
-    assert torch.allclose(predicted(backbone, clips, twice), predicted(backbone, clips, turned), atol=1e-5)
+    swapped = dataclasses.replace(twice, features=twice.features.roll(4, dims=1))
+    assert torch.allclose(predicted(backbone, clips, twice), predicted(backbone, clips, swapped), atol=1e-5)
 
 
 @every_variant
@@ -75,14 +75,14 @@ def test_a_dropped_memory_is_no_memory(form):
 def test_an_emptied_memory_is_no_memory(form):
     backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
     memory = backbone.memory_condition(dataclasses.replace(clips, tokens=tokens))
-    some, none = predicted(backbone, clips, tokens), predicted(backbone, clips, None)
-    assert torch.allclose(predicted_of(backbone, clips, memory.emptied()), none, atol=1e-5)
-    one = predicted_of(
+    remembered, bare = predicted(backbone, clips, tokens), predicted(backbone, clips, None)
+    assert torch.allclose(predicted_of(backbone, clips, memory.emptied()), bare, atol=1e-5)
+    mixed = predicted_of(
         backbone, clips, dataclasses.replace(memory, memory=memory.memory.only(torch.tensor([True, False])))
     )
-    assert torch.allclose(one[0], some[0], atol=1e-5)
-    assert torch.allclose(one[1], none[1], atol=1e-5)
-    assert not torch.allclose(some, none, atol=1e-3)
+    assert torch.allclose(mixed[0], remembered[0], atol=1e-5)
+    assert torch.allclose(mixed[1], bare[1], atol=1e-5)
+    assert not torch.allclose(remembered, bare, atol=1e-3)
 
 
 @every_variant
@@ -90,12 +90,12 @@ def test_gradients_are_the_same_with_checkpointing(form):
     backbone, clips = trained(form), random_clips(tokens=random_tokens(2, 40))
     parameters = backbone.trained_parameters("2")
     backbone(clips, "2")["loss"].backward()
-    plain = {name: each.grad.clone() for name, each in parameters.items()}
+    plain = {name: parameter.grad.clone() for name, parameter in parameters.items()}
     backbone.zero_grad()
     backbone.apply_memory_savings("2", MemorySavings(gradient_checkpointing=True))
     backbone.train()
     backbone(clips, "2")["loss"].backward()
-    assert all(torch.allclose(each.grad, plain[name], atol=1e-6) for name, each in parameters.items())
+    assert all(torch.allclose(parameter.grad, plain[name], atol=1e-6) for name, parameter in parameters.items())
 
 
 @every_variant
@@ -106,9 +106,8 @@ def test_training_in_bfloat16_follows_training_in_float32(form):
         loss = backbone(clips, "2")["loss"]
     loss.backward()
     assert loss.item() == pytest.approx(exact, rel=0.05)
-    assert all(
-        each.grad.isfinite().all() for each in backbone.trained_parameters("2").values() if each.grad is not None
-    )
+    gradients = [parameter.grad for parameter in backbone.trained_parameters("2").values()]
+    assert all(gradient.isfinite().all() for gradient in gradients if gradient is not None)
 
 
 @every_variant
@@ -123,7 +122,7 @@ def test_an_adapter_in_bfloat16_takes_the_same_tokens(form):
     assert after.any()
 
 
-@told_by_cameras
+@forms_of_visible_tokens
 @pytest.mark.parametrize("place", [(0.0, 0.0, -1.0), (9.0, 0.0, 3.0), (0.0, -9.0, 3.0)])
 def test_tokens_that_no_camera_of_the_clip_sees_change_nothing(form, place):
     backbone, clips = trained(form), random_clips()

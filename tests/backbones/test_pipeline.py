@@ -1,4 +1,4 @@
-"""The pipeline of diffusers' kind: the same clips as the backbone's, whatever diffusers' users do to a pipeline."""
+"""The pipeline of diffusers' kind gives its backbone's clips with every feature that diffusers' users expect."""
 
 from pathlib import Path
 
@@ -35,16 +35,16 @@ FRAMEWISE = {"vae": {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "lat
 
 
 def call(pipeline: WorldPipeline, **changes: object) -> WorldPipelineOutput:
-    """The clips of ``CLIPS`` in three steps with guidance."""
+    """Call the pipeline on ``CLIPS`` in three steps with guidance."""
     pipeline.set_progress_bar_config(disable=True)
     seeds = [torch.Generator().manual_seed(seed) for seed in CLIPS.seeds]
-    given = {"num_inference_steps": 3, "guidance_scale": 1.5, "generator": seeds, "output_type": "pt"}
-    given |= {"memory_tokens": CLIPS.tokens} | changes
-    return pipeline(CLIPS.rgb[:, 0], CLIPS.depth[:, 0], CLIPS.cameras, **given)
+    options = {"num_inference_steps": 3, "guidance_scale": 1.5, "generator": seeds, "output_type": "pt"}
+    options |= {"memory_tokens": CLIPS.tokens} | changes
+    return pipeline(CLIPS.rgb[:, 0], CLIPS.depth[:, 0], CLIPS.cameras, **options)
 
 
 def same(one: WorldPipelineOutput, two: WorldPipelineOutput) -> bool:
-    """Whether two answers are equal to the bit."""
+    """Whether two outputs are equal to the bit."""
     return torch.equal(one.frames, two.frames) and torch.equal(one.depth, two.depth)
 
 
@@ -52,9 +52,9 @@ def same(one: WorldPipelineOutput, two: WorldPipelineOutput) -> bool:
 def test_a_pipeline_gives_the_clips_of_its_backbone(form):
     backbone = trained(form)
     rgb, depth = backbone.generate(CLIPS, Sampling(3, "ddim", 1.5))
-    found = call(WorldPipeline.of(backbone))
-    assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
-    assert torch.equal(found.depth, depth)
+    output = call(WorldPipeline.of(backbone))
+    assert torch.equal((output.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    assert torch.equal(output.depth, depth)
 
 
 @FORMS
@@ -90,12 +90,12 @@ def test_in_bfloat16_a_clip_comes_out_near_that_of_float32(form):
 def test_offloaded_weights_change_no_result(form, settings):
     exact = call(WorldPipeline.of(trained(form, **settings)))
     whole, layers = (WorldPipeline.of(trained(form, **settings)) for _ in range(2))
-    whole.enable_model_cpu_offload(device="cpu")  # hooks and all; only the other device is missing here
+    whole.enable_model_cpu_offload(device="cpu")  # with all hooks, but to the same device
     assert same(call(whole), exact)
     assert same(call(whole), exact)
     for part in layers.components.values():
         if isinstance(part, torch.nn.Module):
-            accelerate.cpu_offload(part, "cpu")  # what enable_sequential_cpu_offload does, which numbers the device
+            accelerate.cpu_offload(part, "cpu")  # like enable_sequential_cpu_offload, which takes no device "cpu"
     assert same(call(layers), exact)
     assert layers.transformer.device.type == layers.vae.device.type == layers.adapter.device.type == "meta"
 
@@ -107,10 +107,10 @@ def test_offloaded_weights_sample_on_the_gpu(form, offload):
     exact = call(WorldPipeline.of(trained(form)).to("cuda"))
     pipeline = WorldPipeline.of(trained(form))
     getattr(pipeline, offload)()
-    found = call(pipeline)
-    assert found.frames.device.type == "cuda"
-    assert torch.allclose(found.frames, exact.frames, atol=1e-3)
-    assert torch.cuda.memory_allocated() < sum(each.nbytes for each in pipeline.transformer.parameters())
+    output = call(pipeline)
+    assert output.frames.device.type == "cuda"
+    assert torch.allclose(output.frames, exact.frames, atol=1e-3)
+    assert torch.cuda.memory_allocated() < sum(weight.nbytes for weight in pipeline.transformer.parameters())
 
 
 def test_slicing_and_tiling_of_the_codec_hardly_change_a_clip():
@@ -123,7 +123,7 @@ def test_slicing_and_tiling_of_the_codec_hardly_change_a_clip():
 
 
 def tokens_of(sample: int) -> MemoryTokens:
-    """Those of one sample of ``CLIPS``."""
+    """The tokens of one sample of ``CLIPS``."""
     return MemoryTokens(*(getattr(CLIPS.tokens, name)[sample] for name in ("features", "positions", "mask")))
 
 
@@ -149,14 +149,14 @@ def test_a_pipeline_takes_lists_of_samples():
 
 
 def test_a_callback_runs_at_every_step_and_its_changes_take_effect():
-    pipeline, seen = WorldPipeline.of(trained()), []
+    pipeline, steps = WorldPipeline.of(trained()), []
 
     def watch(pipe, number, timestep, tensors):
-        seen.append((number, int(timestep), pipe.num_timesteps, float(tensors["latents"].std()) > 0))
+        steps.append((number, int(timestep), pipe.num_timesteps, float(tensors["latents"].std()) > 0))
         return {"latents": torch.zeros_like(tensors["latents"])} if number == 2 else tensors
 
     assert not call(pipeline, callback_on_step_end=watch, output_type="latent").frames.any()
-    assert seen == [(0, 999, 3, True), (1, 666, 3, True), (2, 332, 3, True)]
+    assert steps == [(0, 999, 3, True), (1, 666, 3, True), (2, 332, 3, True)]
     assert pipeline.current_timestep is None
 
 
@@ -177,8 +177,8 @@ def test_replacing_the_scheduler_changes_the_sampler():
     backbone = trained()
     pipeline = WorldPipeline.of(backbone)
     pipeline.scheduler = CogVideoXDPMScheduler.from_config(pipeline.scheduler.config)
-    found, (rgb, _) = call(pipeline), backbone.generate(CLIPS, Sampling(3, "dpm", 1.5))
-    assert torch.equal((found.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    output, (rgb, _) = call(pipeline), backbone.generate(CLIPS, Sampling(3, "dpm", 1.5))
+    assert torch.equal((output.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
     pipeline.scheduler = EulerDiscreteScheduler()
     with pytest.raises(PersistError, match=r"^scheduler EulerDiscreteScheduler does not keep to training"):
         call(pipeline)
@@ -187,14 +187,14 @@ def test_replacing_the_scheduler_changes_the_sampler():
 def test_a_pipeline_takes_and_returns_pictures_and_arrays_and_takes_noise():
     pipeline = WorldPipeline.of(trained())
     pipeline.set_progress_bar_config(disable=True)
-    picture, way = Image.fromarray(CLIPS.rgb[0, 0].numpy()), CLIPS.cameras[0]
+    picture, path = Image.fromarray(CLIPS.rgb[0, 0].numpy()), CLIPS.cameras[0]
     noise = torch.randn(1, 3, 8, 8, 8)
-    one = pipeline(picture, None, way, num_inference_steps=1, latents=noise)
-    two = pipeline(CLIPS.rgb[:1, 0].movedim(-1, 1) / 255, None, way, num_inference_steps=1, latents=noise,
-                   output_type="np", return_dict=False)  # fmt: skip
-    assert (one.frames[0][0].size, len(one.frames[0])) == ((32, 32), 9)
-    pixels = np.array(one.frames[0][5])
-    assert np.abs(two[0][0, 5] * 255 - pixels).max() <= 0.51
+    from_picture = pipeline(picture, None, path, num_inference_steps=1, latents=noise)
+    from_array = pipeline(CLIPS.rgb[:1, 0].movedim(-1, 1) / 255, None, path, num_inference_steps=1, latents=noise,
+                          output_type="np", return_dict=False)  # fmt: skip
+    assert (from_picture.frames[0][0].size, len(from_picture.frames[0])) == ((32, 32), 9)
+    pixels = np.array(from_picture.frames[0][5])
+    assert np.abs(from_array[0][0, 5] * 255 - pixels).max() <= 0.51
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_images_depth_and_cameras_of_other_sizes_are_refused():
 
 @pytest.fixture
 def checkpoints(tmp_path: Path) -> tuple[CogVideoX, Path, Path]:
-    """A backbone, its base's folder, and that of an adapter on it."""
+    """A backbone, the folder of its base, and the folder of an adapter on that base."""
     backbone, base, stage2 = trained(), tmp_path / "base", tmp_path / "voxel"
     base.mkdir()
     stage2.mkdir()
@@ -268,7 +268,7 @@ def test_the_pipeline_of_diffusers_runs_the_parts_that_we_save(checkpoints):
         scheduler=CogVideoXDDIMScheduler.from_pretrained(base / "scheduler"),
     )  # fmt: skip
     pipeline.set_progress_bar_config(disable=True)
-    found = pipeline(Image.fromarray(CLIPS.rgb[0, 0].numpy()), prompt_embeds=torch.zeros(1, 1, 8), num_frames=9,
-                     height=32, width=32, num_inference_steps=2, guidance_scale=1.0, output_type="pt")  # fmt: skip
-    assert found.frames.shape == (1, 9, 3, 32, 32)
-    assert torch.isfinite(found.frames).all()
+    output = pipeline(Image.fromarray(CLIPS.rgb[0, 0].numpy()), prompt_embeds=torch.zeros(1, 1, 8), num_frames=9,
+                      height=32, width=32, num_inference_steps=2, guidance_scale=1.0, output_type="pt")  # fmt: skip
+    assert output.frames.shape == (1, 9, 3, 32, 32)
+    assert torch.isfinite(output.frames).all()

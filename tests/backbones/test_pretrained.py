@@ -1,4 +1,4 @@
-"""Pretrained weights by directory or by their name on the hub, which is asked only when it must be and can be."""
+"""Pretrained weights from a directory, or from the hub, which is used only for files that are not in its cache."""
 
 import shutil
 
@@ -16,7 +16,7 @@ NAME = "zai-org/CogVideoX-5b-I2V"
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """A hub's cache of its own, and no hub."""
+    """An empty cache of the hub, which itself is offline."""
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.chdir(tmp_path)
@@ -25,7 +25,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def snapshot(cache):
-    """The twin in the hub's cache."""
+    """A twin in the hub's cache."""
     return write_twin("5b-i2v", write_snapshot(cache, NAME))
 
 
@@ -33,7 +33,7 @@ def test_a_name_on_the_hub_is_opened_from_the_cache_without_the_network(snapshot
     by_name, by_folder = load_twin(NAME), load_twin(snapshot)
     assert pretrained_folder(NAME) == snapshot
     pairs = zip(by_name.state_dict().values(), by_folder.state_dict().values(), strict=True)
-    assert all(torch.equal(one, two) for one, two in pairs)
+    assert all(torch.equal(*pair) for pair in pairs)
 
 
 def test_a_local_directory_comes_before_a_name_on_the_hub(snapshot, tmp_path):
@@ -88,8 +88,8 @@ def test_a_meta_model_of_weights_in_the_cache_has_their_size(snapshot):
 
 
 def test_the_names_of_both_publishers_are_known():
-    known = [published_preset(f"{owner}/CogVideoX1.5-5B-I2V") for owner in ("THUDM", "zai-org", "someone")]
-    assert known == ["1.5-5b-i2v", "1.5-5b-i2v", None]
+    presets = [published_preset(f"{owner}/CogVideoX1.5-5B-I2V") for owner in ("THUDM", "zai-org", "someone")]
+    assert presets == ["1.5-5b-i2v", "1.5-5b-i2v", None]
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_a_missing_or_malformed_part_is_refused_in_one_line_without_messages_of_
     folder = write_twin("5b-i2v", tmp_path) / "transformer"
     weights = folder / "diffusion_pytorch_model.safetensors"
     tensors = read_tensors(weights)[0]
-    write_tensors(weights, {name: each for name, each in tensors.items() if name != "patch_embed.pos_embedding"})
+    write_tensors(weights, {name: tensor for name, tensor in tensors.items() if name != "patch_embed.pos_embedding"})
     with pytest.raises(CheckpointError, match=r"its weights lack 1 tensors .*, first 'patch_embed.pos_embedding'"):
         load_twin(tmp_path, SIZE)
     weights.unlink()

@@ -1,4 +1,4 @@
-"""The prompt's embedding: by T5 where it is, from a file, or zeros; never by a download."""
+"""The prompt's embedding: computed by a local T5, read from a file, or zeros, and never downloaded."""
 
 import json
 import shutil
@@ -20,7 +20,7 @@ SPECIAL = ["<pad>", "</s>", "<unk>"]
 
 
 def small_tokenizer() -> T5Tokenizer:
-    """A unigram trained on a line."""
+    """A unigram tokenizer, trained on one line of text."""
     unigram = Tokenizer(models.Unigram())
     unigram.pre_tokenizer = pre_tokenizers.Metaspace()
     trainer = trainers.UnigramTrainer(vocab_size=40, special_tokens=SPECIAL, unk_token="<unk>", show_progress=False)
@@ -46,8 +46,8 @@ def test_a_prompt_is_embedded_as_diffusers_pipeline_embeds_it(folder):
     encoder = T5EncoderModel.from_pretrained(folder / "text_encoder")
     pipe = CogVideoXPipeline(T5Tokenizer.from_pretrained(folder / "tokenizer"), encoder, None, None, None)
     with torch.no_grad():
-        theirs, _ = pipe.encode_prompt(PROMPT, do_classifier_free_guidance=False, max_sequence_length=10)
-    assert torch.equal(ours, theirs)
+        expected, _ = pipe.encode_prompt(PROMPT, do_classifier_free_guidance=False, max_sequence_length=10)
+    assert torch.equal(ours, expected)
     assert ours.any()
     assert not torch.equal(load_twin(folder, prompt="").prompt, ours)
 
@@ -61,9 +61,9 @@ def test_a_checkpoint_stores_the_embedding_of_its_prompt_and_needs_no_t5(folder,
     model.save_base(tmp_path)
     settings = model.checkpoint_settings()
     assert (settings["pretrained"], settings["prompt"], settings["prompt_embedding"]) == (None, None, None)
-    again = make_backbone("cogvideox", settings)
-    again.load_base(tmp_path)
-    assert torch.equal(again.prompt, model.prompt)
+    loaded = make_backbone("cogvideox", settings)
+    loaded.load_base(tmp_path)
+    assert torch.equal(loaded.prompt, model.prompt)
 
 
 def test_a_model_from_an_embedding_equals_the_one_from_its_prompt(folder, tmp_path):
@@ -105,15 +105,15 @@ def test_a_prompt_without_its_encoder_is_refused_with_another_way_to_go(folder, 
 
 
 def test_embedding_a_prompt_never_uses_the_network(tmp_path, monkeypatch):
-    asked, name = [], "zai-org/CogVideoX-2b"
+    hosts, name = [], "zai-org/CogVideoX-2b"
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
-    monkeypatch.setattr("socket.getaddrinfo", lambda host, *_, **__: asked.append(host) or [])
+    monkeypatch.setattr("socket.getaddrinfo", lambda host, *_, **__: hosts.append(host) or [])
     write_twin("2b", write_snapshot(tmp_path / "hub", name))
     assert not load_twin(name).prompt.any()
     with pytest.raises(CheckpointError, match=r"no text_encoder/ to embed the prompt with; give .* zeros$"):
         load_twin(name, prompt=PROMPT)
-    assert asked == []
+    assert hosts == []
 
 
 def test_an_embedding_of_another_size_or_name_is_refused(folder, tmp_path):
@@ -133,9 +133,9 @@ def test_a_base_keeps_its_prompt(folder, tmp_path):
     model = load_twin(folder, prompt=PROMPT)
     model.save_base(tmp_path)
     with torch.device("meta"):
-        other = make_backbone("cogvideox", model.checkpoint_settings() | {"prompt_embedding": "x.safetensors"})
+        loaded = make_backbone("cogvideox", model.checkpoint_settings() | {"prompt_embedding": "x.safetensors"})
     with pytest.raises(CheckpointError, match="trained with a prompt of its own; leave prompt"):
-        other.load_base(tmp_path)
+        loaded.load_base(tmp_path)
 
 
 def test_a_sentencepiece_model_says_which_packages_read_it(folder, tmp_path, monkeypatch):

@@ -16,14 +16,14 @@ from tests.support.published_configs import SCHEDULERS, TRANSFORMERS, VAES
 MODELS = tuple(TRANSFORMERS)
 SIZE = {"height": 480, "width": 720, "frames": 49}
 VAE_PARAMETERS = 215_583_907
-COUNTS = [  # of the published transformer, what widening adds, and the paper's memory block at its defaults
+COUNTS = [  # parameters of the published transformer, its widening, and the paper's memory blocks by default
     ("2b", 1_693_783_872, 750_144, 580_737_920),
     ("5b", 5_570_283_072, 1_155_648, 1_891_102_592),
     ("5b-i2v", 5_570_479_680, 959_040, 1_891_102_592),
     ("1.5-5b", 5_570_676_352, 2_237_056, 1_891_231_616),
     ("1.5-5b-i2v", 5_571_594_880, 1_843_840, 1_891_231_616),
 ]
-SHOWN = {"sample_height", "sample_width", "sample_frames"}  # a preset's are those of the settings
+SAMPLE_SIZES = {"sample_height", "sample_width", "sample_frames"}  # which a preset takes from the settings
 
 
 def on_meta(preset: str) -> CogVideoX:
@@ -38,9 +38,9 @@ def shapes(module: torch.nn.Module) -> dict[str, torch.Size]:
 
 
 def written(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration as its file has it, without the sizes of clips."""
-    kept = {key: value for key, value in config.items() if key not in SHOWN and not key.startswith("_")}
-    return json.loads(json.dumps(kept))
+    """A configuration as in its file, without the sizes of clips."""
+    values = {key: value for key, value in config.items() if key not in SAMPLE_SIZES and not key.startswith("_")}
+    return json.loads(json.dumps(values))
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -56,7 +56,7 @@ def test_a_preset_has_the_parameters_and_the_configuration_of_the_published_mode
 
 
 def count(parameters: Iterable[torch.nn.Parameter]) -> int:
-    return sum(each.numel() for each in parameters)
+    return sum(parameter.numel() for parameter in parameters)
 
 
 @pytest.mark.parametrize(("name", "published", "new", "memory"), COUNTS)

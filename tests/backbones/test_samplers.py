@@ -1,4 +1,4 @@
-"""Samplers: each asks a denoiser once a step, and ends where the denoiser says."""
+"""Samplers: each calls the denoiser once a step and ends at its last clean prediction."""
 
 import functools
 import json
@@ -20,41 +20,41 @@ from persist_backbones.cogvideox.diffusion import (
 
 UNSHIFTED, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3
 CONFIGS = pytest.mark.parametrize("config", [UNSHIFTED, SHIFTED], ids=["shift 1", "shift 3"])
-EVERY = pytest.mark.parametrize("sampler", SAMPLERS)
+EVERY_SAMPLER = pytest.mark.parametrize("sampler", SAMPLERS)
 STEPS = pytest.mark.parametrize("steps", [1, 2, 4, 7, 10, 50, 61])
-# Where training knows no signal the multistep schedulers assume a share of 2⁻¹², and so leave that much of the noise;
-# the rest is float32.
+# At the noise level without signal the multistep schedulers assume a share of 2⁻¹², and leave that much of the noise;
+# the rest is the rounding of float32.
 TOLERANCE = 5 * 2**-12  # noise of the tests stays below 5
 SHAPE = (3, 4, 2, 2)
 
 
 @functools.cache
 def alphas(config: str) -> Tensor:
-    """Share of signal in the variance at each noise level of training."""
+    """Return the share of signal in the variance at each noise level of training."""
     return make_scheduler(json.loads(config), "ddim", 1).alphas_cumprod
 
 
-def levels(config: dict, timesteps: Tensor) -> tuple[Tensor, Tensor]:
-    """Shares of signal and noise in training, for each sample."""
+def signal_and_noise(config: dict, timesteps: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the factors of signal and noise at each sample's timestep in training."""
     signal = alphas(json.dumps(config))[timesteps].float()[:, None, None, None, None]
     return signal.sqrt(), (1 - signal).sqrt()
 
 
-def knowing(clean: Tensor, config: dict) -> Callable[[Tensor, Tensor], Tensor]:
-    """A denoiser that knows the clean latents: its velocity is α ε − σ x₀ with the noise that it must have been."""
+def perfect_denoiser(clean: Tensor, config: dict) -> Callable[[Tensor, Tensor], Tensor]:
+    """Make a denoiser that knows the clean latents x₀: its velocity is α ε − σ x₀, where ε follows from the latents."""
 
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
-        alpha, sigma = levels(config, timesteps)
+        alpha, sigma = signal_and_noise(config, timesteps)
         return alpha * (latents - alpha * clean) / sigma - sigma * clean
 
     return predict
 
 
-def expecting(spread: float, config: dict) -> Callable[[Tensor, Tensor], Tensor]:
-    """The best denoiser of Gaussian latents of this standard deviation."""
+def gaussian_denoiser(spread: float, config: dict) -> Callable[[Tensor, Tensor], Tensor]:
+    """Make the best denoiser of Gaussian latents of this standard deviation."""
 
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
-        alpha, sigma = levels(config, timesteps)
+        alpha, sigma = signal_and_noise(config, timesteps)
         variance = alpha.square() * spread**2 + sigma.square()
         return alpha * sigma * (1 - spread**2) / variance * latents
 
@@ -69,76 +69,76 @@ def denoise(
     steps: int,
     generators: list[torch.Generator],
 ) -> Tensor:
-    """Latents after all steps of a schedule."""
+    """Return the latents after all steps of a schedule."""
     schedule = SamplingSchedule(config, sampler, steps, generators)
     for timestep in schedule.timesteps:
         latents = schedule.step(predict(latents, timestep.expand(len(latents))), timestep, latents)
     return latents
 
 
-def drawn(seeds: list[int]) -> tuple[Tensor, list[torch.Generator]]:
+def draw_noise(seeds: list[int]) -> tuple[Tensor, list[torch.Generator]]:
     generators = sample_generators(seeds)
     return noise_like(torch.zeros(len(seeds), *SHAPE), generators), generators
 
 
 @CONFIGS
-@EVERY
+@EVERY_SAMPLER
 @STEPS
 def test_a_perfect_denoiser_is_called_once_a_step_and_the_clean_latents_come_back(config, sampler, steps):
-    clean, asked = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4)), []
-    knows = knowing(clean, config)
+    clean, calls = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4)), []
+    perfect = perfect_denoiser(clean, config)
 
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
-        asked.append(timesteps)
-        return knows(latents, timesteps)
+        calls.append(timesteps)
+        return perfect(latents, timesteps)
 
-    noise, generators = drawn([0, 1])
+    noise, generators = draw_noise([0, 1])
     assert noise.abs().max() < 5
-    found = denoise(predict, noise, config, sampler, steps, generators)
-    assert torch.allclose(found, clean, rtol=0, atol=TOLERANCE)
-    assert len(asked) == steps
-    assert {int(each) for part in asked for each in part} <= set(range(1000))
+    denoised = denoise(predict, noise, config, sampler, steps, generators)
+    assert torch.allclose(denoised, clean, rtol=0, atol=TOLERANCE)
+    assert len(calls) == steps
+    assert {int(timestep) for timesteps in calls for timestep in timesteps} <= set(range(1000))
 
 
-@EVERY
+@EVERY_SAMPLER
 @pytest.mark.parametrize("steps", [4, 7, 50, 61])
 def test_a_perfect_prediction_of_clean_latents_is_sampled_exactly(sampler, steps):
     clean = torch.randn(2, *SHAPE, generator=torch.Generator().manual_seed(4))
-    noise, generators = drawn([0, 1])
+    noise, generators = draw_noise([0, 1])
     config = UNSHIFTED | {"prediction_type": "sample"}
     assert torch.allclose(denoise(lambda *_: clean, noise, config, sampler, steps, generators), clean, atol=1e-6)
 
 
 @CONFIGS
-@EVERY
+@EVERY_SAMPLER
 @pytest.mark.parametrize("steps", [4, 7, 50, 61])
 def test_the_last_step_leaves_no_noise(config, sampler, steps):
     cleaned = []
 
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
-        alpha, sigma = levels(config, timesteps)
+        alpha, sigma = signal_and_noise(config, timesteps)
         velocity = torch.sin(3 * latents) + alphas(json.dumps(config))[timesteps[0]].float() * 0.3
         cleaned.append(alpha * latents - sigma * velocity)
         return velocity
 
-    noise, generators = drawn([0, 1])
-    found = denoise(predict, noise, config, sampler, steps, generators)
-    assert torch.allclose(found, cleaned[-1], rtol=0, atol=TOLERANCE)
+    noise, generators = draw_noise([0, 1])
+    denoised = denoise(predict, noise, config, sampler, steps, generators)
+    assert torch.allclose(denoised, cleaned[-1], rtol=0, atol=TOLERANCE)
 
 
-@EVERY
+@EVERY_SAMPLER
 @pytest.mark.parametrize("steps", [1, 4, 10])
 def test_a_sample_depends_on_its_seed_and_not_on_its_batch(sampler, steps):
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
         return torch.sin(3 * latents)
 
     def denoised(seeds: list[int]) -> Tensor:
-        noise, generators = drawn(seeds)
+        noise, generators = draw_noise(seeds)
         return denoise(predict, noise, UNSHIFTED, sampler, steps, generators)
 
-    together, alone, other = denoised([3, 4, 5]), denoised([4]), denoised([6])
+    together, alone, reseeded = denoised([3, 4, 5]), denoised([4]), denoised([6])
     assert torch.allclose(together[1], alone[0], atol=1e-6)
-    assert (alone - other).abs().max() > 0.1
+    assert (alone - reseeded).abs().max() > 0.1
 
 
 @CONFIGS
@@ -170,14 +170,14 @@ def test_multistep_samplers_stay_nearer_to_the_flow_than_ddim(config, steps):
 
 
 def distance_from_flow(spread: float, config: dict, sampler: str, steps: int) -> float:
-    """Of the latents before the last step; Gaussian latents flow from pure noise along √(α² spread² + σ²) · noise."""
-    expects, distances = expecting(spread, config), []
-    noise, generators = drawn([0, 1])
+    """Measure the latents before the last step; Gaussian latents flow along √(α² spread² + σ²) · noise."""
+    best, distances = gaussian_denoiser(spread, config), []
+    noise, generators = draw_noise([0, 1])
 
     def predict(latents: Tensor, timesteps: Tensor) -> Tensor:
-        alpha, sigma = levels(config, timesteps)
+        alpha, sigma = signal_and_noise(config, timesteps)
         distances.append(float((latents - (alpha.square() * spread**2 + sigma.square()).sqrt() * noise).std()))
-        return expects(latents, timesteps)
+        return best(latents, timesteps)
 
     denoise(predict, noise, config, sampler, steps, generators)
     return distances[-1]

@@ -1,4 +1,4 @@
-"""Tokens as a camera sees them: where they fall, how large, and what hides what."""
+"""Splatting of tokens into camera views: their pixels, their size, and the order of their depths."""
 
 import pytest
 import torch
@@ -18,12 +18,12 @@ def views(frames: int = 1) -> Cameras:
 
 
 def on_ray(column: float, row: float, depth: float) -> list[float]:
-    """The point at this depth that falls on the middle of a pixel."""
+    """Return the point at this depth that is projected onto the middle of a pixel."""
     return [(column + 0.5 - SIDE / 2) / FOCAL * depth, (row + 0.5 - SIDE / 2) / FOCAL * depth, depth]
 
 
-def drawn(points, features, cameras=None, size=0.0, most=1):
-    """The first view's canvas: features, coverage, log depth."""
+def draw(points, features, cameras=None, size=0.0, most=1):
+    """Draw the canvas of the first view: features, coverage, log depth."""
     cameras = cameras or views()
     positions = torch.tensor(points, dtype=torch.float64)[None]
     splats = rasterize(positions, torch.ones(1, len(points), dtype=torch.bool), cameras, size, most)
@@ -33,7 +33,7 @@ def drawn(points, features, cameras=None, size=0.0, most=1):
 
 @pytest.mark.parametrize(("column", "row"), [(0, 0), (5, 2), (7, 7), (3, 6)])
 def test_a_token_on_a_ray_lands_on_its_pixel_and_nowhere_else(column, row):
-    value, coverage, logs = drawn([on_ray(column, row, 3.0)], [7.0])
+    value, coverage, logs = draw([on_ray(column, row, 3.0)], [7.0])
     assert coverage.nonzero().tolist() == [[row, column]]
     assert value[row, column] == 7
     assert logs[row, column] == pytest.approx(torch.tensor(3.0).log().item())
@@ -43,29 +43,29 @@ def test_a_token_on_a_ray_lands_on_its_pixel_and_nowhere_else(column, row):
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_nearer_token_hides_a_farther_one(order):
     points, features = [on_ray(4, 4, 2.0), on_ray(4, 4, 3.0), on_ray(1, 1, 3.0)], [1.0, 2.0, 3.0]
-    value = drawn(points[::order], features[::order])[0]
+    value = draw(points[::order], features[::order])[0]
     assert (value[4, 4], value[1, 1]) == (1, 3)
 
 
 @pytest.mark.parametrize("point", [[0.0, 0.0, -2.0], [0.0, 0.0, 0.0], [9.0, 0.0, 2.0], [0.0, -9.0, 2.0]])
 def test_tokens_behind_the_camera_or_out_of_view_do_not_appear(point):
-    assert not drawn([point], [1.0], size=0.25, most=5).any()
+    assert not draw([point], [1.0], size=0.25, most=5).any()
 
 
 def test_tokens_as_near_as_each_other_are_averaged():
-    assert drawn([on_ray(4, 4, 2.0)] * 3, [1.0, 2.0, 6.0])[0, 4, 4] == 3
+    assert draw([on_ray(4, 4, 2.0)] * 3, [1.0, 2.0, 6.0])[0, 4, 4] == 3
 
 
 def test_a_token_is_as_large_as_it_appears():
     # a square of 1 m seen from 2 m at a focal length of 5.6 px is 2.8 px wide: it covers the middles of 3 × 3 pixels
-    near = drawn([on_ray(4, 3, 2.0)], [1.0], size=1.0, most=7)[1]
+    near = draw([on_ray(4, 3, 2.0)], [1.0], size=1.0, most=7)[1]
     assert near.nonzero().tolist() == [[row, column] for row in (2, 3, 4) for column in (3, 4, 5)]
-    assert drawn([on_ray(4, 3, 20.0)], [1.0], size=1.0, most=7)[1].sum() == 1
-    assert drawn([on_ray(4, 3, 0.5)], [1.0], size=1.0, most=3)[1].sum() == 9
+    assert draw([on_ray(4, 3, 20.0)], [1.0], size=1.0, most=7)[1].sum() == 1
+    assert draw([on_ray(4, 3, 0.5)], [1.0], size=1.0, most=3)[1].sum() == 9
 
 
 def test_a_token_outside_the_image_reaches_into_it():
-    assert drawn([on_ray(-1, 3, 2.0)], [1.0], size=1.0, most=5)[1].nonzero().tolist() == [[2, 0], [3, 0], [4, 0]]
+    assert draw([on_ray(-1, 3, 2.0)], [1.0], size=1.0, most=5)[1].nonzero().tolist() == [[2, 0], [3, 0], [4, 0]]
 
 
 def test_the_splat_of_a_wall_does_not_depend_on_how_the_world_is_turned():
@@ -76,8 +76,8 @@ def test_the_splat_of_a_wall_does_not_depend_on_how_the_world_is_turned():
     camera = views()
     turned = Cameras(motion @ camera.world_from_camera, camera.intrinsics, SIDE, SIDE)
     features = [float(number) for number in range(len(cells))]
-    here = drawn(cells.tolist(), features, camera, 0.25, 3)
-    assert torch.allclose(here, drawn(moved.tolist(), features, turned, 0.25, 3), atol=1e-4)
+    canvas = draw(cells.tolist(), features, camera, 0.25, 3)
+    assert torch.allclose(canvas, draw(moved.tolist(), features, turned, 0.25, 3), atol=1e-4)
 
 
 def test_every_frame_has_its_own_view():

@@ -1,4 +1,4 @@
-"""The widened model: diffusers' own weights and outputs to the bit, and what it cannot be made of."""
+"""The widened model: diffusers' own weights to the bit, and parts and sizes that are refused."""
 
 import pytest
 import torch
@@ -35,9 +35,9 @@ def test_a_plain_diffusers_directory_gives_the_widened_model(plain_folder):
 def test_diffusers_loads_the_base_that_we_save(plain_folder, tmp_path):
     model = make_backbone("cogvideox", {"pretrained": str(plain_folder), "height": SIZE, "width": SIZE})
     model.save_base(tmp_path / "ours")
-    again = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "ours", subfolder="transformer")
+    reloaded = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "ours", subfolder="transformer")
     assert all(
-        torch.equal(value, model.transformer.base.state_dict()[name]) for name, value in again.state_dict().items()
+        torch.equal(value, model.transformer.base.state_dict()[name]) for name, value in reloaded.state_dict().items()
     )
 
 
@@ -70,4 +70,5 @@ def test_settings_of_impossible_sizes_are_refused(change, cause):
 def test_the_tiny_preset_has_ten_million_parameters():
     with torch.device("meta"):
         model = make_backbone("cogvideox", {})
-    assert sum(each.numel() for each in model.transformer.base.parameters()) == pytest.approx(9.88e6, rel=0.01)
+    parameters = model.transformer.base.parameters()
+    assert sum(parameter.numel() for parameter in parameters) == pytest.approx(9.88e6, rel=0.01)

@@ -1,4 +1,4 @@
-"""Models of RGB alone, as many parameters as with depth."""
+"""Models of RGB alone, which have as many parameters as models with depth."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def backbone() -> CogVideoX:
 
 def test_a_model_without_depth_neither_uses_nor_gives_depth(backbone: CogVideoX) -> None:
     clips = random_clips(1)
-    other = dataclasses.replace(clips, depth=clips.depth + 1)
+    deeper = dataclasses.replace(clips, depth=clips.depth + 1)
     rgb, depth = backbone.generate(clips, Sampling(2))
-    assert torch.equal(backbone.generate(other, Sampling(2))[0], rgb)
-    assert torch.equal(backbone(clips, "1")["loss"], backbone(other, "1")["loss"])
+    assert torch.equal(backbone.generate(deeper, Sampling(2))[0], rgb)
+    assert torch.equal(backbone(clips, "1")["loss"], backbone(deeper, "1")["loss"])
     assert torch.equal(depth[:, 0], clips.depth[:, 0])
     assert not depth[:, 1:].any()
 
@@ -49,5 +49,5 @@ def test_a_model_without_depth_logs_no_loss_of_depth(backbone: CogVideoX) -> Non
 
 
 def test_a_model_without_depth_has_as_many_parameters(backbone: CogVideoX) -> None:
-    sizes = {sum(each.numel() for each in model.parameters()) for model in (backbone, micro())}
+    sizes = {sum(parameter.numel() for parameter in model.parameters()) for model in (backbone, micro())}
     assert len(sizes) == 1

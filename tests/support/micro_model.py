@@ -1,4 +1,4 @@
-"""A micro CogVideoX and random clips for it."""
+"""A micro CogVideoX, and random clips and tokens for it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANNELS = 6
 
 
 def micro(**settings: Any) -> CogVideoX:
-    """A micro model with weights of seed 0."""
+    """Make a micro model with weights of seed 0."""
     torch.manual_seed(0)
     backbone = make_backbone("cogvideox", MICRO | settings)
     assert isinstance(backbone, CogVideoX)
@@ -29,7 +29,7 @@ def micro(**settings: Any) -> CogVideoX:
 
 
 def with_adapter(backbone: CogVideoX, **settings: Any) -> CogVideoX:
-    """The model with a fresh adapter in use."""
+    """Add a fresh adapter to the model and use it."""
     torch.manual_seed(1)
     backbone.add_adapter("voxel", CHANNELS, {"width": 16, "dropout": 0.0} | settings)
     return backbone
@@ -44,19 +44,19 @@ def shaken(module: torch.nn.Module, scale: float = 0.1) -> None:
 
 
 def trained(form: str = "cross", **settings: Any) -> CogVideoX:
-    """A micro model with an adapter, both as training would leave them."""
+    """Make a micro model with an adapter, both with weights as if trained."""
     backbone = with_adapter(micro(**settings), form=form, **({"head_width": 8} if form == "canvas" else {}))
     shaken(backbone)
     return backbone
 
 
 def equal(one: Sequence[Tensor], two: Sequence[Tensor]) -> bool:
-    """Whether two answers are equal to the bit."""
+    """Whether two sequences of tensors are equal to the bit."""
     return all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 def random_tokens(batch: int, count: int, seed: int = 3) -> MemoryTokens:
-    """Tokens within a few metres."""
+    """Make tokens with random features, within a few metres of the origin."""
     draw = torch.Generator().manual_seed(seed)
     features = torch.randn(batch, count, CHANNELS, generator=draw)
     positions = torch.randn(batch, count, 3, generator=draw, dtype=torch.float64) * 2
@@ -69,7 +69,7 @@ def random_clips(
     interactions: Any = None,
     size: tuple[int, int, int] = (9, SIZE, SIZE),
 ) -> Clips:
-    """Noise images, so many frames of this height and width, on a path that moves ahead."""
+    """Make clips of noise, of ``size`` frames, height and width, on a path that moves ahead."""
     draw = torch.Generator().manual_seed(2)
     frames, height, width = size
     poses = torch.eye(4, dtype=torch.float64).repeat(batch, frames, 1, 1)
@@ -87,13 +87,13 @@ def random_clips(
 
 
 def predicted(backbone: CogVideoX, clips: Clips, tokens: MemoryTokens | None) -> Tensor:
-    """What the transformer says of the clips' latents at one noise level."""
+    """Predict from the clips' latents and tokens at one noise level."""
     return predicted_of(backbone, clips, backbone.memory_condition(dataclasses.replace(clips, tokens=tokens)))
 
 
 @torch.no_grad()
 def predicted_of(backbone: CogVideoX, clips: Clips, memory: MemoryCondition) -> Tensor:
-    """The same of prepared tokens."""
+    """Predict from the clips' latents and a prepared memory at one noise level."""
     latents = backbone.codec.encode(clips.rgb, clips.depth)
-    given = backbone.conditions(clips, torch.full((len(clips.seeds),), 500), memory)
-    return backbone.predict(latents, backbone.encode_first(clips), given)
+    conditions = backbone.conditions(clips, torch.full((len(clips.seeds),), 500), memory)
+    return backbone.predict(latents, backbone.encode_first(clips), conditions)

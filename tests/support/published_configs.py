@@ -1,7 +1,7 @@
-"""Configurations of the five published CogVideoX models, word for word what their repositories on the hub say.
+"""Configurations of the five published CogVideoX models, word for word as in their repositories on the hub.
 
-Taken from their transcripts in painebenjamin/taproot (one class a model, its configuration a literal), and equal to
-what diffusers' ``scripts/convert_cogvideox_to_diffusers.py`` makes of the original weights: ``--i2v`` gives 32 input
+They are taken from painebenjamin/taproot (one class a model, its configuration a literal), and equal the output of
+diffusers' ``scripts/convert_cogvideox_to_diffusers.py`` for the original weights: ``--i2v`` gives 32 input
 channels, with version 1.0 learned positions and with 1.5 the ``ofs`` embedding; ``--version 1.5`` gives
 ``patch_size_t`` 2, ``patch_bias`` false, 300x300 latents of 81 frames and a VAE that inverts the scale of image
 latents. The shift of the SNR is 3 for 2b and 1 for all others (zai-org/CogVideo, ``sat/configs``).

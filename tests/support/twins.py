@@ -14,7 +14,7 @@ from tests.support.published_configs import SCHEDULERS, TRANSFORMERS, VAES
 
 NAMES = tuple(TRANSFORMERS)
 
-SIZE = (17, 32, 48)  # that of the configurations: frames, height and width
+SIZE = (17, 32, 48)  # frames, height and width in the configurations
 
 SMALL = {
     "num_attention_heads": 2, "attention_head_dim": 16, "num_layers": 2, "time_embed_dim": 16, "text_embed_dim": 8,
@@ -28,7 +28,7 @@ SMALL_VAE = {
 
 
 def transformer_config(name: str) -> dict[str, Any]:
-    """The published configuration with small sizes."""
+    """Return the published configuration with small sizes."""
     published = TRANSFORMERS[name]
     channels = {"in_channels": published["in_channels"] // 4, "out_channels": published["out_channels"] // 4}
     offset = {"ofs_embed_dim": 16} if "ofs_embed_dim" in published else {}
@@ -36,7 +36,7 @@ def transformer_config(name: str) -> dict[str, Any]:
 
 
 def write_twin(name: str, folder: Path) -> Path:
-    """A diffusers directory; all but 2b's scheduler is the DPM one, whose file differs in its class alone."""
+    """Write a diffusers directory; its scheduler is DPM, except for 2b, and their files differ in the class alone."""
     torch.manual_seed(0)
     transformer = CogVideoXTransformer3DModel(**transformer_config(name))
     if transformer.config.use_learned_positional_embeddings:
@@ -51,7 +51,7 @@ def write_twin(name: str, folder: Path) -> Path:
 
 
 def write_snapshot(hub: Path, name: str) -> Path:
-    """The folder of a repository's only snapshot in a hub's cache, as its client would leave it, for its files."""
+    """Make an entry for a repository in a hub's cache, and return the folder for the files of its only snapshot."""
     commit, home = "0" * 40, hub / f"models--{name.replace('/', '--')}"
     (home / "refs").mkdir(parents=True)
     (home / "refs" / "main").write_text(commit)
@@ -59,9 +59,9 @@ def write_snapshot(hub: Path, name: str) -> Path:
 
 
 def load_twin(folder: Path, size: tuple[int, int, int] = SIZE, **settings: Any) -> CogVideoX:
-    """The twin as our backbone."""
+    """Load a twin as our backbone."""
     frames, height, width = size
-    shown = {"frames": frames, "height": height, "width": width}
-    backbone = make_backbone("cogvideox", {"pretrained": str(folder)} | shown | settings)
+    clip_size = {"frames": frames, "height": height, "width": width}
+    backbone = make_backbone("cogvideox", {"pretrained": str(folder)} | clip_size | settings)
     assert isinstance(backbone, CogVideoX)
     return backbone.eval()
