@@ -43,14 +43,13 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write)
     model = WorldModel(backbone, [agent], sampling)
     rollouts = roll(model, paths)
-    pairs = list(zip(rollouts, folders, strict=True))
-    figures = [
-        write_outputs(rollout, folder, describe(checkpoint, adapter, plan, rollout)) for rollout, folder in pairs
-    ]
+    records = [describe(checkpoint, adapter, plan, rollout) for rollout in rollouts]
+    triples = zip(rollouts, folders, records, strict=True)
+    figures = [write_outputs(rollout, folder, record) for rollout, folder, record in triples]
     if json:
         print_json(figures if len(figures) > 1 else figures[0])
         return
-    for rollout, folder in pairs:
+    for rollout, folder in zip(rollouts, folders, strict=True):
         frames, actions = len(rollout.seen), rollout.path.actions
         say(f"{frames} frames in {rollout.seconds:.1f} s along {actions!r}; written to {folder}")
 
