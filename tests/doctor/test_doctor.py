@@ -9,7 +9,7 @@ import shlex
 import pytest
 import torch
 
-from persist_backbones.cogvideox.inputs import _fitted
+from persist_backbones.cogvideox.inputs import _fitted_positions
 from persist_cli.api.backbone import ClipLatents
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, launch_command
@@ -181,11 +181,11 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
     rotary = ["use_rotary_positional_embeddings: true", "num_layers: 4", "in_channels: 8", "out_channels: 4"]
     settings = f"backbone.settings.transformer={{{', '.join(rotary)}, num_attention_heads: 1, attention_head_dim: 32}}"
     meta_model = micro_meta_model(settings)
-    _fitted.cache_clear()
+    _fitted_positions.cache_clear()
     ShallowCopies(meta_model.backbone, None).activations(meta_model.recipe, StepKind(1, True), encoded())
     region = ((0, 0), (2, 2))
-    assert type(_fitted(32, (1, 2, 2), region, "cpu")[0]) is torch.Tensor
-    assert _fitted.cache_info().currsize == 1
+    assert type(_fitted_positions(32, (1, 2, 2), region, "cpu")[0]) is torch.Tensor
+    assert _fitted_positions.cache_info().currsize == 1
 
 
 @pytest.mark.parametrize(
