@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from persist_backbones.adapters.splat import rasterize, splat
+from persist_backbones.adapters.splat import Splats, rasterize, splat
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.cameras import Cameras
 
@@ -87,3 +87,22 @@ def test_every_frame_has_its_own_view():
     canvas = splat(torch.ones(1, 1, 1), splats, (1, 2, SIDE, SIDE))
     assert canvas[0, 0, 1].any()
     assert not canvas[0, 1].any()
+
+
+def test_with_several_threads_a_drawing_has_the_same_gradient_every_time():
+    random, before = torch.Generator().manual_seed(0), torch.get_num_threads()
+    pixel, token = (torch.randint(0, count, (60000,), generator=random) for count in (9000, 4096))
+    splats = Splats(pixel, token, torch.ones(60000, dtype=torch.float64))
+    features = torch.randn(1, 4096, 32, generator=random, requires_grad=True)
+
+    def gradient():
+        features.grad = None
+        splat(features, splats, (1, 1, 90, 100)).square().sum().backward()
+        return features.grad
+
+    torch.set_num_threads(2)
+    try:
+        first = gradient()
+        assert all(torch.equal(gradient(), first) for _ in range(40))
+    finally:
+        torch.set_num_threads(before)

@@ -46,8 +46,10 @@ def splat(
     nearest = nearest_at(splats.pixel, splats.depth, pixels)
     visible = splats.depth <= nearest[splats.pixel] * (1 + TIE)
     pixel, token = splats.pixel[visible], splats.token[visible]
+    # index_select rather than brackets, whose gradient several threads add up in no fixed order
+    drawn = features.flatten(0, 1).index_select(0, token)
     # on CUDA the order of this sum, and so its last bit, is not fixed for three or more tokens at one depth
-    total = features.new_zeros(pixels, features.shape[-1]).index_add(0, pixel, features.flatten(0, 1)[token])
+    total = features.new_zeros(pixels, features.shape[-1]).index_add(0, pixel, drawn)
     count = features.new_zeros(pixels).index_add(0, pixel, features.new_ones(len(pixel)))
     covered = count > 0
     logs = torch.where(covered, nearest, torch.ones_like(nearest)).log().to(features.dtype)
