@@ -132,7 +132,7 @@ class DinoV2(Encoder):
 
     @cached_property
     def _source(self) -> tuple[str, bool]:
-        """What ``from_pretrained`` shall open, and whether it is on this machine already."""
+        """The argument of ``from_pretrained``, and whether it is on this machine already."""
         weights = self.settings.weights
         if Path(weights).is_dir():
             return weights, True

@@ -1,4 +1,4 @@
-"""Which cells of a grid the cameras see, nearest first; a camera's view is bounded by planes."""
+"""The cells of a grid that cameras see, nearest first; a camera's view is bounded by planes."""
 
 from __future__ import annotations
 
