@@ -1,1 +1,1 @@
-"""Files, settings, the hub and checkpoint folders."""
+"""Files that are whole or absent, strict settings, and the Hugging Face hub."""
