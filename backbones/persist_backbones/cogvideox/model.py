@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from persist_backbones.adapters.base import MemoryCondition, VideoShape
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
-from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches
+from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches, zero_init
 
 OFFSET = 2.0  # the value of ``ofs`` in the training of CogVideoX 1.5 image-to-video
 NO_MEMORY = MemoryCondition()
@@ -80,9 +80,7 @@ class WorldTransformer(nn.Module):
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
         self.camera_channels = camera * shape.token_frames  # at a video token
         self.in_channels, self.out_channels = in_channels, out_channels
-        for module in (self.extra_in, self.extra_out, self.interactions):
-            for parameter in module.parameters():
-                nn.init.zeros_(parameter)
+        zero_init(self.extra_in, self.extra_out, self.interactions)
 
     def video_shape(self, spatial: int, temporal: int) -> VideoShape:
         """Return the sizes of the model, with the codec's compression in space and time, for an adapter."""

@@ -48,7 +48,6 @@ class ExtendedCogVideoX(CogVideoX):
         noise: Tensor | None = None,
     ) -> Tensor:
         """Denoise latents of clips from noise, with the caches that are enabled; see ``CogVideoX.sample``."""
-        self.check_sampling(sampling)
         self.caches = ClipCaches(self.transformer)
         try:
             return super().sample(first, sampling, on_step, generators, noise)
