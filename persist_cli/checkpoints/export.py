@@ -32,7 +32,7 @@ from persist_cli.io.files import (
     write_text,
 )
 from persist_cli.recipe import parse_yaml_mapping
-from persist_cli.viewing.console import print_json, print_table, say, watched
+from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
 PRECISIONS: Final = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
 
@@ -100,7 +100,8 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     with folder_aside(out) as folder:
         card = _write_checkpoint(folder, base, adapters, PRECISIONS[plan.dtype])
         write_card(folder, card | defaults | {"exported_by": __version__}, scenes)
-        files = _write_sums(folder)
+        with busy("hashing the files"):
+            files = _write_sums(folder)
     _print_files(out, {"fingerprint": card["fingerprint"]} | defaults, files, json)
 
 
@@ -175,7 +176,7 @@ def _write_checkpoint(
         for name, adapter in adapters.items():
             files = sorted(path for path in adapter.folder.glob("[!.]*") if path.is_file())
             jobs += [(path, folder / ADAPTERS / name / path.name) for path in files]
-        for source, target in watched(jobs, "export", "file"):
+        for source, target in watched(jobs, "export", "files"):
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
                 _convert(source, target, dtype) if source.suffix == ".safetensors" else _copy(source, target)
@@ -192,7 +193,8 @@ def _merged_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
         yield base.base_folder
         return
     with empty_folder_aside(beside) as folder:
-        load_backbone(base).save_base(folder)
+        with busy("merging LoRA into its base"):
+            load_backbone(base).save_base(folder)
         yield folder
 
 

@@ -120,4 +120,4 @@ def strategies(changes: Sequence[Change]) -> Iterator[Strategy]:
 
 def smallest_fitting(changes: Sequence[Change], fits: Callable[[Strategy], bool]) -> Strategy | None:
     """The strategy of the lowest cost that fits, ``None`` when none does."""
-    return next(filter(fits, watched([*strategies(changes)], "together", "strategy")), None)
+    return next(filter(fits, watched([*strategies(changes)], "together", "strategies")), None)

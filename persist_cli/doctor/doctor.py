@@ -18,7 +18,7 @@ from persist_cli.doctor.meta_model import MetaModel, build_meta_model, build_sta
 from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
 from persist_cli.train.distributed import check_sharded
-from persist_cli.viewing.console import print_json, print_table, say, watched
+from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
 COLUMNS: Final = ("weights", "gradients", "optimizer", "average", "encoding", "activations", "update", "peak")
 
@@ -95,7 +95,7 @@ class Doctor:
         works = [partial(self.examine, Strategy((change,) if change else ())) for change in (None, *self.changes)]
         if self.stage2 is not None:
             works.append(partial(self.examine_stage2, self.stage2))
-        return [work() for work in watched(works, "each alone", "strategy")]
+        return [work() for work in watched(works, "each alone", "strategies")]
 
     def examine_stage2(self, stage2: MetaModel) -> Finding:
         """Estimate what a stage 2 needs."""
@@ -125,8 +125,10 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     if sharded:
         meta_model.backbone.trained_parameters(meta_model.recipe.stage)
         check_sharded(meta_model.recipe, meta_model.backbone)
-    doctor = Doctor(meta_model, machine, sharded, build_stage2_meta_model(meta_model, overrides))
-    model, findings, best = dry_run(meta_model), doctor.findings(), doctor.smallest()
+    with busy("building the model without weights"):
+        doctor = Doctor(meta_model, machine, sharded, build_stage2_meta_model(meta_model, overrides))
+        model = dry_run(meta_model)
+    findings, best = doctor.findings(), doctor.smallest()
     if json:
         print_json(_record(machine, model, findings, best))
         return

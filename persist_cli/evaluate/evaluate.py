@@ -20,7 +20,7 @@ from persist_cli.evaluate.provenance import checkpoint_json, command, environmen
 from persist_cli.evaluate.report.page import write_report
 from persist_cli.evaluate.report.text import print_tables
 from persist_cli.io.files import check_folder, write_json
-from persist_cli.viewing.console import print_json, say
+from persist_cli.viewing.console import busy, print_json, say
 
 RESULTS = "metrics.json"
 
@@ -44,10 +44,13 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
     measure_rows(run, loader, processes)
     if not processes.main:
         return
-    results = results_json(run, processes.count)
+    with busy("computing the results"):
+        results = results_json(run, processes.count)
     write_json(out / RESULTS, results)
     if report is not None:
-        write_report(results, make_pictures(run, clips_by_domain(run), loader), report)
+        pictures = make_pictures(run, clips_by_domain(run), loader)
+        with busy("writing the report"):
+            write_report(results, pictures, report)
     if json:
         print_json(results)
         return

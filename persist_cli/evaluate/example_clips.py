@@ -50,19 +50,19 @@ def row_pictures(run: Evaluation, domains: dict[str, list[int]], loader: Backbon
     """
     pictures = []
     with progress() as bar:
-        task = add_task(bar, "pictures", len(run.rows), "row")
+        task = add_task(bar, "pictures", len(run.rows), "rows")
         for number, row in enumerate(run.rows):
-            bar.advance(task)
+            bar.update(task, note=row.name)
             metric = next(iter(run.suites[number].frame_metrics.values()), None)
-            if metric is None:
-                continue
-            figures = first_figures(run, number)
-            for name, clips in domains.items():
-                picks = [
-                    clip_picture(run, loader, ExampleClip(number, clip), f"{metric.title} {float(figures[clip]):.2f}")
-                    for clip in pick_clips(figures, clips, metric)
-                ]
-                pictures.append(RowPictures(name, row.name, *picks))
+            if metric is not None:
+                figures = first_figures(run, number)
+                for name, clips in domains.items():
+                    picks = [
+                        clip_picture(run, loader, ExampleClip(number, clip), f"{metric.title} {figures[clip]:.2f}")
+                        for clip in pick_clips(figures, clips, metric)
+                    ]
+                    pictures.append(RowPictures(name, row.name, *picks))
+            bar.advance(task)
     return pictures
 
 

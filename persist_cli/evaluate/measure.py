@@ -16,7 +16,7 @@ from persist_cli.evaluate.metric_suite import VIDEO
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.rollout.world_model import clip_seed
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.viewing.console import add_task, busy, progress
 
 SHEET_CLIPS = 3  # clips whose videos are kept of every row, for the contact sheets
 
@@ -28,18 +28,19 @@ def measure_rows(run: Evaluation, loader: BackboneLoader, processes: Processes) 
         for number in range(len(run.rows))
     ]
     with progress() as bar:
-        bar.disable = not processes.main
         measure_truth(run, processes, bar)
-        task = add_task(bar, "eval", sum(len(run.batch(unit.batch)) for units in todo for unit in units), "clip")
+        task = add_task(bar, "eval", sum(len(run.batch(unit.batch)) for units in todo for unit in units), "clips")
         for row, units in zip(run.rows, todo, strict=True):
             if not units:
                 continue
-            backbone = loader.load_for(row)
             bar.update(task, note=row.name)
+            backbone = loader.load_for(row)
             for unit in units:
                 measure_unit(run, row, backbone, unit)
                 bar.advance(task, len(run.batch(unit.batch)))
-    processes.wait()
+    if processes.count > 1:
+        with busy("waiting for the other processes"):
+            processes.wait()
 
 
 def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
@@ -48,7 +49,7 @@ def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
     units = [Unit(TRUTH, 0, batch) for batch in range(run.batches) if processes.owns(batch)]
     todo = [unit for unit in units if suite.set_metrics and not run.journal.has(unit)]
     if todo:
-        task = add_task(bar, "true videos", sum(len(run.batch(unit.batch)) for unit in todo), "clip")
+        task = add_task(bar, "true videos", sum(len(run.batch(unit.batch)) for unit in todo), "clips")
     for unit in todo:
         run.journal.write(unit, suite.true_features(run.batch(unit.batch)))
         bar.advance(task, len(run.batch(unit.batch)))

@@ -22,7 +22,7 @@ from persist_cli.evaluate.rows.build_rows import RowConfig, build_control_rows, 
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
-from persist_cli.viewing.console import say
+from persist_cli.viewing.console import busy, say
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,8 @@ def prepare(
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
     protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
-    bases = check_bases(checkpoints, plan.data, sampling, loader)
+    with busy("loading the models"):
+        bases = check_bases(checkpoints, plan.data, sampling, loader)
     models = build_model_rows(checkpoints, config, protocol)  # unknown memories are reported before clips are sought
     search = ClipSearch(plan.data, plan.frames, plan.clips, bases.frames_per_clip - 1, training_scenes(checkpoints))
     journal = Journal(out)
@@ -125,9 +126,11 @@ def prepare(
             say(f"finding clips for the protocol {protocol.name!r} in {search.where}")
             cases = protocol.find(search)
             build_control_rows(models, checkpoints, config, protocol, cases)  # controls may not suit the clips
-            journal.begin(values, cases)
+            with busy("hashing the data"):
+                journal.begin(values, cases)
         else:
-            journal.check_data()
+            with busy("hashing the data"):
+                journal.check_data()
     processes.wait()
     cases = journal.cases() or []
     rows = [*models, *build_control_rows(models, checkpoints, config, protocol, cases)]

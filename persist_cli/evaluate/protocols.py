@@ -129,7 +129,7 @@ class Revisit(Protocol):
     def find(self, search: ClipSearch) -> list[Case]:
         """Find the clips with the most to recall, taking turns over trajectories, disjoint within each."""
         frames = search.frames or search.predicted_at_once + 1
-        files = watched(search.trajectories(), "what returns", "trajectory")
+        files = watched(search.trajectories(), "what returns", "trajectories")
         ranked = [self.rank_starts(file, frames) for file in files]
         turns = range(max(map(len, ranked), default=0))
         chosen = [
@@ -166,7 +166,7 @@ class Revisit(Protocol):
         """Make the cases of (start, number of the trajectory), reading each trajectory once."""
         files = search.trajectories()
         cases: dict[tuple[int, int], Case] = {}
-        for number in watched(list(dict.fromkeys(number for _, number in chosen)), "seen before", "trajectory"):
+        for number in watched(list(dict.fromkeys(number for _, number in chosen)), "seen before", "trajectories"):
             seen = files[number].read().observations
             for start in (start for start, owner in chosen if owner == number):
                 cases[start, number] = self.make_case(files[number], seen, (start, frames, start + 1), search)
@@ -214,12 +214,12 @@ class ThereAndBack(Protocol):
     def find(self, search: ClipSearch) -> list[Case]:
         """Find one clip in each trajectory that turns round and comes back far enough, all of one length."""
         poses = {file.path: file.poses() for file in search.trajectories()}
-        files = watched(search.trajectories(), "turning points", "trajectory")
+        files = watched(search.trajectories(), "turning points", "trajectories")
         turns = {file.path: turning_point(poses[file.path]) for file in files}
         lengths = sorted(length for _, length in turns.values() if length >= LEAST_RETURN_FRAMES)
         frames = search.frames or min(RETURN_FRAMES, lengths[len(lengths) // 2] if lengths else RETURN_FRAMES)
         cases: list[Case] = []
-        for file in watched(search.trajectories(), "seen before", "trajectory"):
+        for file in watched(search.trajectories(), "seen before", "trajectories"):
             twice, length = turns[file.path]
             if length < max(frames, LEAST_RETURN_FRAMES) or len(cases) == search.limit:
                 continue
@@ -274,7 +274,7 @@ class Long(Protocol):
             )
         return [
             self.make_case(file, file.read(slice(0, start + frames)).observations, (start, frames, 0), search)
-            for file, start in watched(places[: search.limit], "seen before", "clip")
+            for file, start in watched(places[: search.limit], "seen before", "clips")
         ]
 
 

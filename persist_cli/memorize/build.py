@@ -16,7 +16,7 @@ from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_conf
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.plugins import make_encoder, make_memory
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
+from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, watched
 from persist_cli.viewing.map import draw_map
 
 
@@ -32,7 +32,8 @@ def run_memorize(data: list[str], plan: MemorizePlan, out: Path, json: bool) -> 
     _check_out(out)
     config, origin = resolve_memory_config(plan)
     sources = find_sources(data)
-    encoder = make_encoder(config.encoder, config.encoder_settings)
+    with busy("loading the encoder"):
+        encoder = make_encoder(config.encoder, config.encoder_settings)
     memory = make_memory(config.name, config.settings, encoder, common_reference(sources))
     seconds = write_sources(memory, sources)
     frames = sum(len(source.frames) for source in sources)
@@ -53,7 +54,7 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
         raise CheckpointError("nothing to merge; name two memory files or more, as in --merge A B")
     _check_out(out)
     merged = load_memory(paths[0])
-    for path in paths[1:]:
+    for path in watched(paths[1:], "merging", "memories"):
         try:
             merged.merge(load_memory(path))
         except CheckpointError as error:
@@ -78,8 +79,9 @@ def _save_and_print(memory: Memory, paths: Mapping[str, Tensor], out: Path, json
     map_file = out.with_suffix(".png")
     for path in (out, map_file):
         remove_leftovers(path.parent, path.name)
-    memory.save(out)
-    draw_map(memory.points(), memory.reference.world_up, paths, map_file)
+    with busy("writing the memory and its map"):
+        memory.save(out)
+        draw_map(memory.points(), memory.reference.world_up, paths, map_file)
     figures = memory.figures()
     result = {
         "file": str(out),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
+from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.memory import Memory
@@ -20,7 +23,7 @@ from persist_cli.memorize.memory_file import load_memory
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
 from persist_cli.rollout.outputs import describe, write_outputs
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import add_task, print_json, progress, say
+from persist_cli.viewing.console import add_task, busy, print_json, progress, say
 
 
 def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> None:
@@ -33,19 +36,22 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     paths = plan_camera_paths(plan)
     folders = check_folders(out, len(paths))
     info = paths[0].info
-    backbone = load_backbone(checkpoint, adapter=adapter)
+    with busy("loading the model"):
+        backbone = load_backbone(checkpoint, adapter=adapter)
     check_size(info, backbone.image_size, plan.start)
     sampling = checkpoint.sampling_with(plan.sampling)
     backbone.check_sampling(sampling)
     plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(sampling)))
     backbone.prepare_inference(plan.placement)
-    memory = open_memory(checkpoint, adapter, plan, info)
+    with busy("loading the memory"):
+        memory = open_memory(checkpoint, adapter, plan, info)
     agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write)
     model = WorldModel(backbone, [agent], sampling)
     rollouts = roll(model, paths)
     records = [describe(checkpoint, adapter, plan, rollout) for rollout in rollouts]
     triples = zip(rollouts, folders, records, strict=True)
-    figures = [write_outputs(rollout, folder, record) for rollout, folder, record in triples]
+    with busy("writing videos and maps"):
+        figures = [write_outputs(rollout, folder, record) for rollout, folder, record in triples]
     if json:
         print_json(figures if len(figures) > 1 else figures[0])
         return
@@ -94,6 +100,16 @@ def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
             raise CheckpointError(f"{path}: its {name} is {header[key]!r}, wanted here is {expected[key]!r}")
 
 
+@contextlib.contextmanager
+def on_denoised(backbone: Backbone, call: Callable[[], None]) -> Iterator[None]:
+    """Within the block ``call`` is called after each denoising step, if the backbone says when one is done."""
+    backbone.on_denoised = call
+    try:
+        yield
+    finally:
+        backbone.on_denoised = None
+
+
 def roll(model: WorldModel, paths: Sequence[CameraPath]) -> list[Rollout]:
     """Imagine several paths from one start frame clip by clip, with a progress bar."""
     memory = model.agents[0].memory
@@ -101,11 +117,15 @@ def roll(model: WorldModel, paths: Sequence[CameraPath]) -> list[Rollout]:
     model.reset([paths[0].start], [paths[0].info])
     branches = model.branches(len(paths)) if len(paths) > 1 else model
     cameras, clips = [path.cameras for path in paths], []
+    steps, total = model.sampling.steps, sum(map(len, cameras))
+    clip_count = -(-max(map(len, cameras)) // (model.backbone.frames_per_clip - 1))
     with progress() as bar:
-        task = add_task(bar, "rollout", sum(len(path) for path in cameras), "frame")
-        for frames in branches.imagine(cameras, [path.interactions for path in paths]):
-            clips.append(frames)
-            bar.advance(task, sum(map(len, frames)))
+        task = add_task(bar, "rollout", clip_count * steps, "denoising steps", f"0 of {total} frames")
+        with on_denoised(model.backbone, partial(bar.advance, task)):
+            for frames in branches.imagine(cameras, [path.interactions for path in paths]):
+                clips.append(frames)
+                done = sum(len(seen) for clip in clips for seen in clip)
+                bar.update(task, completed=len(clips) * steps, note=f"{done} of {total} frames")
     seconds, depth = time.monotonic() - began, model.backbone.gives_depth
     videos = [Observations.concatenate(parts) for parts in zip(*clips, strict=True)]
     return [

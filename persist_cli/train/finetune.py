@@ -44,7 +44,7 @@ from persist_cli.train.distributed import (
 from persist_cli.train.run_folder import RunFolder
 from persist_cli.train.state import load_state
 from persist_cli.train.trainer import StopSignal, Trainer
-from persist_cli.viewing.console import say, warn
+from persist_cli.viewing.console import busy, say, warn
 
 LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, as while it writes a large model
 
@@ -126,6 +126,21 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
         The signal that ended the run before its last step, ``None`` when it reached that.
     """
     accelerator = make_accelerator(recipe, run)
+    with busy("loading model and data"):
+        folder, trainer = prepare_run(recipe, run, accelerator, plan)
+    ended_by = trainer.train(folder.log, folder.save, stop)
+    with busy("saving the checkpoint"):
+        folder.save()
+    accelerator.end_training()
+    ended_by = ended_by if trainer.state.step < recipe.training.steps else None
+    if accelerator.is_main_process:
+        trainer.times.report(run / "profile.json")
+        report(recipe, run, trainer.state.step, folder.speed.rate())
+    return ended_by
+
+
+def prepare_run(recipe: Recipe, run: Path, accelerator: Accelerator, plan: FinetunePlan) -> tuple[RunFolder, Trainer]:
+    """The run's folder and its trainer, in the state of the folder's newest checkpoint where there is one."""
     base = find_checkpoint(Path(recipe.base)) if recipe.base else None
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, factory)
@@ -136,15 +151,7 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
     load_state(run, trainer.state)
     if accelerator.log_with:
         accelerator.init_trackers("persist")
-    folder = RunFolder(run, trainer, base)
-    ended_by = trainer.train(folder.log, folder.save, stop)
-    folder.save()
-    accelerator.end_training()
-    ended_by = ended_by if trainer.state.step < recipe.training.steps else None
-    if accelerator.is_main_process:
-        trainer.times.report(run / "profile.json")
-        report(recipe, run, trainer.state.step, folder.speed.rate())
-    return ended_by
+    return RunFolder(run, trainer, base), trainer
 
 
 def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:

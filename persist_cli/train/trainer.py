@@ -264,11 +264,9 @@ class Trainer:
         settings = self.recipe.training
         saved = time.monotonic()
         with progress() as bar:
-            bar.disable = not self.accelerator.is_main_process
-            task = add_task(bar, f"stage {self.recipe.stage}", settings.steps * settings.batch, "sample")
-            bar.advance(task, self.state.step * settings.batch)
+            task = add_task(bar, "training", settings.steps, "steps", done=self.state.step)
             for values in self.steps():
-                bar.update(task, advance=settings.batch, note=f"loss {values['loss']:.4f}")
+                bar.update(task, advance=1, note=f"loss {values['loss']:.4f}")
                 if self.accelerator.is_main_process:
                     log.add(self.state.step, values | {"learning_rate": learning_rate(settings, self.state.step - 1)})
                 self.accelerator.log(values, step=self.state.step)

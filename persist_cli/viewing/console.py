@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sys
-from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -13,9 +17,11 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    SpinnerColumn,
     Task,
     TaskID,
     TextColumn,
+    TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table
@@ -28,6 +34,10 @@ Item = TypeVar("Item")
 BORDER = 3  # characters between two columns of a table
 LONGEST_NAME = 40  # characters of a row's name that are not broken into lines
 PIPED_WIDTH = 160  # columns of a table that goes into a file or pipe
+
+FIRST_LINE: Final = 10.0  # seconds after which a log is told how far a work is
+
+LINE_EVERY: Final = 60.0  # seconds between two such lines
 
 OUT = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
 PROGRESS = Console(stderr=True)
@@ -43,8 +53,119 @@ class RateColumn(ProgressColumn):
         return Text("" if rate is None else f"{rate:.3g} {unit}/s", style="progress.data.speed")
 
 
+class ProgressLines(Progress):
+    """Progress in plain lines on standard error, for log files and batch jobs.
+
+    A line comes after ``FIRST_LINE`` seconds, then every ``LINE_EVERY`` seconds, whether or not anything advances, and
+    one at the end of a task that took so long. A shorter work writes nothing.
+
+    Args:
+        clock: gives seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(console=PROGRESS, auto_refresh=False, get_time=clock)
+        self.due = clock() + FIRST_LINE
+        self.ended = threading.Event()
+        self.speaker = threading.Thread(target=self._speak_until_the_end, daemon=True)
+
+    def start(self) -> None:
+        """Begin to write lines."""
+        self.speaker.start()
+
+    def stop(self) -> None:
+        """Write a line for each long task that did not come to its end, and no more lines."""
+        self.ended.set()
+        with self._lock:
+            for task in self.tasks:
+                self._write_end(task)
+
+    def update(self, task_id: TaskID, **changes: Any) -> None:
+        """Change a task as ``Progress.update`` does; write the lines that are due."""
+        super().update(task_id, **changes)
+        self._changed(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        """Add to what is done of a task; write the lines that are due."""
+        super().advance(task_id, advance)
+        self._changed(task_id)
+
+    def _changed(self, task_id: TaskID) -> None:
+        with self._lock:
+            if self._tasks[task_id].finished:
+                self._write_end(self._tasks[task_id])
+            self._write_due()
+
+    def _speak_until_the_end(self) -> None:
+        while not self.ended.wait(max(0.1, self.due - self.get_time())):
+            self._write_due()
+
+    def _write_due(self) -> None:
+        """Write the line of the newest task that goes on, when it is time."""
+        with self._lock:
+            going_on = [task for task in self.tasks if not task.finished]
+            if going_on and self.get_time() >= self.due and not self.ended.is_set():
+                self._write(progress_line(going_on[-1]))
+
+    def _write_end(self, task: Task) -> None:
+        """Write the last line of a task that took long, once."""
+        seconds = task.elapsed if task.finished_time is None else task.finished_time
+        if (seconds or 0) >= FIRST_LINE and not task.fields.get("ended"):
+            task.fields["ended"] = True
+            self._write(progress_line(task))
+
+    def _write(self, line: str) -> None:
+        self.due = self.get_time() + LINE_EVERY
+        if not self.disable:
+            printable = "".join(letter if letter.isprintable() else "?" for letter in line)
+            sys.stderr.write(printable + "\n")
+            sys.stderr.flush()
+
+
+def progress_line(task: Task) -> str:
+    """A line that says what is done, of how much, at which rate, and how long it still takes.
+
+    An example: ``training: 340 of 2,000 steps, 2.1 steps/s, 13 min left, loss 0.241``.
+    """
+    unit, elapsed = task.fields.get("unit", ""), task.elapsed or 0.0
+    rate = (task.completed - task.fields.get("begun_at", 0)) / elapsed if elapsed else 0.0
+    if task.finished:
+        parts = [f"{int(task.completed):,} {unit} in {duration(elapsed)}"]
+    elif task.total is None:
+        return f"{task.description}: {duration(elapsed)} {'in all' if task.fields.get('ended') else 'so far'}"
+    else:
+        parts = [f"{int(task.completed):,} of {int(task.total):,} {unit}"]
+    parts += [f"{rate_number(rate)} {unit}/s"] if rate else []
+    if not task.finished:
+        remaining = (task.total - task.completed) / rate if rate and task.total is not None else None
+        parts.append(f"{duration(elapsed)} so far" if remaining is None else f"{duration(remaining)} left")
+    parts += [task.fields["note"]] if task.fields.get("note") else []
+    return f"{task.description}: {', '.join(parts)}"
+
+
+def rate_number(rate: float) -> str:
+    """A rate with two digits at least, as in ``2.1`` and ``1,340``."""
+    return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+
+
+def duration(seconds: float) -> str:
+    """A duration in the unit that fits: ``45 s``, ``13 min``, ``5 h 20 min``."""
+    minutes = round(seconds / 60)
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60:,} h {minutes % 60} min"
+
+
 def progress() -> Progress:
-    """A progress bar with count, rate and time left, on standard error; ``add_task`` adds tasks to it."""
+    """Progress on standard error with count, rate and time left; ``add_task`` adds tasks to it.
+
+    On a terminal it is a bar, in a log file lines. Of several processes the main one alone shows it.
+    """
+    main = os.environ.get("RANK", "0") == "0"  # as accelerate and torch name the processes that they start
+    if not sys.stderr.isatty() or PROGRESS.is_dumb_terminal:
+        lines = ProgressLines()
+        lines.disable = not main
+        return lines
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -54,12 +175,22 @@ def progress() -> Progress:
         TextColumn("{task.fields[note]}"),
         console=PROGRESS,
         transient=True,
+        disable=not main,
     )
 
 
-def add_task(bar: Progress, description: str, total: int, unit: str, note: str = "") -> TaskID:
-    """Add a task that counts ``unit`` up to ``total``; ``bar.update(task, note=…)`` changes its note."""
-    return bar.add_task(description, total=total, unit=unit, note=note)
+def add_task(bar: Progress, description: str, total: int | None, unit: str, note: str = "", done: int = 0) -> TaskID:
+    """Add a task that counts ``unit`` up to ``total``; ``bar.update(task, note=…)`` changes its note.
+
+    Args:
+        bar: the progress.
+        description: what is done, as in ``training``.
+        total: how many there are, ``None`` where nothing can be counted.
+        unit: what is counted, in the plural.
+        note: what else to say.
+        done: how many an earlier run has done.
+    """
+    return bar.add_task(description, total=total, completed=done, unit=unit, note=note, begun_at=done)
 
 
 def watched(items: Sequence[Item], description: str, unit: str) -> Iterator[Item]:
@@ -69,6 +200,23 @@ def watched(items: Sequence[Item], description: str, unit: str) -> Iterator[Item
         for item in items:
             yield item
             bar.advance(task)
+
+
+@contextlib.contextmanager
+def busy(description: str, bar_of_its_own: bool = False) -> Iterator[None]:
+    """Show within the block what is done, where nothing can be counted, as in ``loading the model``.
+
+    Args:
+        description: what is done.
+        bar_of_its_own: whether another library draws a bar on a terminal meanwhile, so that none is drawn here.
+    """
+    with progress() as bar:
+        if not isinstance(bar, ProgressLines):
+            if bar_of_its_own:
+                bar.stop()
+            bar.columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        add_task(bar, description, None, "")
+        yield
 
 
 def print_json(value: Any) -> None:

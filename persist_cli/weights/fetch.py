@@ -10,7 +10,7 @@ from pathlib import Path
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import file_sha256, folder_aside, read_json
 from persist_cli.io.hub import cached_weight, weights_home
-from persist_cli.viewing.console import PROGRESS, print_json, print_table, say
+from persist_cli.viewing.console import busy, print_json, print_table, say
 from persist_cli.weights.cache import fill_folder
 from persist_cli.weights.catalog import WEIGHTS, Weight, find_weight
 from persist_cli.weights.weight_sources import DOWNLOADS, find_source, from_directory
@@ -58,7 +58,7 @@ def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
     try:
         home.mkdir(parents=True, exist_ok=True)
         file = find_source(weight, directory, offline)
-        verifying = PROGRESS.status(f"{weight.name}: verifying and converting")
+        verifying = busy(f"{weight.name}: verifying and converting")
         with folder_aside(home / weight.name) as aside, verifying:
             provenance = fill_folder(weight, file, aside)
     except CheckpointError:

@@ -16,7 +16,7 @@ from typing import Final, Literal
 from persist_cli.errors import PersistError
 from persist_cli.io.files import read_json
 from persist_cli.io.hub import MODEL_FILES, hub_obstacle, weights_home
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.viewing.console import add_task, busy, progress
 from persist_cli.weights.catalog import Archive, HubRepository, Weight
 
 DOWNLOADS: Final = ".downloads"  # folder of downloaded archives beside the weights
@@ -118,7 +118,8 @@ def hub_files(repository: HubRepository, offline: bool) -> dict[str, Path]:
     obstacle = "not asked" if offline else hub_obstacle()
     if obstacle:
         raise SourceError(f"hub {repository.name}: {obstacle}")
-    return {name: _download_hub_file(repository, name) for name in MODEL_FILES}
+    with busy(f"downloading {repository.name}", bar_of_its_own=True):
+        return {name: _download_hub_file(repository, name) for name in MODEL_FILES}
 
 
 def download_archive(archive: Archive, folder: Path, size: int) -> Path:

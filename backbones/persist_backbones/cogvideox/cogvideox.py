@@ -204,7 +204,9 @@ class CogVideoX(Backbone):
 
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
         """Generate clips from each sample's own noise; the first frame is that of ``first``."""
-        colors, depth = self.decode(self.sample(first, sampling), first)
+        denoised = self.on_denoised
+        latents = self.sample(first, sampling, None if denoised is None else lambda _: denoised())
+        colors, depth = self.decode(latents, first)
         return to_uint8(colors), depth
 
     @torch.no_grad()
