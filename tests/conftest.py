@@ -69,6 +69,15 @@ def persist(capsys: pytest.CaptureFixture[str]) -> Persist:
 
 
 @pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder on the module path, like site-packages."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+    return folder
+
+
+@pytest.fixture
 def fresh_accelerator() -> Iterator[None]:
     """Let a test choose a precision, which accelerate else fixes for a process by its first accelerator."""
     from accelerate.state import AcceleratorState

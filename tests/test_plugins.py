@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import textwrap
-from pathlib import Path
 
 import pytest
 
 from persist_cli.errors import PluginError
 from persist_cli.plugins import list_plugins, load_plugin
 from tests.support.micro_runs import stage
+from tests.support.packages import install
 
 LAST_FRAME = """
     import torch
@@ -26,26 +25,6 @@ LAST_FRAME = """
         def tensors(self): return {"frame": self.frame}
         def restore(self, tensors): self.frame = tensors.get("frame", torch.zeros(0))
 """
-
-
-def install(folder: Path, package: str, group: str, target: str, code: str = "") -> None:
-    """Install a distribution as pip does: a module and its metadata."""
-    module = target.partition("=")[2].partition(":")[0].strip()
-    if code:
-        (folder / f"{module}.py").write_text(textwrap.dedent(code))
-    info = folder / f"{package.replace('-', '_')}-1.2.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.2\n")
-    (info / "entry_points.txt").write_text(f"[{group}]\n{target}\n")
-
-
-@pytest.fixture
-def site(tmp_path, monkeypatch):
-    """A folder on the module path, like site-packages."""
-    folder = tmp_path / "site"
-    folder.mkdir()
-    monkeypatch.syspath_prepend(str(folder))
-    return folder
 
 
 def test_a_memory_of_another_package_works_in_every_command_by_name(persist, site, walks, stage1, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 from collections.abc import Sequence
@@ -12,10 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.errors import DataError, hint
+from persist_cli.errors import DataError
 
 FREE = "free"  # a motion that no named action describes; only the poses of the trajectory describe it
 STAY = "stay"
+WALK = ("stay", "forward", "backward", "left", "right")  # the actions that move a camera over the ground
+STEP = 0.25  # metres of a step where nobody says another
+TURN = 15.0  # degrees of a turn
 WORD = re.compile(r"^(?P<name>[a-z_]+)(?:\*(?P<count>\d+))?$")
 
 
@@ -37,6 +41,20 @@ class Action:
     reverse: str | None = None
     interaction: bool = False
 
+    @property
+    def effect(self) -> str:
+        """What it does, in words such as ``"0.25 m ahead"`` or ``"turns 15° to the left"``."""
+        if self.name == FREE:
+            return "any motion, which only the recorded poses tell"
+        motions = []
+        if self.forward:
+            motions.append(f"{abs(self.forward):g} m {'ahead' if self.forward > 0 else 'back'}")
+        if self.turn:
+            motions.append(f"turns {abs(self.turn):g}° to the {'left' if self.turn > 0 else 'right'}")
+        if self.interaction:
+            motions.append("acts on what is there")
+        return ", then ".join(motions) or "stays in place"
+
 
 @dataclass(frozen=True)
 class ActionVocabulary:
@@ -48,7 +66,42 @@ class ActionVocabulary:
         for action in self.actions:
             if action.name == name:
                 return action
-        raise DataError(f"unknown action {name!r}; {hint(name, (action.name for action in self.actions))}")
+        close = difflib.get_close_matches(name, self.names, n=1)
+        meant = f"did you mean {close[0]!r}? " if close else ""
+        raise DataError(f"unknown action {name!r}; {meant}known: {self.listing()}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of each action."""
+        return tuple(action.name for action in self.actions)
+
+    @property
+    def can_walk(self) -> bool:
+        """Whether any action has a motion of its own, so that a camera can be moved by names."""
+        return any(action.forward or action.turn for action in self.actions)
+
+    def listing(self) -> str:
+        """Return all actions in one line, as in ``"forward (0.25 m ahead), left (turns 15° to the left)"``."""
+        return ", ".join(f"{action.name} ({action.effect})" for action in self.actions) or "none"
+
+    def walking(self, step: float | None = None, turn: float | None = None) -> ActionVocabulary:
+        """Return these actions and those of ``WALK``, the latter with steps and turns of a size, added or replaced.
+
+        Args:
+            step: metres; ``None`` for those of the own ``forward``, else 0.25.
+            turn: degrees; ``None`` for those of the own ``left``, else 15.
+
+        Raises:
+            DataError: when the step is not positive and finite, or the turn is not above 0 and at most 180.
+        """
+        own = {action.name: action for action in self.actions}
+        step = step if step is not None else own["forward"].forward if "forward" in own else STEP
+        turn = turn if turn is not None else own["left"].turn if "left" in own else TURN
+        if not 0 < step < math.inf or not 0 < turn <= 180:
+            raise DataError(f"a step of {step:g} m and a turn of {turn:g}°; give --step above 0 and --turn up to 180")
+        walk = {name: action for name, action in own.items() if name not in WALK}
+        walk |= {action.name: action for action in walking_actions(step, turn).actions if action.name in WALK}
+        return ActionVocabulary(tuple(walk.values()))
 
     def parse(self, text: str) -> tuple[str, ...]:
         """Return the action names of a text such as ``"forward*4 left"``; ``DataError`` when it cannot be read."""
@@ -56,7 +109,11 @@ class ActionVocabulary:
         for word in text.split():
             match = WORD.match(word)
             if match is None:
-                raise DataError(f"cannot read action {word!r}; write NAME or NAME*COUNT, as in 'forward*4 left*2'")
+                lower = WORD.match(word.lower())
+                advice = (
+                    f"write it in lower case: {word.lower()}" if lower else "write NAME or NAME*COUNT, as in left*2"
+                )
+                raise DataError(f"cannot read action {word!r}; {advice}")
             names += [self[match["name"]].name] * int(match["count"] or 1)
         if not names:
             raise DataError("no action given; write them as 'forward*4 left*2'")
@@ -127,7 +184,7 @@ def format_actions(names: Sequence[str]) -> str:
     return " ".join(name if count == 1 else f"{name}*{count}" for name, count in runs)
 
 
-def walking_actions(step: float = 0.25, turn: float = 15.0) -> ActionVocabulary:
+def walking_actions(step: float = STEP, turn: float = TURN) -> ActionVocabulary:
     """Return the usual vocabulary of an embodied agent: steps of ``step`` metres, turns of ``turn`` degrees."""
     return ActionVocabulary(
         (

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -17,13 +18,14 @@ class ForeignTrajectory:
     Args:
         name: unique within the data set and fit for a file name.
         info: scene, camera and vocabulary, which all frames share.
-        frames: every frame in order, converted to OpenCV axes, metres and planar z.
-        length: number of frames, for the progress bar.
+        frames: every frame in order, converted to OpenCV axes, metres and planar z. In the place of a frame that cannot
+            be used stands the error that says why: the command raises it, or leaves the frame out with ``--skip-bad``.
+        length: number of frames, those that cannot be used included.
     """
 
     name: str
     info: TrajectoryInfo
-    frames: Iterator[Frame]
+    frames: Iterator[Frame | DataError]
     length: int
 
 
@@ -37,5 +39,5 @@ class Importer(ABC):
         """Yield every trajectory under the file or folder ``source``.
 
         Raises:
-            DataError: when a file is missing, truncated or wrong; the message names the file.
+            DataError: when what all frames share is missing or wrong; the message names the file.
         """

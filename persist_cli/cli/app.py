@@ -19,7 +19,9 @@ from persist_cli.cli.options import (
     JsonOption,
     SamplerOption,
     SaveMemoryOption,
+    StepOption,
     StepsOption,
+    TurnOption,
     show_version,
     split_names,
 )
@@ -88,15 +90,24 @@ def import_(
     out: Annotated[Path, typer.Option(help="Data set folder.")],
     size: Annotated[str | None, typer.Option(help="Resize (after cropping to the aspect) to HxW.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Keep every n-th frame.")] = 1,
+    step: Annotated[float | None, typer.Option(min=0.001, help="Store walking actions: metres of a step.")] = None,
+    turn: Annotated[
+        float | None, typer.Option(min=0.001, max=180.0, help="Store walking actions: degrees of a turn.")
+    ] = None,
+    skip_bad: Annotated[
+        bool, typer.Option("--skip-bad", help="Leave out frames whose pose or images cannot be used, and count them.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Import posed RGB-D of another format.
 
+    A capture has no named actions; --step 0.1 --turn 5 stores some with it, so that rollouts can walk from its frames.
+
     persist import 7scenes captures/kitchen --out runs/kitchen --size 64x64
     """
-    from persist_cli.data.importers.importing import run_import
+    from persist_cli.data.importers.importing import ImportPlan, run_import
 
-    run_import(format, source, out, size, every, json)
+    run_import(format, source, out, ImportPlan.of(size, every, step, turn, skip_bad), json)
 
 
 @app.command()
@@ -210,7 +221,9 @@ def rollout(
         Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
     ] = None,
     actions: ActionsOption = None,
-    follow: Annotated[bool, typer.Option("--follow", help="Take the trajectory's own actions.")] = False,
+    step: StepOption = None,
+    turn: TurnOption = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Take the trajectory's own poses.")] = False,
     frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
     memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
@@ -226,6 +239,7 @@ def rollout(
     """Roll out a world model from a start frame along actions, clip by clip.
 
     Several --actions are branches of one start, imagined together, each with its own memory: OUT/0, OUT/1, …
+    The agent has no body: it goes through walls.
 
     persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
     """
@@ -235,7 +249,7 @@ def rollout(
     plan = RolloutPlan(
         start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
         write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance),
-        placement=InferenceOptions.of(dtype, save_memory),
+        placement=InferenceOptions.of(dtype, save_memory), step=step, turn=turn,
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 

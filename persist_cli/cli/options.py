@@ -49,7 +49,22 @@ SaveMemoryOption = Annotated[
 ]
 
 ActionsOption = Annotated[
-    list[str] | None, typer.Option("--actions", help='Actions, as in "left*4 forward*6"; given again, another branch.')
+    list[str] | None,
+    typer.Option(
+        "--actions",
+        help='As in "left*4 forward*6"; given again, another branch. Usual: stay, forward, backward, left, right, '
+        "pick_up, drop, toggle; `persist inspect DATA` lists those of DATA.",
+    ),
+]
+
+StepOption = Annotated[
+    float | None,
+    typer.Option("--step", min=0.001, help="Metres of forward and backward; DATA's own, else 0.25 with --turn."),
+]
+
+TurnOption = Annotated[
+    float | None,
+    typer.Option("--turn", min=0.001, max=180.0, help="Degrees of left and right; DATA's own, else 15 with --step."),
 ]
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from persist_cli.api.actions import format_actions
+from persist_cli.api.actions import ActionVocabulary, format_actions
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
@@ -14,13 +14,16 @@ from persist_cli.api.observations import Observations, Trajectory, TrajectoryInf
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import TrajectoryFile
-from persist_cli.errors import DataError
+from persist_cli.errors import DataError, PersistError
 from persist_cli.rollout.world_model import cameras_along
 
 
 @dataclass(frozen=True)
 class RolloutPlan:
-    """The options of ``persist rollout``; see its help."""
+    """The options of ``persist rollout``; see its help.
+
+    ``step`` metres and ``turn`` degrees are those of the walking actions; ``None`` for the trajectory's own.
+    """
 
     start: str
     actions: tuple[str, ...]
@@ -32,6 +35,8 @@ class RolloutPlan:
     seed: int
     sampling: SamplingOverrides
     placement: InferenceOptions
+    step: float | None = None
+    turn: float | None = None
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,7 @@ class CameraPath:
         start: the observed first frame.
         cameras: cameras of the frames to imagine.
         interactions: interaction before each of these frames, ``None`` for none.
-        actions: the actions as text, as in ``"forward*4 left*2"``.
+        actions: the action that leads to each of these frames.
         truth: true frames of these cameras when the path follows a trajectory, else ``None``.
         info: scene, up axis and vocabulary of the start frame's trajectory.
     """
@@ -50,9 +55,14 @@ class CameraPath:
     start: Observations
     cameras: Cameras
     interactions: Interactions
-    actions: str
+    actions: tuple[str, ...]
     truth: Observations | None
     info: TrajectoryInfo
+
+    @property
+    def text(self) -> str:
+        """The actions as text, as in ``"forward*4 left*2"``."""
+        return format_actions(self.actions)
 
 
 @dataclass(frozen=True)
@@ -81,9 +91,30 @@ def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:
     reference = parse_reference(plan.start)
     file = reference.single()
     if plan.follow:
+        if plan.step is not None or plan.turn is not None:
+            raise PersistError("--step and --turn are for --actions; --follow takes the trajectory's own poses")
         return [path_of_trajectory(file, reference.frame, plan.frames)]
+    vocabulary = walking_vocabulary(file, plan)
     start = file.read([reference.frame])
+    start = replace(start, info=replace(start.info, vocabulary=vocabulary))
     return [path_along_actions(start, text) for text in plan.actions]
+
+
+def walking_vocabulary(file: TrajectoryFile, plan: RolloutPlan) -> ActionVocabulary:
+    """Return the actions of a trajectory, with walking actions of the plan's step and turn.
+
+    Raises:
+        DataError: when no action moves the camera, as in a capture, and the plan has neither step nor turn.
+    """
+    own = file.info.vocabulary
+    if plan.step is not None or plan.turn is not None:
+        return own.walking(plan.step, plan.turn)
+    if not own.can_walk:
+        raise DataError(
+            f"{plan.start}: its actions ({', '.join(own.names)}) have no motion of their own, as in every capture; add "
+            "--step 0.1 --turn 5 (metres and degrees of an action) here, or to `persist import` once for all rollouts"
+        )
+    return own
 
 
 def path_along_actions(start: Trajectory, text: str) -> CameraPath:
@@ -91,7 +122,7 @@ def path_along_actions(start: Trajectory, text: str) -> CameraPath:
     names = start.info.vocabulary.parse(text)
     cameras = cameras_along(start.observations.cameras, start.info, names)
     interactions = interactions_of(names, start.info.vocabulary)
-    return CameraPath(start.observations, cameras, interactions, format_actions(names), None, start.info)
+    return CameraPath(start.observations, cameras, interactions, names, None, start.info)
 
 
 def path_of_trajectory(file: TrajectoryFile, first: int, frames: int) -> CameraPath:
@@ -105,7 +136,7 @@ def path_of_trajectory(file: TrajectoryFile, first: int, frames: int) -> CameraP
         start=frames_read.observations[:1],
         cameras=frames_read.observations.cameras[1:],
         interactions=interactions_of(frames_read.actions[:-1], file.info.vocabulary),
-        actions=format_actions(names),
+        actions=names,
         truth=frames_read.observations[1:],
         info=file.info,
     )

@@ -60,7 +60,7 @@ def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rol
     return {
         "checkpoint": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
-        "plan": options | {"adapter": adapter, "actions": rollout.path.actions},
+        "plan": options | {"adapter": adapter, "actions": rollout.path.text},
         "frames": len(rollout.seen),
         "seconds": rollout.seconds,
         "memory": memory,

@@ -56,7 +56,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
         print_json(figures if len(figures) > 1 else figures[0])
         return
     for rollout, folder in zip(rollouts, folders, strict=True):
-        frames, actions = len(rollout.seen), rollout.path.actions
+        frames, actions = len(rollout.seen), rollout.path.text
         say(f"{frames} frames in {rollout.seconds:.1f} s along {actions!r}; written to {folder}")
 
 

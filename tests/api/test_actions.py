@@ -51,3 +51,33 @@ def test_unknown_actions_are_refused(text, cause):
 def test_a_free_motion_cannot_be_replayed_without_poses():
     with pytest.raises(DataError, match="follow the trajectory"):
         free_motion().move(torch.eye(4), "free", UP)
+
+
+def test_an_action_in_capitals_is_shown_in_lower_case():
+    with pytest.raises(DataError, match=r"cannot read action 'Left\*2'; write it in lower case: left\*2"):
+        WALK.parse("Left*2")
+
+
+def test_an_unknown_action_is_answered_by_all_actions_and_what_they_do():
+    with pytest.raises(DataError, match=r"known: .*forward \(0\.25 m ahead\), .*left \(turns 15° to the left\)"):
+        WALK.parse("jump")
+
+
+def test_a_capture_gets_walking_actions_of_any_size_beside_its_own():
+    walk = free_motion().walking(0.1, 5.0)
+    assert walk.names == ("free", "stay", "forward", "backward", "left", "right")
+    assert (walk["backward"].forward, walk["right"].turn) == (-0.1, -5.0)
+    assert walk.reversed(["left", "forward"]) == ("backward", "right")
+    assert not free_motion().can_walk
+
+
+def test_walking_actions_of_another_size_replace_only_what_is_named():
+    walk = WALK.walking(step=0.5)
+    assert (walk["forward"].forward, walk["left"].turn) == (0.5, 15.0)
+    assert walk["pick_up"].interaction
+
+
+@pytest.mark.parametrize(("step", "turn"), [(0.0, 5.0), (float("nan"), 5.0), (0.1, 181.0), (0.1, -5.0)])
+def test_a_step_or_turn_that_is_no_motion_is_refused(step, turn):
+    with pytest.raises(DataError, match="give --step above 0 and --turn up to 180"):
+        free_motion().walking(step, turn)

@@ -8,15 +8,17 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from persist_cli.api.actions import FREE, free_motion
-from persist_cli.api.importer import ForeignTrajectory
+from persist_cli.api.actions import FREE, ActionVocabulary, free_motion
+from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.images import CropResize, crop_resize, parse_size
 from persist_cli.data.store import SUFFIX, TrajectoryFile, schema, write_trajectory
-from persist_cli.errors import DataError
+from persist_cli.errors import DataError, PluginError
 from persist_cli.io.files import ASIDE
-from persist_cli.plugins import make_importer
+from persist_cli.plugins import find_plugin, make_importer
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
+
+MOST_CAUSES = 3  # that are printed for a trajectory
 
 
 @dataclass(frozen=True)
@@ -26,97 +28,166 @@ class ImportPlan:
     Args:
         size: height and width in pixels, ``None`` to keep them.
         every: keep every n-th frame.
+        step: metres of a step of walking actions to add, ``None`` for the usual one, or for no such actions.
+        turn: degrees of a turn of walking actions to add, as ``step``.
+        skip_bad: leave out frames that cannot be used.
     """
 
     size: tuple[int, int] | None = None
     every: int = 1
+    step: float | None = None
+    turn: float | None = None
+    skip_bad: bool = False
+
+    @staticmethod
+    def of(size: str | None, every: int, step: float | None, turn: float | None, skip_bad: bool) -> ImportPlan:
+        """Return the plan of the command's options; ``size`` is ``HEIGHTxWIDTH`` in pixels."""
+        return ImportPlan(parse_size(size) if size else None, every, step, turn, skip_bad)
 
     def info(self, info: TrajectoryInfo) -> TrajectoryInfo:
         """The info of the imported trajectory."""
-        if self.every > 1:  # the foreign actions lead to frames that are left out
-            info = replace(info, vocabulary=free_motion(), source={**info.source, "every": self.every})
+        info = replace(info, vocabulary=self._vocabulary(info.vocabulary))
+        if self.every > 1:
+            info = replace(info, source={**info.source, "every": self.every})
+        if self.skip_bad:
+            info = replace(info, source={**info.source, "skip_bad": True})
         return self._crop(info).info(info) if self.size else info
 
-    def frames(self, trajectory: ForeignTrajectory) -> Iterator[Frame]:
-        """The frames that are kept, at their new size; the last one has no action."""
+    def frames(self, trajectory: ForeignTrajectory, left_out: list[DataError]) -> Iterator[Frame]:
+        """Yield the frames that are kept, at their new size.
+
+        An action that leads over a frame that is left out becomes ``free``: what is named is one step to the next
+        frame. The last frame has no action. Times stay as they were.
+
+        Args:
+            trajectory: what is imported.
+            left_out: gets the cause of each bad frame that is left out.
+
+        Raises:
+            DataError: for a bad frame, unless bad frames are left out; and when all are.
+        """
         crop = self._crop(trajectory.info) if self.size else None
-        last = self.length(trajectory) - 1
-        for number, frame in enumerate(islice(trajectory.frames, 0, None, self.every)):
-            action = None if number == last else FREE if self.every > 1 else frame.action
-            frame = replace(frame, action=action)
-            yield crop.frame(frame) if crop else frame
+        last, gap = None, False
+        for frame in islice(trajectory.frames, 0, None, self.every):
+            if isinstance(frame, DataError):
+                if not self.skip_bad:
+                    raise DataError(f"{frame}; --skip-bad leaves such frames out") from frame
+                left_out.append(frame)
+                gap = True
+                continue
+            if last is not None:
+                yield replace(last, action=FREE if gap or self.every > 1 else last.action)
+            last, gap = crop.frame(frame) if crop else frame, False
+        if last is None and left_out:
+            raise DataError(f"{trajectory.name}: none of its frames can be used; {left_out[0]}")
+        if last is not None:
+            yield replace(last, action=None)
 
     def length(self, trajectory: ForeignTrajectory) -> int:
-        """Number of frames that are kept."""
+        """Number of frames that are kept when none is bad."""
         return -(-trajectory.length // self.every)
+
+    def _vocabulary(self, own: ActionVocabulary) -> ActionVocabulary:
+        """The foreign actions, or ``free`` where they lead to frames that are left out, and walking ones if wanted."""
+        vocabulary = free_motion() if self.every > 1 else own
+        if self.skip_bad and FREE not in vocabulary.names:
+            vocabulary = ActionVocabulary((*vocabulary.actions, *free_motion().actions))
+        if self.step is None and self.turn is None:
+            return vocabulary
+        if vocabulary.can_walk:
+            raise DataError(f"--step and --turn: the frames have actions of their own, {vocabulary.listing()}")
+        return vocabulary.walking(self.step, self.turn)
 
     def _crop(self, info: TrajectoryInfo) -> CropResize:
         return crop_resize((info.height, info.width), self.size or (info.height, info.width))
 
 
-def run_import(format: str, source: Path, out: Path, size: str | None, every: int, json: bool) -> None:
+def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: bool) -> None:
     """Import every trajectory of ``source`` that is not yet in ``out``, and print what there is.
 
     Args:
         format: name of an importer.
         source: folder or file of that format.
         out: data set folder.
-        size: ``HEIGHTxWIDTH`` in pixels, after a central crop to that aspect.
-        every: keep every n-th frame.
+        plan: changes to every trajectory.
         json: print JSON instead of a table.
 
     Raises:
         PersistError: for an unknown format, a source that cannot be read, or a trajectory of other settings in ``out``.
     """
-    plan = ImportPlan(parse_size(size) if size else None, every)
     importer = make_importer(format)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")
-    rows = [import_trajectory(trajectory, plan, out) for trajectory in importer.trajectories(source)]
+    rows = [import_trajectory(importer, trajectory, plan, out) for trajectory in importer.trajectories(source)]
     if json:
         print_json({"out": str(out), "trajectories": rows})
         return
-    columns = ("trajectory", "frames", "size", "state")
-    table = [(row["name"], str(row["frames"]), f"{row['height']}×{row['width']}", row["state"]) for row in rows]
+    columns = ("trajectory", "frames", "left out", "size", "state")
+    table = [
+        (row["name"], str(row["frames"]), str(row["left_out"]), f"{row['height']}×{row['width']}", row["state"])
+        for row in rows
+    ]
     print_table(str(out), columns, table)
+    for row in rows:
+        if row["causes"]:
+            rest = row["left_out"] - len(row["causes"])
+            say(f"left out of {row['name']}: {'; '.join(row['causes'])}{f'; and {rest} more' if rest else ''}")
     say(f"next: persist inspect {out}")
 
 
-def import_trajectory(trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
-    """Write one trajectory unless it is there; name, frames, size and state are returned for the table."""
+def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
+    """Write one trajectory unless it is there, and return what the table says of it."""
     path = out / f"{trajectory.name}{SUFFIX}"
     info = plan.info(trajectory.info)
-    state = "already there"
-    if not _is_imported(path, info, plan.length(trajectory)):
-        _write(path, info, trajectory, plan)
+    state, left_out = "already there", list[DataError]()
+    if not _is_imported(path, info, plan, trajectory):
+        frames = _checked(plan.frames(trajectory, left_out), info, importer)
+        _write(path, info, plan.length(trajectory), frames)
         state = "written"
+    length = TrajectoryFile(path).length
     return {
         "name": trajectory.name,
-        "frames": plan.length(trajectory),
+        "frames": length,
+        "left_out": plan.length(trajectory) - length,
+        "causes": [str(cause) for cause in left_out[:MOST_CAUSES]],
         "height": info.height,
         "width": info.width,
         "state": state,
     }
 
 
-def _is_imported(path: Path, info: TrajectoryInfo, length: int) -> bool:
+def _checked(frames: Iterator[Frame], info: TrajectoryInfo, importer: Importer) -> Iterator[Frame]:
+    """Yield the frames; ``PluginError`` naming the importer for an action that is not in the vocabulary."""
+    for number, frame in enumerate(frames):
+        if frame.action is not None and frame.action not in info.vocabulary.names:
+            plugin = find_plugin("importer", importer.name)
+            raise PluginError(
+                f"{plugin} is broken: frame {number} takes the action {frame.action!r}, which its vocabulary "
+                f"({', '.join(info.vocabulary.names)}) does not have"
+            )
+        yield frame
+
+
+def _is_imported(path: Path, info: TrajectoryInfo, plan: ImportPlan, trajectory: ForeignTrajectory) -> bool:
     """Whether an earlier run wrote this very trajectory; another one of that name is an error."""
     if not path.exists():
         return False
     file = TrajectoryFile(path)
-    if file.length != length or schema(file.info).metadata != schema(info).metadata:
+    most = plan.length(trajectory)
+    length_fits = 0 < file.length <= most if plan.skip_bad else file.length == most
+    if not length_fits or schema(file.info).metadata != schema(info).metadata:
         raise DataError(f"{path}: holds another trajectory or one of other settings; remove it or take another --out")
     return True
 
 
-def _write(path: Path, info: TrajectoryInfo, trajectory: ForeignTrajectory, plan: ImportPlan) -> None:
+def _write(path: Path, info: TrajectoryInfo, length: int, frames: Iterator[Frame]) -> None:
     for leftover in path.parent.glob(f"{ASIDE}*-{path.name}"):
         leftover.unlink(missing_ok=True)  # of a killed run
     with progress() as bar:
-        task = add_task(bar, trajectory.name, plan.length(trajectory), "frames")
+        task = add_task(bar, path.name.removesuffix(SUFFIX), length, "frames")
 
         def frames_with_progress() -> Iterator[Frame]:
-            for frame in plan.frames(trajectory):
+            for frame in frames:
                 yield frame
                 bar.advance(task)
 

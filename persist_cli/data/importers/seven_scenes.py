@@ -55,7 +55,7 @@ class SevenScenes(Importer):
         """Read every sequence of ``source`` as a trajectory named after its scene.
 
         Raises:
-            DataError: when there is none, or a frame lacks one of its files.
+            DataError: when there is none, or what a whole sequence needs is missing or wrong.
         """
         source = source.resolve()
         if not source.is_dir():
@@ -94,15 +94,18 @@ def _sequence(folder: Path) -> ForeignTrajectory:
     is_part = bool(SEQUENCE.match(folder.name))
     scene = folder.parent.name if is_part else folder.name
     files = _frame_files(folder)
-    poses = np.stack([read_matrix(frame.pose, 4, 4) for frame in files])
-    _check_poses(poses, files)
-    height, width = read_color(files[0].color).shape[:2]
+    intrinsics = _intrinsics(folder)
+    poses = [_pose(frame) for frame in files]
+    good = [pose for pose in poses if not isinstance(pose, DataError)]
+    if not good:
+        raise DataError(f"{folder}: none of its {len(files)} frames has a pose that can be used; {poses[0]}")
+    height, width = _image_size(files)
     info = TrajectoryInfo(
         scene=scene,
-        intrinsics=_intrinsics(folder),
+        intrinsics=intrinsics,
         height=height,
         width=width,
-        world_up=estimate_up(poses),
+        world_up=estimate_up(np.stack(good)),
         vocabulary=free_motion(),
         source={"format": "7scenes", "folder": folder.name, "world_up": "estimated from the cameras"},
     )
@@ -111,7 +114,7 @@ def _sequence(folder: Path) -> ForeignTrajectory:
 
 
 def _frame_files(folder: Path) -> list[FrameFiles]:
-    """The files of every frame in order; a frame that lacks one of them is an error."""
+    """The files of every frame in order, of a frame that lacks one the path where it should be."""
     paths_by_stem: dict[str, dict[str, Path]] = {}
     for path in sorted(folder.iterdir()):
         match = FRAME.match(path.name)
@@ -119,21 +122,38 @@ def _frame_files(folder: Path) -> list[FrameFiles]:
             paths_by_stem.setdefault(match["stem"], {})[match["part"].partition(".")[0]] = path
     if not paths_by_stem:
         raise DataError(f"{folder}: no frame-NNNNNN.color.png or .jpg files in it")
-    for stem, paths in paths_by_stem.items():
-        for part in ("color", "depth", "pose"):
-            if part not in paths:
-                present = ", ".join(path.name for path in paths.values())
-                raise DataError(f"{folder}: {stem} has no {part} file (only {present})")
-    return [FrameFiles(int(stem.removeprefix("frame-")), **paths) for stem, paths in sorted(paths_by_stem.items())]
+    return [
+        FrameFiles(
+            number=int(stem.removeprefix("frame-")),
+            color=paths.get("color", folder / f"{stem}.color.png"),
+            depth=paths.get("depth", folder / f"{stem}.depth.png"),
+            pose=paths.get("pose", folder / f"{stem}.pose.txt"),
+        )
+        for stem, paths in sorted(paths_by_stem.items())
+    ]
 
 
-def _check_poses(poses: np.ndarray[Any, Any], files: list[FrameFiles]) -> None:
-    """Raise ``DataError`` naming the file of the first pose that is not rigid."""
-    for pose, frame in zip(poses, files, strict=True):
+def _pose(frame: FrameFiles) -> np.ndarray[Any, Any] | DataError:
+    """The frame's pose, or the error that names its file and why the pose cannot be used."""
+    try:
+        pose = read_matrix(frame.pose, 4, 4)
+        check_poses(torch.from_numpy(pose)[None], str(frame.pose))
+    except DataError as error:
+        return DataError(str(error).replace("the pose of frame 0", "the pose"))
+    return pose
+
+
+def _image_size(files: list[FrameFiles]) -> tuple[int, int]:
+    """Height and width of the first colour image that can be read; ``DataError`` naming the first when none can."""
+    errors = []
+    for frame in files:
         try:
-            check_poses(torch.from_numpy(pose)[None], str(frame.pose))
+            height, width = read_color(frame.color).shape[:2]
         except DataError as error:
-            raise DataError(str(error).replace("the pose of frame 0", "the pose")) from error
+            errors.append(error)
+        else:
+            return height, width
+    raise errors[0]
 
 
 def _intrinsics(folder: Path) -> np.ndarray[Any, Any]:
@@ -150,13 +170,28 @@ def _intrinsics(folder: Path) -> np.ndarray[Any, Any]:
     return matrix
 
 
-def _frames(files: list[FrameFiles], poses: np.ndarray[Any, Any], info: TrajectoryInfo) -> Iterator[Frame]:
+def _frames(
+    files: list[FrameFiles], poses: list[np.ndarray[Any, Any] | DataError], info: TrajectoryInfo
+) -> Iterator[Frame | DataError]:
     for position, (frame, pose) in enumerate(zip(files, poses, strict=True)):
-        rgb = read_color(frame.color)
-        depth = read_depth(frame.depth, 1000.0, NO_DEPTH)
-        for path, image in ((frame.color, rgb), (frame.depth, depth)):
-            if image.shape[:2] != (info.height, info.width):
-                size = f"{image.shape[0]}×{image.shape[1]}"
-                raise DataError(f"{path}: {size} pixels, the first colour image has {info.height}×{info.width}")
+        if isinstance(pose, DataError):
+            yield pose
+            continue
+        try:
+            rgb, depth = _images(frame, info)
+        except DataError as error:
+            yield error
+            continue
         action = FREE if position + 1 < len(files) else None
         yield Frame(rgb, depth, pose, action, (frame.number - files[0].number) / FRAMES_PER_SECOND)
+
+
+def _images(frame: FrameFiles, info: TrajectoryInfo) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Colour and depth of the frame; ``DataError`` naming the one that cannot be read or has another size."""
+    rgb = read_color(frame.color)
+    depth = read_depth(frame.depth, 1000.0, NO_DEPTH)
+    for path, image in ((frame.color, rgb), (frame.depth, depth)):
+        if image.shape[:2] != (info.height, info.width):
+            size = f"{image.shape[0]}×{image.shape[1]}"
+            raise DataError(f"{path}: {size} pixels, the first colour image has {info.height}×{info.width}")
+    return rgb, depth

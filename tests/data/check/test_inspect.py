@@ -14,7 +14,7 @@ import typer
 
 from persist_cli.data.check.inspect import run_inspect
 from persist_cli.data.check.reprojection import choose_pairs, reproject
-from persist_cli.data.importers.importing import run_import
+from persist_cli.data.importers.importing import ImportPlan, run_import
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError
 from tests.support import faulty_data as faults
@@ -59,7 +59,7 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not KITCHEN.is_dir():
         pytest.skip("needs the real Kinect frames of ../shared/data/kitchen")
     folder = tmp_path_factory.mktemp("kitchen")
-    run_import("7scenes", KITCHEN, folder, "120x160", 5, False)
+    run_import("7scenes", KITCHEN, folder, ImportPlan((120, 160), 5), False)
     return folder / "kitchen.parquet"
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from persist_cli.data.importers.importing import run_import
+from persist_cli.data.importers.importing import ImportPlan, run_import
 from persist_cli.data.importers.seven_scenes import SevenScenes, estimate_up
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PluginError
@@ -106,9 +106,9 @@ COLOR, DEPTH, POSE = (f"frame-000006.{part}" for part in ("color.png", "depth.pn
         (remove("camera-intrinsics.txt"), r"camera-intrinsics\.txt: no such file"),
         (save("camera-intrinsics.txt", np.zeros((3, 3))), r"camera-intrinsics\.txt: the intrinsics .* are singular"),
         (write("camera-intrinsics.txt", "1 2 3"), r"camera-intrinsics\.txt: 3 numbers, not the 3×3"),
-        (remove(DEPTH), "frame-000006 has no depth file"),
-        (remove(COLOR), "frame-000006 has no color file"),
-        (remove(POSE), "frame-000006 has no pose file"),
+        (remove(DEPTH), r"frame-000006\.depth\.png: no such file"),
+        (remove(COLOR), r"frame-000006\.color\.png: no such file"),
+        (remove(POSE), r"frame-000006\.pose\.txt: no such file"),
         (truncate(COLOR), r"frame-000006\.color\.png: not a whole image"),
         (truncate(DEPTH), r"frame-000006\.depth\.png: not a whole image"),
         (write(COLOR, "no image"), r"frame-000006\.color\.png: not a whole image"),
@@ -125,28 +125,36 @@ def test_a_broken_file_is_named_and_nothing_half_written_is_left(
 ) -> None:
     damage(sequence)
     with pytest.raises(DataError, match=cause) as error:
-        run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(), False)
     assert "\n" not in str(error.value)
     assert not list((tmp_path / "out").glob("*"))
 
 
 def test_a_folder_without_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="neither frame-"):
-        run_import("7scenes", tmp_path, tmp_path / "out", None, 1, False)
+        run_import("7scenes", tmp_path, tmp_path / "out", ImportPlan(), False)
     with pytest.raises(DataError, match="nowhere: no such file or folder"):
-        run_import("7scenes", tmp_path / "nowhere", tmp_path / "out", None, 1, False)
+        run_import("7scenes", tmp_path / "nowhere", tmp_path / "out", ImportPlan(), False)
 
 
 def test_an_unknown_format_gets_a_hint(tmp_path: Path) -> None:
     with pytest.raises(PluginError, match="did you mean '7scenes'"):
-        run_import("7scene", tmp_path, tmp_path / "out", None, 1, False)
+        run_import("7scene", tmp_path, tmp_path / "out", ImportPlan(), False)
 
 
 def test_import_writes_a_store_of_the_size_given(sequence: Path, tmp_path: Path, capsys) -> None:
-    run_import("7scenes", sequence, tmp_path / "out", "24x24", 2, True)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan((24, 24), 2), True)
     report = json.loads(capsys.readouterr().out)
     assert report["trajectories"] == [
-        {"name": "kitchen", "frames": 2, "height": 24, "width": 24, "state": "written"},
+        {
+            "name": "kitchen",
+            "frames": 2,
+            "left_out": 0,
+            "causes": [],
+            "height": 24,
+            "width": 24,
+            "state": "written",
+        },
     ]
     trajectory = Store(tmp_path / "out")["kitchen"].read()
     assert trajectory.observations.rgb.shape == (2, 24, 24, 3)
@@ -155,10 +163,68 @@ def test_import_writes_a_store_of_the_size_given(sequence: Path, tmp_path: Path,
 
 
 def test_a_second_import_leaves_finished_trajectories_alone(sequence: Path, tmp_path: Path, capsys) -> None:
-    run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(), False)
     written = (tmp_path / "out/kitchen.parquet").stat().st_mtime_ns
-    run_import("7scenes", sequence, tmp_path / "out", None, 1, False)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(), False)
     assert "already there" in capsys.readouterr().out
     assert (tmp_path / "out/kitchen.parquet").stat().st_mtime_ns == written
     with pytest.raises(DataError, match="of other settings"):
-        run_import("7scenes", sequence, tmp_path / "out", "24x24", 1, False)
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan((24, 24)), False)
+
+
+LOST = "-1.#IND " * 16
+
+
+def test_bad_frames_are_left_out_with_a_count_and_their_causes(sequence: Path, tmp_path: Path, capsys) -> None:
+    write(POSE, LOST)(sequence)
+    (sequence / "frame-000003.depth.png").write_bytes(b"no image")
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+    text = capsys.readouterr().out
+    assert "│ kitchen    │      2 │        2 │" in text
+    assert "frame-000003.depth.png: not a whole image" in text
+    assert "frame-000006.pose.txt: not a text file of numbers" in text
+
+
+def test_a_bad_frame_is_named_with_the_option_that_leaves_it_out(sequence: Path, tmp_path: Path) -> None:
+    save(POSE, np.full((4, 4), -np.inf))(sequence)
+    with pytest.raises(DataError, match=r"frame-000006\.pose\.txt: the pose is not finite; --skip-bad leaves such"):
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(), False)
+
+
+def test_left_out_frames_at_both_ends_leave_a_whole_trajectory(sequence: Path, tmp_path: Path) -> None:
+    for number in (0, 9):
+        write(f"frame-{number:06d}.pose.txt", LOST)(sequence)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+    assert Store(tmp_path / "out")[0].actions() == ("free", None)
+
+
+def test_times_keep_the_gap_of_a_frame_that_is_left_out(sequence: Path, tmp_path: Path) -> None:
+    remove(DEPTH)(sequence)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+    assert Store(tmp_path / "out")[0].timestamps().tolist() == pytest.approx([0, 0.1, 0.3])
+
+
+def test_a_sequence_without_a_usable_frame_is_refused(sequence: Path, tmp_path: Path) -> None:
+    for path in sequence.glob("*.depth.png"):
+        path.write_bytes(b"no image")
+    with pytest.raises(DataError, match=r"kitchen: none of its frames can be used; .*000000\.depth\.png"):
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+    for path in sequence.glob("*.pose.txt"):
+        path.write_text(LOST)
+    with pytest.raises(DataError, match="none of its 4 frames has a pose that can be used"):
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+
+
+def test_an_import_with_bad_frames_left_out_is_not_repeated(sequence: Path, tmp_path: Path, capsys) -> None:
+    write(POSE, LOST)(sequence)
+    for state in ("written", "already there"):
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), True)
+        (row,) = json.loads(capsys.readouterr().out)["trajectories"]
+        assert (row["state"], row["frames"], row["left_out"]) == (state, 3, 1)
+
+
+def test_an_import_stores_walking_actions_beside_the_free_motion(sequence: Path, tmp_path: Path) -> None:
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(step=0.1, turn=5.0), False)
+    (file,) = Store(tmp_path / "out")
+    assert file.info.vocabulary["left"].turn == 5.0
+    assert file.actions() == ("free", "free", "free", None)
