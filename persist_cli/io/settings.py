@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from persist_cli.errors import RecipeError
+from persist_cli.io.value_kinds import describe_kind, is_fixed_tuple, kind_at, plain_value, union_members
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+    from pydantic_core import ErrorDetails
 
 T = TypeVar("T")
 
@@ -38,12 +42,45 @@ def parse_settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     try:
         instance = TypeAdapter(kind).validate_python(dict(values))
     except ValidationError as error:
-        for item in error.errors():
-            key = ".".join(str(part) for part in item["loc"]) or "value"
-            problems.append(f"{key}: {item['msg']}")
+        problems += plain_problems(kind, values, error)
     if problems or instance is None:
         raise RecipeError(f"{where}: " + "; ".join(problems))
     return instance
+
+
+def plain_problems(kind: Any, values: Mapping[str, Any], error: ValidationError) -> list[str]:
+    """Say in plain words what pydantic found wrong, each problem once.
+
+    Args:
+        kind: the dataclass or pydantic model that the values were checked against.
+        values: the values.
+        error: what pydantic found.
+    """
+    return list(dict.fromkeys(_plain_problem(kind, values, item) for item in error.errors(include_url=False)))
+
+
+def _plain_problem(kind: Any, values: Mapping[str, Any], item: ErrorDetails) -> str:
+    wanted, place = kind_at(kind, item["loc"])
+    key = ".".join(str(part) for part in place) or "value"
+    if item["type"] == "value_error":  # raised by the settings themselves, in words that are ours
+        cause = str(item["ctx"]["error"])
+        return f"{key}: {cause}" if place else cause
+    if item["type"] == "missing" and place == item["loc"]:
+        return f"{key} is missing; it must be {describe_kind(wanted)}"
+    value = _value_at(values, place)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    example = f", as in {[value] * len(typing.get_args(wanted))}" if is_fixed_tuple(wanted) and is_number else ""
+    return f"{key} must be {describe_kind(wanted)}{example}, not {plain_value(value)}"
+
+
+def _value_at(values: Any, place: Sequence[str | int]) -> Any:
+    """The value at a place, or the innermost one around it where pydantic's name of the place is no key of ours."""
+    for part in place:
+        try:
+            values = values[part]
+        except (KeyError, IndexError, TypeError):
+            break
+    return values
 
 
 def _unknown_keys(kind: Any, values: Any, prefix: str) -> typing.Iterator[str]:
@@ -63,6 +100,4 @@ def _unknown_keys(kind: Any, values: Any, prefix: str) -> typing.Iterator[str]:
 
 def _dataclass_in(kind: Any) -> Any:
     """The type itself, or the dataclass in a union such as ``X | None``."""
-    if typing.get_origin(kind) in (typing.Union, types.UnionType):
-        return next((part for part in typing.get_args(kind) if dataclasses.is_dataclass(part)), None)
-    return kind
+    return next((part for part in union_members(kind) if dataclasses.is_dataclass(part)), kind)

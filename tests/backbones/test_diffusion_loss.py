@@ -70,5 +70,5 @@ def test_a_scheduler_that_predicts_noise_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("snr_gamma", 0.0), ("snr_gamma", -5.0), ("kl_weight", -1e-6)])
 def test_a_loss_weight_out_of_range_is_refused(name: str, value: float) -> None:
-    with pytest.raises(RecipeError, match=f"{name}: Input should be greater than"):
+    with pytest.raises(RecipeError, match=f"{name} must be a number (above|of at least) 0, not {value}"):
         micro(**{name: value})

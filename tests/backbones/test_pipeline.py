@@ -19,6 +19,7 @@ from PIL import Image
 import persist_backbones
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.extensions.offload import enable_tiling
+from persist_backbones.pipeline.call_inputs import batch_of_images
 from persist_backbones.pipeline.pipeline import WorldPipeline, WorldPipelineOutput
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import find_checkpoint
@@ -221,8 +222,19 @@ def test_images_depth_and_cameras_of_other_sizes_are_refused():
         pipeline(rgb, depth[:, :16], CLIPS.cameras)
     with pytest.raises(PersistError, match=r"^cameras of 5 frames; a clip of this model has 9$"):
         pipeline(rgb, depth, CLIPS.cameras[(slice(None), slice(5))])
-    with pytest.raises(PersistError, match=r"^an image of shape \[2, 32, 32, 1\]"):
-        pipeline(rgb[..., :1], depth, CLIPS.cameras)
+
+
+@pytest.mark.parametrize(
+    ("image", "given"),
+    [(torch.zeros(2, 32, 32, 1, dtype=torch.uint8), r"\[2, 32, 32, 1\] and torch.uint8"),
+     (torch.zeros(32, 32, 3), r"\[32, 32, 3\] and torch.float32"),
+     (torch.zeros(3, 32, 32, dtype=torch.uint8), r"\[3, 32, 32\] and torch.uint8"),
+     (torch.zeros(32, 32, 3, dtype=torch.int64), r"\[32, 32, 3\] and torch.int64"), (torch.zeros(3), r"\[3\] and")],
+)  # fmt: skip
+def test_an_image_of_another_layout_is_named_as_it_was_given(image, given):
+    wanted = r"give a PIL image, uint8 \[height, width, 3\], or floating point \[3, height, width\] in \[0, 1\]"
+    with pytest.raises(PersistError, match=f"^an image of shape {given}.*{wanted}$"):
+        batch_of_images(image)
 
 
 @pytest.fixture

@@ -197,7 +197,7 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
      (["--gpu-memory", "inf"], "give the GB of a card"),
      (["--gpu-memory", "80", "--gpus", "3"], "by 3 processes with 1 micro-batches; give training.batch=15 training.ac"),
      (["--gpu-memory", "80", "--gpus", "8", "training.accumulation=8"], "give training.accumulation=2"),
-     (["backbone.settings.height=0"], "height: Input should be greater than 0"),
+     (["backbone.settings.height=0"], "height must be a whole number above 0, not 0"),
      (["backbone.settings.transformer={num_layers: 0}"], "num_layers 0: at least 1"),
      (["backbone.settings.vae={temporal_compression_ratio: 0}"], "temporal_compression_ratio 0: at least 1"),
      (["backbone.settings.pretrained=nowhere"], "nowhere: no such directory, and not the name of a repository")],

@@ -61,18 +61,31 @@ def batch_of_images(images: Any) -> Tensor:
 
     Integers must be uint8 ``[height, width, 3]``; floating point values are diffusers' ``pt``, ``[3, height, width]``
     in [0, 1]; both may have a batch axis.
+
+    Raises:
+        DataError: one line with the shape and type that were given.
     """
     if isinstance(images, (list, tuple)):
         return torch.cat([batch_of_images(image) for image in images])
     if not isinstance(images, Tensor):
         pixels = images.convert("RGB") if hasattr(images, "convert") else images
         images = torch.from_numpy(np.array(pixels))
+    _check_images(images)
     if images.is_floating_point():
         images = (images.movedim(-3, -1) * 255).round().clamp(0, 255).to(torch.uint8)
-    if images.ndim not in (3, 4) or images.shape[-1] != 3 or images.dtype != torch.uint8:
-        raise DataError(f"an image of shape {list(images.shape)} and {images.dtype}; give a PIL image or 3 channels")
     batch: Tensor = images.reshape(-1, *images.shape[-3:])
     return batch
+
+
+def _check_images(images: Tensor) -> None:
+    floating = images.is_floating_point()
+    channels_at = -3 if floating else -1
+    if images.ndim in (3, 4) and images.shape[channels_at] == 3 and (floating or images.dtype == torch.uint8):
+        return
+    raise DataError(
+        f"an image of shape {list(images.shape)} and {images.dtype}; give a PIL image, uint8 [height, width, 3], or "
+        "floating point [3, height, width] in [0, 1]"
+    )
 
 
 def batch_of_depth(depth: Any) -> Tensor:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from persist_cli.errors import DataError
+from persist_cli.io.settings import plain_problems
 
 FORMAT = "persist-evaluation"
 
@@ -234,9 +235,7 @@ def check_results(value: Mapping[str, Any], where: str) -> EvalResults:
     try:
         results = EvalResults.model_validate(value)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise DataError(f"{where}: results are damaged: {key}: {first['msg']}") from error
+        raise DataError(f"{where}: results are damaged: {plain_problems(EvalResults, value, error)[0]}") from error
     for table in results.tables:
         if not all(0 <= number < len(results.measured.clips) for number in table.clips):
             raise DataError(f"{where}: results are damaged: table {table.name!r} names clips that are not there")

@@ -141,7 +141,7 @@ BROKEN = {
     "not the results of `persist eval`": "[]",
     "no format 'persist-evaluation' in it": '{"rows": 1}',
     "results of version 2; this persist reads version 1": '{"format": "persist-evaluation", "version": 2}',
-    "results are damaged: measured: Field required": '{"format": "persist-evaluation", "version": 1}',
+    "results are damaged: measured is missing; it must be a mapping": '{"format": "persist-evaluation", "version": 1}',
 }
 
 

@@ -91,7 +91,7 @@ def test_a_file_in_the_way_of_the_report_is_one_line_and_no_page_is_written(tmp_
 def test_damaged_results_are_one_line(tmp_path):
     results = example_results()
     del results["measured"]["image_size"]
-    with pytest.raises(DataError, match=r"results are damaged: measured.image_size: Field required$"):
+    with pytest.raises(DataError, match=r"are damaged: measured.image_size is missing; it must be two whole numbers$"):
         write_report(results, Pictures(), tmp_path / "report")
     assert not (tmp_path / "report").exists()
 
