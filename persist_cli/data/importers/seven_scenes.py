@@ -7,11 +7,11 @@ Colour and depth of this Kinect were not registered to each other: colours lie s
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from persist_cli.api.actions import FREE, free_motion
 from persist_cli.api.cameras import check_intrinsics, check_poses
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.data.importers.gravity import Array, Direction, estimate_up, level_up
 from persist_cli.data.importers.readers import read_color, read_depth, read_matrix
 from persist_cli.errors import DataError
 
@@ -28,7 +29,7 @@ FRAME = re.compile(r"^(?P<stem>frame-\d+)\.(?P<part>color\.jpg|color\.png|depth\
 SEQUENCE = re.compile(r"^seq-?\d+$")
 NO_DEPTH = (0, 65535)  # raw values of pixels without depth
 FRAMES_PER_SECOND = 30.0
-ROLL = 0.07  # radians, four degrees: how much a person holding a camera rolls it
+FRAMES_FOR_UP = 20  # whose depth shows which way is up
 
 
 @dataclass(frozen=True)
@@ -69,35 +70,13 @@ class SevenScenes(Importer):
             yield _sequence(folder)
 
 
-def estimate_up(poses: np.ndarray[Any, Any]) -> tuple[float, float, float]:
-    """The unit vector that points up in the world, estimated from the cameras because 7-Scenes does not store it.
-
-    A hand-held camera pitches a lot and rolls little, so up is nearly perpendicular to all the cameras' x axes. The
-    mean of the cameras' -y axes is taken, and its parts along directions in which the x axes spread by more than the
-    usual roll are damped. On the kitchen of 7-Scenes this is 9° off the normal of its horizontal surfaces, the plain
-    mean 26°.
-
-    Args:
-        poses: world_from_camera ``[frame, 4, 4]``.
-    """
-    right, up = poses[:, :3, 0], -poses[:, :3, 1].mean(0)
-    spread = right.T @ right / len(right)
-    estimate = np.linalg.solve(spread + ROLL**2 * np.eye(3), up)
-    length = float(np.linalg.norm(estimate))
-    if length < 1e-6:  # as many cameras upside down as upright
-        return 0.0, -1.0, 0.0
-    x, y, z = (float(value) for value in estimate / length)
-    return x, y, z
-
-
 def _sequence(folder: Path) -> ForeignTrajectory:
     is_part = bool(SEQUENCE.match(folder.name))
     scene = folder.parent.name if is_part else folder.name
     files = _frame_files(folder)
     intrinsics = _intrinsics(folder)
     poses = [_pose(frame) for frame in files]
-    good = [pose for pose in poses if not isinstance(pose, DataError)]
-    if not good:
+    if all(isinstance(pose, DataError) for pose in poses):
         raise DataError(f"{folder}: none of its {len(files)} frames has a pose that can be used; {poses[0]}")
     height, width = _image_size(files)
     info = TrajectoryInfo(
@@ -105,12 +84,24 @@ def _sequence(folder: Path) -> ForeignTrajectory:
         intrinsics=intrinsics,
         height=height,
         width=width,
-        world_up=estimate_up(np.stack(good)),
+        world_up=_world_up(files, poses, intrinsics),
         vocabulary=free_motion(),
-        source={"format": "7scenes", "folder": folder.name, "world_up": "estimated from the cameras"},
+        source={"format": "7scenes", "folder": folder.name, "world_up": "estimated from cameras and level surfaces"},
     )
     name = f"{scene}-{folder.name}" if is_part else scene
     return ForeignTrajectory(name, info, _frames(files, poses, info), len(files))
+
+
+def _world_up(files: list[FrameFiles], poses: list[Array | DataError], intrinsics: Array) -> Direction:
+    """The direction up, from all usable poses and from the depth of some of their frames."""
+    posed = [(frame, pose) for frame, pose in zip(files, poses, strict=True) if not isinstance(pose, DataError)]
+    up = estimate_up(np.stack([pose for _, pose in posed]))
+    chosen = np.linspace(0, len(posed) - 1, min(FRAMES_FOR_UP, len(posed))).round().astype(int)
+    views = []
+    for frame, pose in (posed[number] for number in chosen):
+        with contextlib.suppress(DataError):  # the frame itself is reported when its turn comes
+            views.append((read_depth(frame.depth, 1000.0, NO_DEPTH), pose))
+    return level_up(up, views, intrinsics)
 
 
 def _frame_files(folder: Path) -> list[FrameFiles]:
@@ -133,7 +124,7 @@ def _frame_files(folder: Path) -> list[FrameFiles]:
     ]
 
 
-def _pose(frame: FrameFiles) -> np.ndarray[Any, Any] | DataError:
+def _pose(frame: FrameFiles) -> Array | DataError:
     """The frame's pose, or the error that names its file and why the pose cannot be used."""
     try:
         pose = read_matrix(frame.pose, 4, 4)
@@ -156,7 +147,7 @@ def _image_size(files: list[FrameFiles]) -> tuple[int, int]:
     raise errors[0]
 
 
-def _intrinsics(folder: Path) -> np.ndarray[Any, Any]:
+def _intrinsics(folder: Path) -> Array:
     """The matrix in or above ``folder``, its principal point moved to pixel centres at (0.5, 0.5)."""
     candidates = [folder / INTRINSICS, folder.parent / INTRINSICS]
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
@@ -171,7 +162,7 @@ def _intrinsics(folder: Path) -> np.ndarray[Any, Any]:
 
 
 def _frames(
-    files: list[FrameFiles], poses: list[np.ndarray[Any, Any] | DataError], info: TrajectoryInfo
+    files: list[FrameFiles], poses: list[Array | DataError], info: TrajectoryInfo
 ) -> Iterator[Frame | DataError]:
     for position, (frame, pose) in enumerate(zip(files, poses, strict=True)):
         if isinstance(pose, DataError):
@@ -186,7 +177,7 @@ def _frames(
         yield Frame(rgb, depth, pose, action, (frame.number - files[0].number) / FRAMES_PER_SECOND)
 
 
-def _images(frame: FrameFiles, info: TrajectoryInfo) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+def _images(frame: FrameFiles, info: TrajectoryInfo) -> tuple[Array, Array]:
     """Colour and depth of the frame; ``DataError`` naming the one that cannot be read or has another size."""
     rgb = read_color(frame.color)
     depth = read_depth(frame.depth, 1000.0, NO_DEPTH)

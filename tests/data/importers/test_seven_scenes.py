@@ -12,10 +12,10 @@ import torch
 from PIL import Image
 
 from persist_cli.data.importers.importing import ImportPlan, run_import
-from persist_cli.data.importers.seven_scenes import SevenScenes, estimate_up
+from persist_cli.data.importers.seven_scenes import SevenScenes
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PluginError
-from tests.support.rooms import Room, look, walk
+from tests.support.rooms import Room, walk
 
 ROOM = Room()
 
@@ -69,12 +69,6 @@ def test_the_sequences_of_a_scene_share_its_name(tmp_path: Path) -> None:
 def test_timestamps_follow_the_frame_numbers(sequence: Path) -> None:
     (trajectory,) = SevenScenes().trajectories(sequence)
     assert [frame.timestamp for frame in trajectory.frames] == pytest.approx([0, 0.1, 0.2, 0.3])
-
-
-def test_up_is_estimated_although_the_camera_looks_down() -> None:
-    poses = np.stack([look((0, 1.5, 0), yaw, -35) for yaw in range(0, 120, 10)])
-    assert np.degrees(np.arccos(np.dot(estimate_up(poses), (0, 1, 0)))) < 3
-    assert np.degrees(np.arccos(np.dot(-poses[:, :3, 1].mean(0), (0, 1, 0)))) > 20  # the plain mean
 
 
 def remove(name: str):
