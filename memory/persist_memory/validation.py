@@ -9,10 +9,12 @@ from torch import Tensor
 
 from persist_cli.api.cameras import check_poses
 from persist_cli.api.memory import Memory
-from persist_cli.api.observations import Observations
+from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.errors import CheckpointError, DataError
 
 Shape = tuple[int | None, ...]  # None first: as many rows as the first tensor has; None later: any size
+
+ORIGINS = "origins"  # the tensor with the origin of each stored item
 
 
 def check_observations(observations: Observations, where: str) -> None:
@@ -20,8 +22,8 @@ def check_observations(observations: Observations, where: str) -> None:
     cameras = observations.cameras
     size = (len(observations), cameras.height, cameras.width)
     sizes = {tuple(observations.rgb.shape[:3]), tuple(observations.depth.shape), size}
-    if len(sizes) > 1 or len(cameras) != len(observations):
-        raise DataError(f"{where}: rgb, depth and cameras differ in frames or size: {sorted(sizes)}")
+    if len(sizes) > 1 or not len(cameras) == len(observations.origins) == len(observations):
+        raise DataError(f"{where}: rgb, depth, cameras and origins differ in frames or size: {sorted(sizes)}")
     check_poses(cameras.world_from_camera.cpu(), where)
 
 
@@ -45,6 +47,20 @@ def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, tuple[to
             raise CheckpointError(f"{where}: tensor {name!r} is {actual}, expected {dtype} {list(wanted)}")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise CheckpointError(f"{where}: tensor {name!r} has numbers that are not finite")
+
+
+def with_origins(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return a memory's tensors with the origin of each item; in files of version 1, without it, all are observed."""
+    if not tensors or ORIGINS in tensors:
+        return tensors
+    return tensors | {ORIGINS: origins_like(next(iter(tensors.values())), Origin.OBSERVED)}
+
+
+def check_origins(tensors: Mapping[str, Tensor], where: str) -> None:
+    """Raise ``CheckpointError`` when a memory's tensors have an origin that this version does not know."""
+    unknown = set(tensors[ORIGINS].unique().tolist()) - set(Origin)
+    if unknown:
+        raise CheckpointError(f"{where}: unknown origin {min(unknown)} of an item; a newer persist may know it")
 
 
 def check_mergeable(memory: Memory, other: Memory) -> None:

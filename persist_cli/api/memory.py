@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -16,13 +16,15 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
-from persist_cli.api.observations import Observations
+from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import write_tensors
 from persist_cli.io.settings import NoSettings
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 1 has neither origins nor paths
+
+PATH = "path:"  # begins the names of tensors in a memory file that hold paths
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,18 @@ class MemoryFigures:
         cells: number of stored items (cells, snapshots, …).
         bytes: size of the stored tensors in bytes.
         bounds: lowest and highest corner in world metres, ``None`` without points.
+        imagined: number of those items that were imagined; the others were observed.
     """
 
     cells: int
     bytes: int
     bounds: tuple[tuple[float, ...], tuple[float, ...]] | None
+    imagined: int = 0
+
+    @property
+    def observed(self) -> int:
+        """The number of items that were observed."""
+        return self.cells - self.imagined
 
 
 @dataclass(frozen=True)
@@ -61,11 +70,17 @@ class MapPoints:
         positions: world metres, float64.
         colors: uint8 RGB, 0…255.
         spread: side in metres of the square that is drawn for each point.
+        origins: the ``Origin`` of each point; without it all are observed.
     """
 
     positions: Float[Tensor, "point 3"]
     colors: UInt8[Tensor, "point 3"]
     spread: float = 0.05
+    origins: UInt8[Tensor, " point"] = None  # type: ignore[assignment]  # set below
+
+    def __post_init__(self) -> None:
+        if self.origins is None:
+            object.__setattr__(self, "origins", origins_like(self.positions, Origin.OBSERVED))
 
 
 class Memory(ABC):
@@ -88,6 +103,9 @@ class Memory(ABC):
     @abstractmethod
     def write(self, observations: Observations) -> None:
         """Add posed frames in metres of the reference's world; pixels without depth (0) get no position.
+
+        ``observations.origins`` says which frames a model imagined. They shall not change what was observed, and an
+        observation shall replace what was imagined of the same place. ``by_origin`` splits the frames.
 
         Raises:
             DataError: when a pose is not finite and rigid, or sizes differ; then nothing is written.
@@ -155,6 +173,7 @@ class Memory(ABC):
 
     def header(self) -> dict[str, Any]:
         """Return the JSON values that a memory file holds beside its tensors: kind, settings, encoder, reference."""
+        figures = self.figures()
         return {
             "format": "persist-memory",
             "version": FORMAT_VERSION,
@@ -165,9 +184,19 @@ class Memory(ABC):
             "channels": self.encoder.channels,
             "reference": self.reference.name,
             "world_up": list(self.reference.world_up),
-            "cells": self.figures().cells,
+            "cells": figures.cells,
+            "imagined": figures.imagined,
         }
 
-    def save(self, path: Path) -> None:
-        """Write a memory file, whole or not at all: safetensors with ``header()``; ``OSError`` when it cannot be."""
-        write_tensors(path, self.tensors(), {"persist": json.dumps(self.header())})
+    def save(self, path: Path, paths: Mapping[str, Float[Tensor, "frame 4 4"]] | None = None) -> None:
+        """Write a memory file, whole or not at all: safetensors with ``header()``.
+
+        Args:
+            path: the file.
+            paths: world_from_camera of the paths along which the frames were seen, by name, for drawing.
+
+        Raises:
+            OSError: when it cannot be written.
+        """
+        poses = {PATH + name: poses.contiguous() for name, poses in (paths or {}).items()}
+        write_tensors(path, self.tensors() | poses, {"persist": json.dumps(self.header())})

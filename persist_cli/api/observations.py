@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,13 @@ class TrajectoryInfo:
     source: dict[str, Any] = field(default_factory=dict)
 
 
+class Origin(IntEnum):
+    """Where a frame comes from, and what a memory holds of it; where two meet in a memory, the higher one stays."""
+
+    IMAGINED = 1
+    OBSERVED = 2
+
+
 @dataclass(frozen=True)
 class Observations:
     """Posed RGB-D frames as tensors.
@@ -65,21 +73,40 @@ class Observations:
         rgb: uint8, 0…255.
         depth: float32 metres, planar z, 0 = missing.
         cameras: one camera for each frame, of the images' size.
+        origins: the ``Origin`` of each frame; without it all are observed.
     """
 
     rgb: UInt8[Tensor, "frame height width 3"]
     depth: Float[Tensor, "frame height width"]
     cameras: Cameras
+    origins: UInt8[Tensor, " frame"] = None  # type: ignore[assignment]  # set below
+
+    def __post_init__(self) -> None:
+        if self.origins is None:
+            object.__setattr__(self, "origins", origins_like(self.rgb, Origin.OBSERVED))
 
     def __len__(self) -> int:
         return self.rgb.shape[0]
 
     def __getitem__(self, index: slice | Tensor | list[int]) -> Observations:
-        return replace(self, rgb=self.rgb[index], depth=self.depth[index], cameras=self.cameras[index])
+        return Observations(self.rgb[index], self.depth[index], self.cameras[index], self.origins[index])
 
     def to(self, device: torch.device | str) -> Observations:
         """Return these frames on ``device``."""
-        return Observations(self.rgb.to(device), self.depth.to(device), self.cameras.to(device))
+        return Observations(
+            self.rgb.to(device), self.depth.to(device), self.cameras.to(device), self.origins.to(device)
+        )
+
+    def with_origin(self, origin: Origin) -> Observations:
+        """Return these frames, all of one origin."""
+        return replace(self, origins=origins_like(self.rgb, origin))
+
+    def by_origin(self) -> list[tuple[Origin, Observations]]:
+        """Return the frames of each origin that there is, in their order, the observed ones first."""
+        values = sorted(set(self.origins.tolist()), reverse=True)
+        if len(values) == 1:
+            return [(Origin(values[0]), self)]
+        return [(Origin(value), self[self.origins == value]) for value in values]
 
     @staticmethod
     def concatenate(parts: Sequence[Observations]) -> Observations:
@@ -88,7 +115,13 @@ class Observations:
             torch.cat([part.rgb for part in parts]),
             torch.cat([part.depth for part in parts]),
             Cameras.concatenate([part.cameras for part in parts]),
+            torch.cat([part.origins for part in parts]),
         )
+
+
+def origins_like(rows: Tensor, origin: Origin) -> UInt8[Tensor, " row"]:
+    """Return one origin for each row of a tensor, on its device."""
+    return torch.full(rows.shape[:1], origin, dtype=torch.uint8, device=rows.device)
 
 
 @dataclass(frozen=True)

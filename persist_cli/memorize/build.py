@@ -13,7 +13,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config
-from persist_cli.memorize.memory_file import load_memory
+from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, watched
@@ -37,7 +37,9 @@ def run_memorize(data: list[str], plan: MemorizePlan, out: Path, json: bool) -> 
     memory = make_memory(config.name, config.settings, encoder, common_reference(sources))
     seconds = write_sources(memory, sources)
     frames = sum(len(source.frames) for source in sources)
-    paths = {source.file.name: source.file.poses()[source.frames.start : source.frames.stop] for source in sources}
+    paths: dict[str, Tensor] = {}
+    for source in sources:
+        add_paths(paths, {source.file.name: source.file.poses()[source.frames.start : source.frames.stop]})
     rate = frames / seconds
     _save_and_print(memory, paths, out, json, {"frames": frames, "frames_per_second": rate, "settings_of": origin})
 
@@ -53,13 +55,14 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
     if len(paths) < 2:
         raise CheckpointError("nothing to merge; name two memory files or more, as in --merge A B")
     _check_out(out)
-    merged = load_memory(paths[0])
+    merged, walked = load_memory(paths[0]), load_paths(paths[0])
     for path in watched(paths[1:], "merging", "memories"):
         try:
             merged.merge(load_memory(path))
         except CheckpointError as error:
             raise CheckpointError(f"{paths[0]} and {path}: {error}") from error
-    _save_and_print(merged, {}, out, json, {"merged": len(paths)})
+        add_paths(walked, load_paths(path))
+    _save_and_print(merged, walked, out, json, {"merged": len(paths)})
 
 
 def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
@@ -80,7 +83,7 @@ def _save_and_print(memory: Memory, paths: Mapping[str, Tensor], out: Path, json
     for path in (out, map_file):
         remove_leftovers(path.parent, path.name)
     with busy("writing the memory and its map"):
-        memory.save(out)
+        memory.save(out, paths)
         draw_map(memory.points(), memory.reference.world_up, paths, map_file)
     figures = memory.figures()
     result = {
@@ -91,6 +94,8 @@ def _save_and_print(memory: Memory, paths: Mapping[str, Tensor], out: Path, json
         "channels": memory.encoder.channels,
         "scene": memory.reference.name,
         "cells": figures.cells,
+        "observed": figures.observed,
+        "imagined": figures.imagined,
         "bytes": figures.bytes,
         "bounds": figures.bounds,
         **extra,
@@ -108,7 +113,7 @@ def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return names and values for people, without paths: digits of large numbers in groups, bounds as ranges."""
     texts = {name: value for name, value in result.items() if name not in ("file", "map", "settings_of")}
     texts["bytes"] = f"{result['bytes']:,}"
-    texts["cells"] = f"{result['cells']:,}"
+    texts |= {name: f"{result[name]:,}" for name in ("cells", "observed", "imagined")}
     if result["bounds"] is None:
         texts["bounds"] = "empty"
     else:

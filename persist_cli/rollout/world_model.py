@@ -17,7 +17,7 @@ from torch import Tensor
 from persist_cli.api.backbone import Backbone, Clip, Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.memory import Memory
-from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.api.observations import Observations, Origin, TrajectoryInfo
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
@@ -137,7 +137,8 @@ class WorldModel:
             rgb, depth = self.denoise(clips)
             frames = [agent.now[:0] for agent in self.agents]
             for row, (number, way) in enumerate(zip(moving, ways, strict=True)):
-                seen = Observations(rgb[row, 1 : len(way) + 1], depth[row, 1 : len(way) + 1], way)
+                new = slice(1, len(way) + 1)
+                seen = Observations(rgb[row, new], depth[row, new], way).with_origin(Origin.IMAGINED)
                 self.agents[number].observe(seen)
                 self.agents[number].memorize(seen, self.backbone.device)
                 frames[number] = seen

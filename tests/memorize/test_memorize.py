@@ -9,13 +9,14 @@ import time
 from dataclasses import replace
 
 import pytest
+import torch
 from PIL import Image
 
 from persist_cli.cli.app import main
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.memory_config import plugin_settings
-from persist_cli.memorize.memory_file import load_memory
+from persist_cli.memorize.memory_file import load_memory, load_paths
 from tests.support.room_views import MEMORIES, same_bits
 from tests.support.rooms import Room, walk
 
@@ -84,12 +85,26 @@ def test_a_memory_of_several_trajectories_equals_their_merged_memories(data, tmp
     merged = memorize(capsys, "--merge", *parts.values(), "--out", tmp_path / "m.safetensors")
     assert merged["cells"] == both["cells"]
     assert (tmp_path / "m.safetensors").read_bytes() == (tmp_path / "both.safetensors").read_bytes()
+    assert (tmp_path / "m.png").read_bytes() == (tmp_path / "both.png").read_bytes()
+
+
+def test_two_parts_of_one_trajectory_are_two_paths_of_a_memory(data, tmp_path, capsys):
+    memorize(capsys, f"{data}#a:0-3", f"{data}#a:3-9", "--out", tmp_path / "m.safetensors")
+    paths = load_paths(tmp_path / "m.safetensors")
+    poses = Store(data)["a"].poses()
+    assert list(paths) == ["a", "a (2)"]
+    assert torch.equal(torch.cat([*paths.values()]), poses[:9])
+    memorize(
+        capsys, "--merge", tmp_path / "m.safetensors", tmp_path / "m.safetensors", "--out", tmp_path / "n.safetensors"
+    )
+    assert list(load_paths(tmp_path / "n.safetensors")) == ["a", "a (2)"]
 
 
 def test_the_printed_table_has_cells_bytes_bounds_and_rate(data, tmp_path, capsys):
     succeed(f"{data}#b", "--out", tmp_path / "room.safetensors")
     printed = capsys.readouterr().out
-    assert all(word in printed for word in ("cells", "bytes", "bounds", "frames/s", "room.png"))
+    words = ("cells", "observed", "imagined", "bytes", "bounds", "frames/s", "room.png")
+    assert all(word in printed for word in words)
 
 
 def test_data_that_cannot_be_memorized_is_refused_in_one_line(data, tmp_path, capsys):

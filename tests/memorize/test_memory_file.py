@@ -8,9 +8,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from persist_cli.api.observations import Origin
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import read_tensors
-from persist_cli.memorize.memory_file import load_memory, read_header
+from persist_cli.memorize.memory_file import load_memory, load_paths, read_header
 from tests.support.room_views import MEMORIES, room_walk, same_bits, written_memory
 
 
@@ -96,6 +97,35 @@ def test_a_header_that_does_not_fit_is_refused_in_one_line_naming_the_file(saved
         load_memory(with_header(saved, **changes))
     assert str(caught.value).startswith(str(saved))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_a_memory_file_of_version_1_still_loads_with_all_of_it_observed(tmp_path, name):
+    memory, path = written_memory(name, room_walk(3)), tmp_path / "old.safetensors"
+    header = {key: value for key, value in memory.header().items() if key != "imagined"} | {"version": 1}
+    tensors = {key: tensor for key, tensor in memory.tensors().items() if key != "origins"}
+    save_file(tensors, path, {"persist": json.dumps(header)})
+    assert same_bits(load_memory(path), memory)
+    assert load_memory(path).figures().imagined == 0
+    assert load_paths(path) == {}
+
+
+def test_a_memory_file_keeps_what_is_imagined_and_the_paths(tmp_path):
+    walk = room_walk(6)
+    memory = written_memory("voxel", walk[:2])
+    memory.write(walk[2:].with_origin(Origin.IMAGINED))
+    memory.save(tmp_path / "m.safetensors", {"there": walk.cameras.world_from_camera})
+    loaded = load_memory(tmp_path / "m.safetensors")
+    assert same_bits(loaded, memory)
+    assert read_header(tmp_path / "m.safetensors")["imagined"] == loaded.figures().imagined > 0
+    assert torch.equal(load_paths(tmp_path / "m.safetensors")["there"], walk.cameras.world_from_camera)
+
+
+@pytest.mark.parametrize("poses", [torch.zeros(3, 4), torch.full((2, 4, 4), torch.nan)])
+def test_a_damaged_path_in_a_memory_file_is_refused_in_one_line(tmp_path, poses):
+    written_memory("voxel", room_walk(1)).save(tmp_path / "m.safetensors", {"there": poses})
+    with pytest.raises(CheckpointError, match=r"m\.safetensors: its path 'there', .* is no list of finite poses$"):
+        load_paths(tmp_path / "m.safetensors")
 
 
 @pytest.mark.parametrize("damage", ["unsorted", "twice", "beyond"])

@@ -8,6 +8,7 @@ from PIL import Image
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.memory import FrameOfReference
+from persist_cli.api.observations import Origin
 from persist_cli.data.store import Store
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder, make_memory
@@ -121,6 +122,7 @@ def test_the_world_model_writes_imagined_frames_into_the_memory(walks):
     seen = model.step([["left"] * 12])[0]
     assert len(seen) == 12
     assert memory.figures().cells > cells
+    assert (memory.figures().observed, seen.origins.unique().tolist()) == (cells, [Origin.IMAGINED])
     expected = trajectory.info.vocabulary.follow(
         trajectory.observations.cameras.world_from_camera[0], ["left"] * 12, trajectory.world_up
     )

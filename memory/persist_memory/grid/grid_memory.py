@@ -13,7 +13,7 @@ from torch import Tensor
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
-from persist_cli.api.observations import Observations
+from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
@@ -28,7 +28,15 @@ from persist_memory.grid.pooling import (
 )
 from persist_memory.grid.storage import LIMIT, SparseGrid, ValueColumn, pack, unpack
 from persist_memory.grid.visibility import Views, nearest_cells
-from persist_memory.validation import Shape, check_mergeable, check_observations, check_tensors
+from persist_memory.validation import (
+    ORIGINS,
+    Shape,
+    check_mergeable,
+    check_observations,
+    check_origins,
+    check_tensors,
+    with_origins,
+)
 
 PIXELS_ON_CPU = 640 * 480  # pooled at once
 
@@ -38,8 +46,9 @@ PIXELS_ON_GPU = 1 << 24  # take some 2 GB of intermediate results
 class GridMemory(Memory):
     """A sparse grid of pooled features without bounds; it stores the cells that were seen and no others.
 
-    Cells are centred on multiples of their size. Besides its features a cell stores, for drawing only, the
-    colour of its nearest observation.
+    Cells are centred on multiples of their size. Besides its features a cell stores its origin and, for drawing only,
+    the colour of its nearest observation. Imagined frames change no bit of an observed cell, and the first observation
+    of an imagined cell replaces it.
     """
 
     settings_type: ClassVar[type] = GridSettings
@@ -75,10 +84,11 @@ class GridMemory(Memory):
             columns = {
                 "features": ValueColumn(self.encoder.channels, torch.float32, torch.add if is_mean else torch.maximum),
                 "colors": ValueColumn(0, torch.int64, torch.minimum),
+                ORIGINS: ValueColumn(0, torch.uint8, torch.maximum),
             }
             if is_mean:
                 columns["counts"] = ValueColumn(0, torch.int64, torch.add)
-            self._grid = SparseGrid(columns)
+            self._grid = SparseGrid(columns, rank=ORIGINS)
         return self._grid
 
     def write(self, observations: Observations) -> None:
@@ -92,8 +102,9 @@ class GridMemory(Memory):
             return
         on_cpu = observations.depth.device.type == "cpu"
         step = max(1, (PIXELS_ON_CPU if on_cpu else PIXELS_ON_GPU) // observations.depth[0].numel())
-        for begin in range(0, len(observations), step):
-            self._pool(observations[begin : begin + step])
+        for origin, frames in observations.by_origin():
+            for begin in range(0, len(frames), step):
+                self._pool(frames[begin : begin + step], origin)
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """Return at most ``budget`` cells that reach into the view of a camera, the nearest to such a camera first."""
@@ -115,7 +126,7 @@ class GridMemory(Memory):
         return copy
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return cells, features and colours in the order of the cells' keys."""
+        """Return cells, features, colours and origins in the order of the cells' keys."""
         if not len(self.grid):
             return {}
         cells = {"cells": unpack(self.grid.keys).to(torch.int32)}
@@ -127,6 +138,7 @@ class GridMemory(Memory):
         Raises:
             CheckpointError: when they are not tensors of this memory; then the map stays as it was.
         """
+        tensors = with_origins(tensors)
         keys = self._checked_keys(tensors) if tensors else None
         self.grid.clear()
         if keys is not None:
@@ -141,7 +153,8 @@ class GridMemory(Memory):
     def points(self) -> MapPoints:
         """Return the cells' centres, in the colours of their nearest observations."""
         centers = self._in_world(self._centers(self.grid.keys))
-        return MapPoints(centers, unpack_colors(self.grid.values("colors")), self.lattice.across)
+        colors, origins = unpack_colors(self.grid.values("colors")), self.grid.values(ORIGINS)
+        return MapPoints(centers, colors, self.lattice.across, origins)
 
     def figures(self) -> MemoryFigures:
         """Return the number of cells, their bytes, and the corners of the smallest world-aligned box around them."""
@@ -151,15 +164,17 @@ class GridMemory(Memory):
         centers = self._in_world(self._centers(self.grid.keys))
         margin = 0.5 * self.lattice.grid_from_world.T.abs() @ self.lattice.extent
         low, high = centers.amin(0).cpu() - margin, centers.amax(0).cpu() + margin
-        return MemoryFigures(len(self.grid), size, (tuple(low.tolist()), tuple(high.tolist())))
+        bounds = tuple(low.tolist()), tuple(high.tolist())
+        imagined = int((self.grid.values(ORIGINS) == Origin.IMAGINED).sum())
+        return MemoryFigures(len(self.grid), size, bounds, imagined)
 
-    def _pool(self, observations: Observations) -> None:
+    def _pool(self, observations: Observations, origin: Origin) -> None:
         features = self.encoder.encode(observations.rgb).to(observations.depth.device, torch.float32)
         runs = find_runs(observations, self.lattice, self.settings, features.shape[2])
         if not len(runs.keys):
             return
         run_features = RunFeatures(features, runs, observations, self.settings)
-        values = {"colors": runs.colors}
+        values = {"colors": runs.colors, ORIGINS: origins_like(runs.keys, origin)}
         if self.settings.pooling == "max":
             values["features"] = max_pool(runs, run_features)
         else:
@@ -188,6 +203,7 @@ class GridMemory(Memory):
         for name, column in self.grid.columns.items():
             expected[name] = column.dtype, (None, column.width) if column.width else (None,)
         check_tensors(tensors, expected, where)
+        check_origins(tensors, where)
         if "counts" in tensors and bool((tensors["counts"] < 1).any()):
             raise CheckpointError(f"{where}: a cell without a pixel")
         cells = tensors["cells"].long()

@@ -87,10 +87,11 @@ class SparseGrid:
 
     Args:
         columns: how each value is stored, by name.
+        rank: the column whose values rank those of a cell; of two ranks the higher one stays, with all its values.
     """
 
-    def __init__(self, columns: Mapping[str, ValueColumn]) -> None:
-        self.columns = dict(columns)
+    def __init__(self, columns: Mapping[str, ValueColumn], rank: str | None = None) -> None:
+        self.columns, self.rank = dict(columns), rank
         self.keys: Tensor
         self._rows: Tensor
         self._buffers: dict[str, Tensor]
@@ -116,13 +117,13 @@ class SparseGrid:
 
     def copy(self) -> SparseGrid:
         """A grid of the same cells; the two share their tensors until one of them is written."""
-        copy = SparseGrid(self.columns)
+        copy = SparseGrid(self.columns, self.rank)
         copy.keys, copy._rows, copy._buffers, copy._blocks = self.keys, self._rows, dict(self._buffers), self._blocks
         self._shared = copy._shared = True
         return copy
 
     def absorb(self, keys: Int64[Tensor, " cell"], values: Mapping[str, Tensor]) -> None:
-        """Merge the values of cells into the grid.
+        """Merge the values of cells into the grid; a value of higher rank replaces that of a cell, a lower one is lost.
 
         Args:
             keys: keys of the cells, sorted and distinct.
@@ -136,7 +137,7 @@ class SparseGrid:
         keys, values = keys.to(self.device), {name: value.to(self.device) for name, value in values.items()}
         positions = torch.searchsorted(self.keys, keys)
         known = self._contains(keys, positions)
-        self._reduce(self._rows[positions[known]], values, known)
+        self._reduce(self._rows[positions[known]], {name: value[known] for name, value in values.items()})
         if not bool(known.all()):
             self._append(keys[~known], positions[~known], values, ~known)
 
@@ -158,11 +159,18 @@ class SparseGrid:
             return torch.zeros_like(keys, dtype=torch.bool)
         return self.keys[positions.clamp(max=len(self) - 1)] == keys
 
-    def _reduce(self, rows: Tensor, values: Mapping[str, Tensor], selected: Tensor) -> None:
-        """Merge the selected values into rows of the buffers."""
+    def _reduce(self, rows: Tensor, values: Mapping[str, Tensor]) -> None:
+        """Merge values into rows of the buffers; those of a higher rank replace what is there."""
+        if self.rank is not None:
+            old, new = self._buffers[self.rank][rows], values[self.rank]
+            if not torch.equal(old, new):
+                higher, equal = new > old, new == old
+                for name, value in values.items():
+                    self._buffers[name][rows[higher]] = value[higher]
+                rows, values = rows[equal], {name: value[equal] for name, value in values.items()}
         for name, column in self.columns.items():
             buffer = self._buffers[name]
-            buffer[rows] = column.merge(buffer[rows], values[name][selected])
+            buffer[rows] = column.merge(buffer[rows], values[name])
 
     def _append(self, keys: Tensor, positions: Tensor, values: Mapping[str, Tensor], selected: Tensor) -> None:
         """Insert new keys before those at ``positions``; the selected values are theirs."""

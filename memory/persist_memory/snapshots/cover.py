@@ -5,6 +5,8 @@ Everything here is measured in images and along rays, so a rigid motion of the w
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
@@ -26,6 +28,15 @@ def seen_patches(store: SnapshotStore, viewers: SnapshotStore) -> Bool[Tensor, "
     shown = viewers.depth.double().gather(1, by_viewer.flatten(1)).reshape(by_viewer.shape).transpose(0, 1)
     same = (depth - shown).abs() <= SAME_PLACE * shown
     return inside & same & (shown > 0) & (store.depth > 0)[:, None]
+
+
+def without_patches_of(viewers: SnapshotStore, store: SnapshotStore) -> SnapshotStore:
+    """The snapshots of ``store`` without the depth of patches that ``viewers`` show too, those without any left out."""
+    if not len(viewers) or not len(store):
+        return store
+    shown = seen_patches(store, viewers.to(store.content.device)).any(1)
+    hidden = replace(store, depth=torch.where(shown, 0.0, store.depth))
+    return hidden[(hidden.depth > 0).any(1)]
 
 
 def most_redundant(seen: Bool[Tensor, "snapshot viewer patch"], store: SnapshotStore) -> int:

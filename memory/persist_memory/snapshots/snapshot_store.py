@@ -15,7 +15,7 @@ from persist_cli.api.observations import Observations
 
 @dataclass(frozen=True)
 class SnapshotStore:
-    """Images cut into the same grid of patches, sorted by a hash of their contents.
+    """Images cut into the same grid of patches.
 
     Args:
         grid: rows and columns of patches.
@@ -25,7 +25,7 @@ class SnapshotStore:
         world_from_camera: pose of each image, float64.
         intrinsics: intrinsics of each image, float64.
         size: height and width of each image in pixels.
-        content: a hash of each image and its depth; the images are sorted by it.
+        content: a hash of each image and its depth, by which stored images are sorted.
     """
 
     grid: tuple[int, int]
@@ -78,11 +78,21 @@ class SnapshotStore:
         )
 
     def joined(self, other: SnapshotStore) -> SnapshotStore:
-        """The snapshots of both stores, on the device of this one, or of ``other`` when this one is empty."""
+        """The snapshots of both stores, sorted, on the device of this one, or of ``other`` when this one is empty."""
+        both = self.followed_by(other)
+        return both[both.content.argsort(stable=True)]
+
+    def followed_by(self, other: SnapshotStore) -> SnapshotStore:
+        """The snapshots of this store, then those of the other, on the device of ``joined``."""
         device = (self if len(self) else other).content.device
-        others = other.tensors()
-        tensors = {name: torch.cat([own.to(device), others[name].to(device)]) for name, own in self.tensors().items()}
-        return SnapshotStore(self.grid, **tensors)[tensors["content"].argsort(stable=True)]
+        others = other.to(device).tensors()
+        return SnapshotStore(
+            self.grid, **{name: torch.cat([own, others[name]]) for name, own in self.to(device).tensors().items()}
+        )
+
+    def to(self, device: torch.device) -> SnapshotStore:
+        """These snapshots on a device."""
+        return SnapshotStore(self.grid, **{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name; together with the grid they make the store."""

@@ -1,0 +1,157 @@
+"""What writing imagined frames does to a memory: ``python tests/benchmarks/bench_writing.py --data DATA``.
+
+Prints two tables, asserts nothing. DATA are walks there and back through houses that the model was not trained on:
+
+    persist collect miniworld --out DATA --split test --policy there-and-back --frames 97 --scenes 0:10
+
+- Known way: the memory holds the whole walk, which the model then follows. PSNR of the imagined frames to the
+  recorded ones, with their frames written into the memory and without.
+- Unseen way: the memory is empty. The model goes out ``OUT`` frames and comes back by the same poses. PSNR of a frame
+  on the way back to its own frame of the way out at the same pose, and PSNR to the recorded frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
+
+from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations, Trajectory
+from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone, reference_checkpoint
+from persist_cli.data.clips import interactions_of
+from persist_cli.data.store import Store
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.rollout.world_model import Agent, WorldModel
+from persist_cli.viewing.console import print_table
+from tests.benchmarks.timing import say_conditions
+
+OUT = 16  # frames of the unseen way out, and as many back
+LAST = 8  # frames at the end that are also shown alone
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A model with an adapter, and the walks along which it goes.
+
+    Args:
+        backbone: the model, which uses the adapter.
+        factory: makes the memories that the adapter reads.
+        sampling: sampling of the clips.
+        walks: one walk there and back a house.
+        seeds: how many rollouts of each walk.
+    """
+
+    backbone: Backbone
+    factory: MemoryFactory
+    sampling: Sampling
+    walks: Sequence[Trajectory]
+    seeds: int
+    memories: dict[str, Memory] = field(default_factory=dict)
+
+    def follow(self, walks: Sequence[Trajectory], known: bool, write: bool) -> Tensor:
+        """The imagined colours of each walk after its first frame, ``[walk, seed, frame, height, width, 3]``."""
+        agents = [Agent(self.memory(walk, known), seed, write) for walk in walks for seed in range(self.seeds)]
+        each = [walk for walk in walks for _ in range(self.seeds)]
+        model = WorldModel(self.backbone, agents, self.sampling)
+        model.reset([walk.observations[:1] for walk in each], [walk.info for walk in each])
+        cameras = [walk.observations.cameras[1:] for walk in each]
+        interactions = [interactions_of(walk.actions[:-1], walk.info.vocabulary) for walk in each]
+        clips = list(model.imagine(cameras, interactions))
+        videos = [Observations.concatenate(parts).rgb for parts in zip(*clips, strict=True)]
+        return torch.stack(videos).unflatten(0, (len(walks), self.seeds))
+
+    def memory(self, walk: Trajectory, known: bool) -> Memory:
+        """A memory of the whole walk, or an empty one."""
+        if not known:
+            return self.factory.empty(walk.info)
+        if walk.name not in self.memories:
+            self.memories[walk.name] = self.factory.empty(walk.info)
+            self.memories[walk.name].write(walk.observations)
+        return self.memories[walk.name].copy()
+
+    def known_way(self) -> list[tuple[str, ...]]:
+        """A row for each house, and their mean: PSNR without writing, with writing, and both at the end."""
+        truth = torch.stack([walk.observations.rgb[1:] for walk in self.walks])[:, None]
+        likeness = [psnr(self.follow(self.walks, True, write), truth) for write in (False, True)]
+        columns = [
+            values[..., frames].mean((1, 2)) for frames in (slice(None), slice(-LAST, None)) for values in likeness
+        ]
+        return house_rows(self.walks, columns)
+
+    def unseen_way(self) -> list[tuple[str, ...]]:
+        """A row for each house, and their mean: likeness to the own way out and to the truth, without and with."""
+        middle = (len(self.walks[0]) - 1) // 2
+        ways = [part(walk, middle - OUT, middle + OUT + 1) for walk in self.walks]
+        truth = torch.stack([way.observations.rgb[1:] for way in ways])[:, None]
+        videos = [self.follow(ways, False, write) for write in (False, True)]
+        # frame i of the video is at the pose of frame 2 * OUT - 2 - i; the last one is the observed start again
+        own = [psnr(video[:, :, OUT : 2 * OUT - 1], video[:, :, : OUT - 1].flip(2)) for video in videos]
+        true = [psnr(video, truth) for video in videos]
+        return house_rows(self.walks, [values.mean((1, 2)) for values in (*own, *true)])
+
+
+def part(walk: Trajectory, first: int, stop: int) -> Trajectory:
+    """Some frames of a walk as a walk of its own."""
+    return Trajectory(walk.name, walk.observations[first:stop], walk.actions[first:stop], walk.info, first)
+
+
+def psnr(one: Tensor, other: Tensor) -> Tensor:
+    """PSNR in dB of each frame."""
+    error = (one.double() - other.double()).square().mean((-3, -2, -1))
+    return 10 * torch.log10(255**2 / error)
+
+
+def house_rows(walks: Sequence[Trajectory], columns: Sequence[Tensor]) -> list[tuple[str, ...]]:
+    """A row for each house and one of their mean; after each pair of columns the second less the first."""
+    names = [*(walk.name for walk in walks), "mean"]
+    table = torch.stack([torch.cat([column, column.mean(0, keepdim=True)]) for column in columns], -1).tolist()
+    rows = []
+    for name, values in zip(names, table, strict=True):
+        pairs = zip(values[::2], values[1::2], strict=True)
+        cells = (
+            text for kept, written in pairs for text in (f"{kept:.2f}", f"{written:.2f}", f"{written - kept:+.2f}")
+        )
+        rows.append((name, *cells))
+    return rows
+
+
+def measure(checkpoint: Checkpoint, adapter: str, options: argparse.Namespace) -> None:
+    """Print both tables of one adapter."""
+    backbone = load_backbone(checkpoint, adapter=None)
+    load_adapter(backbone, checkpoint, adapter)
+    factory = MemoryFactory.of(adapter_memory(checkpoint, adapter))
+    walks = [file.read(slice(0, len(file))) for file in Store(options.data)][: options.houses]
+    bench = Bench(backbone, factory, checkpoint.sampling_with(SamplingOverrides()), walks, options.seeds)
+    columns = ["kept", "written", "gain", "kept", "written", "gain"]
+    if "known" in options.only:
+        title = f"{adapter}, known way: PSNR dB of all frames, and of the last {LAST}"
+        print_table(title, ["house", *columns], bench.known_way())
+    if "unseen" in options.only:
+        title = f"{adapter}, {OUT} unseen frames out and back: PSNR dB to the own way out, and to the recorded frames"
+        print_table(title, ["house", *columns], bench.unseen_way())
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--checkpoint", type=Path)
+    parser.add_argument("--memories", default="voxel,map2d,snapshots")
+    parser.add_argument("--houses", type=int, default=10)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--only", default="known,unseen")
+    options = parser.parse_args()
+    checkpoint = find_checkpoint(options.checkpoint or reference_checkpoint())
+    say_conditions(f"{checkpoint.name}, {options.houses} houses, {options.seeds} seed(s)")
+    for adapter in options.memories.split(","):
+        measure(checkpoint, adapter, options)
