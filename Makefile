@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo demo-train table1 table1-reference test test-slow lint bench clean
+.PHONY: demo demo-train table1 table1-reference test test-slow lint bench docs clean
 
 demo: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.demo runs/demo
@@ -31,6 +31,14 @@ lint: $(STAMP)
 
 bench: $(STAMP)
 	for file in tests/benchmarks/bench_*.py; do $(VENV)/bin/python $$file || exit 1; done
+
+docs: $(VENV)/.docs
+	$(VENV)/bin/python -m sphinx --fail-on-warning --keep-going --nitpicky --fresh-env --quiet docs docs/_build
+	@echo "look at docs/_build/index.html"
+
+$(VENV)/.docs: $(STAMP)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	touch $@
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
