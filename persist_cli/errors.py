@@ -8,6 +8,8 @@ from typing import Final
 
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
 
+TRACEBACK: Final = "PERSIST_TRACEBACK"  # environment variable: print where an error comes from, too
+
 
 class PersistError(Exception):
     """An error that the user can mend; its message is one line that says what is wrong and what to do."""
@@ -18,7 +20,18 @@ class DataError(PersistError):
 
 
 class PluginError(PersistError):
-    """A plugin is unknown, broken or of the wrong kind; the message names plugin, package and cause."""
+    """A plugin is unknown, broken or of the wrong kind; the message names plugin, package and cause.
+
+    Args:
+        message: the line for the user.
+        package: the distribution that the plugin comes with, empty where none is at fault.
+        target: the plugin's class, as ``module:class``.
+        cause: what is wrong with it.
+    """
+
+    def __init__(self, message: str, package: str = "", target: str = "", cause: str = "") -> None:
+        super().__init__(message)
+        self.package, self.target, self.cause = package, target, cause or message
 
 
 class RecipeError(PersistError):

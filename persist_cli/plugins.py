@@ -1,17 +1,22 @@
 """Plugins by entry point: backbones, memories, encoders, simulators and importers, those of persist itself too.
 
-Listing plugins imports none. Loading imports one and checks its base class; any failure becomes one line that names
-plugin, package, version, target and cause.
+Listing plugins imports none. Loading imports one and checks that its class can be used; any failure, here or later in
+one of its methods, becomes one line that names plugin, package, version, target and cause.
 """
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import importlib
+import inspect
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any, Final
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from persist_cli.errors import PluginError, hint
+from persist_cli.errors import TRACEBACK, PersistError, PluginError, hint
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone
@@ -20,14 +25,24 @@ if TYPE_CHECKING:
     from persist_cli.api.memory import FrameOfReference, Memory
     from persist_cli.api.simulator import Simulator
 
-# for each kind of plugin, the group of its entry points and the abstract base class
+
+class PluginKind(NamedTuple):
+    """A kind of plugin: the group of its entry points, its abstract base class, and what it is made from."""
+
+    group: str
+    base: str
+    arguments: tuple[str, ...]
+
+
 KINDS: Final = {
-    "backbone": ("persist.backbones", "persist_cli.api.backbone:Backbone"),
-    "memory": ("persist.memories", "persist_cli.api.memory:Memory"),
-    "encoder": ("persist.encoders", "persist_cli.api.encoder:Encoder"),
-    "simulator": ("persist.simulators", "persist_cli.api.simulator:Simulator"),
-    "importer": ("persist.importers", "persist_cli.api.importer:Importer"),
+    "backbone": PluginKind("persist.backbones", "persist_cli.api.backbone:Backbone", ("settings",)),
+    "memory": PluginKind("persist.memories", "persist_cli.api.memory:Memory", ("settings", "encoder", "reference")),
+    "encoder": PluginKind("persist.encoders", "persist_cli.api.encoder:Encoder", ("settings",)),
+    "simulator": PluginKind("persist.simulators", "persist_cli.api.simulator:Simulator", ("settings",)),
+    "importer": PluginKind("persist.importers", "persist_cli.api.importer:Importer", ()),
 }
+
+OWN: Final = ("persist_cli", "persist_backbones", "persist_memory")  # packages whose errors are bugs of ours
 
 
 @dataclass(frozen=True)
@@ -48,14 +63,22 @@ class Plugin:
     package: str
     version: str
 
+    @property
+    def module(self) -> str:
+        """The outermost package of its module."""
+        return self.target.partition(":")[0].partition(".")[0]
+
+    def error(self, message: str, cause: str) -> PluginError:
+        """An error of this plugin, whose line names it."""
+        return PluginError(f"{self} {message}", self.package, self.target, cause)
+
     def __str__(self) -> str:
         return f"{self.kind} {self.name!r} ({self.package} {self.version}, {self.target})"
 
 
 def list_plugins(kind: str) -> list[Plugin]:
     """All installed plugins of a kind, sorted by name; none is imported."""
-    group, _ = KINDS[kind]
-    plugins = {_describe(kind, entry) for entry in entry_points(group=group)}
+    plugins = {_describe(kind, entry) for entry in entry_points(group=KINDS[kind].group)}
     return sorted(plugins, key=lambda plugin: (plugin.name, plugin.package))
 
 
@@ -91,17 +114,83 @@ def import_plugin(plugin: Plugin) -> type[Any]:
     Raises:
         PluginError: when that fails, or the class is not of the plugin's kind.
     """
-    _, base_target = KINDS[plugin.kind]
-    base = _resolve(base_target)
+    base = _resolve(KINDS[plugin.kind].base)
     try:
         loaded = _resolve(plugin.target)
     except Exception as error:  # the module of another package may raise anything
-        cause = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}"
-        raise PluginError(f"{plugin} is broken: {cause}") from error
+        raise plugin.error(f"is broken: {first_line(error)}", first_line(error)) from error
+    cause = _flaw(loaded, base, KINDS[plugin.kind])
+    if cause:
+        raise plugin.error(f"is broken: {cause}", cause)
+    loaded.name = plugin.name
+    return loaded  # type: ignore[no-any-return]
+
+
+def _flaw(loaded: Any, base: type, kind: PluginKind) -> str:
+    """Why something is no class of plugins of this kind that can be made, empty when it is one."""
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
-        raise PluginError(f"{plugin} is broken: it is no subclass of {base_target.replace(':', '.')}")
-    loaded.name = plugin.name  # type: ignore[attr-defined]
-    return loaded
+        return f"it is no subclass of {kind.base.replace(':', '.')}"
+    missing = sorted(getattr(loaded, "__abstractmethods__", ()))
+    if missing:
+        return f"it lacks {', '.join(missing)}, which {base.__name__} leaves to its subclasses"
+    if "settings" in kind.arguments and not dataclasses.is_dataclass(getattr(loaded, "settings_type", None)):
+        return "its settings_type is no dataclass"
+    try:
+        inspect.signature(loaded).bind(*kind.arguments)
+    except TypeError:
+        return f"its __init__ does not take ({', '.join(kind.arguments)})"
+    return ""
+
+
+@contextlib.contextmanager
+def plugin_errors() -> Iterator[None]:
+    """Within the block, what a plugin of another package raises is one line that says in which method and where.
+
+    Whatever passes through no method of such a plugin is a bug of persist, and stays as it is.
+
+    Raises:
+        PluginError: from an exception that is no ``PersistError`` and passed through a plugin of another package.
+    """
+    try:
+        yield
+    except PersistError:
+        raise
+    except Exception as error:  # a plugin may raise anything
+        blamed = _blame(error)
+        if blamed is None:
+            raise
+        raise blamed from error
+
+
+def _blame(error: Exception) -> PluginError | None:
+    """The error of the plugin that an exception passed through, ``None`` when it passed through none."""
+    plugins = {plugin.module: plugin for kind in KINDS for plugin in list_plugins(kind) if plugin.module not in OWN}
+    inside = [(frame, line) for frame, line in _frames(error.__traceback__) if _package_of(frame) in plugins]
+    if not inside:
+        return None
+    (entered, _), (innermost, line) = inside[0], inside[-1]
+    of_package = [plugin for kind in KINDS for plugin in list_plugins(kind) if plugin.module == _package_of(entered)]
+    method = entered.f_code.co_qualname
+    named = [plugin for plugin in of_package if method.startswith(f"{plugin.target.partition(':')[2]}.")]
+    plugin = (named or of_package)[0]
+    cause = f"{first_line(error)} ({innermost.f_code.co_filename}:{line})"
+    return plugin.error(f"failed in {method}: {cause}; set {TRACEBACK}=1 for the whole traceback", cause)
+
+
+def _frames(place: TracebackType | None) -> Iterator[tuple[FrameType, int]]:
+    """The frames of a traceback and their lines, the outermost first."""
+    while place is not None:
+        yield place.tb_frame, place.tb_lineno
+        place = place.tb_next
+
+
+def _package_of(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__", "")).partition(".")[0]
+
+
+def first_line(error: Exception) -> str:
+    """The class and the first line of an exception."""
+    return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}"
 
 
 def make_encoder(name: str, settings: dict[str, Any]) -> Encoder:

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from persist_cli.errors import PluginError
-from persist_cli.plugins import list_plugins, load_plugin
+from persist_cli.plugins import list_plugins, load_plugin, plugin_errors
 from tests.support.micro_runs import stage
 from tests.support.packages import install
 
@@ -50,6 +50,91 @@ def test_a_broken_plugin_shows_its_cause_and_stops_no_others(persist, site):
     assert rows["voxel"]["state"] == "ok"
     with pytest.raises(PluginError, match=r"memory 'broken' \(persist-broken 1\.2, broken_memory:Broken\) is broken"):
         load_plugin("memory", "broken")
+
+
+UNFINISHED = """
+    from dataclasses import dataclass
+    from persist_cli.api.memory import Memory
+    from persist_cli.api.encoder import Encoder
+
+    class Unfinished(Memory):
+        def read(self, cameras, budget): pass
+        def tensors(self): return {}
+
+    class Alone(Unfinished):
+        def write(self, observations): pass
+        def restore(self, tensors): pass
+        def __init__(self, settings): pass
+
+    class Unset(Encoder):
+        settings_type = dict
+        channels = 3
+        def encode(self, rgb): pass
+
+    def function(settings, encoder, reference): pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "cause"),
+    [("memory", "Unfinished", "it lacks restore, write, which Memory leaves to its subclasses"),
+     ("memory", "Alone", "its __init__ does not take (settings, encoder, reference)"),
+     ("encoder", "Unset", "its settings_type is no dataclass"),
+     ("memory", "function", "it is no subclass of persist_cli.api.memory.Memory"),
+     ("memory", "Absent", "AttributeError: module 'unfinished' has no attribute 'Absent'")],
+)  # fmt: skip
+def test_an_unfinished_plugin_is_shown_as_broken_and_refused_in_one_line(persist, site, walks, kind, name, cause):
+    group = {"memory": "persist.memories", "encoder": "persist.encoders"}[kind]
+    install(site, "persist-unfinished", group, f"unfinished = unfinished:{name}", UNFINISHED)
+    rows = {row["name"]: row for row in json.loads(persist("plugins", "--json").out)}
+    assert rows["unfinished"]["state"] == cause
+    ended = persist("memorize", f"{walks}#0:0-3", f"--{kind}", "unfinished", "--out", site / "m.safetensors")
+    line = f"error: {kind} 'unfinished' (persist-unfinished 1.2, unfinished:{name}) is broken: {cause}"
+    assert (ended.code, ended.err.splitlines()) == (1, [line])
+    with pytest.raises(PluginError) as error:
+        load_plugin(kind, "unfinished")
+    assert (error.value.package, error.value.cause) == ("persist-unfinished", cause)
+
+
+def test_every_plugin_of_persist_can_be_used(persist):
+    states = {row["state"] for row in json.loads(persist("plugins", "--json").out)}
+    assert states == {"ok"}
+
+
+def test_an_exception_in_a_plugin_is_one_line_that_says_where(persist, site, walks, monkeypatch):
+    code = LAST_FRAME.replace("self.frame = self.encoder.encode(observations.rgb[-1:])", "self.frame = [][2]")
+    install(site, "persist-last", "persist.memories", "last = failing_frame:LastFrame", code)
+    arguments = ["memorize", f"{walks}#0:0-3", "--memory", "last", "--out", site / "m.safetensors"]
+    ended = persist(*arguments)
+    cause = f"IndexError: list index out of range ({site / 'failing_frame.py'}:8)"
+    line = f"memory 'last' (persist-last 1.2, failing_frame:LastFrame) failed in LastFrame.write: {cause}; set "
+    assert (ended.code, ended.err.splitlines()) == (1, [f"error: {line}PERSIST_TRACEBACK=1 for the whole traceback"])
+    monkeypatch.setenv("PERSIST_TRACEBACK", "1")
+    assert "Traceback" in persist(*arguments).err
+
+
+def test_an_exception_that_passed_through_no_plugin_keeps_its_traceback():
+    with pytest.raises(ZeroDivisionError), plugin_errors():
+        _ = 1 / 0
+
+
+def test_an_exception_in_a_simulator_comes_back_from_its_process_in_one_line(persist, site, tmp_path, monkeypatch):
+    code = """
+        from persist_cli.api.simulator import Simulator
+        class Flat(Simulator):
+            agent = bounds = info = None
+            def open_scene(self, scene): raise KeyError(scene)
+            def place(self, ground, heading): pass
+            def observe(self): pass
+            def act(self, action): pass
+            def is_free(self, ground): pass
+            def ahead(self, heading): pass
+    """
+    install(site, "persist-flat", "persist.simulators", "flat = flat_world:Flat", code)
+    monkeypatch.setenv("PYTHONPATH", str(site), prepend=":")
+    ended = persist("collect", "flat", "--scenes", "7:8", "--out", tmp_path / "houses")
+    line = "error: simulator 'flat' (persist-flat 1.2, flat_world:Flat) failed in Flat.open_scene: KeyError: 7 ("
+    assert (ended.code, len(ended.err.splitlines()), ended.err.startswith(line)) == (1, 1, True)
 
 
 def test_a_name_that_two_packages_claim_is_an_error_that_names_both(persist, site):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +26,7 @@ from persist_cli.cli.options import (
     show_version,
     split_names,
 )
-from persist_cli.errors import PersistError
+from persist_cli.errors import TRACEBACK, PersistError
 
 app = typer.Typer(
     name="persist",
@@ -40,10 +41,17 @@ app.add_typer(weights_app, name="weights")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; an error that the user can mend is printed in one line and ends with exit code 1."""
+    """Run the command line; an error that the user can mend is printed in one line and ends with exit code 1.
+
+    Where the environment sets PERSIST_TRACEBACK, the traceback of that error is printed before.
+    """
     try:
         app(args=arguments)
     except PersistError as error:
+        if os.environ.get(TRACEBACK):
+            import traceback
+
+            traceback.print_exc()
         typer.secho(f"error: {error}", fg=typer.colors.RED, err=True)
         sys.exit(1)
 

@@ -1,4 +1,4 @@
-"""Options that several commands take, and the group of commands that ends Ctrl-C and a full disk in one line."""
+"""Options that several commands take, and the group of commands that ends what is no fault of persist in one line."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 
 from persist_cli import __version__
 from persist_cli.errors import INTERRUPTED, PersistError
+from persist_cli.plugins import plugin_errors
 
 DISK_ERRORS: Final = {  # of a disk that is full, closed or read-only, which is no fault of a command
     errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM,
@@ -81,12 +82,13 @@ def show_version(show: bool) -> None:
 
 
 class Commands(TyperGroup):
-    """Commands that Ctrl-C ends in one line, with exit code 130, and a disk that is full or closed with 1."""
+    """Commands that Ctrl-C ends in one line, with exit code 130; a full or closed disk and a failing plugin with 1."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command of the context."""
         try:
-            return super().invoke(ctx)
+            with plugin_errors():
+                return super().invoke(ctx)
         except OSError as error:
             if error.errno not in DISK_ERRORS:
                 raise

@@ -29,7 +29,7 @@ from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
-from persist_cli.plugins import load_plugin, make_simulator
+from persist_cli.plugins import load_plugin, make_simulator, plugin_errors
 from persist_cli.simulators.policies import POLICIES, clear_distance, walk
 from persist_cli.viewing.console import add_task, print_json, progress, say
 
@@ -149,6 +149,7 @@ def claim_folder(plan: CollectPlan, out: Path) -> None:
     remove_leftovers(out)
 
 
+@plugin_errors()  # a traceback does not come back from a worker process
 def collect_scene(seed: int, path: Path) -> int:
     """Walk through the scene of a generator seed and write the trajectory, in a worker process.
 

@@ -47,7 +47,7 @@ def plugin_state(plugin: Plugin, claims: int) -> str:
     try:
         import_plugin(plugin)
     except PluginError as error:
-        return str(error).partition(" is broken: ")[2]
+        return error.cause
     return "ok"
 
 
