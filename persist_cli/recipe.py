@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import typing
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ EXTENDS: Final = "extends"
 
 # the key that chooses a variant: settings of one variant mean nothing to another
 CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "adapter": "form"}
+SETTINGS: Final = ("adapter", "settings", "encoder_settings")  # keys that may be left empty
 SETTINGS_OF: Final = {"backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings"}
 
 CHANGEABLE: Final = "a run may be resumed with another value"
@@ -33,6 +35,9 @@ Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Settings = Annotated[  # YAML reads a key with nothing behind it as null
+    dict[str, Any], BeforeValidator(lambda value: {} if value is None else value)
+]
 Precision = Annotated[  # YAML reads the word no as false
     Literal["no", "bf16"], BeforeValidator(lambda value: "no" if value is False else value)
 ]
@@ -46,27 +51,27 @@ class TrainingSettings:
         steps: optimizer steps.
         batch: samples an optimizer step, over all processes and accumulated micro-batches.
         accumulation: micro-batches that a step is split into.
-        learning_rate: the optimizer's, after the warm-up.
+        learning_rate: learning rate of the optimizer after the warm-up.
         warmup: steps over which the learning rate rises linearly.
         cooldown: steps at the end over which the learning rate falls linearly to zero.
-        weight_decay: the optimizer's.
+        weight_decay: weight decay of the optimizer.
         clip: largest norm of all gradients together.
         ema: decay of the moving average of the weights, which is what is saved; 0 saves the last weights.
-        precision: ``no`` or ``bf16``.
-        seed: of everything random: fresh weights, the choice of clips, noise.
+        precision: of the computation: ``no`` for float32, ``bf16`` for mixed precision.
+        seed: seed of everything random: fresh weights, the choice of clips, noise.
         checkpoint_every: steps between checkpoints.
         checkpoint_minutes: most minutes between checkpoints.
         workers: processes that read data.
         threads: CPU threads of torch; 0 leaves the number to torch.
-        tracker: ``none`` or ``tensorboard``.
+        tracker: where losses are logged beside ``log.jsonl``: ``none`` for nowhere, or ``tensorboard``.
         optimizer: ``adamw``, or ``adamw-8bit`` of the package bitsandbytes, whose moments take a quarter of the bytes.
         gradient_checkpointing: keep only the hidden states between blocks and compute the rest again in the backward
             pass; this takes far fewer bytes and about a third more time.
         compile: compile the blocks with ``torch.compile``; the first steps then take minutes.
-        ema_device: where the averaged weights are: beside the ``model``, or in the memory of the ``cpu``.
-        frozen_precision: ``bf16`` holds the weights that a stage does not train in half the bytes; what is saved stays
-            exact.
-        vae_slicing: encode clips one by one.
+        ema_device: where the averaged weights are: with the ``model`` on its device, or in the memory of the ``cpu``.
+        frozen_precision: of the weights that a stage does not train: ``no`` for theirs, ``bf16`` for half the bytes;
+            what is saved stays exact.
+        vae_slicing: encode clips one by one, which takes fewer bytes.
     """
 
     steps: Changeable[Positive] = 1000
@@ -102,12 +107,12 @@ class BackboneConfig:
     """The choice of the video model.
 
     Args:
-        name: of the backbone plugin.
-        settings: of the plugin, on top of those of the base checkpoint where there is one.
+        name: name of the backbone plugin; ``persist plugins`` lists them.
+        settings: settings of the backbone, on top of those of the base checkpoint where there is one.
     """
 
     name: str = "cogvideox"
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -115,16 +120,16 @@ class MemoryConfig:
     """The choice of the memory and of the encoder that gives its features.
 
     Args:
-        name: of the memory plugin.
-        settings: of the memory plugin.
+        name: name of the memory plugin; ``persist plugins`` lists them.
+        settings: settings of the memory.
         encoder: name of the encoder plugin.
-        encoder_settings: of the encoder plugin.
+        encoder_settings: settings of the encoder.
     """
 
     name: str = "voxel"
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: Settings = field(default_factory=dict)
     encoder: str = "patches"
-    encoder_settings: dict[str, Any] = field(default_factory=dict)
+    encoder_settings: Settings = field(default_factory=dict)
 
 
 def _as_list(value: Any) -> Any:
@@ -139,8 +144,8 @@ class DataSettings:
     """The choice of the clips to train on.
 
     Args:
-        path: one data set folder or several; ``--data`` sets them.
-        strides: one is drawn for each clip, which then has every n-th frame of its trajectory. With a negative stride
+        path: one data set folder or several; ``--data`` replaces them.
+        strides: one is drawn for each clip: with 3 it has every third frame of its trajectory. With a negative stride
             the clip plays backwards and its context is what was seen on the way there.
         context_frames: the most earlier frames that a clip's memory is made of (stage 2).
         clips_per_trajectory: how many fixed clips, with fixed contexts, each trajectory offers, so that clips come
@@ -158,9 +163,10 @@ class Recipe:
     """A training run.
 
     Args:
-        stage: ``codec`` (the VAE), ``1`` (the video model) or ``2`` (a memory adapter on the frozen rest).
+        stage: what is trained: ``codec`` (the VAE), ``1`` (the video model) or ``2`` (a memory adapter, all else
+            frozen).
         description: one line for ``persist recipes``.
-        base: run or checkpoint to start from.
+        base: run or checkpoint to start from, ``None`` for none.
         backbone: the video model.
         memory: the memory that the adapter reads, stage 2 only.
         adapter: settings of the memory adapter, stage 2 only.
@@ -174,7 +180,7 @@ class Recipe:
     base: str | None = None
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     memory: MemoryConfig | None = None
-    adapter: dict[str, Any] = field(default_factory=dict)
+    adapter: Settings = field(default_factory=dict)
     lora: Lora | None = None
     data: DataSettings = field(default_factory=DataSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
@@ -222,6 +228,7 @@ def _read_extended(name: str, extended_by: tuple[str, ...]) -> dict[str, Any]:
 
 def _merge(key: str, base: Any, value: Any) -> Any:
     """Merge a value into that of the extended recipe, key by key where both are mappings of the same variant."""
+    value = {} if value is None and key in SETTINGS else value
     if not isinstance(base, dict) or not isinstance(value, dict) or CHOSEN_BY.get(key) in value:
         return value
     if "encoder" in value:
@@ -237,6 +244,15 @@ def _recipe_text(name: str) -> str:
     if name not in recipe_names():
         raise RecipeError(f"unknown recipe {name!r}; {hint(name, recipe_names())} (a file of your own ends in .yaml)")
     return (resources.files("persist_recipes") / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def recipe_comment(name: str) -> list[str]:
+    """The lines of comment with which a recipe begins: the command that runs it, and what there is to know.
+
+    Raises:
+        RecipeError: when the recipe is unknown.
+    """
+    return [*itertools.takewhile(lambda line: line.startswith("#"), _recipe_text(name).splitlines())]
 
 
 def _is_file(name: str) -> bool:

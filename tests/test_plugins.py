@@ -41,6 +41,29 @@ def test_a_memory_of_another_package_works_in_every_command_by_name(persist, sit
     assert (evaluated.code, "last" in evaluated.out) == (0, True)
 
 
+def test_the_settings_of_a_memory_of_another_package_are_shown_in_a_recipe(persist, site, tmp_path):
+    settings = """
+    from dataclasses import dataclass
+
+    @dataclass(frozen=True)
+    class LastSettings:
+        \"\"\"Settings.
+
+        Args:
+            decay: share that is forgotten in a second.
+        \"\"\"
+
+        decay: float = 0.5
+        untold: int = 3
+    """
+    code = settings + LAST_FRAME.replace("frame = torch", "settings_type = LastSettings\n        frame = torch", 1)
+    install(site, "persist-last", "persist.memories", "last = told_frame:LastFrame", code)
+    (tmp_path / "a.yaml").write_text("extends: tiny-stage2-voxel\nmemory: {name: last, settings: {decay: 0.9}}\n")
+    text = persist("recipes", tmp_path / "a.yaml").out
+    assert "    # share that is forgotten in a second; a number; default 0.5\n    decay: 0.9\n" in text
+    assert "    # a whole number\n    #untold: 3\n" in text
+
+
 def test_a_broken_plugin_shows_its_cause_and_stops_no_others(persist, site):
     install(site, "persist-broken", "persist.memories", "broken = broken_memory:Broken", "raise OSError('no such lib')")
     install(site, "persist-wrong", "persist.encoders", "wrong = wrong_kind:Wrong", "Wrong = dict")

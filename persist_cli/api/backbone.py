@@ -20,6 +20,7 @@ from persist_cli.api.observations import Observations
 from persist_cli.api.stages import Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PersistError
+from persist_cli.io.setting_docs import Setting
 from persist_cli.io.settings import NoSettings
 
 Interactions = tuple[str | None, ...]  # for each step between two frames the interaction's name, if there is one
@@ -280,6 +281,18 @@ class Backbone(nn.Module, ABC):
     @abstractmethod
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter for tokens of ``channels`` channels, with settings of the recipe, and use it."""
+
+    @classmethod
+    def adapter_settings(cls, chosen: Mapping[str, Any]) -> list[Setting]:
+        """Return the settings that ``add_adapter`` knows, for ``persist recipes NAME``; by default it tells none.
+
+        Args:
+            chosen: the settings of the recipe, on which others and their defaults may depend.
+
+        Raises:
+            PersistError: one line when ``add_adapter`` would refuse these settings.
+        """
+        return []
 
     @abstractmethod
     def use_adapter(self, name: str | None) -> None:

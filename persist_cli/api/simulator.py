@@ -41,6 +41,11 @@ class Simulator(ABC):
     def __init__(self, settings: Any) -> None:
         self.settings = settings
 
+    @classmethod
+    def missing(cls) -> str:
+        """Say what must be installed before this simulator can be used; empty when nothing is missing."""
+        return ""
+
     @abstractmethod
     def open_scene(self, scene: int) -> None:
         """Generate the scene of this seed, at least 0; ``place`` then puts the agent into it."""

@@ -340,11 +340,22 @@ def plugins(json: JsonOption = False) -> None:
 
 
 @app.command()
-def recipes(json: JsonOption = False) -> None:
-    """List the recipes that come with persist."""
-    from persist_cli.viewing.listings import show_recipes
+def recipes(
+    name: Annotated[str | None, typer.Argument(help="A recipe, or a YAML file, to show with every setting.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the recipes that come with persist, or show one with every setting, as YAML to start from.
 
-    show_recipes(json)
+    persist recipes tiny-stage1 > mine.yaml
+    """
+    if name is None:
+        from persist_cli.viewing.listings import show_recipes
+
+        show_recipes(json)
+    else:
+        from persist_cli.viewing.recipe_page import show_recipe
+
+        show_recipe(name, json)
 
 
 @weights_app.command("list")

@@ -79,6 +79,7 @@ FROZEN_UNSHARDED: Final = dataclasses.replace(FROZEN, unsharded_only=True)  # in
 AVERAGE: Final = Change("EMA on the CPU", ("training.ema_device=cpu",), 2)
 CHECKPOINTING: Final = Change("gradient checkpointing", ("training.gradient_checkpointing=true",), 3)
 EIGHT_BIT: Final = Change("8-bit optimizer", ("training.optimizer=adamw-8bit",), 4, unsharded_only=True)
+BITSANDBYTES: Final = "bitsandbytes"  # the package of the 8-bit optimizer, and the extra that installs it
 OFFLOAD: Final = Change("CPU offload", (), 8, (SHARDED, OFFLOADED))
 LORA: Final = Change("LoRA", ("lora.rank=64",), 16)
 

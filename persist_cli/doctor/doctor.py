@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
+from rich.markup import escape
+
 from persist_cli.data.clips import check_batch_division
-from persist_cli.doctor.changes import OFFLOADED, SHARDED, STAGE2, Strategy, available_changes, smallest_fitting
+from persist_cli.doctor.changes import (
+    BITSANDBYTES,
+    EIGHT_BIT,
+    LORA,
+    OFFLOADED,
+    SHARDED,
+    STAGE2,
+    Change,
+    Strategy,
+    available_changes,
+    smallest_fitting,
+)
 from persist_cli.doctor.dry_run import dry_run
 from persist_cli.doctor.machine import Machine, gib
 from persist_cli.doctor.memory_estimate import Estimator, Launch, MemoryEstimate
@@ -60,7 +74,20 @@ class Doctor:
         self.meta_model, self.machine, self.sharded = meta_model, machine, sharded
         self.stage2 = stage2
         self.estimators = {meta_model.recipe.lora: Estimator(meta_model.backbone, meta_model.channels)}
-        self.changes = available_changes(meta_model.recipe, machine, sharded)
+        self.not_considered: dict[str, str] = {}  # changes that cannot be made here, and why
+        changes = available_changes(meta_model.recipe, machine, sharded)
+        self.changes = [change for change in changes if self.can_make(change)]
+
+    def can_make(self, change: Change) -> bool:
+        """Whether backbone and installation can make a change that they may lack; else it is ``not_considered``."""
+        if change is not LORA:
+            return True
+        try:
+            self.estimator(self.changed_recipe(Strategy((change,))))
+        except PersistError as error:
+            self.not_considered[change.name] = str(error)
+            return False
+        return True
 
     def examine(self, strategy: Strategy) -> Finding:
         """Estimate what the recipe needs with these changes."""
@@ -130,14 +157,16 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
         model = dry_run(meta_model)
     findings, best = doctor.findings(), doctor.smallest()
     if json:
-        print_json(_record(machine, model, findings, best))
+        print_json(_record(machine, model, findings, best) | {"not_considered": doctor.not_considered})
         return
     parts = [*model["parts"], model["total"]]
     rows = [[part["name"], f"{part['parameters']:,}", gib(part["bytes"])] for part in parts]
     print_table(f"{name}: stage {meta_model.recipe.stage}", ("part", "parameters", "GiB"), rows)
     title = f"GiB on each of {machine}, of which {gib(machine.usable)} are planned with"
     print_table(title, ("strategy", *COLUMNS, "fits"), [_row(finding) for finding in findings])
-    say(_verdict(doctor, overrides, best))
+    for change, cause in doctor.not_considered.items():
+        say(escape(f"not considered: {change} ({cause})"))
+    say(escape(_verdict(doctor, overrides, best)))
 
 
 def _verdict(doctor: Doctor, overrides: Sequence[str], best: Finding | None) -> str:
@@ -148,7 +177,10 @@ def _verdict(doctor: Doctor, overrides: Sequence[str], best: Finding | None) -> 
     need = f"{gib(best.estimate.peak)} of {gib(machine.usable)} GiB"
     if best.estimate.host:
         need += f", and {gib(best.estimate.host)} GiB of the memory of the CPU"
-    return f"fits {changes} ({need}):\n{launch_command(doctor, overrides, best.strategy)}"
+    needed = ""
+    if EIGHT_BIT in best.strategy.changes and importlib.util.find_spec(BITSANDBYTES) is None:
+        needed = f"pip install 'persist-cli[{BITSANDBYTES}]'\n"
+    return f"fits {changes} ({need}):\n{needed}{launch_command(doctor, overrides, best.strategy)}"
 
 
 def launch_command(doctor: Doctor, overrides: Sequence[str], strategy: Strategy) -> str:

@@ -13,7 +13,7 @@ from persist_cli.api.simulator import AgentSettings, Simulator
 from persist_cli.errors import DataError
 from persist_cli.simulators.building import build_house
 from persist_cli.simulators.houses import Ground, House, Rectangle, Thing, is_clear
-from persist_cli.simulators.rendering import Renderer
+from persist_cli.simulators.rendering import INSTALL, Renderer, is_installed
 
 GRAIN = 2.0**32  # positions are whole multiples of this part of a metre, so that going back is exact
 STRIDE = 0.1  # metres between the places that are checked along a step
@@ -66,6 +66,11 @@ class MiniWorld(Simulator):
         self._stale = True  # whether the renderer draws an earlier state of the house
         self._ground: Ground = (0.0, 0.0)
         self._start_heading, self._turned = 0.0, 0.0  # radians and degrees to the left
+
+    @classmethod
+    def missing(cls) -> str:
+        """Say how MiniWorld's package is installed, where it is missing; OpenGL is not tried."""
+        return "" if is_installed() else f"needs {INSTALL}"
 
     @property
     def house(self) -> House:

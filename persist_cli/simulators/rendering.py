@@ -32,6 +32,7 @@ SAMPLES = 4
 LARGEST_TEXTURE = 256  # pixels of a side
 AMBIENT, DIFFUSE = 0.75, 0.4  # light from everywhere, and from the house's own direction
 EGL_PACKAGES = "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri"
+INSTALL = f"`pip install 'persist-cli[miniworld]'` and Mesa's EGL (`apt-get install {EGL_PACKAGES}`)"
 
 Array = np.ndarray[Any, Any]
 
@@ -44,11 +45,14 @@ def assets() -> Path:
         PluginError: when the package is not installed.
     """
     spec = importlib.util.find_spec("miniworld")
-    if spec is None or not spec.submodule_search_locations or importlib.util.find_spec("pyglet") is None:
-        raise PluginError(
-            "simulator 'miniworld' needs the package miniworld; install it with `pip install 'persist-cli[miniworld]'`"
-        )
+    if spec is None or not spec.submodule_search_locations or not is_installed():
+        raise PluginError(f"simulator 'miniworld' needs the package miniworld: {INSTALL}")
     return Path(spec.submodule_search_locations[0])
+
+
+def is_installed() -> bool:
+    """Whether the packages of MiniWorld are here; whether OpenGL is shows when it is used."""
+    return all(importlib.util.find_spec(name) is not None for name in ("miniworld", "pyglet"))
 
 
 @functools.cache

@@ -253,6 +253,11 @@ def say(text: str) -> None:
     OUT.print(text, highlight=False, soft_wrap=True)
 
 
+def print_text(text: str) -> None:
+    """Print text as it is on standard output, brackets and long lines too."""
+    OUT.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)
+
+
 def warn(text: str) -> None:
     """Print one line for people on standard error, apart from the results on standard output."""
     PROGRESS.print(text, highlight=False, soft_wrap=True)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+from rich.markup import escape
+
 from persist_cli.errors import PluginError
 from persist_cli.plugins import KINDS, Plugin, import_plugin, list_plugins
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
-from persist_cli.viewing.console import print_json, print_table
+from persist_cli.viewing.console import print_json, print_table, say
 
 
 def show_plugins(json: bool) -> None:
@@ -24,6 +26,8 @@ def show_recipes(json: bool) -> None:
         recipe = make_recipe(read_recipe(name), name)
         rows.append([name, recipe.stage, recipe.memory.name if recipe.memory else "", recipe.description])
     _show("Recipes", ("name", "stage", "memory", "description"), rows, json)
+    if not json:
+        say("every setting of one, as YAML to start from: persist recipes NAME > mine.yaml")
 
 
 def plugin_rows(plugins: list[Plugin]) -> list[list[str]]:
@@ -45,14 +49,15 @@ def plugin_state(plugin: Plugin, claims: int) -> str:
     if claims > 1:
         return f"name claimed by {claims} packages"
     try:
-        import_plugin(plugin)
+        loaded = import_plugin(plugin)
     except PluginError as error:
         return error.cause
-    return "ok"
+    missing = loaded.missing() if plugin.kind == "simulator" else ""
+    return missing or "ok"
 
 
 def _show(title: str, columns: Sequence[str], rows: list[list[str]], json: bool) -> None:
     if json:
         print_json([dict(zip(columns, row, strict=True)) for row in rows])
     else:
-        print_table(title, columns, rows)
+        print_table(title, columns, [[escape(text) for text in row] for row in rows])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import shlex
+import sys
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ import torch
 from persist_backbones.cogvideox.inputs import _fitted_positions
 from persist_cli.api.backbone import ClipLatents
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
-from persist_cli.doctor.doctor import Doctor, launch_command
+from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
 from persist_cli.doctor.machine import GIB, Machine
 from persist_cli.doctor.memory_estimate import Estimator, Launch
 from persist_cli.doctor.meta_model import build_meta_model
@@ -207,3 +208,20 @@ def test_an_impossible_recipe_or_machine_is_reported_in_one_line(persist, option
         pytest.skip("there is a GPU to know the memory of")
     ended = persist("doctor", "tiny-stage1", *MICRO, *options)
     assert (ended.code, cause in ended.err) == (1, True)
+
+
+def test_what_is_not_installed_is_one_proposal_less_and_no_error(persist, monkeypatch):
+    monkeypatch.setitem(sys.modules, "peft", None)
+    arguments = ["doctor", "tiny-stage1", *MICRO, *SMALL, "--gpu-memory", "80"]
+    ended, record = persist(*arguments), json.loads(persist(*arguments, "--json").out)
+    cause = "lora needs the package peft: pip install 'persist-cli[lora]'"
+    assert (ended.code, f"\nnot considered: LoRA ({cause})\n" in ended.out) == (0, True)
+    assert record["not_considered"] == {"LoRA": cause}
+    assert "LoRA" not in {strategy["name"] for strategy in record["strategies"]}
+
+
+def test_the_optimizer_of_a_package_that_is_not_here_comes_with_its_installation(monkeypatch):
+    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
+    doctor = Doctor(micro_meta_model(), Machine("cuda", 1, 80 * GIB), False)
+    verdict = _verdict(doctor, [], doctor.examine(Strategy((EIGHT_BIT,))))
+    assert "\npip install 'persist-cli[bitsandbytes]'\npersist finetune tiny-stage1 " in verdict

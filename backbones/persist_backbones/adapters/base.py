@@ -28,8 +28,9 @@ class AdapterSettings:
     """Settings that every form of adapter has.
 
     Args:
-        form: one of ``FORMS``.
-        every: n, where the adapter has a block at every n-th transformer block.
+        form: the way of the tokens to the video: ``cross`` (attention to tokens at their places in space, as in the
+            paper), ``projected`` (attention to their places in the views) or ``canvas`` (tokens drawn into the views).
+        every: the adapter has a block at every n-th transformer block; this is n.
         width: channels of a memory token inside the blocks, or of the canvas at a video token.
         ff_factor: hidden width of the feed-forward as a multiple of the video's channels.
         token_budget: the largest number of tokens that is read from memory for a clip.

@@ -114,7 +114,7 @@ class CanvasSettings(AdapterSettings):
         canvas_scale: pixels of the canvas along the edge of a latent pixel.
         token_size: edge in metres of the square that a token is drawn as; 0 draws points.
         splat_pixels: the largest edge of a drawn token in canvas pixels, odd; 1 draws points.
-        head_width: hidden channels of the ``CanvasHead``; 0 leaves it out.
+        head_width: hidden channels of the layers that correct the prediction by the canvas; 0 leaves them out.
     """
 
     form: Literal["canvas"] = "canvas"

@@ -13,7 +13,9 @@ from persist_backbones.adapters.cross import CrossAdapter
 from persist_backbones.adapters.projected import ProjectedAdapter
 from persist_cli.errors import CheckpointError, hint
 from persist_cli.io.files import load_exactly, read_json, read_tensors, write_json, write_tensors
+from persist_cli.io.setting_docs import Setting, settings_of
 from persist_cli.io.settings import parse_settings
+from persist_cli.io.value_kinds import join_words
 
 FORMS: dict[str, type[Adapter[Any]]] = {"cross": CrossAdapter, "projected": ProjectedAdapter, "canvas": CanvasAdapter}
 DEFAULT = "cross"
@@ -36,11 +38,31 @@ def make_adapter(channels: int, settings: Mapping[str, Any], video: VideoShape, 
         RecipeError: one line with every setting that the form does not have or allow.
     """
     settings = _with_preset(settings)
+    form = _form_of(settings)
+    return form(channels, parse_settings(form.settings_type, settings, where), video)
+
+
+def adapter_settings(chosen: Mapping[str, Any]) -> list[Setting]:
+    """The settings of the form and preset that are chosen, with their defaults and meanings.
+
+    Raises:
+        PersistError: one line for an unknown form, preset or setting.
+    """
+    settings = _with_preset(chosen)
+    kind = _form_of(settings).settings_type
+    parse_settings(kind, settings, "adapter")
+    preset = Setting(
+        "preset", "sizes that stand in for those that are not given", f"{join_words(PRESETS, 'or')}, or null"
+    )
+    own = settings_of(kind, {} if chosen.get("preset") is None else PRESETS[str(chosen["preset"])])
+    return [preset, *own]
+
+
+def _form_of(settings: Mapping[str, Any]) -> type[Adapter[Any]]:
     name = str(settings.get("form", DEFAULT))
     if name not in FORMS:
         raise CheckpointError(f"unknown adapter form {name!r}; known: {', '.join(FORMS)}")
-    form = FORMS[name]
-    return form(channels, parse_settings(form.settings_type, settings, where), video)
+    return FORMS[name]
 
 
 def _with_preset(settings: Mapping[str, Any]) -> dict[str, Any]:

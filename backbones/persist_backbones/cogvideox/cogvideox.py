@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCondition, VideoShape
-from persist_backbones.adapters.forms import load_adapter, make_adapter, save_adapter
+from persist_backbones.adapters.forms import adapter_settings, load_adapter, make_adapter, save_adapter
 from persist_backbones.cogvideox.codec import Codec, to_uint8
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import (
@@ -56,6 +56,7 @@ from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.io.setting_docs import Setting
 
 
 @dataclass
@@ -353,6 +354,11 @@ class CogVideoX(Backbone):
         """Measure the scale of the latents on these clips, after the codec's stage only."""
         if stage == "codec":
             self.codec.take_scale((batch.rgb.to(self.device), batch.depth.to(self.device)) for batch in clips)
+
+    @classmethod
+    def adapter_settings(cls, chosen: Mapping[str, Any]) -> list[Setting]:
+        """Return the settings of the form and preset that are chosen."""
+        return adapter_settings(chosen)
 
     def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
         """Add a fresh memory adapter and use it."""

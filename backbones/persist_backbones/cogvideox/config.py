@@ -110,13 +110,13 @@ class CogVideoXSettings:
         width: width of the images in pixels.
         frames: frames of a clip, at least two; 2cn + 1 for a VAE that compresses time by c > 1: 9, 17, … for CogVideoX.
         interactions: actions that change the world; each has one embedding for each step of a clip.
-        rays: ``correct`` Plücker directions, or ``printed`` in the paper, with the translation added.
+        rays: directions of the Plücker rays: ``correct``, or as ``printed`` in the paper, with the translation added.
         depth: false holds depth at zero in the input and leaves it out of the loss: a model of RGB alone with as many
             parameters, whose clips have no depth (0) after the given frame.
-        prediction: ``v_prediction`` for velocities, like CogVideoX, or ``sample`` for clean latents; by default that of
-            the preset or of the pretrained weights, which cannot be loaded with any other.
-        weighting: weighting of errors: ``uniform``, ``min-snr`` or ``min-snr-plus-one`` (see ``loss_weights``).
-        snr_gamma: γ of min-SNR.
+        prediction: what the model predicts: ``v_prediction`` for velocities, like CogVideoX, or ``sample`` for clean
+            latents; by default that of the preset or of the pretrained weights, which cannot be loaded with any other.
+        weighting: weighting of errors: ``uniform``, ``min-snr`` or ``min-snr-plus-one``.
+        snr_gamma: γ of the weighting by min-SNR.
         kl_weight: weight of the codec's latent prior in its loss.
         codec_window: frames (a valid number of ``frames``, or 1), height and width of the random windows that the codec
             is trained on; a quarter of the pixels costs a quarter of the time.

@@ -38,10 +38,11 @@ class GridSettings:
     """How pixels are pooled into cells.
 
     Args:
-        pooling: ``max`` (the paper): writing a frame twice, or frames in another order, changes no bit of the map;
-            ``mean`` is over all pixels ever written: neither holds, and a place seen often weighs more.
+        pooling: of the features in a cell. ``max`` (the paper): writing a frame twice, or frames in another order,
+            changes no bit of the map; ``mean`` is over all pixels ever written: neither holds, and a place seen often
+            weighs more.
         stride: step between the sampled rows, and between the sampled columns, in pixels.
-        max_depth: metres; pixels that are farther are left out.
+        max_depth: largest depth in metres; pixels that are farther are left out, none with ``None``.
     """
 
     pooling: Literal["max", "mean"] = "max"
