@@ -11,6 +11,7 @@ import typer
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
+    DEFAULT_CONTROLS,
     ActionsOption,
     Commands,
     CompareOption,
@@ -270,7 +271,7 @@ def evaluate(
     data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
     protocol: Annotated[str, typer.Option(help="revisit, return, long or unseen.")] = "revisit",
     memories: Annotated[str, typer.Option(help="Memories to compare, the first as reference.")] = "none,voxel",
-    controls: ControlsOption = "copy,nearest,warp,codec,shuffled,emptied",
+    controls: ControlsOption = None,
     metrics: Annotated[str, typer.Option(help="Metrics separated by commas, or all.")] = "all",
     frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
     clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
@@ -304,7 +305,8 @@ def evaluate(
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
-        data=tuple(data), protocol=protocol, memories=split_names(memories), controls=split_names(controls),
+        data=tuple(data), protocol=protocol, memories=split_names(memories), 
+        controls=split_names(DEFAULT_CONTROLS if controls is None else controls), controls_named=controls is not None,
         metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=SamplingOverrides(steps, sampler, guidance), batch=batch, noise=pose_noise,
         placement=InferenceOptions.of(dtype, save_memory),

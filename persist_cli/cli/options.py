@@ -31,8 +31,15 @@ GuidanceOption = Annotated[
     typer.Option("--guidance", min=0, help="Of guidance over memory; the checkpoint's, else 1: none."),
 ]
 
+DEFAULT_CONTROLS: Final = "copy,nearest,warp,codec,shuffled,emptied"
+
 ControlsOption = Annotated[
-    str, typer.Option("--controls", help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy.")
+    str | None,
+    typer.Option(
+        "--controls",
+        help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy.",
+        show_default=DEFAULT_CONTROLS,
+    ),
 ]
 
 CompareOption = Annotated[

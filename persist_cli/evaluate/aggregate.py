@@ -17,6 +17,7 @@ from persist_cli.evaluate.metric_suite import FIGURES, MetricSuite
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.statistics import Figure, difference, mean, mean_figure, number, set_figure
+from persist_cli.viewing.console import watched
 
 BINS = 10  # of the share of a view that was seen before
 
@@ -74,20 +75,33 @@ class Table:
         return make_columns(self.run.metrics, self.run.protocol)
 
     def to_json(self, rows: Sequence[RowResults]) -> dict[str, Any]:
-        """JSON values of every row with its columns and curves; differences are to each of the other rows."""
-        figures = {results.row.name: self.figures(results) for results in rows}
+        """JSON values of every row with its columns and curves; differences are to each of the other rows.
+
+        A row that cannot be made of these clips has the reason in ``na``.
+        """
+        figures = {results.row.name: self.figures(results) for results in watched(rows, "figures", "rows")}
         values: dict[str, Any] = {}
         for results in rows:
-            row = results.row
-            values[row.name] = {
-                "kind": row.kind,
-                "definition": row.definition,
-                "checkpoint": row.base.name if row.uses_model else None,
-                "memory": row.adapter,
+            values[results.row.name] = self.row_json(results.row) | {
                 "columns": {column.name: self.cell(column, results, figures) for column in self.columns},
                 "curves": self.curves(results),
             }
+        for row, reason in self.run.missing:
+            values[row.name] = self.row_json(row) | {
+                "na": reason,
+                "columns": {column.name: {"na": reason} for column in self.columns},
+                "curves": {},
+            }
         return {"name": self.name, "clips": list(self.clips), "rows": values}
+
+    def row_json(self, row: Row) -> dict[str, Any]:
+        """What a row is, as JSON values."""
+        return {
+            "kind": row.kind,
+            "definition": row.definition,
+            "checkpoint": row.base.name if row.uses_model else None,
+            "memory": row.adapter,
+        }
 
     def cell(self, column: Column, results: RowResults, figures: Mapping[str, Mapping[str, Figure]]) -> dict[str, Any]:
         """One figure as JSON values, or the reason why there is none.

@@ -17,16 +17,19 @@ from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.measure import measure_rows
 from persist_cli.evaluate.plan import EvalPlan, Evaluation, prepare
 from persist_cli.evaluate.provenance import checkpoint_json, command, environment, metric_json, scenes_json
-from persist_cli.evaluate.report.page import write_report
-from persist_cli.evaluate.report.text import print_tables
-from persist_cli.io.files import check_folder, write_json
-from persist_cli.viewing.console import busy, print_json, say
+from persist_cli.evaluate.report.page import PAGE, write_report
+from persist_cli.evaluate.report.terminal import print_results
+from persist_cli.evaluate.report.text import table_text
+from persist_cli.io.files import check_folder, write_json, write_text
+from persist_cli.viewing.console import print_json, say
 
 RESULTS = "metrics.json"
 
+TABLES = "tables.md"
+
 
 def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | None, json: bool) -> None:
-    """Measure all rows and write ``metrics.json``, and a report where a folder is named; see ``persist eval --help``.
+    """Measure all rows and write ``metrics.json`` and ``tables.md``, and a report where a folder is named.
 
     Args:
         paths: runs or checkpoints; when empty, the reference model is evaluated.
@@ -44,19 +47,19 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
     measure_rows(run, loader, processes)
     if not processes.main:
         return
-    with busy("computing the results"):
-        results = results_json(run, processes.count)
+    results = results_json(run, processes.count)
     write_json(out / RESULTS, results)
+    write_text(out / TABLES, table_text(results))
     if report is not None:
-        pictures = make_pictures(run, clips_by_domain(run), loader)
-        with busy("writing the report"):
-            write_report(results, pictures, report)
+        write_report(results, make_pictures(run, clips_by_domain(run), loader), report)
     if json:
         print_json(results)
         return
-    print_tables(results)
+    print_results(results)
     say(motion_line(results["measured"]["clips"]))
-    say(f"written to {out / RESULTS}" + (f" and {report / 'report.html'}" if report else ""))
+    say(f"all columns, intervals and definitions: {out / TABLES}; every clip: {out / RESULTS}")
+    if report is not None:
+        say(f"with curves and videos: {report / PAGE}")
 
 
 def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
@@ -88,7 +91,9 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
         | run.plan.placement.changes(),
         "environment": environment(processes),
         "command": command(),
-        "checkpoints": [checkpoint_json(checkpoint) | scenes_json(checkpoint) for checkpoint in run.checkpoints],
+        "checkpoints": [
+            checkpoint_json(checkpoint) | scenes_json(checkpoint, run.cases) for checkpoint in run.checkpoints
+        ],
         "columns": column_json(make_columns(run.metrics, run.protocol)),
         "tables": [Table(run, name, clips).to_json(rows) for name, clips in clips_by_domain(run).items()],
         "first_row": run.rows[0].name,

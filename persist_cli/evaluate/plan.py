@@ -17,17 +17,21 @@ from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.journal import Journal, Processes, Unit
 from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_setup
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, Protocol
-from persist_cli.evaluate.provenance import checkpoint_json, metric_json, training_scenes
+from persist_cli.evaluate.provenance import checkpoint_json, metric_json, scenes_of, trained_on, training_scenes
+from persist_cli.evaluate.report.remarks import contamination
 from persist_cli.evaluate.rows.build_rows import RowConfig, build_control_rows, build_model_rows
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
-from persist_cli.viewing.console import busy, say
+from persist_cli.viewing.console import busy, say, warn
 
 
 @dataclass(frozen=True)
 class EvalPlan:
-    """The options of ``persist eval``; see its help."""
+    """The options of ``persist eval``; see its help.
+
+    ``controls_named`` says whether the user named the controls: one that cannot be made is an error only then.
+    """
 
     data: tuple[Path, ...]
     protocol: str
@@ -41,6 +45,7 @@ class EvalPlan:
     batch: int
     noise: tuple[float, float]
     placement: InferenceOptions
+    controls_named: bool = True
 
     def without_repeats(self) -> EvalPlan:
         """This plan without repeated names, because a memory named twice would be two rows of one name."""
@@ -59,6 +64,7 @@ class Evaluation:
         protocol: the protocol that chose the clips.
         cases: the clips.
         rows: rows of the table.
+        missing: default controls that cannot be made of these clips, each with the reason.
         suites: metrics of each row, as far as they can be measured of it.
         journal: files that keep what was measured.
     """
@@ -69,6 +75,7 @@ class Evaluation:
     protocol: Protocol
     cases: Sequence[Case]
     rows: Sequence[Row]
+    missing: Sequence[tuple[Row, str]]
     suites: Sequence[MetricSuite]
     journal: Journal
 
@@ -109,7 +116,7 @@ def prepare(
     plan, loader = plan.without_repeats(), BackboneLoader(plan.placement)
     checkpoints = list({checkpoint.folder.resolve(): checkpoint for checkpoint in map(find_checkpoint, paths)}.values())
     sampling = common_sampling(checkpoints, plan.sampling)
-    config = RowConfig(plan.memories, plan.controls, sampling, plan.noise)
+    config = RowConfig(plan.memories, plan.controls, sampling, plan.noise, plan.controls_named)
     config.check()
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
@@ -133,10 +140,24 @@ def prepare(
                 journal.check_data()
     processes.wait()
     cases = journal.cases() or []
-    rows = [*models, *build_control_rows(models, checkpoints, config, protocol, cases)]
+    controls = build_control_rows(models, checkpoints, config, protocol, cases)
+    rows = [*models, *controls.rows]
+    if processes.main:
+        warn_of_clips(cases, checkpoints, search)
     depths = [not (row.uses_model and row.base.fingerprint in bases.depthless) for row in rows]
     suites = [MetricSuite(metrics, make_setup(cases, gives_depth)) for gives_depth in depths]
-    return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, suites, journal), loader
+    return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
+
+
+def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], search: ClipSearch) -> None:
+    """Say when there are fewer clips than asked for, and whether a checkpoint was trained on their scenes."""
+    if len(cases) < search.limit:
+        say(f"{len(cases)} clips found, {search.limit} asked for")
+    scenes = scenes_of(cases)
+    for checkpoint in checkpoints:
+        known = trained_on(checkpoint, scenes)
+        if known:
+            warn(f"warning: {contamination(str(checkpoint.folder), known, len(scenes))}")
 
 
 def identity(
@@ -145,7 +166,7 @@ def identity(
     """JSON values of all that changes a figure, but for the data: an evaluation with equal values goes on."""
     options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
     options |= {"sampling": asdict(sampling) | plan.placement.changes()}
-    del options["placement"]  # the rest of it changes no figure
+    del options["placement"], options["controls_named"]  # what is left of them changes no figure
     values = options | {
         "checkpoints": [checkpoint_json(checkpoint) for checkpoint in checkpoints],
         "metric definitions": metric_json(metrics),

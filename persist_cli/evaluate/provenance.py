@@ -15,6 +15,7 @@ import torch
 from persist_cli import __version__
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.checkpoints import lineage
+from persist_cli.evaluate.cases import Case
 from persist_cli.io.files import file_sha256, read_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.metrics.metric import Metric
@@ -54,13 +55,30 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
     }
 
 
-def scenes_json(checkpoint: Checkpoint) -> dict[str, Any]:
+def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str, Any]:
     """The number of scenes that a checkpoint is known to have been trained on, as JSON values.
 
     The number may change between runs: it depends on which earlier checkpoints and data sets can still be read.
+    ``evaluated`` names those of them that the cases show.
     """
     scenes = lineage.training_scenes(checkpoint)
-    return {"training_scenes": {"known": len(scenes.names), "complete": scenes.complete}}
+    return {
+        "training_scenes": {
+            "known": len(scenes.names),
+            "complete": scenes.complete,
+            "evaluated": sorted(scenes.names & scenes_of(cases)),
+        }
+    }
+
+
+def scenes_of(cases: Sequence[Case]) -> frozenset[str]:
+    """Names of the scenes that the cases show."""
+    return frozenset(case.scene for case in cases)
+
+
+def trained_on(checkpoint: Checkpoint, scenes: frozenset[str]) -> list[str]:
+    """Names of those scenes that a checkpoint is known to have been trained on, in order."""
+    return sorted(lineage.training_scenes(checkpoint).names & scenes)
 
 
 def recipe_sha256(folder: Path) -> str | None:

@@ -15,6 +15,16 @@ SET_RESAMPLES = 200  # for distances between sets of videos, which cost more
 
 SEED = 0
 
+LEAST_CLIPS = 6
+"""Fewest clips of an interval or a significance star.
+
+Below six no test of paired differences that makes no assumption about their distribution can be significant: n
+differences of one sign have a two-sided probability of 2 / 2ⁿ under no effect (sign test, signed-rank test), 0.0625 for
+five and 0.031 for six. The percentile bootstrap does not know this and gives an interval even for two clips, far too
+narrow: in 4,000 draws of normal values the 95 % interval of 1,000 resamples held the true mean in 51 % of them for two
+clips, 76 % for three, 79 % for four, 83 % for five, 86 % for six, 91 % for ten, 92 % for 16 and 94 % for 32.
+"""
+
 Array = NDArray[np.float64]
 
 Distance = Callable[[NDArray[np.int64], int], float]  # takes numbers of clips and a sampling seed
@@ -27,7 +37,7 @@ class Figure:
     Args:
         mean: mean over seeds, clips and frames.
         std: standard deviation over sampling seeds of the mean over clips; ``None`` for fewer than two seeds.
-        low: lower end of the 95 % interval over clips.
+        low: lower end of the 95 % interval over clips, NaN for fewer than ``LEAST_CLIPS``.
         high: upper end of that interval.
         count: number of clips that have the figure.
         per_clip: mean of each clip over seeds; ``None`` where only a set of clips has a figure.
@@ -57,7 +67,7 @@ def resamples(clips: int, count: int) -> NDArray[np.int64]:
 
 
 def mean_figure(values: Array) -> Figure:
-    """The figure of a metric that every clip has.
+    """The figure of a metric that every clip has; without an interval where fewer than ``LEAST_CLIPS`` have it.
 
     Args:
         values: ``[seed, clip]``, NaN where a clip has no figure.
@@ -65,13 +75,14 @@ def mean_figure(values: Array) -> Figure:
     by_seed = mean(values, axis=1)
     per_clip = mean(values, axis=0)
     drawn = mean(per_clip[resamples(len(per_clip), RESAMPLES)], axis=1)
-    low, high = interval(drawn)
+    count = int(np.isfinite(per_clip).sum())
+    low, high = interval(drawn, count)
     return Figure(
         mean=float(mean(by_seed)),
         std=float(np.nanstd(by_seed, ddof=1)) if np.isfinite(by_seed).sum() > 1 else None,
         low=low,
         high=high,
-        count=int(np.isfinite(per_clip).sum()),
+        count=count,
         per_clip=per_clip,
         resampled=drawn,
     )
@@ -92,24 +103,39 @@ def set_figure(distance: Distance, clips: int, seeds: int) -> Figure:
     draws = resamples(clips, SET_RESAMPLES)
     drawn = np.array([distance(draw, turn % seeds) for turn, draw in enumerate(draws)])
     drawn += float(mean(by_seed)) - float(mean(drawn))
-    low, high = interval(drawn)
+    low, high = interval(drawn, clips)
     std = float(by_seed.std(ddof=1)) if seeds > 1 else None
     return Figure(float(mean(by_seed)), std, low, high, clips, None, drawn)
 
 
 def difference(figure: Figure, reference: Figure) -> dict[str, float | None] | None:
-    """Paired difference to another row's figure with its 95 % interval, from the same bootstrap samples."""
+    """Paired difference to another row's figure with its 95 % interval, from the same bootstrap samples.
+
+    The interval is ``None`` where fewer than ``LEAST_CLIPS`` clips have both figures.
+    """
     if len(figure.resampled) != len(reference.resampled):
         return None
     value = figure.mean - reference.mean
-    low, high = interval(figure.resampled - reference.resampled)
+    low, high = interval(figure.resampled - reference.resampled, pair_count(figure, reference))
     return {"mean": number(value), "low": number(low), "high": number(high)}
 
 
-def interval(drawn: Array) -> tuple[float, float]:
-    """The 2.5 and 97.5 % quantiles of the finite values."""
+def pair_count(figure: Figure, reference: Figure) -> int:
+    """Number of clips that have both figures."""
+    if figure.per_clip is None or reference.per_clip is None:
+        return min(figure.count, reference.count)
+    return int((np.isfinite(figure.per_clip) & np.isfinite(reference.per_clip)).sum())
+
+
+def interval(drawn: Array, clips: int) -> tuple[float, float]:
+    """The 2.5 and 97.5 % quantiles of the finite values; NaN when there is none or ``clips`` are too few.
+
+    Args:
+        drawn: figure of every bootstrap sample.
+        clips: number of clips that the samples were drawn from, see ``LEAST_CLIPS``.
+    """
     known = drawn[np.isfinite(drawn)]
-    if not len(known):
+    if not len(known) or clips < LEAST_CLIPS:
         return float("nan"), float("nan")
     low, high = np.quantile(known, (0.025, 0.975))
     return float(low), float(high)

@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, Final, TypeVar
 
 from rich.console import Console
@@ -224,10 +224,18 @@ def print_json(value: Any) -> None:
     OUT.print_json(json.dumps(plain(value), allow_nan=False))
 
 
-def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def print_table(
+    title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], sections: Collection[int] = ()
+) -> None:
     """Print a table on standard output; the first column is the row's name.
 
     Columns that do not fit beside the first one without cutting words follow in further tables below.
+
+    Args:
+        title: line above the table; empty for none.
+        columns: headings.
+        rows: texts of each row.
+        sections: numbers of the rows below which a line is drawn.
     """
     cells = [[column, *(row[number] for row in rows)] for number, column in enumerate(columns)]
     texts = [[Text.from_markup(cell).plain for cell in column] for column in cells]
@@ -237,14 +245,14 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
         word_widths[0] = full_widths[0]
     for count, further in enumerate(_columns_by_table(word_widths, OUT.width)):
         numbers = [0, *further]
-        table = Table(title=None if count else title, title_justify="left")
+        table = Table(title=None if count or not title else title, title_justify="left")
         widths = _fit_widths(
             [full_widths[number] for number in numbers], [word_widths[number] for number in numbers], OUT.width
         )
         for number, width in zip(numbers, widths, strict=True):
             table.add_column(columns[number], justify="right" if number else "left", width=width)
-        for row in rows:
-            table.add_row(*(row[number] for number in numbers))
+        for place, row in enumerate(rows):
+            table.add_row(*(row[number] for number in numbers), end_section=place in sections)
         OUT.print(table)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -44,19 +45,19 @@ def uninterrupted(voxel, walks, tmp_path_factory):
     return out
 
 
-def test_eval_leaves_figures_intervals_and_differences(uninterrupted):
+def test_eval_leaves_figures_and_differences(uninterrupted):
     rows = tables(uninterrupted)[0]["rows"]
     assert list(rows)[:4] == ["stage1", "voxel", "voxel, shuffled", "voxel, emptied"]
     assert {row["kind"] for row in rows.values()} == {"model", "memory control", "control"}
     psnr = rows["voxel"]["columns"]["psnr"]
     assert psnr["std"] > 0
-    assert psnr["low"] <= psnr["mean"] <= psnr["high"]
+    assert (psnr["count"], psnr["low"], psnr["high"]) == (2, None, None)  # of two clips there is no interval
     assert psnr["difference"]["mean"] == pytest.approx(psnr["mean"] - rows["stage1"]["columns"]["psnr"]["mean"])
     assert rows["stage1"]["columns"]["psnr"]["difference"] is None
     for one, two in itertools.permutations(rows, 2):
         gap, reverse = (rows[a]["columns"]["psnr"]["differences"][b] for a, b in ((one, two), (two, one)))
         assert gap["mean"] == pytest.approx(-reverse["mean"])
-        assert (gap["low"], gap["high"]) == pytest.approx((-reverse["high"], -reverse["low"]))
+        assert (gap["low"], gap["high"], reverse["low"], reverse["high"]) == (None,) * 4
     assert rows["codec reconstruction"]["columns"]["psnr"]["std"] is None
     assert len(rows["voxel"]["curves"]["psnr"]["per_frame"]) == 8
     assert rows["voxel"]["curves"]["psnr"]["by_seen_before"]
@@ -199,12 +200,74 @@ def test_eval_without_checkpoint_or_trajectories_names_what_is_missing(persist, 
 def test_data_without_depth_is_measured_by_metrics_and_controls_that_need_none(persist, voxel, walks, tmp_path):
     data, command = without_depth(walks, tmp_path / "data"), ["--memories", "voxel", "--seeds", 1, "--steps", 1]
     common = ["--protocol", "return", *command, "--metrics", "psnr,absrel", "--out", tmp_path / "o"]
-    refused = persist("eval", voxel, "--data", data, *common)
-    assert "the control 'warp' needs depth" in refused.err
+    refused = persist("eval", voxel, "--data", data, *common, "--controls", "copy,warp")
+    assert "the control 'warp' needs depth, which the data does not have; leave it out of --controls" in refused.err
     assert not (tmp_path / "o").exists()
-    ended = persist("eval", voxel, "--data", data, *common, "--controls", "copy")
+    ended = persist("eval", voxel, "--data", data, *common)
     assert ended.code == 0, ended.err
     rows = tables(tmp_path / "o")[0]["rows"]
-    assert set(rows) == {"voxel", "copy of the first frame", "ground truth"}
+    assert rows["geometric warp"]["na"] == "needs depth, which the data does not have"
+    assert rows["geometric warp"]["columns"]["psnr"] == {"na": rows["geometric warp"]["na"]}
     assert rows["voxel"]["columns"]["absrel"] == {"na": "the data has no depth"}
     assert rows["ground truth"]["columns"]["psnr-return"]["mean"] == 100.0
+
+
+@pytest.fixture
+def one_room(walks, tmp_path):
+    """The walks, of one room alone."""
+    (tmp_path / "data").mkdir()
+    shutil.copy(next(walks.glob("*.parquet")), tmp_path / "data")
+    return tmp_path / "data"
+
+
+def test_one_scene_leaves_the_default_control_shuffled_a_row_of_na_with_its_reason(persist, voxel, one_room, tmp_path):
+    command = [
+        "eval",
+        voxel,
+        "--data",
+        one_room,
+        "--memories",
+        "voxel",
+        "--metrics",
+        "psnr",
+        "--seeds",
+        1,
+        "--steps",
+        1,
+    ]
+    refused = persist(*command, "--controls", "shuffled", "--out", tmp_path / "o")
+    assert "the control 'shuffled' needs clips of two scenes, all are of 'room-" in refused.err
+    assert not (tmp_path / "o").exists()
+    ended = persist(*command, "--out", tmp_path / "o", "--report", tmp_path / "r")
+    assert ended.code == 0, ended.err
+    assert re.search(r"│ voxel, shuffled +│ +n/a \(1\) │", ended.out)
+    assert "n/a (1): needs clips of two scenes, all are of 'room-" in ended.out
+    assert "needs clips of two scenes" in (tmp_path / "r/report.html").read_text()
+    assert persist(*command, "--out", tmp_path / "o").code == 0  # a finished evaluation goes on to the same
+
+
+def test_fewer_clips_than_asked_for_are_counted_aloud(persist, voxel, walks, tmp_path):
+    command = ["eval", voxel, "--data", walks, "--memories", "stage1", "--metrics", "psnr", "--seeds", 1, "--steps", 1]
+    options = ["--controls", "copy", "--out", tmp_path / "o"]
+    assert "2 clips found, 5 asked for" in persist(*command, *options, "--clips", 5).out
+    assert "asked for" not in persist(*command, *options[:-1], tmp_path / "p", "--clips", 2).out
+
+
+def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, voxel, walks, tmp_path):
+    command = ["eval", voxel, "--data", walks, "--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1]
+    ended = persist(*command, "--controls", "copy", "--out", tmp_path / "o", "--report", tmp_path / "r")
+    warning = "was trained on 2 of these 2 scenes (room-0 to room-1); its figures are not of unseen scenes"
+    assert warning in ended.err
+    page, markdown = (tmp_path / "r/report.html").read_text(), (tmp_path / "o/tables.md").read_text()
+    assert all(warning in text for text in (ended.out, page, markdown))
+    known = results(tmp_path / "o")["checkpoints"][0]["training_scenes"]
+    assert known["evaluated"] == ["room-0", "room-1"]
+
+
+def test_eval_prints_one_table_and_leaves_the_others_beside_the_results(persist, voxel, walks, tmp_path):
+    command = ["eval", voxel, "--data", walks, "--memories", "stage1,voxel", "--seeds", 2, "--steps", 1]
+    ended = persist(*command, "--out", tmp_path)
+    assert ended.out.count("┏") == 1
+    assert len(ended.out.splitlines()) <= 25
+    assert f"{tmp_path / 'tables.md'}" in ended.out
+    assert "difference to stage1" in (tmp_path / "tables.md").read_text()

@@ -9,7 +9,6 @@ import torch
 
 from persist_cli.api.geometry import pose_differences
 from persist_cli.data.store import Store
-from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
 from persist_cli.evaluate.rows.interventions import (
@@ -17,7 +16,7 @@ from persist_cli.evaluate.rows.interventions import (
     NoisyPoses,
     Oracle,
     Shuffled,
-    next_in_another_scene,
+    one_scene,
     small_motions,
 )
 
@@ -36,9 +35,10 @@ def test_a_shuffled_memory_holds_another_scene_moved_to_where_the_clip_begins(ca
 
 
 def test_shuffling_needs_another_scene(cases):
-    one_scene = [replace(case, scene="one") for case in cases]
-    with pytest.raises(DataError, match=r"'shuffled' needs clips of two scenes.*leave it out of --controls"):
-        next_in_another_scene(one_scene, 0)
+    assert one_scene(cases) is None
+    assert one_scene([replace(case, scene="kitchen") for case in cases]) == (
+        "needs clips of two scenes, all are of 'kitchen'"
+    )
 
 
 def test_the_oracle_holds_the_frames_of_the_clip_and_the_emptied_memory_none(cases):

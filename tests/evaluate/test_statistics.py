@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from persist_cli.evaluate.aggregate import seen_bins
-from persist_cli.evaluate.statistics import difference, mean_figure, set_figure
+from persist_cli.evaluate.statistics import LEAST_CLIPS, difference, mean_figure, set_figure
 
 
 def clips(offset: float = 0.0, count: int = 50, seeds: int = 3) -> np.ndarray:
@@ -37,6 +37,21 @@ def test_a_difference_that_is_noise_has_an_interval_around_zero():
     independent = np.random.default_rng(1).normal(20, 4, (3, 50))
     changed = difference(mean_figure(independent), mean_figure(clips()))
     assert changed["low"] < 0 < changed["high"]
+
+
+def test_fewer_than_six_clips_have_neither_interval_nor_paired_interval():
+    few, enough = (clips(count=count) for count in (LEAST_CLIPS - 1, LEAST_CLIPS))
+    assert (mean_figure(few).to_json()["low"], mean_figure(few).to_json()["high"]) == (None, None)
+    assert difference(mean_figure(few + 1), mean_figure(few)) == pytest.approx({"mean": 1.0, "low": None, "high": None})
+    assert set_figure(lambda numbers, seed: float(len(numbers)), LEAST_CLIPS - 1, 1).to_json()["low"] is None
+    assert mean_figure(enough).low < mean_figure(enough).high
+
+
+def test_clips_that_both_rows_have_are_counted_for_a_paired_interval():
+    one, two = clips(count=10), clips(count=10)
+    one[:, :3], two[:, -3:] = np.nan, np.nan
+    assert mean_figure(one).to_json()["low"] is not None
+    assert difference(mean_figure(one), mean_figure(two))["low"] is None
 
 
 def test_clips_without_a_figure_are_left_out():

@@ -11,17 +11,22 @@ import numpy as np
 
 from persist_cli.errors import DataError
 from persist_cli.evaluate.report.agreement import differing_notes, measured_differently
+from persist_cli.evaluate.report.remarks import few_clips
 from persist_cli.evaluate.report.result_file import Cell, ColumnRecord, Difference, EvalResults, read_results
 from persist_cli.evaluate.report.tables import NOT_AVAILABLE, difference_texts, digits_of, heading, number_text
-from persist_cli.evaluate.report.text import PrintedTable, fit_columns, markdown_table
+from persist_cli.evaluate.report.terminal import ordered_columns
+from persist_cli.evaluate.report.text import fit_columns, markdown_table
+from persist_cli.evaluate.statistics import LEAST_CLIPS
+
+PrintedTable = tuple[str, list[str], list[list[str]]]  # title, headings, and the texts of each row
 
 RESAMPLES = 1000
 
-LEAST_PAIRS = 2  # of fewer clips an interval would be a single point
+MEAN_LEGEND = "B − A: paired over clips where both have them"
 
-DIFFERENCE_LEGEND = (
-    f"B − A: paired over clips where both have them, with its 95 % interval ({RESAMPLES:,} bootstrap resamples of "
-    "the clips); * the interval leaves zero out"
+INTERVAL_LEGEND = (
+    f"{MEAN_LEGEND}, with its 95 % interval ({RESAMPLES:,} bootstrap resamples of the clips); * the interval leaves "
+    "zero out"
 )
 
 
@@ -50,7 +55,10 @@ class ComparedTable:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two runs that measured the same clips; ``notes`` say in what else they differ."""
+    """Two runs that measured the same clips; ``notes`` say in what else they differ.
+
+    ``columns`` has the most important for the protocol first.
+    """
 
     a: str
     b: str
@@ -58,11 +66,31 @@ class Comparison:
     tables: list[ComparedTable]
     notes: list[str]
 
+    @property
+    def cells(self) -> list[ComparedCell]:
+        """The cells of all tables."""
+        return [cell for table in self.tables for row in table.rows.values() for cell in row.values()]
+
+    @property
+    def legend(self) -> str:
+        """What a difference is, and that there is no interval where the clips are too few."""
+        if any(cell.low is not None for cell in self.cells):
+            return INTERVAL_LEGEND
+        few = max((cell.pairs for cell in self.cells if cell.pairs < LEAST_CLIPS), default=0)
+        return f"{MEAN_LEGEND}; {few_clips(few)}" if few else MEAN_LEGEND
+
+    @property
+    def left_out(self) -> list[str]:
+        """Titles of the columns that neither run has a figure in."""
+        rows = [row for table in self.tables for row in table.rows.values()]
+        measured = {key for row in rows for key, cell in row.items() if cell.a is not None or cell.b is not None}
+        return [column.title for key, column in self.columns.items() if key not in measured]
+
     def to_json(self) -> dict[str, Any]:
         """The comparison as JSON values."""
         columns = {name: {"title": column.title, "better": column.better} for name, column in self.columns.items()}
         return {
-            "a": self.a, "b": self.b, "difference": DIFFERENCE_LEGEND, "notes": self.notes, "columns": columns,
+            "a": self.a, "b": self.b, "difference": self.legend, "notes": self.notes, "columns": columns,
             "tables": [asdict(table) for table in self.tables],
         }  # fmt: skip
 
@@ -82,7 +110,7 @@ def compare_runs(a: Path, b: Path) -> Comparison:
     reasons = measured_differently(one, two)
     if reasons:
         raise DataError(f"{a} and {b} were measured differently: {'; '.join(reasons)}")
-    columns = {name: column for name, column in one.columns.items() if name in two.columns}
+    columns = {name: one.columns[name] for name in ordered_columns(one) if name in two.columns}
     tables = list(_compared_tables(one, two, columns))
     if not any(table.rows for table in tables) or not columns:
         raise DataError(f"{a} and {b} have no {'row' if columns else 'column'} in common")
@@ -110,20 +138,30 @@ def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
     if json:
         print_json(comparison.to_json())
         return
+    shown = 0
     for title, heads, rows in comparison_tables(comparison, OUT.width):
-        print_table(escape(title), [escape(head) for head in heads], [[escape(text) for text in row] for row in rows])
+        sections = range(2, len(rows), 3)
+        cells = [[escape(text) for text in row] for row in rows]
+        print_table(escape(title), [escape(head) for head in heads], cells, sections)
+        shown = len(heads) - 2
     for line in _remarks(comparison):
         say(escape(line))
+    more = len(comparison.columns) - len(comparison.left_out) - shown
+    if out is not None:
+        say(escape(f"all columns: {out / 'compare.md'}; every figure: {out / 'compare.json'}"))
+    elif more > 0:
+        say(f"{more} more columns: give --report FOLDER, or --json")
 
 
 def comparison_tables(comparison: Comparison, width: int = 0) -> list[PrintedTable]:
-    """The tables as texts; columns beyond ``width`` go into a further table, 0 keeps all in one."""
+    """The tables as texts, with the first columns that fit into ``width``; 0 keeps all columns that have figures."""
     tables: list[PrintedTable] = []
-    heads = ["row", "run", *(heading(column.title, column.better) for column in comparison.columns.values())]
+    columns = {key: column for key, column in comparison.columns.items() if column.title not in comparison.left_out}
+    heads = ["row", "run", *(heading(column.title, column.better) for column in columns.values())]
     for table in comparison.tables:
-        rows = list(_text_rows(table, list(comparison.columns)))
-        for places in fit_columns(heads, rows, width, fixed=2) if width else [range(len(heads))]:
-            tables.append((table.name, [heads[at] for at in places], [[row[at] for at in places] for row in rows]))
+        rows = list(_text_rows(table, list(columns)))
+        places = next(fit_columns(heads, rows, width, fixed=2)) if width else range(len(heads))
+        tables.append((table.name, [heads[at] for at in places], [[row[at] for at in places] for row in rows]))
     return tables
 
 
@@ -143,7 +181,7 @@ def compare_cells(a: Cell | None, b: Cell | None) -> ComparedCell:
     gaps = np.array([in_b - in_a for in_a, in_b in pairs if in_a is not None and in_b is not None])
     if not len(gaps):
         return ComparedCell(first, second, second - first)
-    if len(gaps) < LEAST_PAIRS:
+    if len(gaps) < LEAST_CLIPS:
         return ComparedCell(first, second, float(gaps.mean()), pairs=len(gaps))
     draws = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLES, len(gaps)))
     low, high = np.percentile(gaps[draws].mean(axis=1), [2.5, 97.5])
@@ -184,4 +222,5 @@ def _gap(cell: ComparedCell, digits: int) -> str:
 
 def _remarks(comparison: Comparison) -> list[str]:
     notes = [f"differs: {note}" for note in comparison.notes]
-    return [f"A: {comparison.a}", f"B: {comparison.b}", DIFFERENCE_LEGEND, *notes]
+    left_out = [f"left out: {', '.join(comparison.left_out)} (neither run has them)"] if comparison.left_out else []
+    return [f"A: {comparison.a}", f"B: {comparison.b}", comparison.legend, *left_out, *notes]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Callable, Sequence
 
+from persist_cli.evaluate.report.remarks import contamination_lines, left_out_line, too_few_lines, without_command
 from persist_cli.evaluate.report.result_file import EvalResults
 from persist_cli.evaluate.report.tables import CellView, CompactTable, RowView, TableView, compact_tables
 from persist_cli.evaluate.report.text import fit_columns
@@ -38,14 +39,17 @@ def latex_tables(results: EvalResults) -> str:
         label = f"tab:persist-{number}" if number else "tab:persist"
         blocks.append(_float(view, view.kind_groups(), _figure, _caption(results, table), label))
         if rows:
-            caption = (
-                f"Paired difference to {escape(results.first_row or '')} with 95\\,\\% interval (bootstrap over "
-                "clips); $^*$ the interval leaves zero out."
-            )
+            caption = f"Paired difference to {escape(results.first_row or '')}"
+            if table.has_intervals:
+                caption += " with 95\\,\\% interval (bootstrap over clips); $^*$ the interval leaves zero out"
+            caption += "".join(f". {escape(line)}" for line in too_few_lines(view)) + "."
             groups = [(title, [row for row in group if row in rows]) for title, group in view.kind_groups()]
             groups = [(title, group) for title, group in groups if group]
             blocks.append(_float(view, groups, _difference, caption, f"{label}-differences"))
-    return HEAD + "\n".join(blocks)
+        if table.left_out:
+            blocks.append(f"% {left_out_line(table.left_out, commands=False)}\n")
+    warnings = [f"% warning: {line}\n" for line in contamination_lines(results)]
+    return HEAD + "\n".join([*warnings, *blocks])
 
 
 def escape(text: str) -> str:
@@ -80,8 +84,8 @@ def _caption(results: EvalResults, table: CompactTable) -> str:
     seeds = len(results.sampling.seeds)
     domain = f" ({view.name})" if len(results.tables) > 1 else ""
     clips = f"{view.clips} clips of {protocol.frames} frames at {height}×{width}"
-    notes = [*(f"({number}) {note}" for number, note in view.notes.items()), *table.absent]
-    deviation = f"mean ± standard deviation over {seeds} sampling seed{'s' * (seeds != 1)}"
+    notes = [f"({number}) {without_command(note)}" for number, note in view.notes.items()]
+    deviation = f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "one sampling seed"
     text = f"{protocol.title or protocol.name}{domain}: {clips}; {deviation}"
     return escape(" ".join(f"{sentence}." for sentence in [text, *notes]))
 
@@ -93,7 +97,7 @@ def _figure(cell: CellView) -> list[str]:
 
 def _difference(cell: CellView) -> list[str]:
     marked = escape(cell.difference.rstrip("*")) + ("$^*$" if cell.difference.endswith("*") else "")
-    return [marked, f"\\scriptsize {escape(cell.difference_interval)}"]
+    return [marked, f"\\scriptsize {escape(cell.difference_interval)}" if cell.difference_interval else ""]
 
 
 def _float(view: TableView, groups: Groups, write_cell: CellWriter, caption: str, label: str) -> str:
@@ -121,7 +125,8 @@ def _tabular(view: TableView, groups: Groups, write_cell: CellWriter, columns: S
         for row in rows:  # the braces keep a name that begins with [ from being the argument of the line before
             texts = zip(*(write_cell(row.cells[number]) for number in columns), strict=True)
             names = [f"{{{escape(row.name)}}}", ""]
-            lines += [" & ".join([name, *line]) + LINE_END for name, line in zip(names, texts, strict=False)]
+            filled = [(name, line) for name, line in zip(names, texts, strict=False) if any(line)]
+            lines += [" & ".join([name, *line]) + LINE_END for name, line in filled]
             lines += ["\\addlinespace[2pt]"] if write_cell is _difference else []
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}"])
 

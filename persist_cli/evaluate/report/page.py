@@ -13,8 +13,15 @@ from persist_cli.errors import PersistError
 from persist_cli.evaluate.report.curves import COLORS, DARK_COLORS, HEIGHT, WIDTH, Plot, plots, row_styles
 from persist_cli.evaluate.report.latex import latex_tables
 from persist_cli.evaluate.report.pictures import Pictures, RowClips, file_name, write_row_clips, write_sheets
+from persist_cli.evaluate.report.remarks import (
+    known_scenes,
+    left_out_line,
+    seed_legend,
+    too_few_lines,
+    warning_lines,
+)
 from persist_cli.evaluate.report.result_file import FILE, EvalResults, check_results
-from persist_cli.evaluate.report.tables import TableView, view_tables
+from persist_cli.evaluate.report.tables import CompactTable, compact_tables
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json, write_text
 
@@ -31,7 +38,7 @@ FOLDERS = ("clips", "curves", "sheets")
 class Section:
     """A table on the page with its plots and clips."""
 
-    view: TableView
+    table: CompactTable
     plots: list[Plot]
     rows: list[RowClips]
 
@@ -70,14 +77,16 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
     rows = write_row_clips(pictures, folder)
     common = {"styles": list(styles.values()), "colors": COLORS, "width": WIDTH, "height": HEIGHT}
     sections = []
-    for place, (table, view) in enumerate(zip(results.tables, view_tables(results), strict=True)):
+    for place, (table, view) in enumerate(zip(results.tables, compact_tables(results), strict=True)):
         table_plots = plots(results, table, styles)
         for plot in table_plots:
             name = plot.name if len(results.tables) == 1 else file_name(place, table.name, plot.name)
             write_text(folder / "curves" / f"{name}.svg", curve.render(plot=plot, legend=True, **common))
         sections.append(Section(view, table_plots, [row for row in rows if row.table == table.name]))
     return jinja.get_template("report.html.jinja").render(
-        results=results, sections=sections, sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
+        results=results, sections=sections, warnings=warning_lines(results), known_scenes=known_scenes,
+        too_few_lines=too_few_lines, left_out_line=left_out_line, seed_legend=seed_legend(results),
+        sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
         facts=_environment_facts(results), lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
         **common,
     )  # fmt: skip

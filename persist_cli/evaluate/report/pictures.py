@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from persist_cli.viewing.console import watched
 from persist_cli.viewing.sheet import write_sheet
 from persist_cli.viewing.video import SMALLEST, below, beside, color_depth, enlarge, labelled, write_video
 
@@ -98,7 +99,7 @@ class RowClips:
 def write_row_clips(pictures: Pictures, folder: Path) -> list[RowClips]:
     """Write ``clips/*.mp4`` and ``sheets/*.png`` of every row, and return them for the page."""
     rows = []
-    for place, row in enumerate(pictures.rows):
+    for place, row in enumerate(watched(pictures.rows, "videos of the report", "rows")):
         clips = []
         for pick, clip in row.picks():
             name = file_name(place, row.table, row.row, pick)

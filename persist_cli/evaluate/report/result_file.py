@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 from persist_cli.errors import DataError
+from persist_cli.evaluate.statistics import LEAST_CLIPS
 from persist_cli.io.settings import plain_problems
 
 FORMAT = "persist-evaluation"
@@ -108,7 +109,10 @@ class Difference(ResultModel):
 
 
 class Cell(ResultModel):
-    """A figure with its spread, or in ``na`` the reason why there is none."""
+    """A figure with its spread, or in ``na`` the reason why there is none.
+
+    Intervals of fewer than ``LEAST_CLIPS`` clips, which earlier versions wrote, are left out on reading.
+    """
 
     na: str | None = None
     mean: FiniteOrNone = None
@@ -119,6 +123,21 @@ class Cell(ResultModel):
     per_clip: list[FiniteOrNone] | None = None
     difference: Difference | None = None
     differences: dict[str, Difference | None] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _drop_intervals_of_few_clips(cls, values: Any) -> Any:
+        if not isinstance(values, dict) or not isinstance(values.get("count"), int) or values["count"] >= LEAST_CLIPS:
+            return values
+        gaps = values.get("differences")
+        kept = {"difference": _without_interval(values.get("difference"))}
+        if isinstance(gaps, dict):
+            kept["differences"] = {name: _without_interval(gap) for name, gap in gaps.items()}
+        return _without_interval(values) | kept
+
+
+def _without_interval(values: Any) -> Any:
+    return values | {"low": None, "high": None} if isinstance(values, dict) else values
 
 
 class Bin(ResultModel):
@@ -143,10 +162,11 @@ class Curve(ResultModel):
 
 
 class RowRecord(ResultModel):
-    """A row of the table."""
+    """A row of the table, or in ``na`` the reason why it cannot be made of these clips."""
 
     kind: Literal["model", "control", "memory control"]
     definition: str = ""
+    na: str | None = None
     checkpoint: str | None = None
     memory: str | None = None
     columns: dict[str, Cell]
@@ -162,10 +182,14 @@ class TableRecord(ResultModel):
 
 
 class KnownScenes(ResultModel):
-    """The number of scenes that a checkpoint is known to have been trained on, and whether these are all."""
+    """The number of scenes that a checkpoint is known to have been trained on, and whether these are all.
+
+    ``evaluated`` names those of them that the evaluated clips show; results of earlier versions do not say.
+    """
 
     known: int
     complete: bool
+    evaluated: list[str] = []
 
 
 class CheckpointRecord(ResultModel):

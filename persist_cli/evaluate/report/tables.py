@@ -51,22 +51,33 @@ class CellView:
 
 @dataclass(frozen=True)
 class ColumnView:
-    """A column's heading, its definition, and how many clips or videos it counts."""
+    """A column's name and heading, its definition, and how many clips or videos it counts.
 
+    Args:
+        key: name of the column in the results.
+        heading: title with the arrow of the better direction.
+        definition: what is measured.
+        count: clips or videos behind its figures, as in ``32`` or ``30 to 32``.
+        fewest: the least of these numbers, 0 where there is no figure.
+    """
+
+    key: str
     heading: str
     definition: str
     count: str
+    fewest: int = 0
 
 
 @dataclass(frozen=True)
 class RowView:
-    """A row with its cells."""
+    """A row with its cells; ``missing`` when the row cannot be made of these clips."""
 
     name: str
     kind: str
     definition: str
     reference: bool
     cells: list[CellView]
+    missing: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,10 +98,25 @@ class TableView:
 
 @dataclass(frozen=True)
 class CompactTable:
-    """A table without the columns that no row has a figure in; ``absent`` says which they are and why."""
+    """A table without the columns that no row has a figure in.
+
+    Args:
+        view: the table.
+        left_out: names of the metrics or headings of the columns that were left out, by the reason.
+    """
 
     view: TableView
-    absent: list[str]
+    left_out: dict[str, list[str]]
+
+    @property
+    def has_intervals(self) -> bool:
+        """Whether any figure or difference has an interval."""
+        return any(cell.interval or cell.difference_interval for row in self.view.rows for cell in row.cells)
+
+    @property
+    def has_differences(self) -> bool:
+        """Whether any figure has a difference to the first row."""
+        return any(cell.difference for row in self.view.rows for cell in row.cells)
 
 
 def view_tables(results: EvalResults) -> list[TableView]:
@@ -100,23 +126,40 @@ def view_tables(results: EvalResults) -> list[TableView]:
 
 
 def compact_tables(results: EvalResults) -> list[CompactTable]:
-    """Every table, for the forms that have no room for empty columns."""
-    tables = []
-    for view in view_tables(results):
-        places, absent = [], []
-        for place, column in enumerate(view.columns):
-            column_notes = [row.cells[place].note for row in view.rows]
-            reasons = " / ".join(dict.fromkeys(view.notes[note] for note in column_notes if note))
-            if not all(column_notes):
-                places.append(place)
-            elif reasons:
-                absent.append(f"{column.heading}: n/a ({reasons})")
-        rows = [replace(row, cells=[row.cells[place] for place in places]) for row in view.rows]
-        used_notes = {cell.note for row in rows for cell in row.cells}
-        notes = {number: note for number, note in view.notes.items() if number in used_notes}
-        smaller = replace(view, columns=[view.columns[place] for place in places], rows=rows, notes=notes)
-        tables.append(CompactTable(smaller, absent))
-    return tables
+    """Every table without empty columns, as all forms show it."""
+    return [_compact_table(results, view) for view in view_tables(results)]
+
+
+def _compact_table(results: EvalResults, view: TableView) -> CompactTable:
+    reasons = {place: _reason(view, place) for place in range(len(view.columns))}
+    places = [place for place, reason in reasons.items() if reason is None]
+    rows = [replace(row, cells=[row.cells[place] for place in places]) for row in view.rows]
+    used_notes = {cell.note for row in rows for cell in row.cells}
+    notes = {number: note for number, note in view.notes.items() if number in used_notes}
+    smaller = replace(view, columns=[view.columns[place] for place in places], rows=rows, notes=notes)
+    empty = {view.columns[place].key: reason for place, reason in reasons.items() if reason is not None}
+    return CompactTable(smaller, _by_reason(results, empty))
+
+
+def _reason(view: TableView, place: int) -> str | None:
+    """Why no row has a figure in this column, ``None`` when one has; rows that are missing altogether say nothing."""
+    notes = [row.cells[place].note for row in view.rows if not row.missing]
+    if not notes or not all(notes):
+        return None
+    return " / ".join(dict.fromkeys(view.notes[note] for note in notes))
+
+
+def _by_reason(results: EvalResults, empty: dict[str, str]) -> dict[str, list[str]]:
+    """The empty columns by their reason, under the metric's title where all columns of the metric are empty for it."""
+    names: dict[str, list[str]] = {}
+    for key, reason in empty.items():
+        column = results.columns[key]
+        metric = results.measured.metrics.get(column.metric)
+        whole = all(empty.get(other) == reason for other, one in results.columns.items() if one.metric == column.metric)
+        title = metric.title if metric and whole else column.title
+        if title not in names.setdefault(reason, []):
+            names[reason].append(title)
+    return names
 
 
 def digits_of(values: Iterable[float | None]) -> int:
@@ -179,8 +222,8 @@ def _view_table(results: EvalResults, table: TableRecord, notes: list[str]) -> T
         for name, cell in zip(names, views, strict=True):
             cells[name].append(cell)
     rows = [
-        RowView(name, table.rows[name].kind, table.rows[name].definition, name == results.first_row, cells[name])
-        for name in names
+        RowView(name, row.kind, row.definition, name == results.first_row, cells[name], row.na is not None)
+        for name, row in ((name, table.rows[name]) for name in names)
     ]
     columns = [_column_head(results, key, table) for key in results.columns]
     used_notes = sorted({cell.note for row in rows for cell in row.cells} - {0})
@@ -222,7 +265,9 @@ def _column_head(results: EvalResults, key: str, table: TableRecord) -> ColumnVi
     metric = results.measured.metrics.get(column.metric)
     counts = sorted({cell.count for row in table.rows.values() if (cell := row.columns.get(key)) and cell.count})
     return ColumnView(
+        key,
         heading(column.title, column.better),
         column.definition or (metric.definition if metric else ""),
         " to ".join(str(count) for count in dict.fromkeys([*counts[:1], *counts[-1:]])),
+        counts[0] if counts else 0,
     )

@@ -1,67 +1,25 @@
-"""The tables as text, for the console and as Markdown."""
+"""The complete tables as Markdown."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from textwrap import wrap
 from typing import Any
 
-from rich.markup import escape
-
+from persist_cli.evaluate.report.remarks import all_left_out, figure_legend, left_out_line, too_few_lines, warning_lines
 from persist_cli.evaluate.report.result_file import EvalResults, check_results
 from persist_cli.evaluate.report.tables import CellView, ColumnView, RowView, compact_tables
 
-PrintedTable = tuple[str, list[str], list[list[str]]]  # title, headings, and the texts of each row
-
 TextTable = tuple[str, list[RowView], list[ColumnView], Callable[[CellView], str]]  # the last writes a cell
-
-NAME_WIDTH = 28  # characters of a row's name on the console before it goes on in the next line
-
-LEGEND = (
-    "mean ± standard deviation over sampling seeds; [95 % interval, bootstrap over clips]; "
-    "* the interval of the difference leaves zero out"
-)
-
-
-def console_tables(results: Mapping[str, Any] | EvalResults, width: int | None = None) -> list[PrintedTable]:
-    """The tables as ``print_table`` takes them, no wider than the console where that is possible.
-
-    First the figures with their intervals, then the differences to the first row; columns that do not fit go into a
-    further table.
-    """
-    from persist_cli.viewing.console import OUT
-
-    tables: list[PrintedTable] = []
-    for name, rows, columns, cell_text in _text_tables(_checked(results)):
-        cells = [
-            ["\n".join(wrap(row.name, NAME_WIDTH)) + _kind(row), *(cell_text(cell) for cell in row.cells)]
-            for row in rows
-        ]
-        heads = ["row", *(column.heading for column in columns)]
-        for places in fit_columns(heads, cells, width or OUT.width):
-            title = name if places[1] == 1 else f"{name} (goes on)"
-            texts = [[escape(row[place]) for place in places] for row in cells]
-            tables.append((escape(title), [escape(heads[place]) for place in places], texts))
-    return tables
-
-
-def print_tables(results: Mapping[str, Any] | EvalResults) -> None:
-    """Print every table, the reasons of missing figures, and the definitions of columns and rows."""
-    from persist_cli.viewing.console import print_table, say
-
-    checked = _checked(results)
-    for title, columns, cells in console_tables(checked):
-        print_table(title, columns, cells)
-    say(LEGEND)
-    for line in remark_lines(checked):
-        say(escape(line))
 
 
 def table_text(results: Mapping[str, Any] | EvalResults) -> str:
-    """Every table as Markdown: figures, differences, notes and definitions."""
-    checked = _checked(results)
-    blocks = [f"# {_plain(checked.measured.protocol.title or checked.measured.protocol.name)}", LEGEND]
+    """Every table as Markdown: warnings, figures, differences, notes and definitions."""
+    checked = results if isinstance(results, EvalResults) else check_results(results, "results")
+    blocks = [f"# {_plain(checked.measured.protocol.title or checked.measured.protocol.name)}"]
+    blocks += [f"**Warning:** {_plain(line)}" for line in warning_lines(checked)]
+    legends = dict.fromkeys(figure_legend(checked, table) for table in compact_tables(checked))
+    blocks += [_plain(legend) for legend in legends]
     for name, rows, columns, cell_text in _text_tables(checked):
         heads = ["row", *(column.heading for column in columns)]
         cells = [[row.name + _kind(row), *map(cell_text, row.cells)] for row in rows]
@@ -82,15 +40,16 @@ def markdown_table(
 
 
 def remark_lines(results: EvalResults) -> list[str]:
-    """Lines that say why figures or whole columns are missing, then define each column and each row."""
-    tables = compact_tables(results)
-    views = [table.view for table in tables]
+    """Lines that say why intervals, figures or whole columns are missing, then define each column and each row."""
+    views = [table.view for table in compact_tables(results)]
     notes = {number: note for view in views for number, note in view.notes.items()}
     columns = {column.heading: column for view in reversed(views) for column in view.columns}
     counts = {name: f" (n = {column.count})" if column.count else "" for name, column in columns.items()}
     rows = {row.name: row.definition for view in views for row in view.rows if row.definition}
+    left_out = left_out_line(all_left_out(results))
     return [
-        *dict.fromkeys(line for table in tables for line in table.absent),
+        *dict.fromkeys(line for view in views for line in too_few_lines(view)),
+        *([left_out] if left_out else []),
         *(f"n/a ({number}): {note}" for number, note in sorted(notes.items())),
         *(f"{name}: {column.definition}{counts[name]}" for name, column in columns.items() if column.definition),
         *(f"{name}: {definition}" for name, definition in rows.items()),
@@ -152,7 +111,3 @@ def _plain(text: str) -> str:
     """Escape what Markdown would read as its own; line breaks stay."""
     escaped = re.sub(r"([\\`*_|#~$])", r"\\\1", text).replace("<", "&lt;").replace("](", "]\\(")
     return escaped.replace("\r", " ")
-
-
-def _checked(results: Mapping[str, Any] | EvalResults) -> EvalResults:
-    return results if isinstance(results, EvalResults) else check_results(results, "results")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from persist_cli.api.backbone import Sampling
@@ -19,12 +19,11 @@ from persist_cli.evaluate.rows.interventions import (
     Oracle,
     Shuffled,
     Unmodified,
+    one_scene,
 )
-from persist_cli.evaluate.rows.model_rows import ModelRow, RowMemory
+from persist_cli.evaluate.rows.model_rows import NO_MEMORY, ModelRow, RowMemory
 from persist_cli.evaluate.rows.row import Row, unique_bases
 from persist_cli.memorize.factory import MemoryFactory
-
-NO_MEMORY = "none"  # name of the memory that never reads a token, so that no intervention can change anything
 
 CONTROLS: dict[str, type[Control]] = {
     "copy": Copy, "nearest": Nearest, "warp": Warp, "codec": CodecReconstruction, "truth": Truth,
@@ -38,6 +37,15 @@ INTERVENTIONS: dict[str, Callable[[RowConfig, Sequence[Case]], MemoryInterventio
 }
 
 
+def no_depth(cases: Sequence[Case]) -> str | None:
+    """The reason why earlier frames cannot be warped, ``None`` when the cases have depth."""
+    missing = all(share is None for case in cases for share in case.seen_before)
+    return "needs depth, which the data does not have" if missing else None
+
+
+OBSTACLES = {"shuffled": one_scene, "warp": no_depth}  # of controls that not all clips allow
+
+
 @dataclass(frozen=True)
 class RowConfig:
     """Names of the memories and controls that become rows, and how their clips are sampled.
@@ -47,12 +55,14 @@ class RowConfig:
         controls: names of ``CONTROLS`` and ``INTERVENTIONS``.
         sampling: sampling of every row of a model.
         noise: centimetres and degrees of the control ``noisy``.
+        named: whether the user named the controls, so that one that cannot be made is an error.
     """
 
     memories: Sequence[str]
     controls: Sequence[str]
     sampling: Sampling
     noise: tuple[float, float] = (5.0, 2.0)
+    named: bool = True
 
     def check(self) -> None:
         """Raise ``PersistError`` when no memory is named, for an unknown control, and for negative noise."""
@@ -64,6 +74,19 @@ class RowConfig:
                 raise PersistError(f"unknown control {name!r}; {hint(name, known)}")
         if min(self.noise) < 0:
             raise PersistError(f"the pose noise {self.noise[0]:g} cm, {self.noise[1]:g}° must not be negative")
+
+
+@dataclass(frozen=True)
+class ControlRows:
+    """The rows of controls.
+
+    Args:
+        rows: those that can be made of the clips.
+        missing: those that cannot, each with the reason.
+    """
+
+    rows: list[Row]
+    missing: list[tuple[Row, str]]
 
 
 def build_model_rows(checkpoints: Sequence[Checkpoint], config: RowConfig, protocol: Protocol) -> list[ModelRow]:
@@ -90,13 +113,31 @@ def build_control_rows(
     config: RowConfig,
     protocol: Protocol,
     cases: Sequence[Case],
-) -> list[Row]:
+) -> ControlRows:
     """Build the model rows again with a memory intervention, then the controls that need no training.
 
     Raises:
-        DataError: when the clips do not allow a control.
+        DataError: when the clips do not allow a control that the user named.
     """
-    rows: list[Row] = []
+    reasons = {name: reason for name in config.controls if (reason := OBSTACLES.get(name, possible)(cases))}
+    if config.named:
+        for name, reason in reasons.items():
+            raise DataError(f"the control {name!r} {reason}; leave it out of --controls")
+    named_rows = [*intervention_rows(models, config, cases), *untrained_rows(checkpoints, config, protocol)]
+    return ControlRows(
+        rows=[row for name, row in named_rows if name not in reasons],
+        missing=[(row, reasons[name]) for name, row in named_rows if name in reasons],
+    )
+
+
+def possible(cases: Sequence[Case]) -> None:
+    """No obstacle: the control can be made of any clips."""
+
+
+def intervention_rows(
+    models: Sequence[ModelRow], config: RowConfig, cases: Sequence[Case]
+) -> Iterator[tuple[str, ModelRow]]:
+    """Name of the control and row, for each model that reads a memory and each intervention in it."""
     for row in models:
         if row.adapter in (None, NO_MEMORY):
             continue
@@ -105,19 +146,22 @@ def build_control_rows(
                 intervention = make_intervention(config, cases)
                 row_memory = replace(row.row_memory, intervention=intervention)
                 row_name = f"{row.name}, {intervention.name}"
-                rows.append(ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory))
-    if "warp" in config.controls and all(share is None for case in cases for share in case.seen_before):
-        raise DataError("the control 'warp' needs depth, which the data does not have; leave it out of --controls")
+                yield name, ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory)
+
+
+def untrained_rows(
+    checkpoints: Sequence[Checkpoint], config: RowConfig, protocol: Protocol
+) -> Iterator[tuple[str, Control]]:
+    """Name of the control and row, for the controls that were named and the protocol's guards."""
     bases = unique_bases(checkpoints)
     for name, control in CONTROLS.items():
         if name not in (*config.controls, *protocol.guards):
             continue
         if control.uses_model and len(bases) > 1:  # each base has a codec of its own
-            pairs = zip(bases, labels(bases), strict=True)
-            rows += [control(f"{control.title} ({label})", base, protocol.writes) for base, label in pairs]
+            for base, label in zip(bases, labels(bases), strict=True):
+                yield name, control(f"{control.title} ({label})", base, protocol.writes)
         else:
-            rows.append(control(control.title, bases[0], protocol.writes))
-    return rows
+            yield name, control(control.title, bases[0], protocol.writes)
 
 
 def checkpoints_with(memory: str, checkpoints: Sequence[Checkpoint]) -> list[Checkpoint]:

@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -13,7 +14,6 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, invert_rigid
 from persist_cli.api.observations import Observations
-from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case, CaseFrames, read_case
 
 
@@ -79,17 +79,20 @@ class Shuffled(MemoryIntervention):
     """The memory of another clip, in another scene.
 
     Args:
-        cases: all cases of the evaluation; each gets the memory of the next one in another scene.
-
-    Raises:
-        DataError: when all cases are in one scene.
+        cases: all cases of the evaluation; each gets the memory of the next one in another scene, so there must be
+            two scenes, see ``one_scene``.
     """
 
     name = "shuffled"
     definition = "its memory is that of the next clip in another scene, moved to where this clip begins"
 
     def __init__(self, cases: Sequence[Case]) -> None:
-        self.partners = {case: next_in_another_scene(cases, number) for number, case in enumerate(cases)}
+        self.cases = cases
+
+    @cached_property
+    def partners(self) -> dict[Case, Case]:
+        """For each case the one whose memory it gets."""
+        return {case: next_in_another_scene(self.cases, number) for number, case in enumerate(self.cases)}
 
     def context(self, clip: CaseFrames) -> Observations | None:
         """The partner's frames, moved so that the partner begins where this clip begins."""
@@ -134,20 +137,16 @@ class NoisyPoses(MemoryIntervention):
         return replace(seen, cameras=replace(seen.cameras, world_from_camera=wrong))
 
 
-def next_in_another_scene(cases: Sequence[Case], number: int) -> Case:
-    """The case after this number, cyclically, that is in another scene.
+def one_scene(cases: Sequence[Case]) -> str | None:
+    """The reason why memories cannot be shuffled among these cases, ``None`` when they are of two scenes or more."""
+    scenes = {(case.data, case.scene) for case in cases}
+    return f"needs clips of two scenes, all are of {cases[0].scene!r}" if len(scenes) < 2 else None
 
-    Raises:
-        DataError: when all are in one scene.
-    """
+
+def next_in_another_scene(cases: Sequence[Case], number: int) -> Case:
+    """The case after this number, cyclically, that is in another scene; there must be one."""
     scene = (cases[number].data, cases[number].scene)
-    for case in (*cases[number + 1 :], *cases[:number]):
-        if (case.data, case.scene) != scene:
-            return case
-    raise DataError(
-        f"the control 'shuffled' needs clips of two scenes, all are of {cases[number].scene!r}; "
-        "leave it out of --controls or add scenes"
-    )
+    return next(case for case in (*cases[number + 1 :], *cases[:number]) if (case.data, case.scene) != scene)
 
 
 def move_cameras(cameras: Cameras, motion: Tensor) -> Cameras:

@@ -21,6 +21,13 @@ from persist_cli.evaluate.rows.row import Row
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.rollout.world_model import Agent, WorldModel
 
+NO_MEMORY = "none"  # name of the memory that never gives a token, so that no intervention can change anything
+
+IDLE = (
+    "which reads nothing; in the form canvas, that of the packaged model, it equals stage 1 to the bit, since without "
+    "tokens its parameters are idle"
+)
+
 
 @dataclass(frozen=True)
 class RowMemory:
@@ -63,6 +70,8 @@ class ModelRow(Row):
         """A few words with the checkpoint, the adapter and the content of the memory."""
         if self.adapter is None:
             return f"{self.checkpoint.name} without an adapter (stage 1)"
+        if self.adapter == NO_MEMORY:
+            return f"{self.checkpoint.name} with the adapter {NO_MEMORY!r}, {IDLE}"
         return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.row_memory.intervention.definition}"
 
     def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:

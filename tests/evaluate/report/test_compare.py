@@ -58,6 +58,25 @@ def test_a_clip_without_a_figure_in_one_run_is_no_pair(tmp_path):
 
     cell = compared_psnr(tmp_path, change)
     assert (cell.pairs, cell.difference) == (4, pytest.approx(1))
+    assert (cell.low, cell.high) == (None, None)  # of four pairs there is no interval
+
+
+def test_runs_of_five_clips_are_compared_without_intervals_and_say_why(tmp_path, capsys):
+    def fewer(results):
+        results.update(example_results(clips=5))
+
+    def better(results):
+        fewer(results)
+        add_one_decibel(results)
+
+    a, b = write_results(tmp_path, "a.json", fewer), write_results(tmp_path, "b.json", better)
+    run_compare(a, b, False, tmp_path / "out")
+    for text in (capsys.readouterr().out, (tmp_path / "out/compare.md").read_text()):
+        assert "5 clips: too few for an interval; give at least 6" in text
+        assert "+1.00" in text
+        assert "*" not in text.replace("\\*", "*").replace("**", "")
+    comparison = json.loads((tmp_path / "out/compare.json").read_text())
+    assert comparison["tables"][0]["rows"]["voxel"]["psnr"]["low"] is None
 
 
 def test_without_figures_clip_by_clip_there_is_a_difference_of_means_and_no_interval(tmp_path):
@@ -179,6 +198,8 @@ def test_run_compare_prints_a_table_and_leaves_json_and_markdown(tmp_path, capsy
     run_compare(tmp_path / "report", write_results(tmp_path, "b.json", add_one_decibel), False, tmp_path / "out")
     printed = capsys.readouterr().out
     assert "B − A" in printed
+    assert printed.count("┏") == 1
+    assert "left out: DreamSim (neither run has them)" in printed
     assert "+1.00*" in printed
     comparison = json.loads((tmp_path / "out/compare.json").read_text())
     assert comparison["tables"][0]["rows"]["voxel"]["psnr"]["difference"] == pytest.approx(1)

@@ -6,16 +6,13 @@ import math
 import re
 import shutil
 import subprocess
-from io import StringIO
 
 import pytest
-from rich.console import Console
-from rich.table import Table
 
 from persist_cli.evaluate.report.latex import latex_tables
 from persist_cli.evaluate.report.result_file import Difference, check_results
 from persist_cli.evaluate.report.tables import difference_texts, digits_of, number_text, verdict, view_tables
-from persist_cli.evaluate.report.text import console_tables, print_tables, table_text
+from persist_cli.evaluate.report.text import table_text
 from tests.support.example_results import DREAMSIM, ROWS, example_results
 
 LATEX = r"\documentclass{article}\usepackage{booktabs}\begin{document}\input{table}\end{document}"
@@ -84,10 +81,44 @@ def test_each_reason_of_a_missing_figure_is_one_footnote():
     assert (text.count("n/a (1) |"), text.count("n/a (1): never returns"), text.count("never returns")) == (2, 1, 1)
 
 
-def test_a_column_without_figures_is_one_line_in_the_text_and_a_footnote_on_the_page():
-    assert table_text(example_results()).count(f"DreamSim ↓: n/a ({DREAMSIM})") == 1
-    assert "n/a (1) |" not in table_text(example_results())
-    assert cells_of("none", "dreamsim").note == 1
+def test_a_column_without_figures_is_left_out_and_named_in_one_line():
+    text, latex = table_text(example_results()), latex_tables(check_results(example_results(), "example"))
+    assert text.count("DreamSim") == 1
+    assert "- left out: DreamSim (weights are not here: persist weights fetch dreamsim)" in text
+    assert latex.count("DreamSim") == 1
+    assert "% left out: DreamSim (weights dreamsim are not here)" in latex
+
+
+def test_captions_name_no_command():
+    results = example_results()
+    results["tables"][0]["rows"]["none"]["columns"]["psnr"] = {"na": DREAMSIM}
+    latex = latex_tables(check_results(results, "example"))
+    assert "n/a$^{(1)}$" in latex
+    assert "(1) weights dreamsim are not here." in latex
+    assert "persist weights" not in latex
+
+
+def test_tables_of_five_clips_have_no_interval_and_no_star_and_say_why():
+    results = example_results(clips=5)  # with intervals, as earlier versions wrote them
+    text, latex = table_text(results), latex_tables(check_results(results, "example"))
+    for form in (text, latex):
+        assert "5 clips: too few for an interval; give at least 6" in form
+        assert "interval leaves zero out" not in form
+    assert "| +2.00 |" in text
+    assert "[" not in text
+    assert "$^*$" not in latex
+    assert "\\scriptsize" not in latex
+    assert "[" in table_text(example_results(clips=6))
+
+
+def test_a_row_that_cannot_be_made_leaves_no_column_out_and_makes_none_empty():
+    results = example_results()
+    row = results["tables"][0]["rows"]["voxel, shuffled"]
+    row |= {"na": "needs two scenes", "columns": {name: {"na": "needs two scenes"} for name in row["columns"]}}
+    text = table_text(results)
+    assert re.search(r"\| voxel, shuffled<br>\(memory control\) \|( n/a \(1\) \|){5}", text)
+    assert "- n/a (1): needs two scenes" in text
+    assert "left out: DreamSim (weights are not here: persist weights fetch dreamsim)" in text
 
 
 def test_markdown_tables_stay_whole_when_a_row_name_holds_markup():
@@ -95,25 +126,6 @@ def test_markdown_tables_stay_whole_when_a_row_name_holds_markup():
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in rows}) == 1
     assert "<script>" not in text
-
-
-def test_console_tables_fit_the_console_and_keep_every_column():
-    for width in (50, 80, 160):
-        tables = console_tables(example_results(), width)
-        assert {head for _, heads, _ in tables for head in heads} >= {"PSNR ↑", "SSIM ↑", "LPIPS ↓", "PSNR last ↑"}
-        for _, heads, cells in tables:
-            table = Table(*heads)
-            for row in cells:
-                table.add_row(*row)
-            assert table.__rich_measure__(Console(width=500), Console(width=500).options).maximum <= width
-
-
-def test_a_row_name_that_looks_like_markup_is_printed_literally(monkeypatch):
-    printed = Console(file=StringIO(), width=160)
-    monkeypatch.setattr("persist_cli.viewing.console.OUT", printed)
-    print_tables(example_results(rows={"none": "model", "[bold]x[/red]": "control"}))
-    assert "[bold]x[/red]" in printed.file.getvalue()
-    assert "difference to none" in printed.file.getvalue()
 
 
 def test_latex_tables_have_a_cell_for_each_column_in_every_row():

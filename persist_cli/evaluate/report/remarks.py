@@ -1,0 +1,142 @@
+"""Remarks below a table: what it leaves out and why, what is too little for an interval, what the models knew."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from persist_cli.api.checkpoint import name_ranges, run_folder
+from persist_cli.evaluate.report.result_file import CheckpointRecord, EvalResults
+from persist_cli.evaluate.report.tables import MARK, CompactTable, TableView, compact_tables
+from persist_cli.evaluate.statistics import LEAST_CLIPS
+
+MOST_SCENES = 3  # names or ranges of scenes in a warning
+
+FETCH = re.compile(r"weights \S.* are not here: (?P<command>persist weights fetch) (?P<name>\S+)(?P<options>.*)")
+
+
+def figure_legend(results: EvalResults, table: CompactTable) -> str:
+    """A sentence that says what stands in a cell of the figures and of the differences."""
+    parts = [seed_legend(results)]
+    if table.has_intervals:
+        parts.append("[95 % interval, bootstrap over clips]")
+    if table.has_differences:
+        parts.append(difference_legend(results, table.has_intervals))
+    return "; ".join(parts)
+
+
+def seed_legend(results: EvalResults) -> str:
+    """Say what a figure is the mean of."""
+    seeds = len(results.sampling.seeds)
+    return (
+        f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "mean over clips, one sampling seed"
+    )
+
+
+def difference_legend(results: EvalResults, intervals: bool) -> str:
+    """Say what a difference is and, where there are intervals, what the mark behind it means."""
+    mark = f"; {MARK} its 95 % interval (bootstrap over clips) leaves zero out" if intervals else ""
+    return f"Δ: paired difference to {results.first_row}{mark}"
+
+
+def too_few_lines(view: TableView) -> list[str]:
+    """A line that says why a table has no intervals, or which of its columns have none."""
+    if view.clips < LEAST_CLIPS:
+        return [few_clips(view.clips)]
+    few = [column for column in view.columns if 0 < column.fewest < LEAST_CLIPS]
+    return [f"{column.heading}: defined for {few_clips(column.fewest)}" for column in few]
+
+
+def few_clips(clips: int) -> str:
+    """Say that so many clips are too few for an interval."""
+    return f"{clips} clip{'s' * (clips != 1)}: too few for an interval; give at least {LEAST_CLIPS}"
+
+
+def left_out_line(left_out: dict[str, list[str]], commands: bool = True) -> str:
+    """One line that names the columns without a figure and the reasons, empty when there are none.
+
+    Args:
+        left_out: names by reason, as ``CompactTable`` has them.
+        commands: whether the commands that help are named too.
+    """
+    groups: dict[str, list[str]] = {}
+    for reason, names in _together(left_out).items() if commands else left_out.items():
+        groups.setdefault(reason if commands else without_command(reason), []).extend(names)
+    parts = [f"{', '.join(dict.fromkeys(names))} ({reason})" for reason, names in groups.items()]
+    return f"left out: {'; '.join(parts)}" if parts else ""
+
+
+def without_command(reason: str) -> str:
+    """A reason without the command that would help."""
+    return "; ".join(part.partition(": persist ")[0] for part in reason.split("; "))
+
+
+def contamination_lines(results: EvalResults) -> list[str]:
+    """A warning for each checkpoint that was trained on scenes of the evaluated clips."""
+    total = len({clip.scene for clip in results.measured.clips})
+    return [
+        contamination(record.path or record.name, record.training_scenes.evaluated, total)
+        for record in results.checkpoints
+        if record.training_scenes and record.training_scenes.evaluated
+    ]
+
+
+def contamination(path: str, scenes: Sequence[str], total: int) -> str:
+    """A warning that a checkpoint was trained on some of the evaluated scenes.
+
+    Args:
+        path: folder of the checkpoint.
+        scenes: names of the scenes that it was trained on and is evaluated on.
+        total: number of scenes that it is evaluated on.
+    """
+    ranges = [" to ".join([entry] if isinstance(entry, str) else entry) for entry in name_ranges(scenes)]
+    names = ", ".join(ranges[:MOST_SCENES]) + ", …" * (len(ranges) > MOST_SCENES)
+    return (
+        f"{run_folder(Path(path))} was trained on {len(scenes)} of these {total} scenes ({names}); "
+        "its figures are not of unseen scenes"
+    )
+
+
+def unknown_scenes_lines(results: EvalResults) -> list[str]:
+    """A line for each checkpoint of which it is not known whether it was trained on the evaluated scenes."""
+    return [
+        f"{run_folder(Path(record.path or record.name))}: {known_scenes(record)}; the evaluated ones may be among them"
+        for record in results.checkpoints
+        if record.training_scenes is None or not record.training_scenes.complete
+    ]
+
+
+def known_scenes(record: CheckpointRecord) -> str:
+    """Say how many scenes a checkpoint was trained on, as far as it is known."""
+    scenes = record.training_scenes
+    if scenes is None or not (scenes.complete or scenes.known):
+        return "training scenes unknown"
+    return (
+        f"{scenes.known} training scenes" if scenes.complete else f"training scenes not all known ({scenes.known} are)"
+    )
+
+
+def warning_lines(results: EvalResults) -> list[str]:
+    """All warnings about the results as a whole."""
+    return [*contamination_lines(results), *unknown_scenes_lines(results)]
+
+
+def all_left_out(results: EvalResults) -> dict[str, list[str]]:
+    """What all tables leave out, by the reason."""
+    merged: dict[str, list[str]] = {}
+    for table in compact_tables(results):
+        for reason, names in table.left_out.items():
+            merged[reason] = list(dict.fromkeys([*merged.get(reason, []), *names]))
+    return merged
+
+
+def _together(left_out: dict[str, list[str]]) -> dict[str, list[str]]:
+    """The same with all weights that one command fetches under one reason."""
+    weights = {reason: match for reason in left_out if (match := FETCH.fullmatch(reason))}
+    merged: dict[str, list[str]] = {}
+    for options in dict.fromkeys(match["options"] for match in weights.values()):
+        alike = [reason for reason, match in weights.items() if match["options"] == options]
+        command = " ".join([weights[alike[0]]["command"], *(weights[reason]["name"] for reason in alike)])
+        merged[f"weights are not here: {command}{options}"] = [name for reason in alike for name in left_out[reason]]
+    return {reason: names for reason, names in left_out.items() if reason not in weights} | merged
