@@ -213,9 +213,11 @@ class ThereAndBack(Protocol):
 
     def find(self, search: ClipSearch) -> list[Case]:
         """Find one clip in each trajectory that turns round and comes back far enough, all of one length."""
-        poses = {file.path: file.poses() for file in search.trajectories()}
-        files = watched(search.trajectories(), "turning points", "trajectories")
-        turns = {file.path: turning_point(poses[file.path]) for file in files}
+        poses: dict[Path, Tensor] = {}
+        turns: dict[Path, tuple[int, int]] = {}
+        for file in watched(search.trajectories(), "turning points", "trajectories"):
+            poses[file.path] = file.poses()
+            turns[file.path] = turning_point(poses[file.path])
         lengths = sorted(length for _, length in turns.values() if length >= LEAST_RETURN_FRAMES)
         frames = search.frames or min(RETURN_FRAMES, lengths[len(lengths) // 2] if lengths else RETURN_FRAMES)
         cases: list[Case] = []
