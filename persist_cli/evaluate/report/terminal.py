@@ -81,7 +81,7 @@ def headline(results: EvalResults, table: TerminalTable) -> str:
     height, width = measured.image_size
     clips = f"{len(measured.clips)} clip{'s' * (len(measured.clips) != 1)} of {measured.protocol.frames} frames"
     seeds = f"{len(sampling.seeds)} seed{'s' * (len(sampling.seeds) != 1)}"
-    steps = f", {sampling.steps} steps of {sampling.sampler}" if sampling.steps else ""
+    steps = f", {sampling.steps} step{'s' * (sampling.steps != 1)} of {sampling.sampler}" if sampling.steps else ""
     form = "mean ± deviation over seeds" if table.deviations else "means"
     return f"{measured.protocol.title or measured.protocol.name}: {clips}, {height}×{width}, {seeds}{steps}; {form}"
 
