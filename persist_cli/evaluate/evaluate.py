@@ -15,7 +15,7 @@ from persist_cli.evaluate.columns import column_json, make_columns
 from persist_cli.evaluate.example_clips import make_pictures
 from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.measure import measure_rows
-from persist_cli.evaluate.plan import EvalPlan, Evaluation, prepare
+from persist_cli.evaluate.plan import EvalPlan, Evaluation, contamination_warnings, prepare
 from persist_cli.evaluate.provenance import checkpoint_json, command, environment, metric_json, scenes_json
 from persist_cli.evaluate.report.page import PAGE, write_report
 from persist_cli.evaluate.report.terminal import print_results
@@ -89,6 +89,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
             "batch": run.plan.batch,
         }
         | run.plan.placement.changes(),
+        "warnings": contamination_warnings(run.checkpoints, run.cases),
         "environment": environment(processes),
         "command": command(),
         "checkpoints": [

@@ -153,11 +153,15 @@ def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], sear
     """Say when there are fewer clips than asked for, and whether a checkpoint was trained on their scenes."""
     if len(cases) < search.limit:
         say(f"{len(cases)} clips found, {search.limit} asked for")
+    for line in contamination_warnings(checkpoints, cases):
+        warn(f"warning: {line}")
+
+
+def contamination_warnings(checkpoints: Sequence[Checkpoint], cases: Sequence[Case]) -> list[str]:
+    """A line for each checkpoint that is known to have been trained on scenes of the cases."""
     scenes = scenes_of(cases)
-    for checkpoint in checkpoints:
-        known = trained_on(checkpoint, scenes)
-        if known:
-            warn(f"warning: {contamination(str(checkpoint.folder), known, len(scenes))}")
+    known = [(str(checkpoint.folder), trained_on(checkpoint, scenes)) for checkpoint in checkpoints]
+    return [contamination(folder, names, len(scenes)) for folder, names in known if names]
 
 
 def identity(

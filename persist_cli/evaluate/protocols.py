@@ -138,7 +138,7 @@ class Revisit(Protocol):
         if not chosen:
             raise DataError(
                 f"{search.where}: no clip of {frames} frames returns to a place seen before; collect with "
-                "--policy there-and-back or longer trajectories"
+                "--policy there-and-back or longer trajectories, or evaluate with --protocol long"
             )
         return self.make_cases(chosen[: search.limit], frames, search)
 
@@ -232,7 +232,8 @@ class ThereAndBack(Protocol):
             longest = max((length for _, length in turns.values()), default=0)
             raise DataError(
                 f"{search.where}: no trajectory goes away and comes back by the same poses within {frames} "
-                f"frames (the longest there and back has {longest}); collect with --policy there-and-back"
+                f"frames (the longest there and back has {longest}); collect with --policy there-and-back, or evaluate "
+                "with --protocol revisit or long"
             )
         return cases
 

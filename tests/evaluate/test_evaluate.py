@@ -260,6 +260,7 @@ def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, vox
     assert warning in ended.err
     page, markdown = (tmp_path / "r/report.html").read_text(), (tmp_path / "o/tables.md").read_text()
     assert all(warning in text for text in (ended.out, page, markdown))
+    assert [warning in line for line in results(tmp_path / "o")["warnings"]] == [True]
     known = results(tmp_path / "o")["checkpoints"][0]["training_scenes"]
     assert known["evaluated"] == ["room-0", "room-1"]
 

@@ -99,11 +99,14 @@ def contamination(path: str, scenes: Sequence[str], total: int) -> str:
 
 
 def unknown_scenes_lines(results: EvalResults) -> list[str]:
-    """A line for each checkpoint of which it is not known whether it was trained on the evaluated scenes."""
+    """A line for each checkpoint of which it is not known whether it was trained on the evaluated scenes.
+
+    Results of earlier versions do not say it of any.
+    """
     return [
         f"{run_folder(Path(record.path or record.name))}: {known_scenes(record)}; the evaluated ones may be among them"
         for record in results.checkpoints
-        if record.training_scenes is None or not record.training_scenes.complete
+        if (scenes := record.training_scenes) is None or not scenes.complete or scenes.evaluated is None
     ]
 
 

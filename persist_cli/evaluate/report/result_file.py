@@ -189,7 +189,7 @@ class KnownScenes(ResultModel):
 
     known: int
     complete: bool
-    evaluated: list[str] = []
+    evaluated: list[str] | None = None
 
 
 class CheckpointRecord(ResultModel):

@@ -185,6 +185,17 @@ def test_data_in_another_folder_and_results_named_by_their_folder_compare_alike(
     assert list(compare_runs(write_results(tmp_path, "a.json"), tmp_path / "eval").tables[0].rows) == list(ROWS)
 
 
+def test_weights_that_one_run_did_not_have_are_no_reason_to_refuse(tmp_path):
+    def change(results):
+        results["measured"]["metrics"]["lpips-alex"]["weights"] = {}
+        for row in results["tables"][0]["rows"].values():
+            row["columns"]["lpips-alex"] = {"na": "weights lpips-alex are not here"}
+
+    comparison = compare_runs(write_results(tmp_path, "a.json"), write_results(tmp_path, "b.json", change))
+    assert comparison.tables[0].rows["voxel"]["lpips-alex"].b is None
+    assert comparison.tables[0].rows["voxel"]["psnr"].difference == 0
+
+
 def test_runs_without_a_common_row_are_one_line(tmp_path):
     def change(results):
         results["tables"][0]["rows"] = {"other": results["tables"][0]["rows"]["none"]}

@@ -54,5 +54,6 @@ def test_results_that_do_not_know_all_training_scenes_say_so():
         (None, "training scenes unknown"),
         ({"known": 0, "complete": False}, "training scenes unknown"),
         ({"known": 4, "complete": False}, "training scenes not all known (4 are)"),
+        ({"known": 4, "complete": True}, "4 training scenes"),  # as an earlier version wrote it
     ):
         assert f"{words}; the evaluated ones may be among them" in table_text(trained_on(scenes))
