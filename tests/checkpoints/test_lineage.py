@@ -77,7 +77,7 @@ def test_scenes_that_no_card_has_are_those_in_the_recipes_data_sets_that_still_e
     assert "not all scenes that it was trained on are known" in capsys.readouterr().err
     shutil.rmtree(tmp_path / "walks")
     assert training_scenes(checkpoint) == TrainingScenes(complete=False)
-    assert scenes_json(checkpoint)["training_scenes"] == {"known": 0, "complete": False}
+    assert scenes_json(checkpoint)["training_scenes"] == {"known": 0, "complete": False, "evaluated": []}
 
 
 def test_the_hash_of_an_exports_recipes_depends_on_each_of_them(persist, stage1, voxel, tmp_path):

@@ -14,11 +14,12 @@ from persist_cli.evaluate.report.curves import COLORS, DARK_COLORS, HEIGHT, WIDT
 from persist_cli.evaluate.report.latex import latex_tables
 from persist_cli.evaluate.report.pictures import Pictures, RowClips, file_name, write_row_clips, write_sheets
 from persist_cli.evaluate.report.remarks import (
+    contamination_lines,
     known_scenes,
     left_out_line,
     seed_legend,
     too_few_lines,
-    warning_lines,
+    unknown_scenes_lines,
 )
 from persist_cli.evaluate.report.result_file import FILE, EvalResults, check_results
 from persist_cli.evaluate.report.tables import CompactTable, compact_tables
@@ -84,7 +85,8 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
             write_text(folder / "curves" / f"{name}.svg", curve.render(plot=plot, legend=True, **common))
         sections.append(Section(view, table_plots, [row for row in rows if row.table == table.name]))
     return jinja.get_template("report.html.jinja").render(
-        results=results, sections=sections, warnings=warning_lines(results), known_scenes=known_scenes,
+        results=results, sections=sections, warnings=contamination_lines(results),
+        unknown_scenes=unknown_scenes_lines(results), known_scenes=known_scenes,
         too_few_lines=too_few_lines, left_out_line=left_out_line, seed_legend=seed_legend(results),
         sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
         facts=_environment_facts(results), lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],

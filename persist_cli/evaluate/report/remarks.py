@@ -92,10 +92,8 @@ def contamination(path: str, scenes: Sequence[str], total: int) -> str:
     """
     ranges = [" to ".join([entry] if isinstance(entry, str) else entry) for entry in name_ranges(scenes)]
     names = ", ".join(ranges[:MOST_SCENES]) + ", …" * (len(ranges) > MOST_SCENES)
-    return (
-        f"{run_folder(Path(path))} was trained on {len(scenes)} of these {total} scenes ({names}); "
-        "its figures are not of unseen scenes"
-    )
+    which = f"{len(scenes)} of these {total} scenes" if total > 1 else "the evaluated scene"
+    return f"{run_folder(Path(path))} was trained on {which} ({names}); its figures are not of unseen scenes"
 
 
 def unknown_scenes_lines(results: EvalResults) -> list[str]:
@@ -118,11 +116,6 @@ def known_scenes(record: CheckpointRecord) -> str:
     return (
         f"{scenes.known} training scenes" if scenes.complete else f"training scenes not all known ({scenes.known} are)"
     )
-
-
-def warning_lines(results: EvalResults) -> list[str]:
-    """All warnings about the results as a whole."""
-    return [*contamination_lines(results), *unknown_scenes_lines(results)]
 
 
 def all_left_out(results: EvalResults) -> dict[str, list[str]]:

@@ -6,7 +6,14 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-from persist_cli.evaluate.report.remarks import all_left_out, figure_legend, left_out_line, too_few_lines, warning_lines
+from persist_cli.evaluate.report.remarks import (
+    all_left_out,
+    contamination_lines,
+    figure_legend,
+    left_out_line,
+    too_few_lines,
+    unknown_scenes_lines,
+)
 from persist_cli.evaluate.report.result_file import EvalResults, check_results
 from persist_cli.evaluate.report.tables import CellView, ColumnView, RowView, compact_tables
 
@@ -17,7 +24,7 @@ def table_text(results: Mapping[str, Any] | EvalResults) -> str:
     """Every table as Markdown: warnings, figures, differences, notes and definitions."""
     checked = results if isinstance(results, EvalResults) else check_results(results, "results")
     blocks = [f"# {_plain(checked.measured.protocol.title or checked.measured.protocol.name)}"]
-    blocks += [f"**Warning:** {_plain(line)}" for line in warning_lines(checked)]
+    blocks += [f"**Warning:** {_plain(line)}" for line in contamination_lines(checked)]
     legends = dict.fromkeys(figure_legend(checked, table) for table in compact_tables(checked))
     blocks += [_plain(legend) for legend in legends]
     for name, rows, columns, cell_text in _text_tables(checked):
@@ -53,6 +60,7 @@ def remark_lines(results: EvalResults) -> list[str]:
         *(f"n/a ({number}): {note}" for number, note in sorted(notes.items())),
         *(f"{name}: {column.definition}{counts[name]}" for name, column in columns.items() if column.definition),
         *(f"{name}: {definition}" for name, definition in rows.items()),
+        *unknown_scenes_lines(results),
     ]
 
 
