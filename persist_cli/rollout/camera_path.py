@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
 
 from persist_cli.api.actions import ActionVocabulary, format_actions
 from persist_cli.api.backbone import Interactions
@@ -76,6 +80,7 @@ class Rollout:
         memory: the memory after the rollout, ``None`` without one.
         seconds: duration of all branches together, without loading.
         gives_depth: whether the imagined frames have depth.
+        kept_paths: world_from_camera of the paths that the memory's file shall keep, by name.
     """
 
     path: CameraPath
@@ -84,6 +89,7 @@ class Rollout:
     memory: Memory | None
     seconds: float
     gives_depth: bool
+    kept_paths: Mapping[str, Float[Tensor, "frame 4 4"]] = field(default_factory=dict)
 
 
 def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:

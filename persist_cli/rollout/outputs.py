@@ -126,4 +126,4 @@ def write_maps(rollout: Rollout, out: Path) -> None:
         if memory is not None and len(memory.points().positions):
             draw_map(memory.points(), memory.reference.world_up, {"rollout": path_of(rollout)}, out / f"{name}.png")
     if rollout.memory is not None:
-        rollout.memory.save(out / "memory.safetensors")
+        rollout.memory.save(out / "memory.safetensors", rollout.kept_paths)

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+from torch import Tensor
+
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
 from persist_cli.api.inference import SamplingOverrides
@@ -19,9 +21,9 @@ from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.memorize.memory_file import load_memory
+from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
-from persist_cli.rollout.outputs import describe, write_outputs
+from persist_cli.rollout.outputs import describe, path_of, write_outputs
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, progress, say
 
@@ -47,7 +49,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
         memory = open_memory(checkpoint, adapter, plan, info)
     agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write)
     model = WorldModel(backbone, [agent], sampling)
-    rollouts = roll(model, paths)
+    rollouts = [dataclasses.replace(rollout, kept_paths=paths_to_keep(plan, rollout)) for rollout in roll(model, paths)]
     records = [describe(checkpoint, adapter, plan, rollout) for rollout in rollouts]
     triples = zip(rollouts, folders, records, strict=True)
     with busy("writing videos and maps"):
@@ -89,6 +91,13 @@ def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, 
     memory = load_memory(plan.memory)
     check_memory(memory, empty, plan.memory)
     return memory
+
+
+def paths_to_keep(plan: RolloutPlan, rollout: Rollout) -> dict[str, Tensor]:
+    """Return the paths of the memory's file, and that of the rollout if its frames were written."""
+    paths = load_paths(plan.memory) if plan.memory else {}
+    add_paths(paths, {"rollout": path_of(rollout)} if plan.write else {})
+    return paths
 
 
 def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.memory import MapPoints
+from persist_cli.api.observations import Origin
 from persist_cli.io.files import written_aside
 
 PATH_COLORS = ("#d81b60", "#1e88e5", "#ffb300", "#004d40", "#8e24aa")
@@ -20,6 +21,8 @@ MARGIN = 0.5  # metres around what is drawn
 ABOVE_CAMERA = 0.1  # metres over the cameras at which the ceiling is cut away
 DOTS_ACROSS = 5  # dots along the side of the square that stands for a point
 MOST_DOTS = 900  # dots along the longer side of the picture
+STRIPE = 6  # dots from one stripe of what is imagined to the next
+PALE = (0.85, 0.45)  # share of white in its stripes and between them
 LONG_SIDE = 8.0  # inches
 ARROW = 0.06  # length as a share of the long side
 Array = np.ndarray[Any, Any]
@@ -34,13 +37,15 @@ def draw_map(
     """Write a PNG of the map from above, true to scale, without the points higher than the cameras.
 
     Args:
-        points: points of a memory; without any the picture shows the paths alone.
+        points: points of a memory; without any the picture shows the paths alone. The legend says when some of them
+            are imagined.
         world_up: unit vector that points up in the world.
         paths: world_from_camera of each path, by the name that the legend shows, or in order without names.
         out: path of the PNG file.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     ground = ground_axes(world_up)
     named = dict(paths) if isinstance(paths, Mapping) else {str(number): path for number, path in enumerate(paths)}
@@ -60,7 +65,10 @@ def draw_map(
         headings = (lines[name][:, :3, 2] @ ground[:2].T).numpy()
         end = headings[-1] / max(float(np.linalg.norm(headings[-1])), 1e-9) * ARROW * max(width, height)
         _draw_path(axes, place[:, :2], end, PATH_COLORS[number % len(PATH_COLORS)], name)
-    _finish_axes(axes, low, high, len(places) if isinstance(paths, Mapping) else 0)
+    handles = axes.get_legend_handles_labels()[0] if isinstance(paths, Mapping) else []
+    if _imagined(points).any():
+        handles.append(Patch(facecolor="#b8b8b8", edgecolor="white", hatch="////", label="imagined"))
+    _finish_axes(axes, low, high, handles)
     with written_aside(out) as aside:
         figure.savefig(aside, dpi=150, format="png")
 
@@ -81,6 +89,8 @@ def paint(
 ) -> tuple[Array | None, tuple[float, float, float, float] | None]:
     """Return the picture of some points, each square in the colour of the highest point under the ceiling.
 
+    Observed points are drawn over imagined ones, and what is imagined is pale with stripes.
+
     Args:
         points: points to draw.
         ground: rows as ``ground_axes`` gives them.
@@ -99,13 +109,31 @@ def paint(
     visible = heights <= ceiling
     if not visible.any():
         visible[:] = True
-    order = np.argsort(heights[visible], kind="stable")
-    colors = points.colors.cpu().numpy()[visible][order] / 255.0
-    return _stamp(places[visible][order, :2], colors, points.spread)
+    imagined = _imagined(points)[visible]
+    order = np.lexsort((heights[visible], ~imagined))
+    colors = points.colors.cpu().numpy()[visible] / 255.0
+    image, extent = _stamp(places[visible][order, :2], np.column_stack([colors, imagined])[order], points.spread)
+    return _hatched(image), extent
 
 
-def _stamp(places: Array, colors: Array, spread: float) -> tuple[Array, tuple[float, float, float, float]]:
-    """Paint a square for each place, later ones over earlier ones."""
+def _imagined(points: MapPoints) -> Array:
+    return (points.origins == Origin.IMAGINED).cpu().numpy()
+
+
+def _hatched(image: Array) -> Array:
+    """Return RGBA of an image with a fifth channel, whose dots are imagined where that is 1."""
+    rows, columns = np.indices(image.shape[:2])
+    stripe = np.where((rows + columns) % STRIPE < STRIPE / 2, *PALE)
+    share = (image[..., 4] * stripe)[..., None]
+    return np.concatenate([image[..., :3] * (1 - share) + share, image[..., 3:4]], axis=-1)
+
+
+def _stamp(places: Array, values: Array, spread: float) -> tuple[Array, tuple[float, float, float, float]]:
+    """Paint a square for each place, later ones over earlier ones; the values are RGB and one more channel.
+
+    Returns:
+        RGBA and that channel ``[row, column, 5]``, and the extent.
+    """
     dot = max(spread / DOTS_ACROSS, float(np.ptp(places, axis=0).max()) / MOST_DOTS)
     low = places.min(0) - spread / 2
     across = max(1, round(spread / dot))
@@ -114,8 +142,8 @@ def _stamp(places: Array, colors: Array, spread: float) -> tuple[Array, tuple[fl
     shift = np.arange(across)
     x = (corner[:, 0, None, None] + shift).repeat(across, axis=1)
     y = (corner[:, 1, None, None] + shift[:, None]).repeat(across, axis=2)
-    image = np.zeros((rows, columns, 4))
-    image[y, x] = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)[:, None, None]
+    image = np.zeros((rows, columns, 5))
+    image[y, x] = np.insert(values, 3, 1.0, axis=1)[:, None, None]
     return image, (low[0], low[0] + columns * dot, low[1], low[1] + rows * dot)
 
 
@@ -146,7 +174,7 @@ def _draw_path(axes: Any, place: Array, look: Array, color: str, name: str) -> N
         axes.annotate(text, at, offset, textcoords="offset points", color=color, fontsize=8, bbox=box, zorder=7)
 
 
-def _finish_axes(axes: Any, low: Array, high: Array, names: int) -> None:
+def _finish_axes(axes: Any, low: Array, high: Array, legend: list[Any]) -> None:
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal")
@@ -158,5 +186,5 @@ def _finish_axes(axes: Any, low: Array, high: Array, names: int) -> None:
     x, y = low + 0.04 * (high - low)
     axes.plot([x, x + bar], [y, y], color="black", linewidth=3, solid_capstyle="butt", zorder=8)
     axes.annotate(f"{bar:g} m", (x + bar / 2, y), (0, 4), textcoords="offset points", ha="center", fontsize=8, zorder=8)
-    if names:
-        axes.legend(loc="upper right", fontsize=8, framealpha=0.85)
+    if legend:
+        axes.legend(handles=legend, loc="upper right", fontsize=8, framealpha=0.85)

@@ -10,7 +10,7 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Origin
 from persist_cli.data.store import Store
-from persist_cli.memorize.memory_file import load_memory
+from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.outputs import quaternion
 from persist_cli.rollout.world_model import Agent, WorldModel
@@ -70,7 +70,23 @@ def test_a_memory_file_stays_as_it_was_when_the_rollout_does_not_write(persist, 
     assert roll(persist, voxel, walks, tmp_path / "o", "--actions", "left", "--memory", memory, "--no-write").code == 0
     before, after = load_memory(memory).tensors(), load_memory(tmp_path / "o/memory.safetensors").tensors()
     assert all(torch.equal(after[name], value) for name, value in before.items())
+    assert [*load_paths(tmp_path / "o/memory.safetensors")] == [*load_paths(memory)] == ["walk-0"]
     assert (tmp_path / "o/map-before.png").is_file()
+
+
+def test_a_rollout_adds_imagined_cells_and_its_path_to_the_memory_and_leaves_observed_cells(
+    persist, voxel, walks, tmp_path
+):
+    memory, out = tmp_path / "m.safetensors", tmp_path / "o"
+    assert persist("memorize", f"{walks}#0:0-1", "--out", memory).code == 0
+    assert roll(persist, voxel, walks, out, "--actions", "left*8", "--memory", memory).code == 0
+    before, after = load_memory(memory), load_memory(out / "memory.safetensors")
+    before.write(Store(walks)[0].read([2]).observations)
+    kept = after.tensors()["origins"] == Origin.OBSERVED
+    assert all(torch.equal(after.tensors()[name][kept], value) for name, value in before.tensors().items())
+    figures = json.loads((out / "rollout.json").read_text())["memory"]
+    assert figures["imagined"] == after.figures().imagined > 0
+    assert load_paths(out / "memory.safetensors").keys() == {"walk-0", "rollout"}
 
 
 def test_a_rollout_without_an_adapter_is_plain_stage_one(persist, stage1, walks, tmp_path):

@@ -1,5 +1,7 @@
 """The map is seen from above, true to scale, and repeatable."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -43,6 +45,27 @@ def test_the_map_is_transparent_where_there_is_no_point():
 def test_points_are_drawn_even_when_all_are_above_the_cameras():
     image, _ = paint(points(((0, 5.0, 0), RED)), ground_axes(UP), 1.0)
     assert (image[..., 3] > 0).any()
+
+
+def test_what_is_imagined_is_pale_and_striped_and_never_hides_what_was_observed():
+    floor, cloud = ((0, 0.0, 0), RED), ((0, 1.0, 0), BLUE)
+    mixed = replace(points(floor, cloud, ((3, 0, 0), BLUE)), origins=torch.tensor([2, 1, 1], dtype=torch.uint8))
+    image, _ = paint(mixed, ground_axes(UP), None)
+    drawn = {tuple(color) for color in image[image[..., 3] > 0][:, :3].round(2)}
+    assert drawn == {(1.0, 0.0, 0.0), (0.85, 0.85, 1.0), (0.45, 0.45, 1.0)}
+
+
+def test_a_map_without_imagined_points_looks_as_before_and_has_no_legend_for_them(tmp_path):
+    walk = room_walk(4)
+    memory = written_memory("voxel", walk)
+    seen, dreamt = memory.points(), replace(memory.points(), origins=torch.ones(memory.figures().cells))
+    for name, some in (("seen", seen), ("dreamt", dreamt)):
+        draw_map(some, UP, {}, tmp_path / f"{name}.png")
+    pictures = [np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB")) for name in ("seen", "dreamt")]
+    assert pictures[0].shape == pictures[1].shape
+    assert pictures[1].mean() > pictures[0].mean() + 5
+    corners = [picture[: len(picture) // 8, -picture.shape[1] // 4 :] for picture in pictures]
+    assert not np.array_equal(*corners)
 
 
 def test_a_map_shows_several_paths_in_their_colours(tmp_path):

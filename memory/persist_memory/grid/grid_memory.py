@@ -17,6 +17,7 @@ from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
+from persist_memory.grid.occlusion import without_observed
 from persist_memory.grid.pooling import (
     GridSettings,
     Lattice,
@@ -27,7 +28,7 @@ from persist_memory.grid.pooling import (
     unpack_colors,
 )
 from persist_memory.grid.storage import LIMIT, SparseGrid, ValueColumn, pack, unpack
-from persist_memory.grid.visibility import Views, nearest_cells
+from persist_memory.grid.visibility import Views, cells_in_view, nearest_cells
 from persist_memory.validation import (
     ORIGINS,
     Shape,
@@ -104,7 +105,8 @@ class GridMemory(Memory):
         step = max(1, (PIXELS_ON_CPU if on_cpu else PIXELS_ON_GPU) // observations.depth[0].numel())
         for origin, frames in observations.by_origin():
             for begin in range(0, len(frames), step):
-                self._pool(frames[begin : begin + step], origin)
+                part = frames[begin : begin + step]
+                self._pool(part if origin == Origin.OBSERVED else self._unknown(part), origin)
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """Return at most ``budget`` cells that reach into the view of a camera, the nearest to such a camera first."""
@@ -167,6 +169,15 @@ class GridMemory(Memory):
         bounds = tuple(low.tolist()), tuple(high.tolist())
         imagined = int((self.grid.values(ORIGINS) == Origin.IMAGINED).sum())
         return MemoryFigures(len(self.grid), size, bounds, imagined)
+
+    def _unknown(self, imagined: Observations) -> Observations:
+        """Imagined frames without the depth of pixels along whose rays an observed cell lies."""
+        if self.lattice.flat or not len(self.grid):
+            return imagined
+        cells = cells_in_view(self.grid, self.lattice, self.views(imagined.cameras.to(self.grid.device)))
+        cells = cells[self.grid.values(ORIGINS, cells) == Origin.OBSERVED]
+        centers = self._in_world(self._centers(self.grid.keys[cells])).to(imagined.depth.device)
+        return without_observed(imagined, centers, self.lattice.across)
 
     def _pool(self, observations: Observations, origin: Origin) -> None:
         features = self.encoder.encode(observations.rgb).to(observations.depth.device, torch.float32)

@@ -91,6 +91,13 @@ def horizontal_views(cameras: Cameras, lattice: Lattice) -> Views:
     return Views(_flat(_in_grid(cameras.centers.double(), lattice)), torch.where(narrow, normals, 0.0))
 
 
+def cells_in_view(grid: SparseGrid, lattice: Lattice, views: Views) -> Int64[Tensor, " cell"]:
+    """Positions (in the order of keys) of all cells of the blocks that reach into a view."""
+    blocks, starts, counts = grid.blocks()
+    chosen = _block_distances(blocks, lattice, views).isfinite().any(0)
+    return _ranges(starts[chosen], counts[chosen])
+
+
 def nearest_cells(
     grid: SparseGrid, lattice: Lattice, views: Views, groups: Sequence[Tensor], budget: int
 ) -> list[Int64[Tensor, " token"]]:
@@ -109,9 +116,8 @@ def nearest_cells(
     """
     size = lattice.extent.to(grid.device)
     blocks, starts, counts = grid.blocks()
-    half_block, point = 0.5 * BLOCK * size, torch.zeros_like(size)
-    block_centers = (blocks * BLOCK + 0.5 * (BLOCK - 1)).double() * size
-    block_distances = views.visible_distances(block_centers, half_block, half_block)
+    point = torch.zeros_like(size)
+    block_distances = _block_distances(blocks, lattice, views)
     nearest = [block_distances[group].amin(0) for group in groups]
     results: dict[int, Tensor] = {}
     wanted = max(FIRST_CELLS, 2 * budget)
@@ -127,6 +133,13 @@ def nearest_cells(
                 results[number] = positions[order[:budget]]
         wanted *= 4
     return [results[number] for number in range(len(groups))]
+
+
+def _block_distances(blocks: Tensor, lattice: Lattice, views: Views) -> Float[Tensor, "view block"]:
+    """Metres from each apex to each block that reaches into its view, infinite to the others."""
+    size = lattice.extent.to(blocks.device)
+    half = 0.5 * BLOCK * size
+    return views.visible_distances((blocks * BLOCK + 0.5 * (BLOCK - 1)).double() * size, half, half)
 
 
 def _nearest_blocks(nearest: Tensor, counts: Tensor, wanted: int) -> tuple[Bool[Tensor, " block"], float]:

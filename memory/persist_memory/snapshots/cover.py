@@ -30,13 +30,24 @@ def seen_patches(store: SnapshotStore, viewers: SnapshotStore) -> Bool[Tensor, "
     return inside & same & (shown > 0) & (store.depth > 0)[:, None]
 
 
-def without_patches_of(viewers: SnapshotStore, store: SnapshotStore) -> SnapshotStore:
-    """The snapshots of ``store`` without the depth of patches that ``viewers`` show too, those without any left out."""
-    if not len(viewers) or not len(store):
-        return store
-    shown = seen_patches(store, viewers.to(store.content.device)).any(1)
-    hidden = replace(store, depth=torch.where(shown, 0.0, store.depth))
-    return hidden[(hidden.depth > 0).any(1)]
+def without_observed(imagined: SnapshotStore, observed: SnapshotStore) -> SnapshotStore:
+    """Imagined snapshots without the depth of patches that are known already, those without any left are dropped.
+
+    A patch is known when an observed snapshot shows it at the same depth, or when an observed patch falls into it,
+    however deep: generated depth is often too small, and such a patch would hide what is behind it.
+    """
+    if not len(observed) or not len(imagined):
+        return imagined
+    observed = observed.to(imagined.content.device)
+    cell, _, inside = locate(
+        observed.points, imagined.world_from_camera, imagined.intrinsics, imagined.size, imagined.grid
+    )
+    inside = (inside & (observed.depth > 0)[:, None]).transpose(0, 1).flatten(1)
+    cells = torch.where(inside, cell.transpose(0, 1).flatten(1), imagined.depth.shape[1])
+    known = torch.zeros(len(imagined), imagined.depth.shape[1] + 1, dtype=torch.bool, device=cells.device)
+    known = known.scatter_(1, cells, True)[:, :-1] | seen_patches(imagined, observed).any(1)
+    rest = replace(imagined, depth=torch.where(known, 0.0, imagined.depth))
+    return rest[(rest.depth > 0).any(1)]
 
 
 def most_redundant(seen: Bool[Tensor, "snapshot viewer patch"], store: SnapshotStore) -> int:

@@ -23,7 +23,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.snapshots.album import Album
-from persist_memory.snapshots.cover import covered_view, greedy_cover, without_patches_of
+from persist_memory.snapshots.cover import covered_view, greedy_cover, without_observed
 from persist_memory.snapshots.snapshot_store import SnapshotStore
 from persist_memory.validation import (
     ORIGINS,
@@ -63,8 +63,8 @@ class Snapshots(Memory):
     ``capacity`` frames the order of writing changes no bit.
 
     Imagined frames have an album of their own, with room for ``capacity`` more, so they change no bit of the observed
-    images. Patches of imagined images that an observed one shows at the same depth lose their depth, whichever comes
-    first; an image without any is dropped.
+    images. Patches of imagined images that observed ones show too lose their depth, whichever comes first; an image
+    without any is dropped. See ``without_observed``.
 
     Reading lays the token grid over the image of each camera. A snapshot shows a place, a cell of that grid, when one
     of its patches falls into it and lies not far behind the nearest patch there. Snapshots are chosen greedily, each
@@ -203,6 +203,6 @@ class Snapshots(Memory):
         if origin == Origin.OBSERVED:
             observed.add(snapshots)
             if len(imagined):
-                imagined.replace(without_patches_of(observed.store, imagined.store))
+                imagined.replace(without_observed(imagined.store, observed.store))
         else:
-            imagined.add(without_patches_of(observed.store, snapshots))
+            imagined.add(without_observed(snapshots, observed.store))

@@ -1,0 +1,56 @@
+"""What an imagined frame adds to a grid: the pixels along whose rays there is no observed cell.
+
+Where a ray meets an observed cell, the memory knows already what is seen, and the model was told. The depth that it
+imagines there is often wrong: written down, it would stand as points in the air before the observed surface or behind
+it, and hide from other cameras what was observed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import project
+from persist_cli.api.observations import Observations
+
+
+def without_observed(observations: Observations, centers: Float[Tensor, "cell 3"], edge: float) -> Observations:
+    """Frames without the depth of the pixels that show an observed cell, however deep, so that these are not written.
+
+    Args:
+        observations: imagined frames.
+        centers: centres of the observed cells, world metres, float64.
+        edge: edge of a cell in metres.
+    """
+    known = covered(centers, edge, observations.cameras)
+    return replace(observations, depth=torch.where(known, 0.0, observations.depth))
+
+
+def covered(centers: Float[Tensor, "cell 3"], edge: float, cameras: Cameras) -> Bool[Tensor, "frame height width"]:
+    """Whether a cell lies along the ray of each pixel.
+
+    A cell is drawn as one pixel of an image that is reduced by a power of two, so that this pixel is at least as large
+    as the cell is seen. So cells side by side leave no hole, however near they are.
+    """
+    frames = len(cameras)
+    pixels, depth = project(centers.expand(frames, -1, -1), cameras)
+    ahead = depth > edge / 2
+    sizes = cameras.intrinsics[:, 0, 0].double()[:, None] * edge / depth.clamp(min=edge / 2)  # pixels
+    levels = sizes.log2().ceil().clamp(min=0).long()
+    frame = torch.arange(frames, device=depth.device)[:, None].expand_as(depth)
+    found = torch.zeros(frames, cameras.height, cameras.width, dtype=torch.bool, device=depth.device)
+    for level in levels[ahead].unique().tolist():
+        side = 1 << level
+        rows, columns = math.ceil(cameras.height / side), math.ceil(cameras.width / side)
+        column, row = (pixels / side).floor().long().unbind(-1)
+        inside = ahead & (levels == level) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        image = found.new_zeros(frames, rows, columns)
+        image[frame[inside], row[inside], column[inside]] = True
+        image = image.repeat_interleave(side, 1).repeat_interleave(side, 2)
+        found |= image[:, : cameras.height, : cameras.width]
+    return found

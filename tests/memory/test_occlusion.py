@@ -1,0 +1,52 @@
+import torch
+
+from persist_cli.api.geometry import unproject
+from persist_cli.api.observations import Origin
+from persist_memory.grid.occlusion import covered, without_observed
+from tests.support.room_views import observe, written_memory
+from tests.support.rooms import look
+
+FINE = {"cell": (0.1, 0.1, 0.1)}
+
+
+def test_the_cells_of_a_frame_cover_all_its_pixels():
+    view = observe([look((0.0, 1.4, 0.0), 20.0)], 96, 128)
+    memory = written_memory("voxel", view, **FINE)
+    assert covered(memory.points().positions, 0.1, view.cameras).all()
+
+
+def test_a_cell_is_drawn_as_large_as_it_is_seen_and_one_behind_the_camera_is_not_drawn():
+    cameras = observe([look((0.0, 1.4, 0.0), 0.0)], 96, 128).cameras
+    ahead = unproject(torch.full((1, 96, 128), 1.0), cameras)[0, 48, 64]
+    for edge in (0.05, 0.2):
+        drawn = covered(ahead[None], edge, cameras).sum().sqrt()
+        seen = float(cameras.intrinsics[0, 0, 0]) * edge
+        assert seen <= drawn < 2 * seen
+    behind = 2 * cameras.centers[0] - ahead
+    assert not covered(behind[None], 0.2, cameras).any()
+
+
+def test_an_imagined_frame_writes_only_pixels_that_show_no_observed_cell():
+    views = observe([look((0.0, 1.4, 0.0), yaw) for yaw in (0.0, 40.0)])
+    memory = written_memory("voxel", views[:1], **FINE)
+    left = without_observed(views, memory.points().positions, 0.1)
+    assert (left.depth[0] > 0).float().mean() < 0.01
+    assert 0.3 < (left.depth[1] > 0).float().mean() < 0.8
+
+
+def test_imagined_depth_that_is_too_small_leaves_no_points_in_the_air():
+    view = observe([look((0.0, 1.4, 0.0), 0.0)])
+    memory = written_memory("voxel", view, **FINE)
+    wrong = type(view)(view.rgb, 0.7 * view.depth, view.cameras).with_origin(Origin.IMAGINED)
+    memory.write(wrong)
+    assert memory.figures().imagined < 0.02 * memory.figures().observed
+
+
+def test_imagined_places_are_written_and_recalled_where_nothing_was_observed():
+    views = observe([look((0.0, 1.4, 0.0), yaw) for yaw in (0.0, 180.0)])
+    memory = written_memory("voxel", views[:1], **FINE)
+    memory.write(views[1:].with_origin(Origin.IMAGINED))
+    alone = written_memory("voxel", views[1:].with_origin(Origin.IMAGINED), **FINE)
+    assert memory.figures().imagined == alone.figures().cells > 0
+    camera = views.cameras[1:]
+    assert torch.equal(memory.read(camera, 64).features, alone.read(camera, 64).features)
