@@ -166,4 +166,8 @@ def first_difference(earlier: Any, new: Any, where: str = "") -> str:
     if isinstance(earlier, dict) and isinstance(new, dict):
         key = next(key for key in sorted({*earlier, *new}) if earlier.get(key) != new.get(key))
         return first_difference(earlier.get(key), new.get(key), f"{where} {key}".strip())
+    pairs = list(zip(earlier, new, strict=False)) if isinstance(earlier, list) and isinstance(new, list) else []
+    if pairs and isinstance(pairs[0][0], dict) and len(earlier) == len(new):
+        place = next(place for place, (one, two) in enumerate(pairs) if one != two)
+        return first_difference(*pairs[place], f"{where} {place}")
     return f"{where}: {earlier}, now {new}"

@@ -23,7 +23,7 @@ from persist_cli.evaluate.rows.build_rows import RowConfig, build_control_rows, 
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
-from persist_cli.viewing.console import busy, say, warn
+from persist_cli.viewing.console import busy, warn
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def prepare(
         values = identity(plan, sampling, checkpoints, metrics)
         journal.check(values)
         if journal.cases() is None:
-            say(f"finding clips for the protocol {protocol.name!r} in {search.where}")
+            warn(f"finding clips for the protocol {protocol.name!r} in {search.where}")
             cases = protocol.find(search)
             build_control_rows(models, checkpoints, config, protocol, cases)  # controls may not suit the clips
             with busy("hashing the data"):
@@ -152,7 +152,7 @@ def prepare(
 def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], search: ClipSearch) -> None:
     """Say when there are fewer clips than asked for, and whether a checkpoint was trained on their scenes."""
     if len(cases) < search.limit:
-        say(f"{len(cases)} clips found, {search.limit} asked for")
+        warn(f"{len(cases)} clips found, {search.limit} asked for")
     for line in contamination_warnings(checkpoints, cases):
         warn(f"warning: {line}")
 

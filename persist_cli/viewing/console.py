@@ -239,7 +239,7 @@ def print_table(
     """
     cells = [[column, *(row[number] for row in rows)] for number, column in enumerate(columns)]
     texts = [[Text.from_markup(cell).plain for cell in column] for column in cells]
-    full_widths = [max(map(len, column)) for column in texts]
+    full_widths = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
     word_widths = [max(len(word) for text in column for word in (*text.split(), "")) for column in texts]
     if full_widths[0] <= LONGEST_NAME:
         word_widths[0] = full_widths[0]

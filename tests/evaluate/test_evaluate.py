@@ -249,8 +249,10 @@ def test_one_scene_leaves_the_default_control_shuffled_a_row_of_na_with_its_reas
 def test_fewer_clips_than_asked_for_are_counted_aloud(persist, voxel, walks, tmp_path):
     command = ["eval", voxel, "--data", walks, "--memories", "stage1", "--metrics", "psnr", "--seeds", 1, "--steps", 1]
     options = ["--controls", "copy", "--out", tmp_path / "o"]
-    assert "2 clips found, 5 asked for" in persist(*command, *options, "--clips", 5).out
-    assert "asked for" not in persist(*command, *options[:-1], tmp_path / "p", "--clips", 2).out
+    assert "2 clips found, 5 asked for" in persist(*command, *options, "--clips", 5).err
+    both = persist(*command, *options[:-1], tmp_path / "p", "--clips", 2, "--json")
+    assert "asked for" not in both.err
+    assert json.loads(both.out) == results(tmp_path / "p")  # nothing but JSON on standard output
 
 
 def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, voxel, walks, tmp_path):

@@ -77,6 +77,14 @@ def test_the_tables_of_several_domains_are_one_table_under_their_names(monkeypat
     assert "3 clips: too few for an interval" in text
 
 
+@pytest.mark.parametrize("length", [35, 70])
+def test_a_long_row_name_goes_on_in_the_next_line_of_one_table(monkeypatch, length):
+    name = f"voxel ({'runs/' * length}"[:length]
+    text = printed(monkeypatch, example_results(rows={"none": "model", name: "model"}))
+    assert text.count("┏") == 1
+    assert max(len(line) for line in text.splitlines() if line.startswith("│")) <= 80
+
+
 def test_a_row_name_that_looks_like_markup_is_printed_literally(monkeypatch):
     results = example_results(rows={"none": "model", "[bold]x[/red]": "control"})
     assert "[bold]x[/red]" in printed(monkeypatch, results, 160)
