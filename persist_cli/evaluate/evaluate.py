@@ -124,4 +124,4 @@ def motion_line(clips: Sequence[dict[str, Any]]) -> str:
     )
     shares = [share for clip in clips for share in clip["seen_before"][1:] if share is not None]
     seen = f"; {sum(shares) / len(shares):.0%} of what they look at was seen before" if shares else ""
-    return f"{len(clips)} clips, on average {metres:.1f} m long, {distance:.1f} m away, {degrees:.0f}° of turns{seen}"
+    return f"the clips are on average {metres:.1f} m long, {distance:.1f} m away, {degrees:.0f}° of turns{seen}"

@@ -152,7 +152,7 @@ def prepare(
 def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], search: ClipSearch) -> None:
     """Say when there are fewer clips than asked for, and whether a checkpoint was trained on their scenes."""
     if len(cases) < search.limit:
-        warn(f"{len(cases)} clips found, {search.limit} asked for")
+        warn(f"{len(cases)} clip{'s' * (len(cases) != 1)} found, {search.limit} asked for")
     for line in contamination_warnings(checkpoints, cases):
         warn(f"warning: {line}")
 
