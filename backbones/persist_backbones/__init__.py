@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from persist_cli.io.checksums import verifying
+
 if TYPE_CHECKING:
     from persist_backbones.pipeline.pipeline import WorldPipeline
     from persist_cli.api.inference import Precision
 
 
-def load(folder: Path | str, adapter: str | None = None, dtype: Precision | None = None) -> WorldPipeline:
+def load(
+    folder: Path | str, adapter: str | None = None, dtype: Precision | None = None, verify: bool = False
+) -> WorldPipeline:
     """Load a checkpoint as a pipeline of diffusers' kind, on the CPU and ready to sample.
 
     ``pipeline = persist_backbones.load("runs/voxel")``, then ``pipeline.to("cuda")`` or
@@ -21,13 +25,15 @@ def load(folder: Path | str, adapter: str | None = None, dtype: Precision | None
         folder: folder of a checkpoint, of an export, or of a run, whose newest checkpoint is loaded.
         adapter: name of a memory adapter, by default the checkpoint's default or only one; ``stage1`` for no adapter.
         dtype: precision of the weights: ``float32`` (by default), ``bfloat16`` or ``float16``.
+        verify: whether large files are verified by their checksums too; those of up to 256 MiB always are.
 
     Raises:
         PersistError: one line when there is no such checkpoint or adapter, or it is damaged.
     """
     from persist_backbones.pipeline.pipeline import load_pipeline  # diffusers takes seconds to import
 
-    return load_pipeline(Path(folder), adapter, dtype)
+    with verifying(verify):
+        return load_pipeline(Path(folder), adapter, dtype)
 
 
 def write_prompt(prompt: str, pretrained: str, path: Path | str) -> None:

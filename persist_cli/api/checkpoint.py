@@ -17,11 +17,13 @@ from typing import TYPE_CHECKING, Any, Final
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json
+from persist_cli.io.sha256sums import check_sums
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Sampling
 
 CARD: Final = "persist.json"
+WEIGHTS: Final = ".safetensors"
 VERSION: Final = 1
 STEP: Final = "step-"  # start of the names of the folders of a run's checkpoints
 PLAIN: Final = "stage1"  # name of the base without any adapter
@@ -67,6 +69,21 @@ class Checkpoint:
             known = ", ".join(self.adapters) or "none"
             raise CheckpointError(f"{self.folder}: no memory adapter {adapter!r} in it; it has {known}")
         return self.adapters[adapter]
+
+    def check_weights(self, adapter: str | None = None) -> None:
+        """Verify the weights of the base, and of an adapter, by ``SHA256SUMS`` where there is one; see ``check_sums``.
+
+        Raises:
+            CheckpointError: one line for the first file that is damaged or missing.
+        """
+        base: Path | dict[str, Any] | None = self.base_folder
+        while isinstance(base, Path):
+            check_sums(base, lambda name: name.endswith(WEIGHTS) and not name.startswith("adapters/"))
+            base = lora_base(base)
+        if adapter is not None:
+            folder = self.adapter_folder(adapter)
+            within = f"{folder.relative_to(self.folder).as_posix()}/"
+            check_sums(self.folder, lambda name: name.endswith(WEIGHTS) and name.startswith(within))
 
     def sampling_with(self, overrides: SamplingOverrides) -> Sampling:
         """Return the card's sampling settings, or else 50 steps of DDIM without guidance, with these overrides."""
@@ -148,8 +165,12 @@ def model_folder(path: Path) -> Path:
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """Return a checkpoint's card; ``CheckpointError`` when it is missing, incomplete or of another version."""
+    """Return a checkpoint's card; ``CheckpointError`` when it is missing, incomplete or of another version.
+
+    All small files of the folder, the card among them, are verified by ``SHA256SUMS`` where there is one.
+    """
     path = folder / CARD
+    check_sums(folder, lambda name: not name.endswith(WEIGHTS))
     card = read_json(path)
     if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
         raise CheckpointError(f"{path}: not the card of a persist checkpoint")

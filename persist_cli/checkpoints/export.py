@@ -18,25 +18,22 @@ from persist_cli.api.checkpoint import CARD, PLAIN, Checkpoint, find_checkpoint,
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.lineage import RECIPE, RECIPES, save_stage_recipes, stage_recipes, training_scenes
 from persist_cli.checkpoints.load import empty_backbone, load_backbone
-from persist_cli.checkpoints.save import base_files, fingerprint, write_card
+from persist_cli.checkpoints.save import base_files, fingerprint, hash_weights, write_card
 from persist_cli.errors import CheckpointError, PersistError, hint
 from persist_cli.io.files import (
     check_folder,
     empty_folder_aside,
-    file_sha256,
     folder_aside,
     read_json,
     read_tensors,
     write_json,
     write_tensors,
-    write_text,
 )
+from persist_cli.io.sha256sums import SUMS, write_sums
 from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
 PRECISIONS: Final = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
-
-SUMS: Final = "SHA256SUMS"
 
 ADAPTERS: Final = "adapters"  # the folder of the adapters, and in the folder of recipes that of theirs
 
@@ -98,10 +95,13 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     for adapter in adapters.values():
         scenes |= training_scenes(adapter.checkpoint)
     with folder_aside(out) as folder:
-        card = _write_checkpoint(folder, base, adapters, PRECISIONS[plan.dtype])
-        write_card(folder, card | defaults | {"exported_by": __version__}, scenes)
+        _write_checkpoint(folder, base, adapters, PRECISIONS[plan.dtype])
         with busy("hashing the files"):
-            files = _write_sums(folder)
+            hashes = hash_weights(folder)
+            card = {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(hashes)}
+            write_card(folder, card | defaults | {"exported_by": __version__}, scenes)
+            hashes = write_sums(folder, hashes)
+        files = {name: {"bytes": (folder / name).stat().st_size, "sha256": hashes[name]} for name in sorted(hashes)}
     _print_files(out, {"fingerprint": card["fingerprint"]} | defaults, files, json)
 
 
@@ -166,10 +166,8 @@ def _default_sampling(base: Checkpoint, requested: SamplingOverrides) -> dict[st
     return asdict(sampling)
 
 
-def _write_checkpoint(
-    folder: Path, base: Checkpoint, adapters: dict[str, AdapterSource], dtype: torch.dtype
-) -> dict[str, Any]:
-    """Write base, adapters and recipes into the folder; returns what the card must say of them."""
+def _write_checkpoint(folder: Path, base: Checkpoint, adapters: dict[str, AdapterSource], dtype: torch.dtype) -> None:
+    """Write base, adapters and recipes into the folder."""
     with _merged_base(base, folder) as home:
         paths = [path.relative_to(home) for path in base_files(home, "*")]
         jobs = [(home / path, folder / path) for path in paths if _is_copied(path)]
@@ -183,7 +181,6 @@ def _write_checkpoint(
             except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
                 raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
     save_stage_recipes(folder, _recipes(base, adapters))
-    return {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(folder)}
 
 
 @contextlib.contextmanager
@@ -262,17 +259,6 @@ def _last_part(value: Any) -> Any:
     if isinstance(value, list):
         return [_last_part(path) for path in value]
     return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
-
-
-def _write_sums(folder: Path) -> dict[str, dict[str, Any]]:
-    """Write ``SHA256SUMS`` for ``sha256sum -c``; returns size and hash of every file by its path in the folder."""
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    files = {
-        path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
-        for path in paths
-    }
-    write_text(folder / SUMS, "".join(f"{file['sha256']}  {name}\n" for name, file in files.items()))
-    return files
 
 
 def _print_files(out: Path, card: dict[str, Any], files: dict[str, dict[str, Any]], json: bool) -> None:

@@ -37,6 +37,7 @@ def load_backbone(
         settings: settings of the backbone that replace those of the base.
         adapter: the name of the checkpoint's adapter to use, ``None`` for plain stage 1.
     """
+    checkpoint.check_weights(adapter)
     backbone = empty_backbone(checkpoint, settings)
     backbone.load_base(checkpoint.base_folder)
     if adapter is not None:
@@ -59,6 +60,7 @@ def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None
     if adapter is None:
         backbone.use_adapter(None)
     else:
+        checkpoint.check_weights(adapter)
         backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
 
 

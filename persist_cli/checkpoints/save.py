@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.api.checkpoint import CARD, VERSION, Checkpoint, TrainingScenes, run_folder
-from persist_cli.io.files import file_sha256, write_json
+from persist_cli.io.files import write_json
+from persist_cli.io.sha256sums import hash_files, write_sums
 from persist_cli.recipe import MemoryConfig
 
 if TYPE_CHECKING:
@@ -17,21 +19,26 @@ if TYPE_CHECKING:
 
 
 def save_base(backbone: Backbone, folder: Path, scenes: TrainingScenes | None = None) -> None:
-    """Write the backbone's own files and a card into an existing folder."""
+    """Write the backbone's own files, a card and ``SHA256SUMS``.
+
+    The existing folder may hold other files, which are listed too.
+    """
     backbone.save_base(folder)
-    card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(folder)}
+    hashes = hash_weights(folder)
+    card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(hashes)}
     write_card(folder, card, scenes)
+    write_sums(folder, hashes)
 
 
 def save_lora(
     backbone: Backbone, base: Checkpoint | None, folder: Path, home: Path, scenes: TrainingScenes | None = None
 ) -> None:
-    """Write what LoRA trained and a card that points to the base that it changes.
+    """Write what LoRA trained, a card that points to the base that it changes, and ``SHA256SUMS``.
 
     Args:
         backbone: a backbone with LoRA.
         base: the checkpoint that LoRA was trained on; ``None`` for the pretrained weights in the backbone's settings.
-        folder: the existing folder to write into.
+        folder: the existing folder to write into, which may hold other files to be listed.
         home: the place where that folder will be in the end; the path to the base is relative to it.
         scenes: the scenes that base and LoRA were trained on, where they are known.
     """
@@ -39,9 +46,11 @@ def save_lora(
     changes: dict[str, Any] = {"settings": backbone.origin()}
     if base is not None:
         changes = {"base": _path_to_base(base, home), "fingerprint": base.fingerprint}
-    own = hashlib.sha256(f"{fingerprint(folder)} {changes.get('fingerprint')}".encode()).hexdigest()
+    hashes = hash_weights(folder)
+    own = hashlib.sha256(f"{fingerprint(hashes)} {changes.get('fingerprint')}".encode()).hexdigest()
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings()}
     write_card(folder, card | {"changes": changes, "fingerprint": own}, scenes)
+    write_sums(folder, hashes)
 
 
 def write_card(folder: Path, card: dict[str, Any], scenes: TrainingScenes | None) -> None:
@@ -58,13 +67,13 @@ def save_adapter(
     home: Path,
     scenes: TrainingScenes | None = None,
 ) -> None:
-    """Write the adapter in use and a card that points to its base.
+    """Write the adapter in use, a card that points to its base, and ``SHA256SUMS``.
 
     Args:
         backbone: a backbone that uses the adapter.
         base: the checkpoint that the adapter was trained on.
         memory: the choice of the memory that the adapter reads.
-        folder: the existing folder to write into.
+        folder: the existing folder to write into, which may hold other files to be listed.
         home: the place where that folder will be in the end; the path to the base is relative to it.
         scenes: the scenes that base and adapter were trained on, where they are known.
     """
@@ -73,6 +82,7 @@ def save_adapter(
     backbone.save_adapter(adapter)
     write_json(adapter / "memory.json", dataclasses.asdict(memory))
     write_card(folder, {"base": _path_to_base(base, home), "fingerprint": base.fingerprint}, scenes)
+    write_sums(folder)
 
 
 def base_files(folder: Path, pattern: str) -> list[Path]:
@@ -81,12 +91,17 @@ def base_files(folder: Path, pattern: str) -> list[Path]:
     return sorted(path for path in files if path.relative_to(folder).parts[0] != "adapters")
 
 
-def fingerprint(folder: Path) -> str:
-    """SHA-256 over all weight files of a checkpoint's base, in order of their paths."""
+def hash_weights(folder: Path) -> dict[str, str]:
+    """SHA-256 of each weight file of a checkpoint's base by its name in the folder."""
+    return hash_files(folder, [path.relative_to(folder).as_posix() for path in base_files(folder, "*.safetensors")])
+
+
+def fingerprint(hashes: Mapping[str, str]) -> str:
+    """SHA-256 over all weight files of a checkpoint's base, in order of their paths, given those of the files."""
     digest = hashlib.sha256()
-    for path in base_files(folder, "*.safetensors"):
-        digest.update(str(path.relative_to(folder)).encode())
-        digest.update(bytes.fromhex(file_sha256(path)))
+    for path in sorted(map(Path, hashes)):
+        digest.update(str(path).encode())
+        digest.update(bytes.fromhex(hashes[path.as_posix()]))
     return digest.hexdigest()
 
 

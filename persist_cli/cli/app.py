@@ -24,6 +24,7 @@ from persist_cli.cli.options import (
     StepOption,
     StepsOption,
     TurnOption,
+    VerifyOption,
     show_version,
     split_names,
 )
@@ -144,6 +145,7 @@ def finetune(
     cache_gigabytes: Annotated[float | None, typer.Option(min=0, help="Most that the cache may hold; 20.")] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Say where the time of a step goes.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count parameters; no data, no weights.")] = False,
+    verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
     """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
@@ -178,6 +180,7 @@ def export(
     steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps when none are named.")] = None,
     sampler: Annotated[str | None, typer.Option(help="Sampler when none is named.")] = None,
     guidance: Annotated[float | None, typer.Option(min=0, help="Guidance over memory when none is named.")] = None,
+    verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
     """Write a base and memory adapters as one checkpoint folder that stands alone.
@@ -203,6 +206,7 @@ def memorize(
         Path | None, typer.Option(help="Whose adapter shall read it; the reference model when no setting is given.")
     ] = None,
     merge: Annotated[list[Path] | None, typer.Option(help="Memory files to join: --merge A B.")] = None,
+    verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
     """Build a memory from posed RGB-D, or join memories of one frame of reference.
@@ -243,6 +247,7 @@ def rollout(
     guidance: GuidanceOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
+    verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
     """Roll out a world model from a start frame along actions, clip by clip.
@@ -281,6 +286,7 @@ def evaluate(
     guidance: GuidanceOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
+    verify: VerifyOption = False,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
     out: Annotated[Path, typer.Option(help="Folder for metrics.json, tables.md; a stopped run goes on.")] = Path(

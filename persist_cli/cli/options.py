@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 
 from persist_cli import __version__
 from persist_cli.errors import INTERRUPTED, PersistError
+from persist_cli.io.checksums import verifying
 from persist_cli.plugins import plugin_errors
 
 DISK_ERRORS: Final = {  # of a disk that is full, closed or read-only, which is no fault of a command
@@ -54,6 +55,20 @@ DtypeOption = Annotated[
 SaveMemoryOption = Annotated[
     str | None,
     typer.Option("--save-memory", help="Of model-offload, sequential-offload, vae-slicing, vae-tiling, with commas."),
+]
+
+
+def verify_everything(context: typer.Context, verify: bool) -> bool:
+    """Let the command of a context verify every file with a checksum, when ``verify`` is set."""
+    context.with_resource(verifying(verify))
+    return verify
+
+
+VerifyOption = Annotated[
+    bool,
+    typer.Option(
+        "--verify", callback=verify_everything, help="Check every file by its checksum, not only those up to 256 MiB."
+    ),
 ]
 
 ActionsOption = Annotated[

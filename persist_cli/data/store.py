@@ -6,6 +6,7 @@ import bisect
 import contextlib
 import difflib
 import json
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -273,6 +274,7 @@ def schema(info: TrajectoryInfo) -> pa.Schema:
         "vocabulary": info.vocabulary.to_json(),
         "source": info.source,
     }
+    header["crc32"] = _header_checksum(header)  # pages have checksums of Parquet's, the metadata has none
     return COLUMNS.with_metadata({METADATA_KEY: json.dumps(header), b"huggingface": json.dumps(_hugging_face_info())})
 
 
@@ -292,6 +294,8 @@ def read_info(metadata: dict[bytes, bytes] | None, path: Path) -> TrajectoryInfo
                 f"{path}: written as {header['format']} version {header['version']}; "
                 f"this persist reads {FORMAT} up to version {VERSION}"
             )
+        if "crc32" in header and header["crc32"] != _header_checksum(header):
+            raise DataError(f"{path}: its header is damaged, the checksum is wrong; take a whole copy")
         info = _parse_header(header)
         check_info(info, str(path))
     except (KeyError, TypeError, ValueError) as error:
@@ -310,6 +314,12 @@ def check_info(info: TrajectoryInfo, where: str) -> None:
     up = np.asarray(info.world_up, dtype=np.float64)
     if up.shape != (3,) or not abs(float(np.linalg.norm(up)) - 1) < 1e-3:
         raise DataError(f"{where}: world_up {list(info.world_up)} is not a unit vector of three numbers")
+
+
+def _header_checksum(header: dict[str, Any]) -> str:
+    """CRC-32 of the values of a header but the checksum itself."""
+    values = {key: value for key, value in header.items() if key != "crc32"}
+    return f"{zlib.crc32(json.dumps(values, sort_keys=True).encode()):08x}"
 
 
 def _parse_header(header: dict[str, Any]) -> TrajectoryInfo:

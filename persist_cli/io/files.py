@@ -7,15 +7,15 @@ import hashlib
 import json
 import math
 import os
-import re
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.io.checksums import CHECKSUM, is_verified, is_whole, tensor_bytes, tensor_checksum
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -29,6 +29,13 @@ def check_folder(path: Path) -> None:
     nearest = next((folder for folder in (path, *path.parents) if folder.exists()), path)
     if nearest.exists() and not nearest.is_dir():
         raise PersistError(f"{path}: no folder can be made there, {nearest} is a file; choose another --out")
+
+
+SAFETENSORS_TYPES: Final = {  # the format's names for those of torch
+    "float64": "F64", "float32": "F32", "float16": "F16", "bfloat16": "BF16", "float8_e4m3fn": "F8_E4M3",
+    "float8_e5m2": "F8_E5M2", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8", "uint64": "U64",
+    "uint32": "U32", "uint16": "U16", "uint8": "U8", "bool": "BOOL", "complex64": "C64",
+}  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -66,23 +73,43 @@ def plain(value: Any) -> Any:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write a safetensors file, whole or not at all.
+    """Write a safetensors file with a checksum, whole or not at all; equal tensors make equal bytes.
+
+    The file is written here and not by the safetensors package, which orders metadata at random, lets nobody but the
+    user read the file, and leaves a temporary file when it is killed.
 
     Raises:
         OSError: when it cannot be written, as on a full disk.
+        ValueError: for a tensor of a type that safetensors does not have.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import save_file
+    plain_tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    header = dict(metadata or {})
+    header[CHECKSUM] = tensor_checksum(plain_tensors, header)
+    order = sorted(plain_tensors, key=lambda name: (-plain_tensors[name].element_size(), name))
+    with written_aside(path) as aside:
+        try:
+            with aside.open("wb") as file:
+                file.write(_safetensors_header(plain_tensors, order, header))
+                for name in order:
+                    file.write(tensor_bytes(plain_tensors[name]))
+        except OSError as error:  # it does not name the file
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
-    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # safetensors writes a temporary file of its own beside its target: after a kill, a folder around both can be found
-    with empty_folder_aside(path) as folder:
-        with written_aside(folder / path.name) as aside:
-            try:
-                save_file(contiguous, aside, dict(metadata or {}))
-            except SafetensorError as error:
-                raise _os_error(path, str(error).splitlines()[0]) from error
-        (folder / path.name).replace(path)
+
+def _safetensors_header(tensors: Mapping[str, Tensor], order: Sequence[str], metadata: Mapping[str, str]) -> bytes:
+    """The beginning of a safetensors file: the length of a JSON text, and that with the place of each tensor."""
+    values: dict[str, Any] = {"__metadata__": dict(sorted(metadata.items()))}
+    end = 0
+    for name in order:
+        tensor = tensors[name]
+        kind = str(tensor.dtype).removeprefix("torch.")
+        if kind not in SAFETENSORS_TYPES:
+            raise ValueError(f"{name}: safetensors has no type {kind}")
+        begin, end = end, end + tensor.nbytes
+        values[name] = {"dtype": SAFETENSORS_TYPES[kind], "shape": list(tensor.shape), "data_offsets": [begin, end]}
+    text = json.dumps(values, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # tensors begin at a multiple of eight bytes
+    return len(text).to_bytes(8, "little") + text
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -93,7 +120,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     the written one did.
 
     Raises:
-        CheckpointError: one line when the file is missing, truncated or not safetensors.
+        CheckpointError: one line when the file is missing, truncated, not safetensors, or differs from its checksum.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -101,9 +128,14 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise CheckpointError(f"{path}: no such file")
     try:
         with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name).clone() for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+            metadata = dict(file.metadata() or {})
     except (SafetensorError, ValueError, OSError) as error:
         raise CheckpointError(f"{path}: not a whole safetensors file ({str(error).splitlines()[0]})") from error
+    if is_verified(path) and not is_whole(tensors, metadata):
+        raise CheckpointError(f"{path}: damaged, its checksum is wrong; take a whole copy, or make it anew")
+    metadata.pop(CHECKSUM, None)
+    return tensors, metadata
 
 
 def load_exactly(module: nn.Module, tensors: dict[str, Tensor], names: set[str], path: Path) -> None:
@@ -199,10 +231,13 @@ def remove_leftovers(folder: Path, name: str = "") -> None:
             leftover.unlink(missing_ok=True)
 
 
-def _os_error(path: Path, message: str) -> OSError:
-    """The error of the operating system that safetensors, which is written in Rust, reports as text."""
-    match = re.search(r"os error (\d+)", message)
-    return OSError(int(match[1]), os.strerror(int(match[1])), str(path)) if match else OSError(f"{path}: {message}")
+def follow_umask(folder: Path) -> None:
+    """Give the files below a folder the mode that new files get; the safetensors package lets only the user read."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    for path in folder.rglob("*"):
+        if path.is_file():
+            path.chmod(0o666 & ~mask)
 
 
 def _path_aside(path: Path) -> Path:

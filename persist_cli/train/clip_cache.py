@@ -13,7 +13,6 @@ import hashlib
 import json
 import shutil
 import time
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,7 +36,7 @@ from persist_cli.plugins import find_plugin
 from persist_cli.recipe import MemoryConfig, Recipe
 from persist_cli.viewing.console import say
 
-FORMAT: Final = 2  # of the entries; those of another format are not found
+FORMAT: Final = 3  # of the entries; those of another format are not found
 
 SCANS: Final = 64  # how often at most the folder is measured while it fills up
 
@@ -98,12 +97,9 @@ class TensorCache:
         if not path.is_file():
             return None
         try:
-            tensors, metadata = read_tensors(path)
+            tensors, _ = read_tensors(path)
         except CheckpointError as error:
             self._remove(path, str(error))
-            return None
-        if metadata.get("crc32") != _checksum(tensors):
-            self._remove(path, f"{path}: its checksum is wrong")
             return None
         return tensors
 
@@ -120,7 +116,7 @@ class TensorCache:
         before = _size(path)  # another process may have written the same entry already
         try:
             path.parent.mkdir(exist_ok=True)
-            write_tensors(path, tensors, {"crc32": _checksum(tensors)})
+            write_tensors(path, tensors)
         except OSError as error:
             return self._stop(f"not writable ({error})")
         grown = _size(path) - before
@@ -337,14 +333,6 @@ class ClipEncoder:
         """Latents of these frames, on the CPU."""
         with torch.no_grad(), self.accelerator.autocast():
             return self.backbone.encode(Clips.stack([clip]))[0].to("cpu")
-
-
-def _checksum(tensors: Mapping[str, Tensor]) -> str:
-    """CRC-32 of the bytes of all tensors, in order of their names."""
-    code = 0
-    for _, tensor in sorted(tensors.items()):
-        code = zlib.crc32(tensor.detach().cpu().reshape(-1).view(torch.uint8).numpy().data, code)
-    return f"{code:08x}"
 
 
 def _size(path: Path) -> int:

@@ -82,11 +82,11 @@ class RunFolder:
         size = recipe.training.batch
         batches = ([trainer.clips[number * size + row] for row in range(size)] for number in range(CODEC_BATCHES))
         backbone.finish_stage(recipe.stage, (trainer.to_batch(samples) for samples in batches))
+        write_text(folder / RECIPE, to_yaml(recipe))
+        save_stage_recipes(folder, self.recipes)
         if recipe.memory is not None and self.base is not None:
             save_adapter(backbone, self.base, recipe.memory, folder, home, self.scenes)
         elif recipe.lora is not None:
             save_lora(backbone, self.base, folder, home, self.scenes)
         else:
             save_base(backbone, folder, self.scenes)
-        write_text(folder / RECIPE, to_yaml(recipe))
-        save_stage_recipes(folder, self.recipes)

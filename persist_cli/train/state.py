@@ -29,6 +29,7 @@ from torch.distributed.checkpoint.state_dict_saver import save
 from persist_cli.api.checkpoint import STEP, step_folders
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import folder_aside, read_json, read_tensors, write_json, write_tensors
+from persist_cli.io.sha256sums import check_sums, write_sums
 from persist_cli.train.distributed import is_sharded
 
 STATE_FILE: Final = "training.safetensors"  # of a training that is not sharded
@@ -111,6 +112,7 @@ class TrainingState:
         Raises:
             CheckpointError: when a file is missing or damaged, or a tensor is missing or of another shape.
         """
+        check_sums(folder, _has_no_checksum)
         notes: dict[str, Any] = read_json(folder / NOTES_FILE)
         shards = folder / SHARDS_FOLDER if "files" in notes else folder
         if "files" in notes and len(list(shards.glob("*.safetensors"))) != notes["files"]:
@@ -160,6 +162,7 @@ def save_state(run: Path, state: TrainingState, save_model: Callable[[Path, Path
         save_model(aside / "model", checkpoint / "model")
         if main:
             write_json(aside / NOTES_FILE, notes)
+            write_sums(aside, wanted=_has_no_checksum)
     if main:
         for older in step_folders(run)[:-1]:
             shutil.rmtree(older)
@@ -170,6 +173,11 @@ def load_state(run: Path, state: TrainingState) -> None:
     folders = step_folders(run)
     if folders:
         state.read(folders[-1])
+
+
+def _has_no_checksum(name: str) -> bool:
+    """Whether a file in a checkpoint's folder has no checksum of its own; the folder of the model has its own list."""
+    return name == NOTES_FILE or name.startswith(f"{SHARDS_FOLDER}/")
 
 
 def write_shards(folder: Path, tensors: Mapping[str, Tensor]) -> None:

@@ -266,6 +266,7 @@ def test_a_checkpoint_that_cannot_be_loaded_is_refused(checkpoints, tmp_path):
         persist_backbones.load(stage2, dtype="bf16")
     with pytest.raises(PersistError, match="no checkpoint there"):
         persist_backbones.load(tmp_path / "nowhere")
+    (base / "SHA256SUMS").unlink()
     (base / "persist.json").write_text((base / "persist.json").read_text().replace('"cogvideox"', '"dreamer"'))
     with pytest.raises(PersistError, match=r"a checkpoint of backbone 'dreamer', not of 'cogvideox'$"):
         persist_backbones.load(base)

@@ -14,6 +14,7 @@ from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.load import load_adapter, load_backbone
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
+from tests.support.damage import without_sums
 from tests.support.disk import file_limit
 from tests.support.export_runs import write_adapter, write_base, write_runs
 from tests.support.micro_model import random_clips, random_tokens
@@ -128,6 +129,7 @@ def test_the_exported_sampling_is_the_default_of_the_checkpoint(export, runs, tm
 )
 def test_a_card_with_an_invalid_sampling_is_refused(export, tmp_path, value):
     export(tmp_path / "m")
+    without_sums(tmp_path / "m")
     card = json.loads((tmp_path / "m/persist.json").read_text())
     (tmp_path / "m/persist.json").write_text(json.dumps(card | {"sampling": value}))
     with pytest.raises(CheckpointError, match=r"persist\.json: its sampling is"):

@@ -17,6 +17,7 @@ def write_model(folder, scale=0.1, sampling=None, **settings):
     backbone = write_base(folder / "base", scale, **settings)
     model = write_adapter(backbone, folder / "base", folder / "voxel", "voxel")
     if sampling:
+        (model / "SHA256SUMS").unlink(missing_ok=True)
         write_json(model / "persist.json", read_json(model / "persist.json") | {"sampling": sampling})
     return model
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import stat
+
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
+from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import (
     ASIDE,
@@ -17,6 +22,8 @@ from persist_cli.io.files import (
     written_aside,
 )
 from tests.support.disk import file_limit
+from tests.support.export_runs import write_base
+from tests.support.micro_model import micro
 from tests.support.misaligned import ALIGNMENT, write_misaligned
 
 
@@ -34,6 +41,65 @@ def test_tensors_are_read_into_memory_that_torch_allocated(tmp_path):
     copies, _ = read_tensors(tmp_path / "a.safetensors")
     assert all(torch.equal(copies[name], tensor) for name, tensor in tensors.items())
     assert all(tensor.data_ptr() % ALIGNMENT == 0 for tensor in copies.values())
+
+
+TYPES = [torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool]
+
+
+def test_the_safetensors_package_reads_what_is_written(tmp_path):
+    tensors = {str(kind): torch.tensor([[1, 0, 1], [0, 1, 1]], dtype=kind) for kind in TYPES}
+    tensors |= {"scalar": torch.tensor(3.5), "empty": torch.zeros(0, 4), "ünïcode": torch.ones(3, dtype=torch.uint8)}
+    write_tensors(tmp_path / "a.safetensors", tensors, {"b": "1", "a": "ü"})
+    save_file(tensors, tmp_path / "b.safetensors")
+    for name in "ab":
+        read = load_file(tmp_path / f"{name}.safetensors")
+        assert read.keys() == tensors.keys()
+        assert all(torch.equal(read[key], value) and read[key].dtype == value.dtype for key, value in tensors.items())
+    assert read_tensors(tmp_path / "a.safetensors")[1] == {"b": "1", "a": "ü"}
+
+
+def test_equal_tensors_make_equal_files_whatever_their_order_in_memory(tmp_path):
+    tensors = {"a": torch.arange(6.0).reshape(2, 3).t(), "b": torch.ones(3)}
+    write_tensors(tmp_path / "a", tensors, {"x": "1", "y": "2"})
+    backwards = {name: tensors[name].contiguous() for name in ("b", "a")}
+    write_tensors(tmp_path / "b", backwards, {"y": "2", "x": "1"})
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_tensor_file_without_a_checksum_is_read_as_before(tmp_path):
+    save_file({"a": torch.ones(3)}, tmp_path / "a.safetensors", {"b": "c"})
+    tensors, metadata = read_tensors(tmp_path / "a.safetensors")
+    assert torch.equal(tensors["a"], torch.ones(3))
+    assert metadata == {"b": "c"}
+
+
+def test_a_damaged_name_of_the_checksum_does_not_switch_it_off(tmp_path):
+    path = tmp_path / "a.safetensors"
+    write_tensors(path, {"a": torch.ones(3)})
+    path.write_bytes(path.read_bytes().replace(b'"checksum"', b'"checksun"'))
+    with pytest.raises(CheckpointError, match=r"a\.safetensors: damaged, its checksum is wrong"):
+        read_tensors(path)
+
+
+def test_tensors_of_a_type_that_safetensors_lacks_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"^a: safetensors has no type complex128$"):
+        write_tensors(tmp_path / "a", {"a": torch.ones(2, dtype=torch.complex128)})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o007, 0o660)])
+def test_all_files_follow_the_umask(tmp_path, mask, mode):
+    before = os.umask(mask)
+    try:
+        write_base(tmp_path / "base")
+        WorldPipeline.of(micro()).save_pretrained(tmp_path / "pipeline")
+        write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(3)})
+        write_text(tmp_path / "a.txt", "a")
+    finally:
+        os.umask(before)
+    modes = {path: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.rglob("*") if path.is_file()}
+    assert len(modes) > 10
+    assert set(modes.values()) == {mode}, modes
 
 
 def test_a_truncated_tensor_file_is_one_line(tmp_path):

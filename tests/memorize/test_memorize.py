@@ -114,7 +114,7 @@ def test_data_that_cannot_be_memorized_is_refused_in_one_line(data, tmp_path, ca
     assert "no trajectory 'd'" in failure(capsys, f"{data}#d", *out)
     assert "nothing to memorize" in failure(capsys, *out)
     assert "did you mean 'cell'" in failure(capsys, f"{data}#a", "--set", "memory.cells=1", *out)
-    assert "greater than 0" in failure(capsys, f"{data}#a", "--set", "memory.cell=[0, 1, 1]", *out)
+    assert "above 0" in failure(capsys, f"{data}#a", "--set", "memory.cell=[0, 1, 1]", *out)
     assert "did you mean 'voxel'" in failure(capsys, f"{data}#a", "--memory", "voxels", *out)
     assert "name a file" in failure(capsys, f"{data}#a", "--out", tmp_path)
     assert list(tmp_path.iterdir()) == []

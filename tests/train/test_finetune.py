@@ -15,6 +15,7 @@ import torch
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
 from persist_cli.train.trainer import Trainer
+from tests.support.damage import without_sums
 from tests.support.disk import file_limit
 from tests.support.micro_runs import (
     MICRO_SETTINGS,
@@ -237,6 +238,6 @@ def test_a_damaged_checkpoint_or_another_base_ends_a_rollout_in_one_line(persist
     (model / "world.safetensors").write_bytes(b"0" * 20)
     ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     assert (ended.code, "world.safetensors" in ended.err) == (1, True)
-    (model / "persist.json").write_text("{}")
+    (without_sums(model) / "persist.json").write_text("{}")
     ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     assert (ended.code, "not the card of a persist checkpoint" in ended.err) == (1, True)

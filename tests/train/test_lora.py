@@ -21,6 +21,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.stages import Lora
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
+from tests.support.damage import without_sums
 from tests.support.micro_model import micro, predicted, random_clips
 from tests.support.micro_runs import MICRO, MICRO_SETTINGS, equal_runs, run_persist, stage
 from tests.support.twins import load_twin, write_twin
@@ -185,6 +186,7 @@ def test_each_impossible_use_of_lora_ends_in_one_line(persist, walks, stage1, co
 def test_a_damaged_lora_file_or_another_base_ends_in_one_line(persist, walks, stage1, lora, tmp_path):
     for name in ("stage1", "lora"):
         shutil.copytree({"stage1": stage1, "lora": lora}[name], tmp_path / name)
+        without_sums(model_folder(tmp_path / name))
     roll = ("rollout", tmp_path / "lora", "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     card = model_folder(tmp_path / "stage1") / "persist.json"
     card.write_text(card.read_text().replace(find_checkpoint(stage1).fingerprint, "0" * 64))

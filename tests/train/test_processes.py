@@ -19,6 +19,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
 from persist_cli.train.state import read_shards
+from tests.support.damage import without_sums
 from tests.support.micro_runs import (
     MICRO_SETTINGS,
     equal_runs,
@@ -134,7 +135,7 @@ def test_a_sharded_checkpoint_has_a_file_for_each_process_and_no_pickle(runs):
     sizes = [path.stat().st_size for path in sorted((step / "training").glob("*.safetensors"))]
     assert max(sizes) < 0.6 * sum(sizes)
     kinds = {path.suffix for path in step.rglob("*") if path.is_file()}
-    assert kinds == {".safetensors", ".json", ".yaml"}
+    assert kinds == {".safetensors", ".json", ".yaml", ""}  # the last of SHA256SUMS
     assert sharded_state(runs / "fsdp-1").keys() == run_result(runs / "one-1")[0].keys()
 
 
@@ -183,6 +184,10 @@ def test_a_missing_or_damaged_part_of_a_checkpoint_ends_in_one_line(persist, wal
     arguments = stage("stage1", walks, run, f"base={codec}", BATCH, f"training.clip={CLIP}", "--resume")
     part = min(next(run.glob("step-*")).glob("training/*.safetensors"))
     content = part.read_bytes()
+    part.write_bytes(content[:-1] + b"\1")
+    ended = persist(*arguments)
+    assert (ended.code, f"{part}: damaged or changed" in ended.err) == (1, True), ended.err
+    without_sums(next(run.glob("step-*")))  # as in earlier versions
     for damaged, cause in (
         (content[:-9], "its parts cannot be read"),
         (b"", "its parts cannot be read"),

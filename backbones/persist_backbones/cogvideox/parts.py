@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from persist_backbones.cogvideox.codec import spatial_compression
 from persist_backbones.cogvideox.config import PRESETS, CogVideoXSettings
 from persist_cli.errors import CheckpointError
-from persist_cli.io.files import load_exactly, read_json, read_tensors, reallocate, write_tensors
+from persist_cli.io.files import follow_umask, load_exactly, read_json, read_tensors, reallocate, write_tensors
 from persist_cli.io.hub import hub_obstacle, silent
 
 SUBFOLDERS = {
@@ -139,6 +139,8 @@ def save_parts(parts: DiffusersParts, folder: Path) -> None:
     parts.transformer.save_pretrained(folder / "transformer")
     parts.vae.save_pretrained(folder / "vae")
     parts.scheduler.save_pretrained(folder / "scheduler")
+    for name in SUBFOLDERS:
+        follow_umask(folder / name)
 
 
 def save_world(transformer: nn.Module, prompt: Tensor, folder: Path) -> None:

@@ -29,7 +29,7 @@ from persist_cli.api.checkpoint import CARD, PLAIN, find_checkpoint
 from persist_cli.api.inference import Precision
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
-from persist_cli.io.files import reallocate
+from persist_cli.io.files import follow_umask, reallocate
 from persist_cli.io.settings import parse_settings
 
 Callback = Callable[["WorldPipeline", int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
@@ -133,6 +133,8 @@ class WorldPipeline(OffloadingPipeline):
         if not safe_serialization:
             raise CheckpointError(f"{save_directory}: weights are saved as safetensors only")
         super().save_pretrained(save_directory, **options)
+        for name in self.components:
+            follow_umask(Path(save_directory) / name)
 
     @classmethod
     def from_pretrained(cls, pretrained_model_name_or_path: str | Path, **options: Any) -> Self:
@@ -259,8 +261,10 @@ def load_pipeline(folder: Path, adapter: str | None, dtype: Precision | None) ->
     with torch.device("meta"):  # weights come from the files
         backbone = ExtendedCogVideoX(parse_settings(CogVideoXSettings, checkpoint.settings, str(card)))
     backbone.name = NAME
-    backbone.load_base(checkpoint.base_folder)
     adapter = adapter or checkpoint.default_adapter()
-    if adapter is not None and adapter != PLAIN:
+    adapter = None if adapter == PLAIN else adapter
+    checkpoint.check_weights(adapter)
+    backbone.load_base(checkpoint.base_folder)
+    if adapter is not None:
         backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
     return WorldPipeline.of(backbone.to(getattr(torch, dtype or "float32")).eval())
