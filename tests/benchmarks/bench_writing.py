@@ -1,6 +1,7 @@
 """What writing imagined frames does to a memory: ``python tests/benchmarks/bench_writing.py --data DATA``.
 
-Prints two tables, asserts nothing. DATA are walks there and back through houses that the model was not trained on:
+Prints three tables, asserts nothing; without DATA the first one alone, of the sample houses. DATA are walks there and
+back through houses that the model was not trained on:
 
     persist collect miniworld --out DATA --split test --policy there-and-back --frames 97 --scenes 0:10
 
@@ -8,6 +9,7 @@ Prints two tables, asserts nothing. DATA are walks there and back through houses
   recorded ones, with their frames written into the memory and without.
 - Unseen way: the memory is empty. The model goes out ``OUT`` frames and comes back by the same poses. PSNR of a frame
   on the way back to its own frame of the way out at the same pose, and PSNR to the recorded frames.
+- Partly known way: the same, but the memory holds the walk up to the frame from which the model goes out.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -30,6 +32,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Trajectory
 from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone, reference_checkpoint
 from persist_cli.data.clips import interactions_of
+from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.rollout.world_model import Agent, WorldModel
@@ -57,11 +60,16 @@ class Bench:
     sampling: Sampling
     walks: Sequence[Trajectory]
     seeds: int
-    memories: dict[str, Memory] = field(default_factory=dict)
 
-    def follow(self, walks: Sequence[Trajectory], known: bool, write: bool) -> Tensor:
-        """The imagined colours of each walk after its first frame, ``[walk, seed, frame, height, width, 3]``."""
-        agents = [Agent(self.memory(walk, known), seed, write) for walk in walks for seed in range(self.seeds)]
+    def follow(self, walks: Sequence[Trajectory], seen: Sequence[Trajectory], write: bool) -> Tensor:
+        """The imagined colours of each walk after its first frame, ``[walk, seed, frame, height, width, 3]``.
+
+        Args:
+            walks: the ways to go.
+            seen: what the memory of each holds.
+            write: whether imagined frames are written.
+        """
+        agents = [Agent(self.memory(walk), seed, write) for walk in seen for seed in range(self.seeds)]
         each = [walk for walk in walks for _ in range(self.seeds)]
         model = WorldModel(self.backbone, agents, self.sampling)
         model.reset([walk.observations[:1] for walk in each], [walk.info for walk in each])
@@ -71,30 +79,26 @@ class Bench:
         videos = [Observations.concatenate(parts).rgb for parts in zip(*clips, strict=True)]
         return torch.stack(videos).unflatten(0, (len(walks), self.seeds))
 
-    def memory(self, walk: Trajectory, known: bool) -> Memory:
-        """A memory of the whole walk, or an empty one."""
-        if not known:
-            return self.factory.empty(walk.info)
-        if walk.name not in self.memories:
-            self.memories[walk.name] = self.factory.empty(walk.info)
-            self.memories[walk.name].write(walk.observations)
-        return self.memories[walk.name].copy()
+    def memory(self, walk: Trajectory) -> Memory:
+        """A memory of all frames of a walk."""
+        memory = self.factory.empty(walk.info)
+        memory.write(walk.observations)
+        return memory
 
     def known_way(self) -> list[tuple[str, ...]]:
         """A row for each house, and their mean: PSNR without writing, with writing, and both at the end."""
         truth = torch.stack([walk.observations.rgb[1:] for walk in self.walks])[:, None]
-        likeness = [psnr(self.follow(self.walks, True, write), truth) for write in (False, True)]
-        columns = [
-            values[..., frames].mean((1, 2)) for frames in (slice(None), slice(-LAST, None)) for values in likeness
-        ]
-        return house_rows(self.walks, columns)
+        likeness = [psnr(self.follow(self.walks, self.walks, write), truth).mean(1) for write in (False, True)]
+        ends = [values[:, -LAST:] for values in likeness]
+        return house_rows(self.walks, [values.mean(1) for values in (*likeness, *ends)])
 
-    def unseen_way(self) -> list[tuple[str, ...]]:
+    def unknown_way(self, seen_before: bool) -> list[tuple[str, ...]]:
         """A row for each house, and their mean: likeness to the own way out and to the truth, without and with."""
         middle = (len(self.walks[0]) - 1) // 2
         ways = [part(walk, middle - OUT, middle + OUT + 1) for walk in self.walks]
+        seen = [part(walk, 0, middle - OUT + 1 if seen_before else 0) for walk in self.walks]
         truth = torch.stack([way.observations.rgb[1:] for way in ways])[:, None]
-        videos = [self.follow(ways, False, write) for write in (False, True)]
+        videos = [self.follow(ways, seen, write) for write in (False, True)]
         # frame i of the video is at the pose of frame 2 * OUT - 2 - i; the last one is the observed start again
         own = [psnr(video[:, :, OUT : 2 * OUT - 1], video[:, :, : OUT - 1].flip(2)) for video in videos]
         true = [psnr(video, truth) for video in videos]
@@ -127,31 +131,34 @@ def house_rows(walks: Sequence[Trajectory], columns: Sequence[Tensor]) -> list[t
 
 
 def measure(checkpoint: Checkpoint, adapter: str, options: argparse.Namespace) -> None:
-    """Print both tables of one adapter."""
+    """Print the tables of one adapter."""
     backbone = load_backbone(checkpoint, adapter=None)
     load_adapter(backbone, checkpoint, adapter)
     factory = MemoryFactory.of(adapter_memory(checkpoint, adapter))
     walks = [file.read(slice(0, len(file))) for file in Store(options.data)][: options.houses]
     bench = Bench(backbone, factory, checkpoint.sampling_with(SamplingOverrides()), walks, options.seeds)
-    columns = ["kept", "written", "gain", "kept", "written", "gain"]
+    columns = ["not written", "written", "gain", "not written", "written", "gain"]
     if "known" in options.only:
         title = f"{adapter}, known way: PSNR dB of all frames, and of the last {LAST}"
         print_table(title, ["house", *columns], bench.known_way())
-    if "unseen" in options.only:
-        title = f"{adapter}, {OUT} unseen frames out and back: PSNR dB to the own way out, and to the recorded frames"
-        print_table(title, ["house", *columns], bench.unseen_way())
+    for way in ("unseen", "partly known"):
+        if way.split()[0] in options.only:
+            title = f"{adapter}, {way} way of {OUT} frames and back: PSNR dB to the own way out, and to the truth"
+            print_table(title, ["house", *columns], bench.unknown_way(way == "partly known"))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, help="walks there and back; without it the known way in the sample houses")
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--memories", default="voxel,map2d,snapshots")
     parser.add_argument("--houses", type=int, default=10)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--only", default="known,unseen")
+    parser.add_argument("--only", default="known,unseen,partly")
     options = parser.parse_args()
+    if options.data is None:
+        options.data, options.only = sample_data(), "known"
     checkpoint = find_checkpoint(options.checkpoint or reference_checkpoint())
-    say_conditions(f"{checkpoint.name}, {options.houses} houses, {options.seeds} seed(s)")
+    say_conditions(f"{checkpoint.name}, at most {options.houses} houses, {options.seeds} seed(s)")
     for adapter in options.memories.split(","):
         measure(checkpoint, adapter, options)
