@@ -61,6 +61,11 @@ class Bench:
     walks: Sequence[Trajectory]
     seeds: int
 
+    @property
+    def houses(self) -> list[str]:
+        """The names of the walks."""
+        return [walk.name for walk in self.walks]
+
     def follow(self, walks: Sequence[Trajectory], seen: Sequence[Trajectory], write: bool) -> Tensor:
         """The imagined colours of each walk after its first frame, ``[walk, seed, frame, height, width, 3]``.
 
@@ -90,19 +95,20 @@ class Bench:
         truth = torch.stack([walk.observations.rgb[1:] for walk in self.walks])[:, None]
         likeness = [psnr(self.follow(self.walks, self.walks, write), truth).mean(1) for write in (False, True)]
         ends = [values[:, -LAST:] for values in likeness]
-        return house_rows(self.walks, [values.mean(1) for values in (*likeness, *ends)])
+        return house_rows(self.houses, [values.mean(1) for values in (*likeness, *ends)])
 
     def unknown_way(self, seen_before: bool) -> list[tuple[str, ...]]:
         """A row for each house, and their mean: likeness to the own way out and to the truth, without and with."""
         middle = (len(self.walks[0]) - 1) // 2
-        ways = [part(walk, middle - OUT, middle + OUT + 1) for walk in self.walks]
-        seen = [part(walk, 0, middle - OUT + 1 if seen_before else 0) for walk in self.walks]
+        out = min(OUT, middle)
+        ways = [part(walk, middle - out, middle + out + 1) for walk in self.walks]
+        seen = [part(walk, 0, middle - out + 1 if seen_before else 0) for walk in self.walks]
         truth = torch.stack([way.observations.rgb[1:] for way in ways])[:, None]
         videos = [self.follow(ways, seen, write) for write in (False, True)]
-        # frame i of the video is at the pose of frame 2 * OUT - 2 - i; the last one is the observed start again
-        own = [psnr(video[:, :, OUT : 2 * OUT - 1], video[:, :, : OUT - 1].flip(2)) for video in videos]
+        # frame i of the video is at the pose of frame 2 * out - 2 - i; the last one is the observed start again
+        own = [psnr(video[:, :, out : 2 * out - 1], video[:, :, : out - 1].flip(2)) for video in videos]
         true = [psnr(video, truth) for video in videos]
-        return house_rows(self.walks, [values.mean((1, 2)) for values in (*own, *true)])
+        return house_rows(self.houses, [values.mean((1, 2)) for values in (*own, *true)])
 
 
 def part(walk: Trajectory, first: int, stop: int) -> Trajectory:
@@ -116,12 +122,11 @@ def psnr(one: Tensor, other: Tensor) -> Tensor:
     return 10 * torch.log10(255**2 / error)
 
 
-def house_rows(walks: Sequence[Trajectory], columns: Sequence[Tensor]) -> list[tuple[str, ...]]:
+def house_rows(houses: Sequence[str], columns: Sequence[Tensor]) -> list[tuple[str, ...]]:
     """A row for each house and one of their mean; after each pair of columns the second less the first."""
-    names = [*(walk.name for walk in walks), "mean"]
     table = torch.stack([torch.cat([column, column.mean(0, keepdim=True)]) for column in columns], -1).tolist()
     rows = []
-    for name, values in zip(names, table, strict=True):
+    for name, values in zip([*houses, "mean"], table, strict=True):
         pairs = zip(values[::2], values[1::2], strict=True)
         cells = (
             text for kept, written in pairs for text in (f"{kept:.2f}", f"{written:.2f}", f"{written - kept:+.2f}")
@@ -136,7 +141,8 @@ def measure(checkpoint: Checkpoint, adapter: str, options: argparse.Namespace) -
     load_adapter(backbone, checkpoint, adapter)
     factory = MemoryFactory.of(adapter_memory(checkpoint, adapter))
     walks = [file.read(slice(0, len(file))) for file in Store(options.data)][: options.houses]
-    bench = Bench(backbone, factory, checkpoint.sampling_with(SamplingOverrides()), walks, options.seeds)
+    sampling = checkpoint.sampling_with(SamplingOverrides(steps=options.steps))
+    bench = Bench(backbone, factory, sampling, walks, options.seeds)
     columns = ["not written", "written", "gain", "not written", "written", "gain"]
     if "known" in options.only:
         title = f"{adapter}, known way: PSNR dB of all frames, and of the last {LAST}"
@@ -147,18 +153,24 @@ def measure(checkpoint: Checkpoint, adapter: str, options: argparse.Namespace) -
             print_table(title, ["house", *columns], bench.unknown_way(way == "partly known"))
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables of every memory that is asked for."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--data", type=Path, help="walks there and back; without it the known way in the sample houses")
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--memories", default="voxel,map2d,snapshots")
     parser.add_argument("--houses", type=int, default=10)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--steps", type=int)
     parser.add_argument("--only", default="known,unseen,partly")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     if options.data is None:
         options.data, options.only = sample_data(), "known"
     checkpoint = find_checkpoint(options.checkpoint or reference_checkpoint())
     say_conditions(f"{checkpoint.name}, at most {options.houses} houses, {options.seeds} seed(s)")
     for adapter in options.memories.split(","):
         measure(checkpoint, adapter, options)
+
+
+if __name__ == "__main__":
+    main()
