@@ -17,7 +17,7 @@ exclude_patterns = ["_build"]
 nitpicky = True
 
 myst_heading_anchors = 3  # links to headings are checked
-myst_enable_extensions = ["deflist"]
+
 
 html_theme = "furo"  # its fonts and scripts are local; nothing is asked of another server
 html_title = "persist"

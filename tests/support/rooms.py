@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from persist_cli.api.actions import FREE, free_motion
 from persist_cli.api.observations import Frame, TrajectoryInfo
@@ -93,6 +94,30 @@ def walk(frames: int = 24) -> np.ndarray:
             for angle in angles
         ]
     )
+
+
+def write_sequence(folder: Path, frames: int = 4, size: tuple[int, int] = (48, 64), suffix: str = "png") -> Path:
+    """Write a 7-Scenes sequence of a walk through the room; every depth image lacks two pixels.
+
+    Args:
+        folder: the folder to make.
+        frames: number of frames.
+        size: height and width in pixels.
+        suffix: of the colour images.
+    """
+    folder.mkdir(parents=True)
+    room = Room(*size)
+    matrix = room.intrinsics
+    matrix[:2, 2] -= 0.5  # as 7-Scenes counts
+    np.savetxt(folder / "camera-intrinsics.txt", matrix)
+    for number, frame in enumerate(room.frames(walk(24)[:frames])):
+        stem = folder / f"frame-{3 * number:06d}"
+        Image.fromarray(frame.rgb).save(f"{stem}.color.{suffix}")
+        millimetres = np.round(frame.depth * 1000).astype(np.uint16)
+        millimetres[0, :2] = [0, 65535]
+        Image.fromarray(millimetres).save(f"{stem}.depth.png")
+        np.savetxt(f"{stem}.pose.txt", frame.world_from_camera)
+    return folder
 
 
 def _hit(rays: np.ndarray, origin: np.ndarray) -> np.ndarray:

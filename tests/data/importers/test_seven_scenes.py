@@ -15,24 +15,9 @@ from persist_cli.data.importers.importing import ImportPlan, run_import
 from persist_cli.data.importers.seven_scenes import SevenScenes
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PluginError
-from tests.support.rooms import Room, walk
+from tests.support.rooms import Room, walk, write_sequence
 
 ROOM = Room()
-
-
-def write_sequence(folder: Path, frames: int = 4, suffix: str = "png") -> Path:
-    folder.mkdir(parents=True)
-    matrix = ROOM.intrinsics
-    matrix[:2, 2] -= 0.5  # as 7-Scenes counts
-    np.savetxt(folder / "camera-intrinsics.txt", matrix)
-    for number, frame in enumerate(ROOM.frames(walk(24)[:frames])):
-        stem = folder / f"frame-{3 * number:06d}"
-        Image.fromarray(frame.rgb).save(f"{stem}.color.{suffix}")
-        millimetres = np.round(frame.depth * 1000).astype(np.uint16)
-        millimetres[0, :2] = [0, 65535]
-        Image.fromarray(millimetres).save(f"{stem}.depth.png")
-        np.savetxt(f"{stem}.pose.txt", frame.world_from_camera)
-    return folder
 
 
 @pytest.fixture
@@ -58,7 +43,7 @@ def test_depth_of_0_and_65535_is_missing(sequence: Path) -> None:
 
 def test_the_sequences_of_a_scene_share_its_name(tmp_path: Path) -> None:
     for number in (2, 1):
-        write_sequence(tmp_path / "chess" / f"seq-0{number}", 2, "jpg")
+        write_sequence(tmp_path / "chess" / f"seq-0{number}", 2, suffix="jpg")
     shutil.move(tmp_path / "chess/seq-01/camera-intrinsics.txt", tmp_path / "chess")  # one for all
     trajectories = list(SevenScenes().trajectories(tmp_path / "chess"))
     assert [trajectory.name for trajectory in trajectories] == ["chess-seq-01", "chess-seq-02"]
