@@ -240,7 +240,7 @@ def rollout(
     frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
     memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
-    write: Annotated[bool, typer.Option(help="Write what is generated into the memory, beside what was observed.")] = True,
+    write: Annotated[bool, typer.Option(help="Write what is generated into the memory beside what it holds.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
