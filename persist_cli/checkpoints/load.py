@@ -47,11 +47,10 @@ def load_backbone(
 
 def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
     """The backbone of the checkpoint's base on the meta device, without weights."""
-    import torch
-
+    from persist_cli.api.meta_device import without_weights
     from persist_cli.plugins import make_backbone
 
-    with torch.device("meta"):
+    with without_weights():
         return make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from persist_backbones.extensions.offload import prepare_inference, tile_overlap
+from persist_backbones.extensions.inference import prepare_inference, tile_overlap
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.errors import PersistError

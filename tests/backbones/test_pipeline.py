@@ -18,7 +18,7 @@ from PIL import Image
 
 import persist_backbones
 from persist_backbones.cogvideox.cogvideox import CogVideoX
-from persist_backbones.extensions.offload import enable_tiling
+from persist_backbones.extensions.inference import enable_tiling
 from persist_backbones.pipeline.call_inputs import batch_of_images
 from persist_backbones.pipeline.pipeline import WorldPipeline, WorldPipelineOutput
 from persist_cli.api.backbone import Sampling

@@ -9,12 +9,15 @@ from collections.abc import Callable, Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
-from diffusers import AutoencoderKLCogVideoX
-from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXCausalConv3d, CogVideoXSafeConv3d
-from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from persist_backbones.diffusers_models import (
+    AutoencoderKLCogVideoX,
+    CogVideoXCausalConv3d,
+    CogVideoXSafeConv3d,
+    DiagonalGaussianDistribution,
+)
 from persist_cli.errors import CheckpointError
 
 HALF_RANGE = 2.0  # the depth in metres whose code is 0

@@ -5,18 +5,20 @@ The training loss and the sampling loop that put these together are ``CogVideoX.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
-from diffusers import (
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from persist_backbones.diffusers_models import (
     CogVideoXDDIMScheduler,
     CogVideoXDPMScheduler,
     DPMSolverMultistepScheduler,
     UniPCMultistepScheduler,
 )
-from jaxtyping import Float, Int
-from torch import Tensor
 
 Prediction = Literal["v_prediction", "sample"]
 Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
@@ -112,13 +114,22 @@ class SamplingSchedule:
 
 def make_scheduler(config: Any, sampler: str, steps: int) -> Any:
     """Make diffusers' scheduler for a sampler, with ``steps`` timesteps; see ``SamplingSchedule``."""
-    trained = CogVideoXDDIMScheduler.from_config(config)
-    scheduler = COGVIDEOX[sampler].from_config(config) if sampler in COGVIDEOX else _multistep(sampler, trained)
+    trained = scheduler_of(CogVideoXDDIMScheduler, config)
+    scheduler = scheduler_of(COGVIDEOX[sampler], config) if sampler in COGVIDEOX else _multistep(sampler, trained)
     scheduler.set_timesteps(steps)
     scheduler.timesteps = scheduler.timesteps[:steps]  # for some numbers, like 61, rounding adds a timestep: -1
     if sampler in MULTISTEP:
         scheduler.sigmas = torch.cat([scheduler.sigmas[:steps], torch.zeros(1)])
     return scheduler
+
+
+def scheduler_of(kind: Any, config: Mapping[str, Any]) -> Any:
+    """Make a scheduler of diffusers from what its class knows of a configuration.
+
+    diffusers' own ``from_config`` does the same, but first imports all schedulers that it could be converted to.
+    """
+    known = inspect.signature(kind).parameters
+    return kind(**{key: value for key, value in config.items() if key in known})
 
 
 def _multistep(sampler: str, trained: CogVideoXDDIMScheduler) -> Any:

@@ -9,8 +9,6 @@ from typing import Any, get_args
 
 import torch
 import torch.nn.functional as F
-from diffusers import CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
-from diffusers.models.embeddings import get_3d_rotary_pos_embed
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -18,6 +16,11 @@ from persist_backbones.cogvideox.codec import spatial_compression
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import Prediction
 from persist_backbones.cogvideox.parts import DiffusersParts
+from persist_backbones.diffusers_models import (
+    CogVideoXDDIMScheduler,
+    CogVideoXTransformer3DModel,
+    get_3d_rotary_pos_embed,
+)
 from persist_backbones.tensors import fold_frames, frames_per_token, tokens_of
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras, invert_rigid
@@ -284,7 +287,8 @@ def fit_positions(transformer: CogVideoXTransformer3DModel, size: tuple[int, int
     elif table.use_positional_embeddings:
         rows, columns, frames = size[1], size[2], sample_size["sample_frames"]
         device = table.pos_embedding.device
-        table.pos_embedding = table._get_positional_embeddings(rows, columns, frames, device=device)
+        positions = table._get_positional_embeddings(rows, columns, frames, device=torch.device("cpu"))
+        table.pos_embedding = positions.to(device)
     else:
         return
     for name, value in sample_size.items():

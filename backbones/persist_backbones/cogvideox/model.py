@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from diffusers import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from persist_backbones.adapters.base import MemoryCondition, VideoShape
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
+from persist_backbones.diffusers_models import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches, zero_init
 
 OFFSET = 2.0  # the value of ``ofs`` in the training of CogVideoX 1.5 image-to-video

@@ -5,27 +5,32 @@ Pretrained parts are in a local directory of diffusers' layout or in a repositor
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
-from diffusers.loaders.lora_base import LORA_ADAPTER_METADATA_KEY, LORA_WEIGHT_NAME_SAFE
-from diffusers.models.autoencoders.autoencoder_kl_cogvideox import CogVideoXResnetBlock3D
 from torch import Tensor, nn
 
 from persist_backbones.cogvideox.codec import spatial_compression
 from persist_backbones.cogvideox.config import PRESETS, CogVideoXSettings
+from persist_backbones.cogvideox.diffusion import scheduler_of
+from persist_backbones.diffusers_models import (
+    LORA_ADAPTER_METADATA_KEY,
+    LORA_WEIGHT_NAME_SAFE,
+    AutoencoderKLCogVideoX,
+    CogVideoXDDIMScheduler,
+    CogVideoXResnetBlock3D,
+    CogVideoXTransformer3DModel,
+)
+from persist_cli.api.meta_device import without_weights
 from persist_cli.errors import CheckpointError
-from persist_cli.io.files import follow_umask, load_exactly, read_json, read_tensors, reallocate, write_tensors
-from persist_cli.io.hub import hub_obstacle, silent
+from persist_cli.io.files import follow_umask, load_exactly, read_json, read_tensors, write_tensors
+from persist_cli.io.hub import hub_obstacle
 
 SUBFOLDERS = {
     "transformer": CogVideoXTransformer3DModel,
@@ -88,7 +93,7 @@ def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
     }
     transformer = make_part("transformer", preset["transformer"] | size | settings.transformer)
     prediction = {"prediction_type": settings.prediction} if settings.prediction else {}
-    return DiffusersParts(transformer, vae, CogVideoXDDIMScheduler(**(preset["scheduler"] | prediction)))
+    return DiffusersParts(transformer, vae, make_part("scheduler", preset["scheduler"] | prediction))
 
 
 def initialize(vae: AutoencoderKLCogVideoX) -> None:
@@ -125,11 +130,18 @@ def make_part(name: str, config: dict[str, Any]) -> Any:
     Raises:
         CheckpointError: one line for a configuration that diffusers refuses, and for sizes below 1.
     """
-    on_cpu = name == "scheduler"  # its tables are no weights, and needed on the meta device too
+    if name == "scheduler":  # its tables are no weights, and needed on the meta device too
+        with torch.device("cpu"):
+            return _construct(name, config)
+    part = _construct(name, config)
+    return nn.Module.to(part, "meta") if on_meta_device() else part  # diffusers' own ``to`` imports all its hooks
+
+
+def _construct(name: str, config: dict[str, Any]) -> Any:
+    """Make a part on the default device; within ``without_weights`` its tables of positions are on the CPU."""
     _check_sizes(name, config)
     try:
-        with torch.device("cpu") if on_cpu else contextlib.nullcontext():
-            return SUBFOLDERS[name](**config)
+        return SUBFOLDERS[name](**config)
     except (TypeError, ValueError, IndexError, ArithmeticError) as error:
         raise CheckpointError(f"diffusers cannot make a {name} of these settings ({_cause(error)})") from error
 
@@ -241,12 +253,17 @@ def folder_here(name: str) -> Path | None:
 def missing_files(part: Path) -> list[str]:
     """Return the names of the files of configuration and weights that a part's folder lacks."""
     if part.name == "scheduler":
-        wanted = ["scheduler_config.json"]
+        wanted = [part / "scheduler_config.json"]
     else:
-        index = part / "diffusion_pytorch_model.safetensors.index.json"
-        weights = set(read_json(index)["weight_map"].values()) if index.is_file() else {WEIGHTS}
-        wanted = ["config.json", *sorted(weights)]
-    return [name for name in wanted if not (part / name).is_file()]
+        wanted = [part / "config.json", *_weight_files(part)]
+    return [path.name for path in wanted if not path.is_file()]
+
+
+def _weight_files(part: Path) -> list[Path]:
+    """Return the file or shards that hold a part's weights, whether they are there or not."""
+    index = part / "diffusion_pytorch_model.safetensors.index.json"
+    names = set(read_json(index)["weight_map"].values()) if index.is_file() else {WEIGHTS}
+    return [part / name for name in sorted(names)]
 
 
 def published_preset(name: str) -> str | None:
@@ -279,20 +296,39 @@ def _load_part(folder: Path, name: str) -> Any:
     missing = missing_files(folder / name)
     if missing:
         raise CheckpointError(f"{folder / name}: no {missing[0]} in it; take a whole copy, its weights as safetensors")
-    options: dict[str, Any] = {"subfolder": name, "local_files_only": True}
-    try:
-        if name == "scheduler":
-            return SUBFOLDERS[name].from_pretrained(folder, **options)
-        with silent("diffusers.models.modeling_utils"):  # its warnings become errors below
-            part, report = SUBFOLDERS[name].from_pretrained(
-                folder, use_safetensors=True, low_cpu_mem_usage=False, output_loading_info=True, **options
+    if name == "scheduler":
+        return scheduler_of(SUBFOLDERS[name], config)
+    with without_weights():
+        part = _construct(name, config)
+    _load_weights(part, folder / name)
+    return part.eval()
+
+
+def _load_weights(part: nn.Module, folder: Path) -> None:
+    """Load the weights in a part's folder, in one file or in shards, as float32.
+
+    diffusers' ``from_pretrained`` gives the same, but first draws random weights, and imports what is not used here.
+
+    Raises:
+        CheckpointError: when a file is corrupt, or the weights are not those that the part has.
+    """
+    tensors = {name: tensor for path in _weight_files(folder) for name, tensor in read_tensors(path)[0].items()}
+    wanted = part.state_dict()
+    if "patch_embed.pos_embedding" not in wanted:
+        tensors.pop("patch_embed.pos_embedding", None)  # computed, though some copies have it
+    for problem, names in (("lack", set(wanted) - set(tensors)), ("have besides", set(tensors) - set(wanted))):
+        if names:
+            raise CheckpointError(
+                f"{folder}: its weights {problem} {len(names)} tensors of its config.json, first {min(names)!r}; "
+                "take a whole copy of both"
             )
-    except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{folder / name}: cannot be loaded ({_cause(error)})") from error
-    computed = () if config.get("use_learned_positional_embeddings") else ("patch_embed.pos_embedding",)
-    _check_all_loaded(folder / name, report, computed)
-    reallocate(part)
-    return part
+    for name, tensor in tensors.items():
+        if tensor.shape != wanted[name].shape:
+            raise CheckpointError(
+                f"{folder}: cannot be loaded ({name!r} has the shape {tuple(tensor.shape)}, config.json wants "
+                f"{tuple(wanted[name].shape)})"
+            )
+    part.load_state_dict({name: tensor.float() for name, tensor in tensors.items()}, assign=True)
 
 
 def _read_config(folder: Path, name: str) -> dict[str, Any]:
@@ -303,23 +339,6 @@ def _read_config(folder: Path, name: str) -> dict[str, Any]:
     if not isinstance(config, dict):
         raise CheckpointError(f"{folder / name}: its configuration is no mapping; take a whole copy")
     return {key: value for key, value in config.items() if not key.startswith("_")}
-
-
-def _check_all_loaded(folder: Path, report: dict[str, Any], computed: Sequence[str]) -> None:
-    """Raise ``CheckpointError`` if weights and configuration differ; diffusers leaves missing weights random.
-
-    Args:
-        folder: folder of weights and configuration.
-        report: diffusers' report on the loading.
-        computed: tensors that may be missing or not.
-    """
-    for problem, names in (("lack", report["missing_keys"]), ("have besides", report["unexpected_keys"])):
-        names = sorted(set(names) - set(computed))
-        if names:
-            raise CheckpointError(
-                f"{folder}: its weights {problem} {len(names)} tensors of its config.json, first {names[0]!r}; "
-                "take a whole copy of both"
-            )
 
 
 def _check_sizes(name: str, config: dict[str, Any]) -> None:

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from persist_backbones.cogvideox.cogvideox import CogVideoX, SamplingStep
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.model import Conditions
+from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
-from persist_backbones.extensions.caches import ClipCaches
+from persist_backbones.extensions.inference import bring_when_run, prepare_inference
 from persist_backbones.extensions.lora import add_lora, save_lora, train_lora
-from persist_backbones.extensions.offload import OffloadedParts, bring_when_run, prepare_inference
 from persist_backbones.extensions.savings import FrozenWeights, apply_memory_savings
 from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.stages import Lora, MemorySavings, Stage
+
+if TYPE_CHECKING:
+    from persist_backbones.extensions.caches import ClipCaches
+    from persist_backbones.extensions.offload import OffloadedParts
 
 
 class ExtendedCogVideoX(CogVideoX):
@@ -48,6 +52,10 @@ class ExtendedCogVideoX(CogVideoX):
         noise: Tensor | None = None,
     ) -> Tensor:
         """Denoise latents of clips from noise, with the caches that are enabled; see ``CogVideoX.sample``."""
+        if not has_cache(self.transformer):
+            return super().sample(first, sampling, on_step, generators, noise)
+        from persist_backbones.extensions.caches import ClipCaches  # diffusers' hooks take a second to import
+
         self.caches = ClipCaches(self.transformer)
         try:
             return super().sample(first, sampling, on_step, generators, noise)
@@ -97,3 +105,9 @@ class ExtendedCogVideoX(CogVideoX):
         """Write a LoRA file that diffusers' pipelines load, and ``world.safetensors``."""
         save_lora(self.transformer.base, folder)
         save_world(self.transformer, self.prompt, folder)
+
+
+def has_cache(transformer: WorldTransformer) -> bool:
+    """Whether one of diffusers' caches is enabled, or its hooks are still on the transformer."""
+    hooked = any(getattr(module, "_diffusers_hook", None) is not None for module in transformer.modules())
+    return hooked or transformer.base._cache_config is not None

@@ -6,11 +6,14 @@ import json
 from pathlib import Path
 
 import torch
-from diffusers import CogVideoXTransformer3DModel
-from diffusers.loaders.lora_base import LORA_ADAPTER_METADATA_KEY, LORA_WEIGHT_NAME_SAFE
 
 from persist_backbones.cogvideox.parameter_groups import LORA
 from persist_backbones.cogvideox.parts import PREFIX, weights_digest
+from persist_backbones.diffusers_models import (
+    LORA_ADAPTER_METADATA_KEY,
+    LORA_WEIGHT_NAME_SAFE,
+    CogVideoXTransformer3DModel,
+)
 from persist_cli.api.stages import Lora
 from persist_cli.errors import PersistError, RecipeError, hint
 from persist_cli.io.files import write_tensors

@@ -18,6 +18,7 @@ from persist_backbones.cogvideox.inputs import clip_shape
 from persist_backbones.cogvideox.model import widen
 from persist_backbones.cogvideox.parts import DiffusersParts
 from persist_backbones.extensions.extended import ExtendedCogVideoX
+from persist_cli.api.meta_device import without_weights
 from persist_cli.io.settings import parse_settings
 
 BASE = "base"  # diffusers' transformer inside ours, a component of its own
@@ -35,7 +36,7 @@ class WorldModules(ModelMixin, ConfigMixin):  # type: ignore[misc]
     @register_to_config  # type: ignore[untyped-decorator]
     def __init__(self, settings: dict[str, Any], transformer: dict[str, Any], vae: dict[str, Any]) -> None:
         super().__init__()
-        with torch.device("meta"):
+        with without_weights():
             base = CogVideoXTransformer3DModel.from_config(transformer)
             codec = AutoencoderKLCogVideoX.from_config(vae)
         backbone = self.backbone_settings()
@@ -54,7 +55,7 @@ class WorldModules(ModelMixin, ConfigMixin):  # type: ignore[misc]
         """Return the modules of a backbone, shared with it."""
         configs = (backbone.transformer.base.config, backbone.codec.vae.config)
         plain = [{key: value for key, value in config.items() if not key.startswith("_")} for config in configs]
-        with torch.device("meta"):  # keys that begin with _ are paths from which the configurations were read
+        with without_weights():  # keys that begin with _ are paths from which the configurations were read
             world = WorldModules(backbone.checkpoint_settings(), *plain)
         for name in dict(world.named_children()):
             setattr(world, name, getattr(backbone.transformer, name))
@@ -79,7 +80,7 @@ class MemoryAdapter(ModelMixin, ConfigMixin):  # type: ignore[misc]
     @staticmethod
     def of(adapter: Adapter[Any]) -> MemoryAdapter:
         """Return a component of a backbone's adapter, shared with the backbone."""
-        with torch.device("meta"):
+        with without_weights():
             shape = (dataclasses.asdict(adapter.settings), dataclasses.asdict(adapter.video))
             component = MemoryAdapter(adapter.channels, *shape)
         component.adapter = adapter
@@ -92,7 +93,7 @@ def assemble(parts: DiffusersParts, world: WorldModules, memory: MemoryAdapter |
     Raises:
         CheckpointError: when the components do not fit each other.
     """
-    with torch.device("meta"):
+    with without_weights():
         backbone = ExtendedCogVideoX(world.backbone_settings())
     backbone.name = "cogvideox"
     backbone.set_parts(parts)

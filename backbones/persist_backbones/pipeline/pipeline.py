@@ -27,6 +27,7 @@ from persist_cli.api.backbone import Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import CARD, PLAIN, find_checkpoint
 from persist_cli.api.inference import Precision
+from persist_cli.api.meta_device import without_weights
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.io.files import follow_umask, reallocate
@@ -258,7 +259,7 @@ def load_pipeline(folder: Path, adapter: str | None, dtype: Precision | None) ->
     card = checkpoint.base_folder / CARD
     if checkpoint.backbone != NAME:
         raise CheckpointError(f"{card}: a checkpoint of backbone {checkpoint.backbone!r}, not of {NAME!r}")
-    with torch.device("meta"):  # weights come from the files
+    with without_weights():  # weights come from the files
         backbone = ExtendedCogVideoX(parse_settings(CogVideoXSettings, checkpoint.settings, str(card)))
     backbone.name = NAME
     adapter = adapter or checkpoint.default_adapter()
