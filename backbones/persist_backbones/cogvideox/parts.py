@@ -305,7 +305,7 @@ def _load_part(folder: Path, name: str) -> Any:
 
 
 def _load_weights(part: nn.Module, folder: Path) -> None:
-    """Load the weights in a part's folder, in one file or in shards, as float32.
+    """Load the weights in a part's folder, in one file or in shards, in the precision of a fresh part.
 
     diffusers' ``from_pretrained`` gives the same, but first draws random weights, and imports what is not used here.
 
@@ -328,7 +328,7 @@ def _load_weights(part: nn.Module, folder: Path) -> None:
                 f"{folder}: cannot be loaded ({name!r} has the shape {tuple(tensor.shape)}, config.json wants "
                 f"{tuple(wanted[name].shape)})"
             )
-    part.load_state_dict({name: tensor.float() for name, tensor in tensors.items()}, assign=True)
+    part.load_state_dict({name: tensor.to(wanted[name].dtype) for name, tensor in tensors.items()}, assign=True)
 
 
 def _read_config(folder: Path, name: str) -> dict[str, Any]:
