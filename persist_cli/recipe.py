@@ -61,6 +61,8 @@ class TrainingSettings:
         seed: seed of everything random: fresh weights, the choice of clips, noise.
         checkpoint_every: steps between checkpoints.
         checkpoint_minutes: most minutes between checkpoints.
+        keep_checkpoints: how many of the newest checkpoints the run keeps. One that ended a recipe, or that another
+            run stands on, is always kept.
         workers: processes that read data.
         threads: CPU threads of torch; 0 leaves the number to torch.
         tracker: where losses are logged beside ``log.jsonl``: ``none`` for nowhere, or ``tensorboard``.
@@ -87,6 +89,7 @@ class TrainingSettings:
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # what numpy takes
     checkpoint_every: Changeable[Positive] = 500
     checkpoint_minutes: Changeable[Amount] = 5.0
+    keep_checkpoints: Changeable[Positive] = 1
     workers: Changeable[Count] = 1
     threads: Changeable[Count] = 0
     tracker: Changeable[Literal["none", "tensorboard"]] = "none"

@@ -2,7 +2,8 @@
 
 A checkpoint's folder holds the card ``persist.json``, the backbone's own files and ``adapters/NAME/``. The folder of a
 stage-2 run holds adapters only, and its card says where the base is. The folder of a LoRA run holds the low-rank
-change, and its card says which weights it changes. A run's folder stands for its newest checkpoint.
+change, and its card says which weights it changes. A run's folder stands for its newest checkpoint, and the name
+``reference`` for the model that comes with the package.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.errors import CheckpointError
-from persist_cli.io.files import read_json
+from persist_cli.io.files import bundled_folder, read_json
 from persist_cli.io.sha256sums import check_sums
 
 if TYPE_CHECKING:
@@ -27,7 +28,10 @@ WEIGHTS: Final = ".safetensors"
 VERSION: Final = 1
 STEP: Final = "step-"  # start of the names of the folders of a run's checkpoints
 PLAIN: Final = "stage1"  # name of the base without any adapter
+REFERENCE: Final = "reference"  # names the model that comes with the package
+STARTED_FROM: Final = "started_from"  # the key of a card for the base of a run that holds all weights itself
 SAMPLING_TYPES: Final = {"steps": (int,), "sampler": (str,), "memory_guidance": (int, float)}  # a bool is no int here
+SHOWN: Final = 12  # digits of a fingerprint in messages
 NUMBERED: Final = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)", re.DOTALL)
 
 
@@ -107,12 +111,16 @@ class Checkpoint:
 def find_checkpoint(path: Path) -> Checkpoint:
     """Return the checkpoint in a folder, or the newest one of a run.
 
+    Args:
+        path: the folder; ``reference`` is the model that comes with the package, unless such a folder is here.
+
     Raises:
         CheckpointError: when there is none, its card is damaged, or its base is missing or has other weights.
     """
-    folder = model_folder(path)
+    folder = model_folder(checkpoint_folder(path))
     card = read_card(folder)
-    base, base_card = _open_base(folder, card) if card.get("base") else (folder, card)
+    base = find_base(folder, card) if card.get("base") else folder
+    base_card = read_card(base)
     return Checkpoint(
         folder=folder,
         name=run_folder(folder).name,
@@ -125,6 +133,78 @@ def find_checkpoint(path: Path) -> Checkpoint:
         sampling=_sampling(card, folder / CARD),
         training_scenes=_training_scenes(card, folder / CARD),
     )
+
+
+def checkpoint_folder(path: Path) -> Path:
+    """Return the path, or the folder of the packaged model for ``reference`` unless such a folder is here.
+
+    Raises:
+        CheckpointError: when the packaged model is named and this installation has none.
+    """
+    return reference_checkpoint() if path == Path(REFERENCE) and not path.is_dir() else path
+
+
+def reference_checkpoint() -> Path:
+    """Return the folder of the model that comes with the package, a checkpoint with an adapter for each memory.
+
+    Raises:
+        CheckpointError: when this installation does not have it.
+    """
+    folder = bundled_folder(REFERENCE)
+    if not (folder / CARD).is_file():
+        raise CheckpointError(f"no reference model in {folder}: it comes with the package; give a CHECKPOINT")
+    return folder
+
+
+def base_pointer(card: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the part of a card that says which base the checkpoint was trained on; ``None`` when none does.
+
+    Returns:
+        A mapping in the card with ``base``, a path relative to the card's folder or ``reference``, and the
+        ``fingerprint`` of that base.
+    """
+    parts = (card, card.get("changes"), card.get(STARTED_FROM))
+    return next((part for part in parts if isinstance(part, dict) and part.get("base")), None)
+
+
+def find_base(folder: Path, pointer: Mapping[str, Any]) -> Path:
+    """Return the folder of the base that a checkpoint was trained on.
+
+    Args:
+        folder: the checkpoint's folder.
+        pointer: the part of its card that ``base_pointer`` returns. Cards of earlier versions name the base's run, of
+            which the checkpoint with the right weights is found.
+
+    Raises:
+        CheckpointError: when the base is missing there or has other weights; the message says what to do.
+    """
+    wanted = str(pointer.get("fingerprint", ""))
+    place = (folder / pointer["base"]).resolve()
+    if pointer["base"] == REFERENCE and not place.is_dir():
+        place = reference_checkpoint()
+    base = find_weights(place, wanted)
+    if base is not None:
+        return base
+    run, there = run_folder(folder), fingerprints(place)
+    if not there:
+        raise CheckpointError(
+            f"{run}: its base is missing; the checkpoint with fingerprint {wanted[:SHOWN]} was at {place}; "
+            f"if it moved: persist relink {run} NEW_PLACE"
+        )
+    raise CheckpointError(
+        f"{run}: was trained on another base than the one now at {place}, whose fingerprint is {there[0][:SHOWN]} "
+        f"and not {wanted[:SHOWN]}; if its own is elsewhere: persist relink {run} PLACE"
+    )
+
+
+def find_weights(place: Path, fingerprint: str) -> Path | None:
+    """Return the folder of the base with this fingerprint: the place itself, or among the checkpoints of its run."""
+    return next((folder for folder in _model_folders(place) if _fingerprint(folder) == fingerprint), None)
+
+
+def fingerprints(place: Path) -> list[str]:
+    """Return the fingerprints of the bases that ``find_weights`` looks through, the place's own or newest first."""
+    return [found for found in map(_fingerprint, _model_folders(place)) if found]
 
 
 def lora_base(folder: Path) -> Path | dict[str, Any] | None:
@@ -141,7 +221,7 @@ def lora_base(folder: Path) -> Path | dict[str, Any] | None:
         return None
     if "settings" in changes:
         return dict(changes["settings"])
-    return _open_base(folder, changes)[0]
+    return find_base(folder, changes)
 
 
 def step_folders(run: Path) -> list[Path]:
@@ -227,13 +307,19 @@ def name_ranges(names: Iterable[str]) -> list[str | list[str]]:
     return [run[0] if len(run) == 1 else [run[0], run[-1]] for run in runs]
 
 
-def _open_base(folder: Path, pointer: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
-    """Return folder and card of the base that a card points to; ``CheckpointError`` when its weights are others."""
-    base = model_folder((folder / pointer["base"]).resolve())
-    card = read_card(base)
-    if card["fingerprint"] != str(pointer.get("fingerprint", "")):
-        raise CheckpointError(f"{folder}: was trained on another base than the one now at {base}")
-    return base, card
+def _model_folders(place: Path) -> list[Path]:
+    """Return the place, if it is a checkpoint's folder, and the checkpoints of its run, the newest first."""
+    own = [place] if (place / CARD).is_file() else []
+    return own + [step / "model" for step in reversed(step_folders(run_folder(place))) if step / "model" != place]
+
+
+def _fingerprint(folder: Path) -> str:
+    """Return the fingerprint of the base in a folder, empty where there is none or its card cannot be read."""
+    try:
+        card = read_card(folder)
+    except CheckpointError:
+        return ""
+    return "" if card.get("base") else str(card["fingerprint"])
 
 
 def _sampling(card: dict[str, Any], path: Path) -> Sampling | None:

@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import CARD, Checkpoint
-from persist_cli.errors import CheckpointError, RecipeError
-from persist_cli.io.files import bundled_folder, read_json
+from persist_cli.api.checkpoint import Checkpoint
+from persist_cli.errors import RecipeError
+from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone
-
-
-def reference_checkpoint() -> Path:
-    """The folder of the reference model that comes with the package, a checkpoint with an adapter for each memory.
-
-    Raises:
-        CheckpointError: when this installation does not have it.
-    """
-    folder = bundled_folder("reference")
-    if not (folder / CARD).is_file():
-        raise CheckpointError(f"no reference model in {folder}: it comes with the package; give a CHECKPOINT")
-    return folder
 
 
 def load_backbone(

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import CARD, VERSION, Checkpoint, TrainingScenes, run_folder
-from persist_cli.io.files import write_json
+from persist_cli.api.checkpoint import CARD, REFERENCE, STARTED_FROM, VERSION, Checkpoint, TrainingScenes
+from persist_cli.io.files import bundled_folder, write_json
 from persist_cli.io.sha256sums import hash_files, write_sums
 from persist_cli.recipe import MemoryConfig
 
@@ -18,15 +18,27 @@ if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone
 
 
-def save_base(backbone: Backbone, folder: Path, scenes: TrainingScenes | None = None) -> None:
+def save_base(
+    backbone: Backbone,
+    folder: Path,
+    scenes: TrainingScenes | None = None,
+    base: Checkpoint | None = None,
+    home: Path | None = None,
+) -> None:
     """Write the backbone's own files, a card and ``SHA256SUMS``.
 
-    The existing folder may hold other files, which are listed too.
+    Args:
+        backbone: the backbone with all of its weights.
+        folder: the existing folder to write into, which may hold other files to be listed.
+        scenes: the scenes that it was trained on, where they are known.
+        base: the checkpoint that the training started from, which a resumed run looks for.
+        home: the place where the folder will be in the end, by default the folder itself.
     """
     backbone.save_base(folder)
     hashes = hash_weights(folder)
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(hashes)}
-    write_card(folder, card, scenes)
+    started = {} if base is None else {STARTED_FROM: pointer_to(base.base_folder, base.fingerprint, home or folder)}
+    write_card(folder, card | started, scenes)
     write_sums(folder, hashes)
 
 
@@ -45,11 +57,10 @@ def save_lora(
     backbone.save_lora(folder)
     changes: dict[str, Any] = {"settings": backbone.origin()}
     if base is not None:
-        changes = {"base": _path_to_base(base, home), "fingerprint": base.fingerprint}
+        changes = pointer_to(base.base_folder, base.fingerprint, home)
     hashes = hash_weights(folder)
-    own = hashlib.sha256(f"{fingerprint(hashes)} {changes.get('fingerprint')}".encode()).hexdigest()
-    card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings()}
-    write_card(folder, card | {"changes": changes, "fingerprint": own}, scenes)
+    card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "changes": changes}
+    write_card(folder, card | {"fingerprint": card_fingerprint(hashes, card)}, scenes)
     write_sums(folder, hashes)
 
 
@@ -81,7 +92,7 @@ def save_adapter(
     adapter.mkdir(parents=True)
     backbone.save_adapter(adapter)
     write_json(adapter / "memory.json", dataclasses.asdict(memory))
-    write_card(folder, {"base": _path_to_base(base, home), "fingerprint": base.fingerprint}, scenes)
+    write_card(folder, pointer_to(base.base_folder, base.fingerprint, home), scenes)
     write_sums(folder)
 
 
@@ -105,5 +116,20 @@ def fingerprint(hashes: Mapping[str, str]) -> str:
     return digest.hexdigest()
 
 
-def _path_to_base(base: Checkpoint, home: Path) -> str:
-    return os.path.relpath(run_folder(base.base_folder).resolve(), home.resolve())
+def card_fingerprint(hashes: Mapping[str, str], card: dict[str, Any]) -> str:
+    """The fingerprint that belongs on the card of a base: that of its weights, and with LoRA also of those it changes.
+
+    Args:
+        hashes: SHA-256 of each weight file of the base, as ``hash_weights`` returns them.
+        card: the other values of its card.
+    """
+    if "changes" not in card:
+        return fingerprint(hashes)
+    return hashlib.sha256(f"{fingerprint(hashes)} {card['changes'].get('fingerprint')}".encode()).hexdigest()
+
+
+def pointer_to(base: Path, fingerprint: str, home: Path) -> dict[str, str]:
+    """The values of a card that point to a base: its folder relative to ``home``, or its name, and its fingerprint."""
+    packaged = base.resolve() == bundled_folder(REFERENCE).resolve()
+    place = REFERENCE if packaged else os.path.relpath(base.resolve(), home.resolve())
+    return {"base": place, "fingerprint": fingerprint}

@@ -151,6 +151,8 @@ def finetune(
     """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
 
     persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
+
+    Exit codes: 0 after the last step; 130 after Ctrl-C and 143 after SIGTERM, saved to go on with --resume; 1 an error.
     """
     if dry_run:
         from persist_cli.doctor.dry_run import run_dry_run
@@ -170,7 +172,7 @@ def finetune(
 
 @app.command()
 def export(
-    checkpoint: Annotated[Path, typer.Argument(help="A stage-1 run, or a checkpoint folder.")],
+    checkpoint: Annotated[Path, typer.Argument(help="A stage-1 run, a checkpoint folder, or reference.")],
     out: Annotated[Path, typer.Option(help="Checkpoint folder to write.")],
     runs: Annotated[
         list[str] | None, typer.Argument(metavar="[[NAME=]RUN]...", help="Stage-2 runs on that base.")
@@ -191,6 +193,20 @@ def export(
 
     sampling = SamplingOverrides(steps, sampler, guidance)
     run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling), out, json)
+
+
+@app.command()
+def relink(
+    run: Annotated[Path, typer.Argument(help="A finetune run whose base was moved.")],
+    base: Annotated[Path, typer.Argument(help="The run or checkpoint that holds its base now.")],
+) -> None:
+    """Let a run find its base at another place; refused unless the weights there are the same.
+
+    persist relink runs/voxel /data/models/stage1
+    """
+    from persist_cli.checkpoints.relink import run_relink
+
+    run_relink(run, base)
 
 
 @app.command()

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import signal
+import threading
+from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
 
 from persist_cli import __version__
-from persist_cli.errors import INTERRUPTED, PersistError
+from persist_cli.errors import INTERRUPTED, TERMINATED, PersistError
 from persist_cli.io.checksums import verifying
 from persist_cli.plugins import plugin_errors
 
@@ -104,18 +109,39 @@ def show_version(show: bool) -> None:
 
 
 class Commands(TyperGroup):
-    """Commands that Ctrl-C ends in one line, with exit code 130; a full or closed disk and a failing plugin with 1."""
+    """Commands that end in one line: Ctrl-C with exit code 130, SIGTERM with 143, a full disk or a broken plugin with 1."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command of the context."""
         try:
-            with plugin_errors():
+            with _terminated_like_interrupted(), plugin_errors():
                 return super().invoke(ctx)
         except OSError as error:
             if error.errno not in DISK_ERRORS:
                 raise
             place, cause = error.filename or "a file cannot be written", error.strerror
             raise PersistError(f"{place}: {cause}; make room there, or choose another place") from error
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
             typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED) from None
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a command like Ctrl-C: what it writes aside is removed and its processes are ended."""
+
+
+@contextlib.contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """Within the block SIGTERM raises ``Terminated``, as Ctrl-C raises ``KeyboardInterrupt``."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():  # no other may change what a signal does
+        yield
+        return
+    previous = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from persist_cli.checkpoints.load import reference_checkpoint
+from persist_cli.api.checkpoint import reference_checkpoint
 from persist_cli.data.reference import data_folder
 from persist_cli.evaluate.aggregate import RowResults, Table
 from persist_cli.evaluate.cases import cases_json

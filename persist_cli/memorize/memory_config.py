@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
-from persist_cli.checkpoints.load import adapter_memory, reference_checkpoint
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
+from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from persist_cli.recipe import MemoryConfig
 

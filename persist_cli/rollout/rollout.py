@@ -12,11 +12,11 @@ from pathlib import Path
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, TrajectoryInfo
-from persist_cli.checkpoints.load import adapter_memory, load_backbone, reference_checkpoint
+from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import check_folder
@@ -34,7 +34,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
         raise PersistError("give either --actions TEXT or --follow")
     plan.placement.device()  # a missing accelerator is an error before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
-    adapter = plan.adapter or checkpoint.default_adapter()
+    adapter = None if plan.adapter == PLAIN else plan.adapter or checkpoint.default_adapter()
     paths = plan_camera_paths(plan)
     folders = check_folders(out, len(paths))
     info = paths[0].info
@@ -83,7 +83,8 @@ def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, 
     """Return the memory of the plan's file, else an empty one of the adapter's kind, ``None`` without an adapter."""
     if adapter is None:
         if plan.memory is not None:
-            raise CheckpointError(f"{checkpoint.folder}: has no memory adapter that could read {plan.memory}")
+            without = f"--adapter {PLAIN} is the model" if plan.adapter else f"{checkpoint.folder}: is a model"
+            raise CheckpointError(f"{without} without a memory adapter, which cannot read {plan.memory}")
         return None
     empty = MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
     if plan.memory is None:

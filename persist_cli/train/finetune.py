@@ -6,7 +6,7 @@ import contextlib
 import importlib.util
 import itertools
 import json
-import signal
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,13 +15,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from accelerate import Accelerator
-from accelerate.utils import InitProcessGroupKwargs, set_seed
+from accelerate import Accelerator, PartialState
+from accelerate.utils import InitProcessGroupKwargs, broadcast_object_list, set_seed
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, step_folders
+from persist_cli.api.checkpoint import PLAIN, Checkpoint, base_pointer, find_checkpoint, read_card, step_folders
 from persist_cli.checkpoints.load import start_backbone, starts_from_random_codec
-from persist_cli.errors import INTERRUPTED, PersistError, RecipeError
+from persist_cli.checkpoints.relink import run_base, weights_at
+from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
+from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import (
@@ -31,6 +33,7 @@ from persist_cli.recipe import (
     make_recipe,
     parse_yaml_mapping,
     read_recipe,
+    recipe_names,
     to_plain,
 )
 from persist_cli.train.clip_cache import CacheSettings
@@ -80,7 +83,7 @@ def run_finetune(plan: FinetunePlan) -> None:
     with StopSignal() as stop, limited_threads(recipe.training.threads), explain_lost_processes(run):
         ended_by = finetune(recipe, run, stop, plan)
     if ended_by is not None:
-        sys.exit(INTERRUPTED if ended_by == signal.SIGINT else 0)
+        sys.exit(128 + ended_by)  # as a shell says that a signal ended a command: it must not go on with the next
 
 
 @contextlib.contextmanager
@@ -97,10 +100,12 @@ def limited_threads(threads: int) -> Iterator[None]:
 def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     """Raise ``PersistError`` when no run can be written there, or when this is not the run in the folder to go on with.
 
-    Settings that ``changeable_on_resume`` names may be others than those of the run in the folder.
+    Settings that ``changeable_on_resume`` names may be others than those of the run in the folder, and the base may be
+    at another place.
     """
     check_folder(run)
-    if not step_folders(run):
+    steps = step_folders(run)
+    if not steps:
         return
     if not resume:
         raise PersistError(f"{run}: holds a run already; go on with --resume or choose another --out")
@@ -109,6 +114,9 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     before = to_plain(make_recipe(values, str(path)))  # settings that the run's version did not have get their defaults
     changeable = changeable_on_resume()
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]
+    pointer = base_pointer(read_card(steps[-1] / "model"))
+    if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
+        changed.remove("base")
     if changed:
         raise RecipeError(f"{run}: cannot resume with another recipe; {', '.join(changed)} changed")
 
@@ -126,22 +134,58 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
         The signal that ended the run before its last step, ``None`` when it reached that.
     """
     accelerator = make_accelerator(recipe, run)
-    with busy("loading model and data"):
-        folder, trainer = prepare_run(recipe, run, accelerator, plan)
-    ended_by = trainer.train(folder.log, folder.save, stop)
-    with busy("saving the checkpoint"):
-        folder.save()
-    accelerator.end_training()
+    with held_base(recipe.base, run) as base:
+        with busy("loading model and data"):
+            folder, trainer = prepare_run(recipe, run, base, accelerator, plan)
+        ended_by = trainer.train(folder.log, folder.save, stop)
+        with busy("saving the checkpoint"):
+            kept = folder.finish()
     ended_by = ended_by if trainer.state.step < recipe.training.steps else None
     if accelerator.is_main_process:
         trainer.times.report(run / "profile.json")
         report(recipe, run, trainer.state.step, folder.speed.rate())
+        say(f"{len(kept)} checkpoint{'s' * (len(kept) > 1)} kept: {', '.join(map(str, kept))}")
+        if ended_by is None:
+            say(f"next: {next_command(plan.recipe, recipe, run)}")
+    accelerator.wait_for_everyone()  # as soon as one has ended by a signal, a launcher ends the others
+    accelerator.end_training()
     return ended_by
 
 
-def prepare_run(recipe: Recipe, run: Path, accelerator: Accelerator, plan: FinetunePlan) -> tuple[RunFolder, Trainer]:
+@contextlib.contextmanager
+def held_base(base: str | None, run: Path) -> Iterator[Checkpoint | None]:
+    """The checkpoint that all processes start from, marked in its own run, so that this one does not delete it.
+
+    Args:
+        base: the recipe's base.
+        run: the run that starts; when it has no checkpoint at the end of the block, the mark is removed.
+
+    Raises:
+        CheckpointError: when the base is not there.
+    """
+    if base is None:
+        yield None
+        return
+    main, held = PartialState().is_main_process, None
+    while held is None:
+        found = run_base(base, run)  # by every process, so that each ends when there is none
+        chosen = [str(found.folder)]  # a base that still trains may have a newer one by now
+        if main:
+            mark_in_use(found, run)
+            chosen = [str(found.folder) if found.base_folder.is_dir() else ""]  # "": deleted before it was marked
+        broadcast_object_list(chosen)
+        held = find_checkpoint(Path(chosen[0])) if chosen[0] else None
+    try:
+        yield held
+    finally:
+        if main and not step_folders(run):
+            unmark_in_use(held, run)
+
+
+def prepare_run(
+    recipe: Recipe, run: Path, base: Checkpoint | None, accelerator: Accelerator, plan: FinetunePlan
+) -> tuple[RunFolder, Trainer]:
     """The run's folder and its trainer, in the state of the folder's newest checkpoint where there is one."""
-    base = find_checkpoint(Path(recipe.base)) if recipe.base else None
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
@@ -201,10 +245,29 @@ def prepare_backbone(recipe: Recipe, base: Checkpoint | None, factory: MemoryFac
 def report(recipe: Recipe, run: Path, step: int, rate: float) -> None:
     """Print one line about how the run ended and how fast it went."""
     if step < recipe.training.steps:
-        say(f"stopped at step {step} of {recipe.training.steps} ({rate:.3g} samples/s); go on with --resume")
+        where = f"checkpoint in {run}, go on with --resume"
+        say(f"stopped at step {step} of {recipe.training.steps} ({rate:.3g} samples/s); {where}")
     else:
         done = f"trained {step} steps of {recipe.training.batch} samples ({rate:.3g} samples/s)"
         say(f"stage {recipe.stage} {done}; checkpoint in {run}")
+
+
+def next_command(name: str, recipe: Recipe, run: Path) -> str:
+    """The command that one usually gives after a stage.
+
+    Args:
+        name: the name of the stage's recipe, or its file.
+        recipe: the recipe.
+        run: the run's folder.
+    """
+    if recipe.memory is not None:
+        return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN},{recipe.memory.name}"
+    stage = re.fullmatch(r"(.+)-(?:codec|stage1)(.*)", name)
+    following = "stage1" if recipe.stage == "codec" else "stage2-voxel"
+    guesses = [f"{stage[1]}-{following}{stage[2]}", f"{stage[1]}-{following}"] if stage else []
+    known = next((guess for guess in guesses if guess in recipe_names()), "RECIPE")
+    data = " ".join(f"--data {folder}" for folder in recipe.data.path)
+    return f"persist finetune {known} {data} base={run}"
 
 
 def _different_keys(before: Any, now: Any, key: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The folder of a run: its recipe, its logs and its newest checkpoint."""
+"""The folder of a run: its recipe, its logs and its checkpoints."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Final
 from safetensors import SafetensorError
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.checkpoint import Checkpoint, TrainingScenes
+from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, step_folders
 from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
+from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept_checkpoints, remove_superseded
 from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
@@ -62,6 +63,22 @@ class RunFolder:
         self.trainer.accelerator.wait_for_everyone()
         self.saved = step
 
+    def finish(self) -> list[KeptCheckpoint]:
+        """Write a checkpoint of the last step and return the checkpoints that are kept, the newest last.
+
+        A run that is resumed for just the steps that it has taken ends its recipe with the checkpoint that is there,
+        which then gets this recipe.
+        """
+        self.save()
+        recipe = self.trainer.recipe
+        step, newest = self.trainer.state.step, recipe.training.keep_checkpoints
+        if self.trainer.accelerator.is_main_process:
+            last = step_folders(self.path)[-1]
+            if step == recipe.training.steps and not ended_recipe(last):
+                write_text(last / "model" / RECIPE, to_yaml(recipe))
+            remove_superseded(self.path, newest)
+        return kept_checkpoints(self.path, newest)
+
     def _save(self) -> None:
         state, encoder = self.trainer.state, self.trainer.encoder
         main = self.trainer.accelerator.is_main_process
@@ -69,6 +86,7 @@ class RunFolder:
             self.speed.add(state.step, encoder.figures() if encoder else {})
         save_state(self.path, state, self._save_model)
         if main:
+            remove_superseded(self.path, self.trainer.recipe.training.keep_checkpoints)
             self.log.draw(self.path / "loss.png")
 
     def _save_model(self, folder: Path, home: Path) -> None:
@@ -89,4 +107,4 @@ class RunFolder:
         elif recipe.lora is not None:
             save_lora(backbone, self.base, folder, home, self.scenes)
         else:
-            save_base(backbone, folder, self.scenes)
+            save_base(backbone, folder, self.scenes, self.base, home)

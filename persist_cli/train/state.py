@@ -7,7 +7,6 @@ Where the training is sharded each process writes its parts of all tensors into 
 from __future__ import annotations
 
 import contextlib
-import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
@@ -147,7 +146,7 @@ class TrainingState:
 
 
 def save_state(run: Path, state: TrainingState, save_model: Callable[[Path, Path], None]) -> None:
-    """Write a checkpoint aside, rename it to ``step-…`` and remove the older ones; all processes must call it.
+    """Write a checkpoint aside and rename it to ``step-…``; all processes must call it.
 
     Args:
         run: the run's folder.
@@ -163,9 +162,6 @@ def save_state(run: Path, state: TrainingState, save_model: Callable[[Path, Path
         if main:
             write_json(aside / NOTES_FILE, notes)
             write_sums(aside, wanted=_has_no_checksum)
-    if main:
-        for older in step_folders(run)[:-1]:
-            shutil.rmtree(older)
 
 
 def load_state(run: Path, state: TrainingState) -> None:

@@ -35,7 +35,7 @@ from persist_cli.api.backbone import Backbone, Clip, Clips, Sampling
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.observations import Observations
-from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone, reference_checkpoint
+from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone
 from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store
 from persist_cli.memorize.factory import MemoryFactory

@@ -25,9 +25,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.observations import Observations
-from persist_cli.checkpoints.load import reference_checkpoint
 from persist_cli.checkpoints.save import save_adapter, save_base
 from persist_cli.data.reference import sample_data
 from persist_cli.errors import CheckpointError

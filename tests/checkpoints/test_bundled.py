@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from persist_cli.api.checkpoint import reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.export import ExportPlan, run_export
-from persist_cli.checkpoints.load import reference_checkpoint
 from persist_cli.data.reference import parse_reference, sample_data
 from persist_cli.memorize.memory_file import load_memory
 from tests.support.export_runs import write_runs

@@ -8,7 +8,7 @@ from hashlib import sha256
 
 import pytest
 
-from persist_cli.checkpoints.load import reference_checkpoint
+from persist_cli.api.checkpoint import reference_checkpoint
 
 MOST_BYTES = 40e6
 

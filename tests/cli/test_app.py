@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO_SETTINGS, stage
 
 COMMANDS = (
-    *("collect", "import", "inspect", "finetune", "doctor", "export", "memorize", "rollout", "eval"),
+    *("collect", "import", "inspect", "finetune", "doctor", "export", "relink", "memorize", "rollout", "eval"),
     *("weights", "plugins", "recipes"),
 )
 
@@ -68,6 +69,14 @@ def test_a_file_in_the_place_of_an_output_folder_is_reported_before_any_work(per
     ended = persist(*arguments, "--out", tmp_path / "file" / "there" / "x")
     assert (ended.code, f"{tmp_path / 'file'} is a file" in ended.err) == (1, True)
     assert len(ended.err.strip().splitlines()) == 1
+
+
+def test_sigterm_ends_a_command_in_one_line_with_the_exit_code_of_that_signal(persist, monkeypatch):
+    monkeypatch.setattr("persist_cli.viewing.listings.show_recipes", lambda _: signal.raise_signal(signal.SIGTERM))
+    before = signal.getsignal(signal.SIGTERM)
+    ended = persist("recipes")
+    assert (ended.code, ended.err) == (143, "stopped; what is written is whole, run the same command to go on\n")
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_full_disk_ends_a_command_in_one_line(persist, walks, tmp_path):

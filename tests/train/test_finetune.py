@@ -8,12 +8,15 @@ import shutil
 import signal
 import subprocess
 import time
+from pathlib import Path
 
 import pytest
 import torch
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
+from persist_cli.recipe import make_recipe
+from persist_cli.train.finetune import next_command
 from persist_cli.train.trainer import Trainer
 from tests.support.damage import without_sums
 from tests.support.disk import file_limit
@@ -31,7 +34,7 @@ from tests.support.micro_runs import (
 
 def test_a_run_writes_its_recipe_logs_loss_curve_and_checkpoint(codec):
     names = {"recipe.yaml", "log.jsonl", "loss.png", "speed.jsonl", "step-00000004"}
-    assert {path.name for path in codec.iterdir()} == names
+    assert {path.name for path in codec.iterdir()} - {"used-by"} == names
     assert json.loads((codec / "speed.jsonl").read_text())["samples_per_second"] > 0
     rows = [json.loads(line) for line in (codec / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [1, 2, 3, 4]
@@ -95,7 +98,7 @@ def test_the_saved_weights_are_the_moving_average_of_those_after_each_step(persi
     for changes in (["training.steps=1"], ["training.steps=2", "--resume"]):
         assert persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)).code == 0
         states.append(run_result(tmp_path / "run")[0])
-    model = next((tmp_path / "run").glob("step-*")) / "model/transformer/diffusion_pytorch_model.safetensors"
+    model = max((tmp_path / "run").glob("step-*")) / "model/transformer/diffusion_pytorch_model.safetensors"
     weight = 2 ** (-2 / 3)  # of the new parameters in the second step of diffusers' warm-up
     for name, saved in read_tensors(model)[0].items():
         first, second = (state[f"parameter/transformer.base.{name}"] for state in states)
@@ -152,9 +155,9 @@ def test_a_signal_right_after_the_check_for_signals_loses_no_step(persist, walks
 
     monkeypatch.setattr(Trainer, "agreed", check_before_the_signal)
     ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=5"))
-    message = {3: "stopped at step 4 of 5", 5: "trained 5 steps"}[step]
-    assert (ended.code, message in ended.out) == (0, True)
-    assert [path.name for path in (tmp_path / "run").glob("step-*")] == [f"step-0000000{min(step + 1, 5)}"]
+    code, message = {3: (143, "stopped at step 4 of 5"), 5: (0, "trained 5 steps")}[step]
+    assert (ended.code, message in ended.out) == (code, True)
+    assert saved_steps(tmp_path / "run") == [min(step + 1, 5)]
 
 
 def test_a_full_disk_ends_a_run_with_one_line_and_leaves_the_last_checkpoint(persist, walks, codec, tmp_path):
@@ -185,7 +188,7 @@ def test_a_run_trains_on_the_bundled_sample_data(persist, walks, codec, tmp_path
     assert ended.code == 0, ended.err
 
 
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_ctrl_c_and_preemption_save_a_checkpoint_and_say_how_to_resume(walks, codec, tmp_path, sent, code):
     arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=100000")
     child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
@@ -229,9 +232,11 @@ def test_each_impossible_run_ends_in_one_line(persist, walks, codec, stage1, tmp
 
 def test_a_damaged_checkpoint_or_another_base_ends_a_rollout_in_one_line(persist, walks, codec, tmp_path):
     run = tmp_path / "base"
-    assert persist(*stage("stage1", walks, run, f"base={codec}", "training.steps=1")).code == 0
+    short = [f"base={codec}", "training.steps=1"]
+    assert persist(*stage("stage1", walks, run, *short)).code == 0
     assert persist(*stage("stage2-none", walks, tmp_path / "none", f"base={run}", "training.steps=1")).code == 0
-    assert persist(*stage("stage1", walks, run, "--resume", f"base={codec}", "training.steps=2")).code == 0
+    shutil.rmtree(run)
+    assert persist(*stage("stage1", walks, run, *short, "training.seed=1")).code == 0
     ended = persist("rollout", tmp_path / "none", "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     assert (ended.code, "another base" in ended.err) == (1, True)
     model = next(run.glob("step-*")) / "model"
@@ -241,3 +246,97 @@ def test_a_damaged_checkpoint_or_another_base_ends_a_rollout_in_one_line(persist
     (without_sums(model) / "persist.json").write_text("{}")
     ended = persist("rollout", run, "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     assert (ended.code, "not the card of a persist checkpoint" in ended.err) == (1, True)
+
+
+def saved_steps(run):
+    return [int(path.name.removeprefix("step-")) for path in sorted(run.glob("step-*"))]
+
+
+def test_a_run_keeps_as_many_of_its_newest_checkpoints_as_the_recipe_says(persist, walks, codec, tmp_path):
+    every = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.checkpoint_every=1")
+    ended = persist(*every, "training.steps=3", "training.keep_checkpoints=2")
+    assert (ended.code, saved_steps(tmp_path / "run")) == (0, [2, 3])
+    assert "2 checkpoints kept: step 2, step 3\n" in ended.out
+    ended = persist(*every, "training.steps=4", "--resume")
+    assert "2 checkpoints kept: step 3 (ended its recipe), step 4\n" in ended.out
+    assert saved_steps(tmp_path / "run") == [3, 4]
+    ended = persist(*every, "training.keep_checkpoints=0", "--resume")
+    assert (ended.code, "training.keep_checkpoints" in ended.err) == (1, True)
+
+
+def test_a_run_that_is_resumed_for_the_steps_it_has_taken_ends_its_recipe_there(persist, walks, codec, tmp_path):
+    run = tmp_path / "run"
+    twice = stage("stage1", walks, run, f"base={codec}", "training.checkpoint_every=1", "training.keep_checkpoints=2")
+    assert persist(*twice, "training.steps=2").code == 0
+    shutil.rmtree(run / "step-00000002")  # as if it had been stopped at step 1
+    assert "1 checkpoint kept: step 1\n" in persist(*twice, "training.steps=1", "--resume").out
+    assert persist(*twice, "training.steps=3", "training.keep_checkpoints=1", "--resume").code == 0
+    assert saved_steps(run) == [1, 3]
+
+
+@pytest.fixture(scope="module")
+def extended(walks, codec, tmp_path_factory):
+    """A stage-1 run ``base`` that trained on after ``voxel`` had taken a step on a checkpoint in the middle of it."""
+    folder = tmp_path_factory.mktemp("extended")
+    base = stage("stage1", walks, folder / "base", f"base={codec}", "training.checkpoint_every=1")
+    run_persist(*base, "training.steps=2", "training.keep_checkpoints=2")
+    middle = f"base={folder / 'base/step-00000001'}"
+    run_persist(*stage("stage2-voxel", walks, folder / "voxel", middle, "training.steps=1"))
+    run_persist(*base, "training.steps=3", "--resume")
+    return folder
+
+
+def test_a_stage_2_run_keeps_the_checkpoint_that_it_stands_on_when_its_base_trains_on(persist, walks, extended):
+    assert saved_steps(extended / "base") == [1, 2, 3]
+    card = json.loads((find_checkpoint(extended / "voxel").folder / "persist.json").read_text())
+    assert card["base"] == "../../../base/step-00000001/model"
+    start = ["--start", f"{walks}#0", "--actions", "left", "--steps", 1]
+    ended = persist("rollout", extended / "voxel", *start, "--out", extended / "o")
+    assert ended.code == 0, ended.err
+
+
+def test_a_resumed_stage_2_run_goes_on_with_the_step_of_its_base_that_it_began_on(persist, walks, extended, tmp_path):
+    middle = f"base={extended / 'base/step-00000001'}"
+    assert persist(*stage("stage2-voxel", walks, tmp_path / "whole", middle, "training.steps=2")).code == 0
+    shutil.copytree(extended / "voxel", extended / "halves")
+    newest = f"base={extended / 'base'}"
+    ended = persist(*stage("stage2-voxel", walks, extended / "halves", newest, "training.steps=2", "--resume"))
+    assert ended.code == 0, ended.err
+    assert equal_runs(tmp_path / "whole", extended / "halves")
+
+
+def test_a_resumed_stage_1_run_goes_on_with_the_codec_that_it_began_on(persist, walks, codec, tmp_path):
+    shutil.copytree(codec, tmp_path / "codec")
+    one = stage("stage1", walks, tmp_path / "one", f"base={tmp_path / 'codec'}")
+    assert persist(*one, "training.steps=1").code == 0
+    longer = stage("codec", walks, tmp_path / "codec", *MICRO_SETTINGS, "training.steps=5", "--resume")
+    assert persist(*longer).code == 0
+    assert persist(*one, "training.steps=2", "--resume").code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "whole", f"base={codec}", "training.steps=2")).code == 0
+    assert equal_runs(tmp_path / "whole", tmp_path / "one")
+
+
+def test_a_start_that_fails_leaves_no_mark_in_the_base(persist, walks, extended, tmp_path):
+    base = f"base={extended / 'base'}"
+    assert persist(*stage("stage2-voxel", walks, tmp_path / "a", base, "adapter.widht=3")).code == 1
+    assert not list((extended / "base/used-by").glob("*.a-*"))
+
+
+def test_a_finished_run_says_where_it_is_and_the_next_command(persist, walks, extended, codec):
+    again = stage("stage1", walks, extended / "base", f"base={codec}", "training.checkpoint_every=1")
+    ended = persist(*again, "training.steps=3", "--resume")
+    assert f"checkpoint in {extended / 'base'}\n" in ended.out
+    assert f"next: persist finetune tiny-stage2-voxel --data {walks} base={extended / 'base'}\n" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("recipe", "following"),
+    [
+        ("houses-64-codec", "houses-64-stage1"), ("cogvideox-2b-stage1-lora", "cogvideox-2b-stage2-voxel"),
+        ("houses-64-stage1-rgb", "houses-64-stage2-voxel-rgb"), ("mine.yaml", "RECIPE"),
+    ],
+)  # fmt: skip
+def test_the_next_stage_is_of_the_same_recipes(recipe, following):
+    values = {"stage": "codec" if "codec" in recipe else "1", "data": {"path": "d"}}
+    command = next_command(recipe, make_recipe(values, recipe), Path("run"))
+    assert command == f"persist finetune {following} --data d base=run"

@@ -26,6 +26,8 @@ from tests.support.micro_model import micro, predicted, random_clips
 from tests.support.micro_runs import MICRO, MICRO_SETTINGS, equal_runs, run_persist, stage
 from tests.support.twins import load_twin, write_twin
 
+STEP_4 = "step-00000004/model"
+
 LORA = ["lora.rank=4", "lora.alpha=8", "training.learning_rate=0.01"]
 
 
@@ -78,7 +80,7 @@ def test_a_run_holds_only_the_change_and_points_to_its_base(lora, stage1):
     assert files == {"pytorch_lora_weights.safetensors", "world.safetensors"}
     assert bytes_of(lora) < bytes_of(stage1) / 2
     card = json.loads((model_folder(lora) / "persist.json").read_text())
-    assert card["changes"] == {"base": "../../../stage1", "fingerprint": find_checkpoint(stage1).fingerprint}
+    assert card["changes"] == {"base": f"../../../stage1/{STEP_4}", "fingerprint": find_checkpoint(stage1).fingerprint}
 
 
 def test_a_checkpoint_predicts_what_the_trained_model_does(walks, stage1, lora):

@@ -287,15 +287,16 @@ def test_a_killed_process_ends_the_run_with_one_line_and_a_checkpoint_to_resume(
 
 
 @pytest.mark.parametrize(
-    ("receiver", "code"), [("rank", 0), pytest.param("launcher", 1, marks=pytest.mark.slow)], ids=["rank", "launcher"]
+    "receiver", ["rank", pytest.param("launcher", marks=pytest.mark.slow)], ids=["rank", "launcher"]
 )
-def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(start, resume, receiver, code):
-    """A launcher that gets the signal ends with an exit code of torchrun's own."""
+def test_sigterm_to_one_process_or_to_the_launcher_saves_on_all(start, resume, receiver):
+    """The processes end with 143; the launcher, which may be the first to get the signal, always with 1."""
     run = start("--use_fsdp", "--fsdp_version", "2")
     os.kill({"rank": run.processes[1], "launcher": run.launcher.pid}[receiver], signal.SIGTERM)
     exit_code, output = run.end()
-    assert exit_code == code, output
+    assert exit_code == 1, output
     assert output.count("go on with --resume") == 1, output
+    assert receiver == "launcher" or re.search(r"exitcode +: 143", output), output
     resume()
 
 

@@ -1,0 +1,111 @@
+"""The base of a run, found again: when the run is resumed, and by ``persist relink`` when the base was moved."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from persist_cli.api.checkpoint import (
+    CARD,
+    SHOWN,
+    Checkpoint,
+    base_pointer,
+    checkpoint_folder,
+    find_base,
+    find_checkpoint,
+    find_weights,
+    fingerprints,
+    model_folder,
+    read_card,
+    step_folders,
+)
+from persist_cli.checkpoints.retention import mark_in_use
+from persist_cli.checkpoints.save import card_fingerprint, pointer_to
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import plain, written_aside
+from persist_cli.viewing.console import say
+
+
+def run_base(base: str, run: Path) -> Checkpoint:
+    """The checkpoint that a run starts from, or the very one that it started from, where the run is to go on.
+
+    Args:
+        base: the recipe's base.
+        run: the run's folder, which may be missing or empty.
+
+    Raises:
+        CheckpointError: when it is not there.
+    """
+    steps = step_folders(run)
+    pointer = base_pointer(read_card(steps[-1] / "model")) if steps else None
+    if pointer is None:  # a new run, or one of a version that did not note it
+        return find_checkpoint(Path(base))
+    return find_checkpoint(weights_at(base, pointer) or find_base(steps[-1] / "model", pointer))
+
+
+def weights_at(place: str, pointer: dict[str, Any]) -> Path | None:
+    """The folder of the base that a card's pointer means, if it is at this place, else ``None``."""
+    with contextlib.suppress(CheckpointError):
+        return find_weights(checkpoint_folder(Path(place)).resolve(), str(pointer["fingerprint"]))
+    return None
+
+
+def run_relink(run: Path, base: Path) -> None:
+    """Let the cards of a run point to its base at another place; nothing is changed unless the weights are the same.
+
+    Args:
+        run: the run, or a folder with the card of a checkpoint.
+        base: the run, checkpoint or export that holds the base now, or ``reference``.
+
+    Raises:
+        CheckpointError: when the run stands on no base, or the place holds other weights.
+    """
+    newest = model_folder(run)
+    folders = [newest] if (run / CARD).is_file() else [step / "model" for step in step_folders(run)]
+    cards, places = {folder / CARD: read_card(folder) for folder in folders}, set[Path]()
+    for path, card in cards.items():
+        pointer = base_pointer(card)
+        if pointer is None:
+            raise CheckpointError(f"{run}: stands on no other checkpoint, so there is nothing to relink")
+        place = _same_weights(run, base, pointer)
+        pointer |= pointer_to(place, pointer["fingerprint"], path.parent)
+        places.add(place)
+    for place in places:
+        _check_content(place)
+    _write_together(cards)
+    for place in places:
+        mark_in_use(find_checkpoint(place), run)
+        say(f"{run}: its base is now {place}")
+
+
+def _same_weights(run: Path, base: Path, pointer: dict[str, Any]) -> Path:
+    place, wanted = checkpoint_folder(base), str(pointer["fingerprint"])
+    found = find_weights(place, wanted)
+    if found is None:
+        there = " and ".join(each[:SHOWN] for each in fingerprints(place))
+        cause = f"the fingerprint there is {there}" if there else "no checkpoint is there"
+        raise CheckpointError(
+            f"{base}: not the base of {run}, whose fingerprint is {wanted[:SHOWN]}; {cause}; nothing is changed"
+        )
+    return found
+
+
+def _check_content(folder: Path) -> None:
+    """Read all weights of a base and compare them with its card."""
+    card = read_card(folder)
+    if card_fingerprint(folder, card) != card["fingerprint"]:
+        raise CheckpointError(
+            f"{folder}: its weights are not those of its card, so copy it again, whole; nothing is changed"
+        )
+
+
+def _write_together(files: Mapping[Path, Any]) -> None:
+    """Write JSON files of which none is replaced before all are written aside."""
+    with contextlib.ExitStack() as stack:
+        for path, value in files.items():
+            stack.enter_context(written_aside(path)).write_text(
+                json.dumps(plain(value), indent=2, allow_nan=False) + "\n", encoding="utf-8"
+            )

@@ -1,0 +1,133 @@
+"""The checkpoints that a run keeps: the newest, those that ended a recipe, and those that other runs stand on.
+
+A run that starts from a checkpoint of another run leaves a small JSON file beside it, in ``used-by/``, whose name
+begins with that of the checkpoint. As long as the file is there, the run that owns the checkpoint does not delete it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from persist_cli.api.checkpoint import STEP, Checkpoint, step_folders
+from persist_cli.checkpoints.lineage import RECIPE
+from persist_cli.errors import PersistError
+from persist_cli.io.files import empty_folder_aside, read_json, write_json
+from persist_cli.recipe import parse_yaml_mapping
+from persist_cli.viewing.console import warn
+
+USERS: Final = "used-by"  # the folder of the marks, beside the checkpoints of a run
+
+
+@dataclass(frozen=True)
+class KeptCheckpoint:
+    """A checkpoint that a run keeps.
+
+    Args:
+        folder: the folder ``step-…``.
+        reasons: why, in words; none for one of the newest.
+    """
+
+    folder: Path
+    reasons: Sequence[str]
+
+    def __str__(self) -> str:
+        name = f"step {self.folder.name.removeprefix(STEP).lstrip('0')}"
+        return f"{name} ({', '.join(self.reasons)})" if self.reasons else name
+
+
+def mark_in_use(base: Checkpoint, run: Path) -> None:
+    """Leave a file beside the base's checkpoint which says that a run stands on it, where the base is part of a run.
+
+    Where no file can be written, as on read-only media, a line on standard error says what to do.
+    """
+    step, user, path = base.base_folder.resolve().parent, run.resolve(), _mark_of(base, run)
+    if not step.name.startswith(STEP) or path.is_file():
+        return
+    try:
+        write_json(path, {"checkpoint": step.name, "run": os.path.relpath(user, step.parent)})
+    except OSError as error:
+        if not ended_recipe(step):
+            warn(
+                f"{path.parent}: cannot be written ({error.strerror}), so nothing says there that {run} stands on "
+                f"{step.name}; before that base is trained further, copy {step} and run: persist relink {run} THE_COPY"
+            )
+
+
+def unmark_in_use(base: Checkpoint, run: Path) -> None:
+    """Remove the file that ``mark_in_use`` left, for a run that came to nothing."""
+    with contextlib.suppress(OSError):
+        _mark_of(base, run).unlink(missing_ok=True)
+
+
+def kept_checkpoints(run: Path, newest: int) -> list[KeptCheckpoint]:
+    """The checkpoints that a run keeps, the newest last.
+
+    Args:
+        run: the run's folder.
+        newest: how many of the newest are kept without any other reason.
+    """
+    steps = step_folders(run)
+    checkpoints = [KeptCheckpoint(step, _reasons(step, step == steps[-1])) for step in steps]
+    recent = set(steps[-newest:])
+    return [checkpoint for checkpoint in checkpoints if checkpoint.reasons or checkpoint.folder in recent]
+
+
+def remove_superseded(run: Path, newest: int) -> None:
+    """Delete the checkpoints that a run does not keep; one that another run begins to stand on meanwhile stays.
+
+    Args:
+        run: the run's folder.
+        newest: how many of the newest are kept without any other reason.
+    """
+    kept = {checkpoint.folder for checkpoint in kept_checkpoints(run, newest)}
+    for step in step_folders(run):
+        if step in kept:
+            continue
+        with empty_folder_aside(step) as aside:
+            step.rename(aside / step.name)  # whoever begins on it now sees that it is gone
+            if _marks(step):
+                (aside / step.name).rename(step)
+
+
+def ended_recipe(step: Path) -> bool:
+    """Whether a checkpoint is at the last step of its recipe."""
+    path = step / "model" / RECIPE
+    try:
+        training = parse_yaml_mapping(path.read_text(encoding="utf-8"), str(path)).get("training")
+    except (OSError, PersistError):
+        return False
+    return isinstance(training, dict) and f"{STEP}{training.get('steps', 0):08d}" == step.name
+
+
+def _reasons(step: Path, last: bool) -> list[str]:
+    users = [_user(mark) for mark in _marks(step)]
+    ended = ["ended its recipe"] if not last and ended_recipe(step) else []
+    if len(users) > 2:
+        return [*ended, f"{users[0]} and {len(users) - 1} more stand on it"]
+    return [*ended, f"{' and '.join(users)} {'stands' if len(users) == 1 else 'stand'} on it"] if users else ended
+
+
+def _mark_of(base: Checkpoint, run: Path) -> Path:
+    step, user = base.base_folder.resolve().parent, run.resolve()
+    own = hashlib.sha256(bytes(user)).hexdigest()[:8]  # several machines may write marks at once
+    return step.parent / USERS / f"{step.name}.{user.name}-{own}.json"
+
+
+def _marks(step: Path) -> list[Path]:
+    return sorted((step.parent / USERS).glob(f"{step.name}.*.json"))
+
+
+def _user(mark: Path) -> str:
+    """The run that a mark names, as seen from the working directory where it is below."""
+    try:
+        run = (mark.parent.parent / read_json(mark)["run"]).resolve()
+    except (PersistError, KeyError, TypeError):
+        return mark.stem.partition(".")[2]  # the name says enough
+    here = Path.cwd()
+    return str(run.relative_to(here) if run.is_relative_to(here) else run)
