@@ -235,9 +235,14 @@ def run_folder(folder: Path) -> Path:
 
 
 def model_folder(path: Path) -> Path:
-    """Return the folder if it has a card, else that of the newest checkpoint in it, or raise ``CheckpointError``."""
-    if (path / CARD).is_file():
-        return path
+    """Return the folder with the card: the path, ``model`` in a run's ``step-…``, or that of a run's newest checkpoint.
+
+    Raises:
+        CheckpointError: when there is none.
+    """
+    own = _own_folder(path)
+    if own is not None:
+        return own
     steps = step_folders(path)
     if not steps:
         raise CheckpointError(f"{path}: no checkpoint there (neither persist.json nor a finetune run's step-* folder)")
@@ -309,8 +314,14 @@ def name_ranges(names: Iterable[str]) -> list[str | list[str]]:
 
 def _model_folders(place: Path) -> list[Path]:
     """Return the place, if it is a checkpoint's folder, and the checkpoints of its run, the newest first."""
-    own = [place] if (place / CARD).is_file() else []
-    return own + [step / "model" for step in reversed(step_folders(run_folder(place))) if step / "model" != place]
+    own = _own_folder(place)
+    steps = [step / "model" for step in reversed(step_folders(run_folder(own or place)))]
+    return steps if own is None else [own, *(step for step in steps if step != own)]
+
+
+def _own_folder(place: Path) -> Path | None:
+    """Return the folder with the card of the place itself, which may be the ``step-…`` folder around it."""
+    return next((folder for folder in (place, place / "model") if (folder / CARD).is_file()), None)
 
 
 def _fingerprint(folder: Path) -> str:

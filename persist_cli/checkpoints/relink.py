@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from persist_cli.api.checkpoint import (
     CARD,
@@ -28,6 +29,8 @@ from persist_cli.errors import CheckpointError
 from persist_cli.io.files import plain, written_aside
 from persist_cli.viewing.console import say
 
+HUB_NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # owner/model
+
 
 def run_base(base: str, run: Path) -> Checkpoint:
     """The checkpoint that a run starts from, or the very one that it started from, where the run is to go on.
@@ -42,6 +45,7 @@ def run_base(base: str, run: Path) -> Checkpoint:
     steps = step_folders(run)
     pointer = base_pointer(read_card(steps[-1] / "model")) if steps else None
     if pointer is None:  # a new run, or one of a version that did not note it
+        _check_no_pretrained(base)
         return find_checkpoint(Path(base))
     return find_checkpoint(weights_at(base, pointer) or find_base(steps[-1] / "model", pointer))
 
@@ -51,6 +55,17 @@ def weights_at(place: str, pointer: dict[str, Any]) -> Path | None:
     with contextlib.suppress(CheckpointError):
         return find_weights(checkpoint_folder(Path(place)).resolve(), str(pointer["fingerprint"]))
     return None
+
+
+def _check_no_pretrained(base: str) -> None:
+    """Raise ``CheckpointError`` for weights in diffusers' layout, in a folder or on the hub, which are no base."""
+    folder = Path(base)
+    published = HUB_NAME.fullmatch(base) and not folder.parent.exists()
+    if published or ((folder / "transformer").is_dir() and not (folder / CARD).is_file()):
+        raise CheckpointError(
+            f"base={base}: no checkpoint of persist; for weights of diffusers, in a folder or on the hub, give "
+            f"base=null backbone.settings.pretrained={base}"
+        )
 
 
 def run_relink(run: Path, base: Path) -> None:
@@ -64,7 +79,7 @@ def run_relink(run: Path, base: Path) -> None:
         CheckpointError: when the run stands on no base, or the place holds other weights.
     """
     newest = model_folder(run)
-    folders = [newest] if (run / CARD).is_file() else [step / "model" for step in step_folders(run)]
+    folders = [step / "model" for step in step_folders(run)] or [newest]
     cards, places = {folder / CARD: read_card(folder) for folder in folders}, set[Path]()
     for path, card in cards.items():
         pointer = base_pointer(card)

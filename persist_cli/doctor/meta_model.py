@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import Checkpoint, checkpoint_folder, find_checkpoint
 from persist_cli.api.meta_device import without_weights
 from persist_cli.checkpoints.load import start_backbone, starts_from_random_codec
 from persist_cli.memorize.factory import MemoryFactory
@@ -63,7 +63,8 @@ def build_meta_model(name: str, overrides: Sequence[str]) -> MetaModel:
         PersistError: when the recipe is wrong or its parts do not go together.
     """
     recipe = make_recipe(apply_overrides(read_recipe(name), overrides), name)
-    base = find_checkpoint(Path(recipe.base)) if recipe.base and Path(recipe.base).exists() else None
+    place = checkpoint_folder(Path(recipe.base)) if recipe.base else None
+    base = find_checkpoint(place) if place and place.exists() else None
     if recipe.base and base is None:
         warn(f"{recipe.base}: no base there yet; planned with the backbone settings of {name} and their defaults")
     return MetaModel.of(name, recipe, base)

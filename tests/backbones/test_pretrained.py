@@ -36,6 +36,12 @@ def test_a_name_on_the_hub_is_opened_from_the_cache_without_the_network(snapshot
     assert all(torch.equal(*pair) for pair in pairs)
 
 
+def test_a_model_in_the_cache_under_its_publishers_former_name_is_found(cache):
+    snapshot = write_twin("5b-i2v", write_snapshot(cache, "THUDM/CogVideoX-5b-I2V"))
+    assert pretrained_folder(NAME) == snapshot
+    assert folder_here("someone/CogVideoX-5b-I2V") is None
+
+
 def test_a_local_directory_comes_before_a_name_on_the_hub(snapshot, tmp_path):
     shutil.copytree(snapshot, tmp_path / NAME)
     assert str(pretrained_folder(NAME)) == NAME

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from persist_cli.api.checkpoint import reference_checkpoint
+from persist_backbones import load
+from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.export import ExportPlan, run_export
 from persist_cli.data.reference import parse_reference, sample_data
 from persist_cli.memorize.memory_file import load_memory
 from tests.support.export_runs import write_runs
+from tests.support.micro_runs import stage
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,48 @@ def test_a_rollout_without_a_checkpoint_uses_the_reference_model_and_its_default
     record = roll(persist, here / "a")
     assert (record["checkpoint"], record["plan"]["adapter"]) == (str(reference), "voxel")
     assert roll(persist, here / "b", "--adapter", "none")["plan"]["adapter"] == "none"
+
+
+def test_reference_names_the_model_wherever_a_checkpoint_is_named(persist, reference, here):
+    assert find_checkpoint(Path("reference")).folder == reference
+    assert (pipeline := load("reference")).backbone.adapters.keys() == {"voxel"}
+    assert pipeline.backbone.image_size == (32, 32)
+    start = ("--start", "sample#0:11", "--steps", 1, "--actions", "left")
+    for command in (
+        ("rollout", "reference", *start, "--out", "r"),
+        ("memorize", "sample#0:0-2", "--checkpoint", "reference", "--out", "m.safetensors"),
+        ("export", "reference", "--out", "e"),
+        ("eval", "reference", "--data", "sample", "--metrics", "psnr", "--seeds", 1, "--steps", 1, "--clips", 1,
+         "--controls", "copy", "--out", "o"),
+        ("finetune", "tiny-stage2-voxel", "base=reference", "--dry-run"),
+    ):  # fmt: skip
+        ended = persist(*command)
+        assert ended.code == 0, ended.err
+
+
+def test_a_folder_called_reference_takes_precedence_over_the_packaged_model(reference, home, here):
+    shutil.copytree(home / "runs/stage1", here / "reference")
+    assert find_checkpoint(Path("reference")).folder == Path("reference")
+
+
+def test_a_memory_is_trained_on_the_reference_model_and_finds_it_where_the_package_is(
+    persist, reference, home, here, monkeypatch
+):
+    ended = persist(*stage("stage2-voxel", "sample", "run", "base=reference", "training.steps=1"))
+    assert ended.code == 0, ended.err
+    card = json.loads((find_checkpoint(here / "run").folder / "persist.json").read_text())
+    assert card["base"] == "reference"
+    shutil.copytree(home, here / "elsewhere")
+    monkeypatch.setenv("PERSIST_REFERENCE", str(here / "elsewhere"))
+    assert find_checkpoint(here / "run").base_folder == here / "elsewhere/reference"
+    assert persist("relink", "run", "reference").code == 0
+
+
+def test_a_rollout_with_the_adapter_stage1_is_the_model_without_memory(persist, reference, here):
+    assert roll(persist, here / "a", "--adapter", "stage1")["plan"]["adapter"] is None
+    start = ("--start", "sample#0:11", "--steps", 1, "--follow", "--adapter", "stage1")
+    ended = persist("rollout", *start, "--memory", "m.safetensors", "--out", "o")
+    assert (ended.code, "without a memory adapter, which cannot read m.safetensors" in ended.err) == (1, True)
 
 
 def test_memorize_uses_the_settings_of_the_reference_models_adapter_and_a_line_says_so(persist, reference, here):

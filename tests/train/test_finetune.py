@@ -215,6 +215,7 @@ def test_each_impossible_run_ends_in_one_line(persist, walks, codec, stage1, tmp
             "training.learning_rate changed",
         ),
         (stage("stage1", walks, tmp_path / "a", f"base={tmp_path}"), "no checkpoint there"),
+        (stage("stage1", walks, tmp_path / "a", "base=zai-org/CogVideoX-2b"), "backbone.settings.pretrained=zai-org/"),
         (stage("stage1", tmp_path, tmp_path / "a", base), "no trajectory"),
         (
             stage("stage2-voxel", walks, tmp_path / "a", f"base={stage1}", "memory.encoder=patchs"),

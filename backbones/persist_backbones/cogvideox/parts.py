@@ -39,7 +39,8 @@ SUBFOLDERS = {
 }
 WEIGHTS = "diffusion_pytorch_model.safetensors"  # the weights of a part in a single file
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-PUBLISHED = {  # preset of each repository of THUDM, now zai-org
+PUBLISHERS = ("zai-org", "THUDM")  # of the same repositories, now and before
+PUBLISHED = {  # preset of each of their repositories
     "CogVideoX-2b": "2b",
     "CogVideoX-5b": "5b",
     "CogVideoX-5b-I2V": "5b-i2v",
@@ -235,7 +236,7 @@ def pretrained_folder(name: str) -> Path:
 def folder_here(name: str) -> Path | None:
     """Return the local directory of this name, else the repository in the hub's cache, else ``None``.
 
-    The network is not used.
+    The cache may hold a published model under either name of its publisher. The network is not used.
     """
     from huggingface_hub import errors, snapshot_download
 
@@ -244,10 +245,12 @@ def folder_here(name: str) -> Path | None:
         return folder
     if not REPOSITORY.fullmatch(name):
         return None
-    try:
-        return Path(snapshot_download(name, local_files_only=True))
-    except errors.LocalEntryNotFoundError:
-        return None
+    model = name.partition("/")[2]
+    others = [f"{publisher}/{model}" for publisher in PUBLISHERS] if published_preset(name) else []
+    for repository in (name, *others):
+        with contextlib.suppress(errors.LocalEntryNotFoundError):
+            return Path(snapshot_download(repository, local_files_only=True))
+    return None
 
 
 def missing_files(part: Path) -> list[str]:
@@ -269,7 +272,7 @@ def _weight_files(part: Path) -> list[Path]:
 def published_preset(name: str) -> str | None:
     """Return the preset with the sizes of a published model's repository, ``None`` for any other name."""
     owner, _, model = name.partition("/")
-    return PUBLISHED.get(model) if owner in ("THUDM", "zai-org") else None
+    return PUBLISHED.get(model) if owner in PUBLISHERS else None
 
 
 def origin_of(pretrained: str | None) -> dict[str, str]:
