@@ -109,7 +109,7 @@ def show_version(show: bool) -> None:
 
 
 class Commands(TyperGroup):
-    """Commands that end in one line: Ctrl-C with exit code 130, SIGTERM with 143, a full disk or failing plugin with 1."""
+    """Commands that end in one line: Ctrl-C with exit code 130, SIGTERM with 143, full disks or bad plugins with 1."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command of the context."""
