@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,9 +22,10 @@ from persist_cli.api.checkpoint import (
     step_folders,
 )
 from persist_cli.checkpoints.retention import mark_in_use
-from persist_cli.checkpoints.save import card_fingerprint, pointer_to
+from persist_cli.checkpoints.save import card_fingerprint, hash_weights, pointer_to
 from persist_cli.errors import CheckpointError
-from persist_cli.io.files import plain, written_aside
+from persist_cli.io.files import json_text
+from persist_cli.io.sha256sums import rewrite_files
 from persist_cli.viewing.console import say
 
 HUB_NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # owner/model
@@ -90,7 +89,7 @@ def run_relink(run: Path, base: Path) -> None:
         places.add(place)
     for place in places:
         _check_content(place)
-    _write_together(cards)
+    rewrite_files({path.parent: {CARD: json_text(card)} for path, card in cards.items()})
     for place in places:
         mark_in_use(find_checkpoint(place), run)
         say(f"{run}: its base is now {place}")
@@ -111,16 +110,7 @@ def _same_weights(run: Path, base: Path, pointer: dict[str, Any]) -> Path:
 def _check_content(folder: Path) -> None:
     """Read all weights of a base and compare them with its card."""
     card = read_card(folder)
-    if card_fingerprint(folder, card) != card["fingerprint"]:
+    if card_fingerprint(hash_weights(folder), card) != card["fingerprint"]:
         raise CheckpointError(
             f"{folder}: its weights are not those of its card, so copy it again, whole; nothing is changed"
         )
-
-
-def _write_together(files: Mapping[Path, Any]) -> None:
-    """Write JSON files of which none is replaced before all are written aside."""
-    with contextlib.ExitStack() as stack:
-        for path, value in files.items():
-            stack.enter_context(written_aside(path)).write_text(
-                json.dumps(plain(value), indent=2, allow_nan=False) + "\n", encoding="utf-8"
-            )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +12,7 @@ from typing import Final
 
 from persist_cli.errors import CheckpointError
 from persist_cli.io.checksums import is_verified
-from persist_cli.io.files import file_sha256, write_text
+from persist_cli.io.files import file_sha256, write_text, written_aside
 
 SUMS: Final = "SHA256SUMS"
 
@@ -43,8 +45,23 @@ def write_sums(
     """
     known = known or {}
     hashes = {**known, **hash_files(folder, (name for name in _names(folder) if wanted(name) and name not in known))}
-    write_text(folder / SUMS, "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes)))
+    write_text(folder / SUMS, _text(hashes))
     return hashes
+
+
+def rewrite_files(texts: Mapping[Path, Mapping[str, str]]) -> None:
+    """Replace text files and their lines in the lists of their folders; all are written aside before any is replaced.
+
+    Args:
+        texts: the new texts by folder and by name in it; a folder of an earlier version needs no list.
+    """
+    with contextlib.ExitStack() as stack:
+        for folder, files in texts.items():
+            sums, written = read_sums(folder), dict(files)
+            if sums is not None:
+                written[SUMS] = _text(sums | {name: _sha256(text) for name, text in files.items()})
+            for name, text in written.items():
+                stack.enter_context(written_aside(folder / name)).write_text(text, encoding="utf-8")
 
 
 def read_sums(folder: Path) -> dict[str, str] | None:
@@ -96,6 +113,14 @@ def check_sums(folder: Path, wanted: Callable[[str], bool] = bool) -> None:
 
 
 _ADVICE: Final = f"take a whole copy, or delete {SUMS} if you changed files yourself"
+
+
+def _text(hashes: Mapping[str, str]) -> str:
+    return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _names(folder: Path) -> Iterator[str]:

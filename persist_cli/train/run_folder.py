@@ -14,6 +14,7 @@ from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept
 from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
+from persist_cli.io.sha256sums import rewrite_files
 from persist_cli.recipe import to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
 from persist_cli.train.state import save_state
@@ -75,7 +76,7 @@ class RunFolder:
         if self.trainer.accelerator.is_main_process:
             last = step_folders(self.path)[-1]
             if step == recipe.training.steps and not ended_recipe(last):
-                write_text(last / "model" / RECIPE, to_yaml(recipe))
+                rewrite_files({last / "model": {RECIPE: to_yaml(recipe)}})
             remove_superseded(self.path, newest)
         return kept_checkpoints(self.path, newest)
 
