@@ -5,6 +5,7 @@ Pretrained parts are in a local directory of diffusers' layout or in a repositor
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
