@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
@@ -19,9 +19,13 @@ from persist_cli.io.files import write_json, write_text
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
 from persist_cli.rollout.camera_path import Rollout, RolloutPlan
+from persist_cli.viewing.depth import DepthScale
 from persist_cli.viewing.map import draw_map
 from persist_cli.viewing.sheet import write_sheet
-from persist_cli.viewing.video import beside, color_depth, write_video
+from persist_cli.viewing.video import below, beside, enlarge, labelled, still, write_video
+
+Video = UInt8[Tensor, "frame height width 3"]
+LabelledVideos = Sequence[tuple[str, Video]]
 
 
 def quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
@@ -48,7 +52,10 @@ def write_poses(path: Path, timestamps: Sequence[float], poses: Float[Tensor, "f
     write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
 
 
-SOMETIMES = ("compare.mp4", "map-before.png", "map-after.png", "memory.safetensors")  # files of some rollouts
+# files of some rollouts
+SOMETIMES = ("compare.mp4", "depth.mp4", "map-before.png", "map-after.png", "memory.safetensors")
+
+PRINTED = ("psnr", "lpips-alex", "lpips-vgg")  # figures that the terminal shows
 
 
 def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
@@ -72,21 +79,71 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
     for name in SOMETIMES:
         (out / name).unlink(missing_ok=True)
     start, seen, truth = rollout.path.start, rollout.seen, rollout.path.truth
-    rgb = torch.cat([start.rgb, seen.rgb])
-    depth = torch.cat([start.depth, seen.depth])
-    write_video(out / "rgb.mp4", rgb)
-    write_video(out / "depth.mp4", color_depth(depth))
-    rows = [("generated", rgb), ("depth", color_depth(depth))]
     if truth is not None:
-        true_rgb = torch.cat([start.rgb, truth.rgb])
-        write_video(out / "compare.mp4", beside([true_rgb, rgb]))
-        rows.insert(0, ("ground truth", true_rgb))
-        figures = figures | {"against_ground_truth": compare(start, seen, truth, rollout.gives_depth)}
-    write_sheet(out / "sheet.png", rows)
-    write_poses(out / "poses.txt", [float(number) for number in range(len(rgb))], path_of(rollout))
+        against = compare(start, seen, truth, rollout.gives_depth)
+        figures = figures | {"against_ground_truth": against, "mean_against_ground_truth": means(against)}
+    scale = write_pictures(rollout, out)
+    figures = figures | {"depth_colors": scale and scale.to_json()}
+    poses = path_of(rollout)
+    write_poses(out / "poses.txt", [float(number) for number in range(len(poses))], poses)
     write_maps(rollout, out)
     write_json(out / "rollout.json", figures)
     return figures
+
+
+def write_pictures(rollout: Rollout, out: Path) -> DepthScale | None:
+    """Write the videos and the contact sheet; return the scale of all depth in them, ``None`` without depth."""
+    start, truth = rollout.path.start, rollout.path.truth
+    rgb = torch.cat([start.rgb, rollout.seen.rgb])
+    rows = [("generated", rgb)]
+    if truth is not None:
+        rows.insert(0, ("ground truth", torch.cat([start.rgb, truth.rgb])))
+    depths = depths_of(rollout)
+    scale = DepthScale.of(list(depths.values())) if depths else None
+    colored = [] if scale is None else [(name, scale.color(depth)) for name, depth in depths.items()]
+    write_video(out / "rgb.mp4", rgb)
+    if scale is not None:
+        write_video(out / "depth.mp4", with_bar(enlarge(colored[-1][1]), scale))
+    if truth is not None:
+        write_video(out / "compare.mp4", comparison(rows, colored, scale))
+    actions = [f"{number} {action}" for number, action in enumerate(("start", *rollout.path.actions))]
+    write_sheet(out / "sheet.png", rows + colored, actions, bar=None if scale is None else scale.bar)
+    return scale
+
+
+def depths_of(rollout: Rollout) -> dict[str, Float[Tensor, "frame height width"]]:
+    """Return true depth, where the rollout has it, and generated depth in metres, each with the start frame's."""
+    start, seen, truth = rollout.path.start, rollout.seen, rollout.path.truth
+    if not rollout.gives_depth:
+        return {}
+    generated = {"generated depth": torch.cat([start.depth, seen.depth])}
+    if truth is None or not bool((truth.depth > 0).any()):
+        return generated
+    return {"true depth": torch.cat([start.depth, truth.depth])} | generated
+
+
+def comparison(rows: LabelledVideos, depths: LabelledVideos, scale: DepthScale | None) -> Video:
+    """Return the labelled videos side by side, and their depths, if any, with the bar of their scale below."""
+    pair = beside([labelled(enlarge(video), label) for label, video in rows])
+    if scale is None or len(depths) < len(rows):
+        return pair
+    return with_bar(below([pair, beside([labelled(enlarge(video), label) for label, video in depths])]), scale)
+
+
+def with_bar(video: Video, scale: DepthScale) -> Video:
+    """Return the video above the bar of its depth colours."""
+    return below([video, still(scale.bar(video.shape[2]), len(video))])
+
+
+def means(figures: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Return the mean of each figure over the frames in which it is defined."""
+    return {name: float(torch.tensor(values, dtype=torch.float64).nanmean()) for name, values in figures.items()}
+
+
+def summary(figures: Mapping[str, Any]) -> str:
+    """Return the means against the true frames that the terminal shows, as in ``"PSNR 21.34, LPIPS-Alex 0.3127"``."""
+    measured = figures["mean_against_ground_truth"]
+    return ", ".join(f"{METRICS[name].title} {measured[name]:.4g}" for name in PRINTED if name in measured)
 
 
 def compare(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -21,14 +23,14 @@ from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
+from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths, read_header
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
-from persist_cli.rollout.outputs import describe, path_of, write_outputs
+from persist_cli.rollout.outputs import describe, path_of, summary, write_outputs
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import add_task, busy, print_json, progress, say
+from persist_cli.viewing.console import add_task, busy, print_json, progress, say, warn
 
 
-def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> None:
+def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) -> None:
     """Roll out a checkpoint, or the reference model without a path, and write a folder for each branch."""
     if bool(plan.actions) == plan.follow:
         raise PersistError("give either --actions TEXT or --follow")
@@ -37,7 +39,10 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     adapter = None if plan.adapter == PLAIN else plan.adapter or checkpoint.default_adapter()
     paths = plan_camera_paths(plan)
     folders = check_folders(out, len(paths))
+    warn_of_short_path(plan, paths[0])
     info = paths[0].info
+    with busy("loading the memory"):  # before the model, which takes longer, so that what cannot work fails at once
+        memory = open_memory(checkpoint, adapter, plan, info)
     with busy("loading the model"):
         backbone = load_backbone(checkpoint, adapter=adapter)
     check_size(info, backbone.image_size, plan.start)
@@ -45,8 +50,6 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     backbone.check_sampling(sampling)
     plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(sampling)))
     backbone.prepare_inference(plan.placement)
-    with busy("loading the memory"):
-        memory = open_memory(checkpoint, adapter, plan, info)
     agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write)
     model = WorldModel(backbone, [agent], sampling)
     rollouts = [dataclasses.replace(rollout, kept_paths=paths_to_keep(plan, rollout)) for rollout in roll(model, paths)]
@@ -54,12 +57,14 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, json: bool) -> 
     triples = zip(rollouts, folders, records, strict=True)
     with busy("writing videos and maps"):
         figures = [write_outputs(rollout, folder, record) for rollout, folder, record in triples]
-    if json:
+    if as_json:
         print_json(figures if len(figures) > 1 else figures[0])
         return
-    for rollout, folder in zip(rollouts, folders, strict=True):
+    for rollout, folder, record in zip(rollouts, folders, figures, strict=True):
         frames, actions = len(rollout.seen), rollout.path.text
         say(f"{frames} frames in {rollout.seconds:.1f} s along {actions!r}; written to {folder}")
+        if rollout.path.truth is not None:
+            say(f"mean against the true frames: {summary(record)}")
 
 
 def check_folders(out: Path, branches: int) -> list[Path]:
@@ -89,9 +94,8 @@ def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, 
     empty = MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
     if plan.memory is None:
         return empty
-    memory = load_memory(plan.memory)
-    check_memory(memory, empty, plan.memory)
-    return memory
+    check_memory(read_header(plan.memory), empty, checkpoint, plan.memory)
+    return load_memory(plan.memory)
 
 
 def paths_to_keep(plan: RolloutPlan, rollout: Rollout) -> dict[str, Tensor]:
@@ -101,13 +105,29 @@ def paths_to_keep(plan: RolloutPlan, rollout: Rollout) -> dict[str, Tensor]:
     return paths
 
 
-def check_memory(memory: Memory, wanted: Memory, path: Path) -> None:
-    """Raise ``CheckpointError`` when the memory of a file differs from the kind or scene that the adapter reads."""
-    header, expected = memory.header(), wanted.header()
+def check_memory(header: Mapping[str, Any], wanted: Memory, checkpoint: Checkpoint, path: Path) -> None:
+    """Raise ``CheckpointError`` when a memory file differs from the kind or scene that the adapter reads.
+
+    Args:
+        header: header of the file.
+        wanted: an empty memory as the adapter reads it.
+        checkpoint: the checkpoint, whose other adapters may read the file.
+        path: the file.
+    """
+    expected = json.loads(json.dumps(wanted.header()))
     for key in ("memory", "encoder", "encoder_settings", "channels", "reference"):
         if header[key] != expected[key]:
             name = key.replace("_", " ")
-            raise CheckpointError(f"{path}: its {name} is {header[key]!r}, wanted here is {expected[key]!r}")
+            readers = [one for one in checkpoint.adapters if adapter_memory(checkpoint, one).name == header["memory"]]
+            advice = f"; --adapter {readers[0]} reads it" if key == "memory" and readers else ""
+            raise CheckpointError(f"{path}: its {name} is {header[key]!r}, wanted here is {expected[key]!r}{advice}")
+
+
+def warn_of_short_path(plan: RolloutPlan, path: CameraPath) -> None:
+    """Say so when the trajectory has fewer frames to follow than the plan wants."""
+    frames = len(path.cameras)
+    if plan.follow and frames < plan.frames:
+        warn(f"--frames {plan.frames}: only {frames} frames are left after {plan.start}; {frames} are imagined")
 
 
 @contextlib.contextmanager

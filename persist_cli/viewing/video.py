@@ -1,4 +1,4 @@
-"""Videos: written as MP4 or GIF and read back, side by side, with labels, and depth in colours."""
+"""Videos: written as MP4 or GIF and read back, side by side, and with labels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from persist_cli.errors import DataError
@@ -16,24 +16,6 @@ from persist_cli.io.files import written_aside
 
 SMALLEST = 256  # pixels of the shorter side of a written image
 STRIP = 20  # pixels of the height of the strip with a label
-
-
-def color_depth(
-    depth: Float[Tensor, "frame height width"], farthest: float | None = None
-) -> UInt8[Tensor, "frame height width 3"]:
-    """Return depth as colours from near (dark red) to far (dark blue), with missing depth in black.
-
-    Args:
-        depth: metres, 0 = missing.
-        farthest: metres at the end of the scale; the 98th percentile when not given.
-    """
-    from matplotlib import colormaps
-
-    known = depth[depth > 0]
-    limit = farthest or (float(torch.quantile(known.flatten()[:1_000_000], 0.98)) if len(known) else 1.0)
-    colors = colormaps["turbo_r"]((depth / max(limit, 1e-6)).clamp(0, 1).numpy())[..., :3]
-    colors[depth.numpy() <= 0] = 0
-    return torch.from_numpy((colors * 255).astype(np.uint8))
 
 
 def beside(
@@ -62,8 +44,12 @@ def labelled(video: UInt8[Tensor, "frame height width 3"], label: str) -> UInt8[
 
     strip = Image.new("RGB", (video.shape[2], STRIP), "white")
     ImageDraw.Draw(strip).text((4, 2), label, fill="black", font=label_font())
-    pixels = torch.from_numpy(np.array(strip)).expand(len(video), -1, -1, -1)
-    return torch.cat([pixels, video], dim=1)
+    return torch.cat([still(torch.from_numpy(np.array(strip)), len(video)), video], dim=1)
+
+
+def still(picture: UInt8[Tensor, "height width 3"], frames: int) -> UInt8[Tensor, "frame height width 3"]:
+    """Return the picture as a video in which nothing moves."""
+    return picture.expand(frames, -1, -1, -1)
 
 
 def enlarge(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame height width 3"]:

@@ -13,8 +13,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_cli.viewing.console import watched
+from persist_cli.viewing.depth import DepthScale
 from persist_cli.viewing.sheet import write_sheet
-from persist_cli.viewing.video import SMALLEST, below, beside, color_depth, enlarge, labelled, write_video
+from persist_cli.viewing.video import SMALLEST, below, beside, enlarge, labelled, write_video
 
 SHEET_FRAMES = 9  # of a clip on a contact sheet, so that they are large enough to look at on a page
 
@@ -139,9 +140,9 @@ def _depths(clip: ClipPicture) -> tuple[Tensor, Tensor] | None:
     """True and generated depth in colours of one scale, ``None`` where one is missing."""
     if clip.depth is None or clip.true_depth is None:
         return None
-    known = clip.true_depth[clip.true_depth > 0]
-    farthest = float(known.max()) if len(known) else None
-    return color_depth(clip.true_depth.cpu(), farthest), color_depth(clip.depth.cpu(), farthest)
+    pair = clip.true_depth.cpu(), clip.depth.cpu()
+    scale = DepthScale.of(pair)
+    return scale.color(pair[0]), scale.color(pair[1])
 
 
 def _fit(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "frame height width 3"]:
