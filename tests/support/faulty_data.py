@@ -16,10 +16,12 @@ Change = Callable[[Frame, TrajectoryInfo], Frame]
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def rewrite(good: Path, bad: Path, change: Change, intrinsics: float = 1.0) -> Path:
-    """Write the trajectory with every frame changed and the first two rows of the intrinsics multiplied."""
+def rewrite(good: Path, bad: Path, change: Change, intrinsics: float = 1.0, focal: float = 1.0) -> Path:
+    """Write the trajectory with every frame changed, and two rows of the intrinsics, or fx and fy, multiplied."""
     file = TrajectoryFile(good)
-    info = replace(file.info, intrinsics=np.diag([intrinsics, intrinsics, 1.0]) @ file.info.intrinsics)
+    matrix = np.diag([intrinsics, intrinsics, 1.0]) @ file.info.intrinsics
+    matrix[:2, :2] *= focal
+    info = replace(file.info, intrinsics=matrix)
     write_trajectory(bad, info, (change(frame, file.info) for frame in _frames(file)))
     return bad
 

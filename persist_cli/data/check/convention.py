@@ -6,6 +6,7 @@ the frames agree clearly better, that mistake is named.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -30,6 +31,8 @@ UNITS = {  # the factor that mends the depth, and the mistake that it may come f
 }
 RATIOS = (0.25, 0.33, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0, 2.5, 3.0, 4.0)
 GROSS = (0.2, 0.5, 2.0, 5.0)
+FINER = (0.8, 0.85, 0.9, 0.94, 0.97, 1.03, 1.06, 1.1, 1.15, 1.2)  # between two of the ratios
+FOCAL = "focal length"
 
 # Real Kinect data (7-Scenes kitchen) has a median relative error of 0.006 and a depth score of 0.08, where a wrong
 # hypothesis scores at least 0.11; exact renderings score 0.01. With any fault of the list the score is 0.19 to 1,
@@ -159,6 +162,10 @@ def check_convention(pairs: Sequence[Observations], advance: Callable[[], None] 
         (hypothesis, score(_reproject_all((hypothesis.undo(pair) for pair in tried), advance)))
         for hypothesis in hypotheses(pairs[0].cameras)
     ]
+    scored += [
+        (hypothesis, score(_reproject_all((hypothesis.undo(pair) for pair in tried), lambda: None)))
+        for hypothesis in _finer_focal_lengths(baseline, scored, pairs[0].cameras)
+    ]
     verdict, cause = _judge(baseline, scored, errors)
     undecided = _undecided(baseline, scored) if verdict == OK else []
     return _check(verdict, cause, errors, undecided, _best_of_each_kind(baseline, scored))
@@ -175,7 +182,8 @@ def score(errors: Sequence[ReprojectionErrors]) -> Score:
 
 def hypotheses(cameras: Cameras) -> list[Hypothesis]:
     """Every fault that is tried on frames of these cameras."""
-    return [*_pose_faults(), _depth_along_the_ray(), *_depth_units(), *_intrinsics_of_another_size(cameras)]
+    focal = [_scaled_focal_length(cameras, ratio) for ratio in RATIOS]
+    return [*_pose_faults(), _depth_along_the_ray(), *_depth_units(), *_intrinsics_of_another_size(cameras), *focal]
 
 
 def _reproject_all(pairs: Iterable[Observations], advance: Callable[[], None]) -> list[ReprojectionErrors]:
@@ -304,6 +312,27 @@ def _scaled_intrinsics(cameras: Cameras, x: float, y: float) -> Hypothesis:
     return Hypothesis("intrinsics of another size", cause, partial(_with_scaled_intrinsics, x=x, y=y), x in GROSS)
 
 
+def _scaled_focal_length(cameras: Cameras, ratio: float) -> Hypothesis:
+    focal = float(cameras.intrinsics[0, 0, 0])
+    now, then = (math.degrees(2 * math.atan(cameras.width / 2 / value)) for value in (focal, focal * ratio))
+    size = f"{ratio:.3g} times too small" if ratio > 1 else f"{1 / ratio:.3g} times too large"
+    cause = (
+        f"the focal length looks {size} (a field of view of {now:.0f}° in the place of about {then:.0f}°): multiply fx "
+        f"and fy by {ratio:.3g}"
+    )
+    return Hypothesis(FOCAL, cause, partial(_with_scaled_focal_length, scale=ratio), ratio in GROSS)
+
+
+def _finer_focal_lengths(baseline: Score, scored: HypothesisScores, cameras: Cameras) -> list[Hypothesis]:
+    """Focal lengths around the best one that was tried, if it explains the data better than any other fault."""
+    best, value = min(scored, key=lambda item: item[1].rank)
+    if best.name != FOCAL or not value.is_clearly_better_than(baseline):
+        return []
+    focal = [item for item in scored if item[0].name == FOCAL]
+    ratio = RATIOS[[hypothesis for hypothesis, _ in focal].index(best)]
+    return [_scaled_focal_length(cameras, ratio * factor) for factor in FINER]
+
+
 def _with_poses(pair: Observations, change: Callable[[Tensor], Tensor]) -> Observations:
     return replace(pair, cameras=replace(pair.cameras, world_from_camera=change(pair.cameras.world_from_camera)))
 
@@ -318,6 +347,11 @@ def _with_planar_depth(pair: Observations) -> Observations:
 
 def _with_scaled_depth(pair: Observations, scale: float) -> Observations:
     return replace(pair, depth=pair.depth * scale)
+
+
+def _with_scaled_focal_length(pair: Observations, scale: float) -> Observations:
+    factors = pair.cameras.intrinsics.new_tensor([[scale, 1.0, 1.0], [1.0, scale, 1.0], [1.0, 1.0, 1.0]])
+    return replace(pair, cameras=replace(pair.cameras, intrinsics=pair.cameras.intrinsics * factors))
 
 
 def _with_scaled_intrinsics(pair: Observations, x: float, y: float) -> Observations:

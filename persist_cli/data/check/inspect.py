@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import typer
 
-from persist_cli.api.actions import Action, ActionVocabulary
 from persist_cli.data.check.convention import (
     MOST_TRIED,
     OK,
@@ -20,10 +20,11 @@ from persist_cli.data.check.convention import (
     check_convention,
     hypotheses,
 )
+from persist_cli.data.check.others import describe_other
 from persist_cli.data.check.reprojection import choose_pairs
 from persist_cli.data.reference import Reference, parse_reference
 from persist_cli.data.store import TrajectoryFile
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
+from persist_cli.viewing.console import add_task, print_json, print_table, progress, say, warn
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class TrajectoryFigures:
         turned: degrees, all turns added.
         seconds: from the first to the last frame; 0 where frames have no times.
         actions: how often each is taken.
+        unknown_actions: those that are taken, but are not in the trajectory's vocabulary.
     """
 
     name: str
@@ -51,6 +53,7 @@ class TrajectoryFigures:
     turned: float
     seconds: float
     actions: dict[str, int]
+    unknown_actions: list[str]
 
 
 def run_inspect(data: str, pairs: int, json: bool) -> None:
@@ -61,17 +64,44 @@ def run_inspect(data: str, pairs: int, json: bool) -> None:
         pairs: largest number of frame pairs to reproject.
         json: print JSON instead of tables.
     """
+    other = describe_other(Path(data))
+    if other is not None:
+        _print_other(data, other, json)
+        return
     reference = parse_reference(data)
     files = reference.trajectories()
     figures, check = _inspect(files, reference, pairs)
+    actions = action_effects(files)
     if json:
-        print_json({"data": data, "trajectories": [asdict(one) for one in figures], "check": asdict(check)})
+        trajectories = [asdict(one) for one in figures]
+        print_json({"data": data, "actions": actions, "trajectories": trajectories, "check": asdict(check)})
     else:
-        print_table(data, ("holds", ""), figures_table(figures, files[0].info.vocabulary))
+        print_table(data, ("holds", ""), figures_table(figures, actions))
         print_table(f"convention check, {check.pairs} frame pairs", ("reprojected", ""), check_table(check))
         say(verdict_line(check))
-    if check.verdict == SUSPICIOUS:
+    broken = [one for one in figures if one.unknown_actions]
+    for one in broken:
+        warn(unknown_actions_line(one))
+    if check.verdict == SUSPICIOUS or broken:
         raise typer.Exit(1)
+
+
+def action_effects(files: Sequence[TrajectoryFile]) -> dict[str, str]:
+    """What each action of the data set does; where trajectories differ, what it does in each of them."""
+    effects: dict[str, list[str]] = {}
+    for file in files:
+        for action in file.info.vocabulary.actions:
+            effects.setdefault(action.name, []).append(action.effect)
+    return {name: _distinct(texts) for name, texts in effects.items()}
+
+
+def unknown_actions_line(figures: TrajectoryFigures) -> str:
+    """One line about actions of frames that the trajectory's own vocabulary does not have."""
+    names = ", ".join(figures.unknown_actions)
+    return (
+        f"wrong: frames of {figures.name} take {names}, which its vocabulary does not have; rollouts along it and "
+        "training on it would fail: mend the importer or simulator and write it again"
+    )
 
 
 def trajectory_figures(file: TrajectoryFile, frames: slice | None = None) -> TrajectoryFigures:
@@ -79,6 +109,7 @@ def trajectory_figures(file: TrajectoryFile, frames: slice | None = None) -> Tra
     numbers = file.frame_numbers(frames or slice(None))
     info, poses, times = file.info, file.poses()[numbers], file.timestamps()[numbers]
     names = file.actions()
+    taken = dict(Counter(action for number in numbers if (action := names[number]) is not None))
     steps = (poses[1:, :3, 3] - poses[:-1, :3, 3]).norm(dim=-1)
     between = poses[:-1, :3, :3].transpose(1, 2) @ poses[1:, :3, :3]
     cosines = ((between.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1)
@@ -93,21 +124,23 @@ def trajectory_figures(file: TrajectoryFile, frames: slice | None = None) -> Tra
         metres=float(steps.sum()),
         turned=math.degrees(float(cosines.acos().sum())),
         seconds=float(times[-1] - times[0]),
-        actions=dict(Counter(action for number in numbers if (action := names[number]) is not None)),
+        actions=taken,
+        unknown_actions=[name for name in taken if name not in info.vocabulary.names],
     )
 
 
-def figures_table(figures: Sequence[TrajectoryFigures], vocabulary: ActionVocabulary) -> list[tuple[str, str]]:
-    """Rows of name and value that sum up all trajectories.
+def figures_table(figures: Sequence[TrajectoryFigures], effects: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Rows of name and value that sum up all trajectories, with a row for each action that frames could take.
 
     Args:
         figures: figures of each trajectory.
-        vocabulary: gives the actions their units.
+        effects: what each action does, by name.
     """
-    actions: Counter[str] = Counter()
+    taken: Counter[str] = Counter()
     for one in figures:
-        actions.update(one.actions)
-    units = {action.name: _unit(action) for action in vocabulary.actions}
+        taken.update(one.actions)
+    known = {name: f": {effect}" for name, effect in effects.items()}
+    names = [*known, *(name for name in taken if name not in known)]
     return [
         ("trajectories", str(len(figures))),
         ("scenes", str(len({one.scene for one in figures}))),
@@ -117,7 +150,7 @@ def figures_table(figures: Sequence[TrajectoryFigures], vocabulary: ActionVocabu
         ("metres travelled", _total([one.metres for one in figures], "{:.2f}".format)),
         ("degrees turned", _total([one.turned for one in figures], "{:.0f}".format)),
         ("seconds", _total([one.seconds for one in figures], "{:.1f}".format)),
-        *[(f"action {name}{units.get(name, '')}", str(count)) for name, count in actions.most_common()],
+        *[(f"action {name}{known.get(name, ': not in the vocabulary')}", str(taken[name])) for name in names],
     ]
 
 
@@ -168,11 +201,11 @@ def _inspect(
         return figures, check_convention(frames, partial(bar.advance, task))
 
 
-def _unit(action: Action) -> str:
-    """The unit of an action in brackets, as in ``" (0.25 m)"``."""
-    if action.forward:
-        return f" ({action.forward:g} m)"
-    return f" ({action.turn:g}°)" if action.turn else ""
+def _print_other(path: str, other: str, json: bool) -> None:
+    if json:
+        print_json({"path": path, "is": other})
+    else:
+        say(f"{path} is {other}")
 
 
 def _total(values: Sequence[float], form: Callable[[Any], str]) -> str:

@@ -15,7 +15,7 @@ import typer
 from persist_cli.data.check.inspect import run_inspect
 from persist_cli.data.check.reprojection import choose_pairs, reproject
 from persist_cli.data.importers.importing import ImportPlan, run_import
-from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.data.store import Store, TrajectoryFile, write_trajectory
 from persist_cli.errors import DataError
 from tests.support import faulty_data as faults
 from tests.support.rooms import Room, look, walk
@@ -88,6 +88,18 @@ def test_a_known_fault_is_named_as_the_cause(
     assert (check["verdict"], code) == ("suspicious", 1)
     assert re.search(cause, check["cause"])
     assert "; or " not in check["cause"]
+
+
+@pytest.mark.parametrize("focal", [300 / 585, 0.7, 1.4, 2.0])
+@pytest.mark.parametrize("data", ["room", "kitchen"])
+def test_a_wrong_focal_length_is_named_with_its_likely_ratio(
+    request: pytest.FixtureRequest, tmp_path: Path, data: str, focal: float
+) -> None:
+    bad = faults.rewrite(request.getfixturevalue(data), tmp_path / "bad.parquet", faults.good, focal=focal)
+    check, code = inspect(bad, request.getfixturevalue("capsys"))
+    assert (check["verdict"], code) == ("suspicious", 1)
+    (ratio,) = re.findall(r"the focal length looks .*multiply fx and fy by ([0-9.]+)$", check["cause"])
+    assert float(ratio) == pytest.approx(1 / focal, rel=0.08)
 
 
 def test_poses_of_other_images_are_suspicious_without_a_known_cause(
@@ -173,3 +185,45 @@ def test_data_that_cannot_be_read_is_reported_in_one_line(room: Path, tmp_path: 
     (tmp_path / "half.parquet").write_bytes(room.read_bytes()[:5000])
     with pytest.raises(DataError, match=r"half\.parquet: not a whole Parquet file"):
         run_inspect(str(tmp_path), PAIRS, False)
+
+
+def test_every_action_that_frames_can_take_is_listed_with_what_it_does(persist, walks: Path, room: Path) -> None:
+    text = persist("inspect", walks, "--pairs", PAIRS).out
+    assert re.search(r"action forward: 0\.2 m ahead +│ +\d+ │", text)
+    assert re.search(r"action left: turns 15° to the left +│ +\d+ │", text)
+    assert re.search(r"action toggle: acts on what is there +│ +0 │", text)
+    printed = json.loads(persist("inspect", room.parent, "--pairs", PAIRS, "--json").out)
+    assert printed["actions"] == {"free": "any motion, which only the recorded poses tell"}
+
+
+def test_frames_with_actions_outside_the_vocabulary_are_said(persist, tmp_path: Path) -> None:
+    frames = [Room().see(pose, "jump", number / 10) for number, pose in enumerate(walk()[:6])]
+    write_trajectory(tmp_path / "hop.parquet", Room().info, frames)
+    result = persist("inspect", tmp_path, "--pairs", PAIRS)
+    assert result.code == 1
+    assert "action jump: not in the vocabulary" in result.out
+    assert "wrong: frames of hop take jump, which its vocabulary does not have" in result.err
+
+
+def test_what_is_no_data_set_is_named_with_the_command_that_looks_at_it(
+    persist, walks: Path, voxel: Path, tmp_path: Path
+) -> None:
+    memory = tmp_path / "m.safetensors"
+    assert persist("memorize", f"{walks}#0:0-4", "--memory", "voxel", "--out", memory).code == 0
+    (tmp_path / "rollout").mkdir()
+    (tmp_path / "rollout/rollout.json").write_text("{}")
+    for path, kind, command in (
+        (memory, "is a memory file: voxel of scene 'room-0'", "persist rollout --memory"),
+        (voxel, "is a finetune run, its newest checkpoint step-00000004: backbone cogvideox", "persist eval"),
+        (
+            next(voxel.glob("step-*/model")),
+            "is a checkpoint folder: backbone cogvideox, adapters voxel",
+            "persist eval",
+        ),
+        (tmp_path / "rollout", "is a rollout", "sheet.png"),
+    ):
+        result = persist("inspect", path)
+        assert (result.code, len(result.out.strip().splitlines())) == (0, 1), result.err
+        assert kind in result.out
+        assert command in result.out
+    assert persist("inspect", tmp_path / "nothing").code == 1
