@@ -25,6 +25,7 @@ from persist_cli.cli.options import (
     StepsOption,
     TurnOption,
     VerifyOption,
+    limit_spinning,
     show_version,
     split_names,
 )
@@ -47,6 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     Where the environment sets PERSIST_TRACEBACK, the traceback of that error is printed before.
     """
+    limit_spinning(os.environ)
     try:
         app(args=arguments)
     except PersistError as error:

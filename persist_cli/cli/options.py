@@ -6,7 +6,7 @@ import contextlib
 import errno
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Final
@@ -23,6 +23,8 @@ DISK_ERRORS: Final = {  # of a disk that is full, closed or read-only, which is 
     errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM,
     errno.EROFS,
 }  # fmt: skip
+
+SPINS: Final = "3000"  # rounds of busy waiting, some microseconds; tests/benchmarks/bench_spinning.py measures it
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
@@ -94,6 +96,16 @@ TurnOption = Annotated[
     float | None,
     typer.Option("--turn", min=0.001, max=180.0, help="Degrees of left and right; DATA's own, else 15 with --step."),
 ]
+
+
+def limit_spinning(environment: MutableMapping[str, str]) -> None:
+    """Let torch's OpenMP threads give up their core soon when they wait, unless the user chose how they wait.
+
+    By default they wait busily for so long that small models are many times slower beside other processes. It must be
+    called before torch is imported; child processes inherit it.
+    """
+    if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & environment.keys():
+        environment["GOMP_SPINCOUNT"] = SPINS
 
 
 def split_names(text: str) -> tuple[str, ...]:

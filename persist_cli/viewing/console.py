@@ -74,27 +74,29 @@ class ProgressLines(Progress):
         self.speaker.start()
 
     def stop(self) -> None:
-        """Write a line for each long task that did not come to its end, and no more lines."""
+        """Write the last line of each long task that has none yet, and no more lines."""
         self.ended.set()
         with self._lock:
             for task in self.tasks:
                 self._write_end(task)
 
+    def add_task(self, *arguments: Any, **options: Any) -> TaskID:
+        """Add a task as ``Progress.add_task`` does; write the last lines of those that are finished."""
+        with self._lock:
+            for task in self.tasks:
+                if task.finished:
+                    self._write_end(task)
+            return super().add_task(*arguments, **options)
+
     def update(self, task_id: TaskID, **changes: Any) -> None:
-        """Change a task as ``Progress.update`` does; write the lines that are due."""
+        """Change a task as ``Progress.update`` does; write the line that is due."""
         super().update(task_id, **changes)
-        self._changed(task_id)
+        self._write_due()
 
     def advance(self, task_id: TaskID, advance: float = 1) -> None:
-        """Add to what is done of a task; write the lines that are due."""
+        """Add to what is done of a task; write the line that is due."""
         super().advance(task_id, advance)
-        self._changed(task_id)
-
-    def _changed(self, task_id: TaskID) -> None:
-        with self._lock:
-            if self._tasks[task_id].finished:
-                self._write_end(self._tasks[task_id])
-            self._write_due()
+        self._write_due()
 
     def _speak_until_the_end(self) -> None:
         while not self.ended.wait(max(0.1, self.due - self.get_time())):

@@ -169,3 +169,14 @@ def test_memory_options_that_cannot_work_are_refused_in_one_line(persist, walks,
         result = roll(persist, tmp_path, walks, tmp_path / "o", "--actions", "forward", *options)
         assert result.code == 1
         assert result.err.strip().endswith(cause)
+
+
+def test_each_denoising_step_of_a_rollout_counts_in_its_progress(persist, voxel, walks, tmp_path, monkeypatch):
+    monkeypatch.setattr("persist_cli.viewing.console.FIRST_LINE", 0.0)
+    monkeypatch.setattr("persist_cli.viewing.console.LINE_EVERY", 0.0)
+    ended = roll(persist, voxel, walks, tmp_path, "--actions", "forward*12")  # two clips, each of two steps
+    lines = [line for line in ended.err.splitlines() if line.startswith("rollout: ")]
+    assert [line.split(" denoising")[0] for line in lines] == [
+        "rollout: 1 of 4", "rollout: 2 of 4", "rollout: 2 of 4", "rollout: 3 of 4", "rollout: 4",
+    ]  # fmt: skip
+    assert lines[-1].endswith("12 of 12 frames")

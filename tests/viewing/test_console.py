@@ -88,6 +88,17 @@ def test_the_rate_of_a_run_that_goes_on_does_not_count_what_was_done_before(caps
     assert capsys.readouterr().err.startswith("training: 1,995 of 2,000 steps, 0.5 steps/s, 10 s left")
 
 
+def test_each_long_part_of_a_work_gets_a_line_at_its_end(capsys):
+    clock = Clock()
+    with ProgressLines(clock) as lines:
+        for name, seconds in (("short", 1), ("long", 20), ("last", 30)):
+            task = add_task(lines, name, 1, "pieces")
+            clock.seconds += seconds
+            lines.advance(task)
+    errors = [line for line in capsys.readouterr().err.splitlines() if " in " in line]
+    assert errors == ["long: 1 pieces in 20 s, 0.05 pieces/s", "last: 1 pieces in 30 s, 0.033 pieces/s"]
+
+
 def test_what_does_not_advance_speaks_too(capsys):
     clock = Clock()
     with ProgressLines(clock) as lines:
