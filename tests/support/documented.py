@@ -1,0 +1,91 @@
+"""The code blocks of a Markdown page and the commands in them, and how one command is run in this process."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from accelerate.state import AcceleratorState
+
+from persist_cli.cli.app import main
+
+FENCE = re.compile(r"^(?P<indent> *)```(?P<language>[a-z]*|{[a-z]+})\n(?P<text>.*?)^(?P=indent)```$", re.M | re.S)
+FILE_NAME = re.compile(r"^# (?P<name>[\w./-]+\.(?:py|toml|yaml|sh))$")  # a first line that says where a block belongs
+
+
+@dataclass(frozen=True)
+class Block:
+    """A code block of a page.
+
+    Args:
+        line: number of its first line in the page.
+        language: the word behind the fence, empty without one.
+        text: what is between the fences, without their indentation.
+    """
+
+    line: int
+    language: str
+    text: str
+
+    @property
+    def file(self) -> str | None:
+        """The file that the block's first line, a comment, names; ``None`` when it names none."""
+        match = FILE_NAME.match(self.text.partition("\n")[0])
+        return None if match is None else match["name"]
+
+
+@dataclass(frozen=True)
+class ShownCommand:
+    """A command of a ``console`` block, and the lines that are shown below it."""
+
+    command: str
+    lines: tuple[str, ...]
+
+
+def read_blocks(page: Path) -> list[Block]:
+    """All code blocks of a page, in order; directives of Sphinx are none."""
+    text = page.read_text(encoding="utf-8")
+    blocks = []
+    for match in FENCE.finditer(text):
+        if match["language"].startswith("{"):
+            continue
+        content = re.sub(f"^{match['indent']}", "", match["text"], flags=re.M)
+        blocks.append(Block(text.count("\n", 0, match.start()) + 2, match["language"], content))
+    return blocks
+
+
+def commands(block: Block) -> list[str]:
+    """The commands of a ``bash`` block: comments are left out, lines that end in a backslash are joined."""
+    joined = re.sub(r"\\\n *", "", block.text)
+    lines = (" ".join(shlex.split(line, comments=True)) and line.strip() for line in joined.splitlines())
+    return [line for line in lines if line]
+
+
+def shown_commands(block: Block) -> Iterator[ShownCommand]:
+    """The commands of a ``console`` block, which begin with a dollar sign, with what is shown of their output."""
+    for part in re.split(r"^\$ ", block.text, flags=re.M)[1:]:
+        command, _, output = part.partition("\n")
+        yield ShownCommand(command, tuple(line for line in output.splitlines() if line.strip()))
+
+
+def run_here(words: list[str]) -> tuple[int, str]:
+    """Run ``persist`` with these arguments in this process; the exit code, and all that it printed."""
+    AcceleratorState._reset_state(reset_partial_state=True)  # it fixes the precision of a process by the first run
+    printed, code = io.StringIO(), 0
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            main(words)
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+    return code, printed.getvalue()
+
+
+def shows(output: str, line: str) -> bool:
+    """Whether the output has a line like the shown one, in which … stands for anything."""
+    pattern = ".*".join(map(re.escape, " ".join(line.split()).split("…")))
+    return any(re.search(pattern, " ".join(text.split())) for text in output.splitlines())
