@@ -105,7 +105,7 @@ def test_rollouts_that_cannot_work_are_refused_in_one_line(persist, voxel, stage
         (voxel, (*left, "--memory", tmp_path / "no.safetensors"), "no.safetensors"),
         (voxel, (*left, "--memory", foreign), "its reference is 'room-1', wanted here is 'room-0'"),
         (voxel, (*left, "--memory", patches), "its encoder settings"),
-        (stage1, (*left, "--memory", foreign), "no memory adapter that could read"),
+        (stage1, (*left, "--memory", foreign), "without a memory adapter, which cannot read"),
         (voxel, (*left, "--adapter", "map2d"), "no memory adapter 'map2d' in it; it has voxel"),
         (voxel, (*left, "--sampler", "euler"), "unknown sampler 'euler'"),
         (voxel, (*left, "--steps", 1001), "1001 denoising steps; it must be 1 to 1000"),
