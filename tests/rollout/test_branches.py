@@ -86,7 +86,9 @@ def test_branches_encode_their_shared_frame_once_and_read_the_memory_once(start,
     searched = record_sizes(monkeypatch, Views, "visible_distances")
     branches.step(ACTIONS)
     assert encoded == [1]
-    assert searched == [21, 21]  # blocks, then cells: the first camera and four turns to the left are the same for two
+    read, written = searched[:2], searched[2:]
+    assert read == [21, 21]  # blocks, then cells: the first camera and four turns to the left are the same for two
+    assert written == [8, 8, 8]  # of the frames of each branch, what no observed cell shows is written
     branches.step(ACTIONS)
     assert encoded == [1, 3]  # by now each branch has a present frame of its own
 

@@ -1,0 +1,116 @@
+"""A world model put together from a checkpoint, one of its adapters and a memory, for ``rollout`` and for Python."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkpoint
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import TrajectoryInfo
+from persist_cli.checkpoints.load import adapter_memory, load_backbone
+from persist_cli.data.clips import check_size
+from persist_cli.data.reference import parse_reference
+from persist_cli.errors import CheckpointError
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.memorize.memory_file import load_memory, read_header
+from persist_cli.rollout.camera_path import RolloutPlan
+from persist_cli.rollout.world_model import Agent, WorldModel
+from persist_cli.viewing.console import busy
+
+
+def open_world(
+    start: str,
+    checkpoint: Path | str = REFERENCE,
+    adapter: str | None = None,
+    memory: Path | str | None = None,
+    sampling: SamplingOverrides | None = None,
+    seed: int = 0,
+) -> WorldModel:
+    """Return a world model whose one agent stands at a frame of a data set.
+
+    For example ``open_world("sample#0:32", memory="runs/house.safetensors").step([["left", "forward"]])``.
+
+    Args:
+        start: the frame, as in ``runs/houses#0:32``; ``sample`` is the data set that comes with the package.
+        checkpoint: a run, an export or ``reference``, the model that comes with the package.
+        adapter: name of a memory adapter, by default the checkpoint's default or only one; ``stage1`` for none.
+        memory: a file that ``persist memorize`` wrote; an empty memory when ``None``.
+        sampling: steps, sampler and guidance in place of the checkpoint's own.
+        seed: seed of the sampling noise.
+
+    Raises:
+        PersistError: one line when one of them is missing or damaged, or they do not go together.
+    """
+    reference, found = parse_reference(start), find_checkpoint(Path(checkpoint))
+    frame = reference.single().read([reference.frame])
+    plan = RolloutPlan(
+        start, (), False, 0, None if memory is None else Path(memory), adapter, True, seed,
+        sampling or SamplingOverrides(), InferenceOptions(),
+    )  # fmt: skip
+    world = assemble_world(found, chosen_adapter(found, adapter), plan, frame.info)
+    world.reset([frame.observations], [frame.info])
+    return world
+
+
+def chosen_adapter(checkpoint: Checkpoint, name: str | None) -> str | None:
+    """Return the adapter of this name, by default the checkpoint's; ``None`` for ``stage1`` and where there is none."""
+    return None if name == PLAIN else name or checkpoint.default_adapter()
+
+
+def assemble_world(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> WorldModel:
+    """Return a world model with one agent, which has not begun yet.
+
+    Args:
+        checkpoint: the checkpoint.
+        adapter: name of its adapter, ``None`` for the model without one.
+        plan: start, memory, seed, sampling and placement.
+        info: scene, up axis and image size of the start frame's trajectory.
+
+    Raises:
+        PersistError: when model, memory, sampling and data do not go together.
+    """
+    with busy("loading the memory"):  # before the model, which takes longer, so that what cannot work fails at once
+        memory = open_memory(checkpoint, adapter, plan, info)
+    with busy("loading the model"):
+        backbone = load_backbone(checkpoint, adapter=adapter)
+    check_size(info, backbone.image_size, plan.start)
+    sampling = checkpoint.sampling_with(plan.sampling)
+    backbone.check_sampling(sampling)
+    backbone.prepare_inference(plan.placement)
+    return WorldModel(backbone, [Agent(memory and memory.to(backbone.device), plan.seed, plan.write)], sampling)
+
+
+def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
+    """Return the memory of the plan's file, else an empty one of the adapter's kind, ``None`` without an adapter."""
+    if adapter is None:
+        if plan.memory is not None:
+            without = f"--adapter {PLAIN} is the model" if plan.adapter else f"{checkpoint.folder}: is a model"
+            raise CheckpointError(f"{without} without a memory adapter, which cannot read {plan.memory}")
+        return None
+    empty = MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
+    if plan.memory is None:
+        return empty
+    check_memory(read_header(plan.memory), empty, checkpoint, plan.memory)
+    return load_memory(plan.memory)
+
+
+def check_memory(header: Mapping[str, Any], wanted: Memory, checkpoint: Checkpoint, path: Path) -> None:
+    """Raise ``CheckpointError`` when a memory file differs from the kind or scene that the adapter reads.
+
+    Args:
+        header: header of the file.
+        wanted: an empty memory as the adapter reads it.
+        checkpoint: the checkpoint, whose other adapters may read the file.
+        path: the file.
+    """
+    expected = json.loads(json.dumps(wanted.header()))
+    for key in ("memory", "encoder", "encoder_settings", "channels", "reference"):
+        if header[key] != expected[key]:
+            name = key.replace("_", " ")
+            readers = [one for one in checkpoint.adapters if adapter_memory(checkpoint, one).name == header["memory"]]
+            advice = f"; --adapter {readers[0]} reads it" if key == "memory" and readers else ""
+            raise CheckpointError(f"{path}: its {name} is {header[key]!r}, wanted here is {expected[key]!r}{advice}")

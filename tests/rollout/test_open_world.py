@@ -1,0 +1,42 @@
+"""A world model is opened at a frame in one call, and is the one that ``persist rollout`` uses."""
+
+from __future__ import annotations
+
+import pytest
+
+from persist_cli.api.inference import SamplingOverrides
+from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.rollout.open_world import open_world
+from persist_cli.viewing.video import read_video
+from tests.support.micro_runs import SIZE
+
+FAST = SamplingOverrides(steps=2)
+
+
+def test_a_world_that_is_opened_imagines_what_rollout_does(persist, voxel, walks, tmp_path):
+    memory, out = tmp_path / "m.safetensors", tmp_path / "out"
+    assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
+    start, options = f"{walks}#0:2", ("--memory", memory, "--steps", 2, "--actions", "left*4 forward*6")
+    assert persist("rollout", voxel, "--start", start, "--out", out, *options).code == 0
+    world = open_world(start, voxel, memory=memory, sampling=FAST)
+    (seen,) = world.step([["left"] * 4 + ["forward"] * 6])
+    assert read_video(out / "rgb.mp4", SIZE, SIZE).shape == (1 + len(seen.rgb), SIZE, SIZE, 3)
+    world.agents[0].memory.save(tmp_path / "after.safetensors")
+    written, remembered = load_memory(out / "memory.safetensors"), load_memory(tmp_path / "after.safetensors")
+    assert all((written.tensors()[name] == tensor).all() for name, tensor in remembered.tensors().items())
+
+
+def test_a_world_without_an_adapter_has_no_memory(voxel, walks):
+    world = open_world(f"{walks}#0:2", voxel, adapter="stage1", sampling=FAST)
+    assert world.agents[0].memory is None
+    assert len(world.step([["left"]])[0]) == 1
+
+
+def test_a_world_is_not_opened_with_the_memory_of_another_scene(persist, voxel, walks, tmp_path):
+    memory = tmp_path / "m.safetensors"
+    assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
+    with pytest.raises(CheckpointError, match="its reference is"):
+        open_world(f"{walks}#1:0", voxel, memory=memory)
+    with pytest.raises(PersistError, match="no checkpoint there"):
+        open_world(f"{walks}#0:0", tmp_path / "none")
