@@ -14,18 +14,15 @@ from torch.overrides import TorchFunctionMode
 def without_weights() -> Iterator[None]:
     """Within the block models are made on the meta device, for weights that are read from files later.
 
-    As ``torch.device("meta")``, but weights are not initialised, and ranges of numbers are made on the CPU, so that
-    tables of positions have values. For both of these torch would first import its compiler, which takes over a second.
+    As ``torch.device("meta")``, but weights are not initialised, for which torch would first import its compiler; that
+    takes over a second.
     """
-    with torch.device("meta"), _Shapes():
+    with torch.device("meta"), _Uninitialised():
         yield
 
 
-class _Shapes(TorchFunctionMode):
+class _Uninitialised(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None) -> Any:
-        kwargs = kwargs or {}
         if getattr(func, "__module__", "") == "torch.nn.init":
-            return args[0] if args else kwargs["tensor"]
-        if func is torch.arange and kwargs.get("device") is None:
-            kwargs = kwargs | {"device": "cpu"}
-        return func(*args, **kwargs)
+            return args[0] if args else (kwargs or {})["tensor"]
+        return func(*args, **(kwargs or {}))

@@ -307,9 +307,7 @@ def evaluate(
     verify: VerifyOption = False,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
-    out: Annotated[Path, typer.Option(help="Folder for metrics.json, tables.md; a stopped run goes on.")] = Path(
-        "runs/eval"
-    ),
+    out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/eval"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html, tables, curves, clips.")] = None,
     compare: CompareOption = None,
     json: JsonOption = False,

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, checkpoint_folder, find_checkpoint
-from persist_cli.api.meta_device import without_weights
 from persist_cli.checkpoints.load import start_backbone, starts_from_random_codec
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
@@ -38,7 +39,7 @@ class MetaModel:
     def of(name: str, recipe: Recipe, base: Checkpoint | None) -> MetaModel:
         """The meta model of a recipe and its base, where there is one."""
         channels = None
-        with without_weights():
+        with torch.device("meta"):
             backbone = start_backbone(recipe.backbone, base)
             if recipe.lora is not None:
                 backbone.add_lora(recipe.lora)

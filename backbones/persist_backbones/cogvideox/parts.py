@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from persist_backbones.cogvideox.codec import spatial_compression
 from persist_backbones.cogvideox.config import PRESETS, CogVideoXSettings
@@ -140,12 +141,23 @@ def make_part(name: str, config: dict[str, Any]) -> Any:
 
 
 def _construct(name: str, config: dict[str, Any]) -> Any:
-    """Make a part on the default device; within ``without_weights`` its tables of positions are on the CPU."""
+    """Make a part on the default device; where that is the meta device, its tables of positions are on the CPU."""
     _check_sizes(name, config)
     try:
-        return SUBFOLDERS[name](**config)
+        with _TablesOnCpu():
+            return SUBFOLDERS[name](**config)
     except (TypeError, ValueError, IndexError, ArithmeticError) as error:
         raise CheckpointError(f"diffusers cannot make a {name} of these settings ({_cause(error)})") from error
+
+
+class _TablesOnCpu(TorchFunctionMode):
+    """Makes ranges of numbers on the CPU, for which torch would import its compiler on the meta device."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None) -> Any:
+        kwargs = kwargs or {}
+        if func is torch.arange and kwargs.get("device") is None:
+            kwargs = kwargs | {"device": "cpu"}
+        return func(*args, **kwargs)
 
 
 def save_parts(parts: DiffusersParts, folder: Path) -> None:
