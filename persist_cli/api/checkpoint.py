@@ -48,7 +48,7 @@ class Checkpoint:
         fingerprint: a hash of the base's weights.
         adapters: folders of the memory adapters by name.
         default: the name of the adapter to use when a command names none.
-        sampling: the default sampling settings of its card; ``None`` when the card has none.
+        sampling: the default sampling settings of its card, else of its base's; ``None`` when neither has any.
         training_scenes: the scenes that base and adapters were trained on; ``None`` for cards of earlier versions.
     """
 
@@ -130,7 +130,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
         fingerprint=str(card.get("fingerprint", "")),
         adapters={path.name: path for path in sorted((folder / "adapters").glob("*")) if path.is_dir()},
         default=base_card.get("default_adapter"),
-        sampling=_sampling(card, folder / CARD),
+        sampling=_sampling(card, folder / CARD) or _sampling(base_card, base / CARD),
         training_scenes=_training_scenes(card, folder / CARD),
     )
 

@@ -26,11 +26,11 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.backbone import Backbone, Sampling
-from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Trajectory
-from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone, reference_checkpoint
+from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store
