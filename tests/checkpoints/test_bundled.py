@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from persist_backbones import load
+from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.export import ExportPlan, run_export
@@ -86,6 +87,8 @@ def test_a_memory_is_trained_on_the_reference_model_and_finds_it_where_the_packa
     assert ended.code == 0, ended.err
     card = json.loads((find_checkpoint(here / "run").folder / "persist.json").read_text())
     assert card["base"] == "reference"
+    assert "sampling" not in card
+    assert find_checkpoint(here / "run").sampling == Sampling(steps=1)  # as the card of the reference model says
     shutil.copytree(home, here / "elsewhere")
     monkeypatch.setenv("PERSIST_REFERENCE", str(here / "elsewhere"))
     assert find_checkpoint(here / "run").base_folder == here / "elsewhere/reference"
