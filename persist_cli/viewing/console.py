@@ -33,6 +33,7 @@ Item = TypeVar("Item")
 
 BORDER = 3  # characters between two columns of a table
 LONGEST_NAME = 40  # characters of a row's name that are not broken into lines
+LONGEST_NUMBER = 40  # characters of cells that stand on the right of their column; longer ones are sentences
 PIPED_WIDTH = 160  # columns of a table that goes into a file or pipe
 
 FIRST_LINE: Final = 10.0  # seconds after which a log is told how far a work is
@@ -252,7 +253,8 @@ def print_table(
             [full_widths[number] for number in numbers], [word_widths[number] for number in numbers], OUT.width
         )
         for number, width in zip(numbers, widths, strict=True):
-            table.add_column(columns[number], justify="right" if number else "left", width=width)
+            is_prose = number == 0 or full_widths[number] > LONGEST_NUMBER
+            table.add_column(columns[number], justify="left" if is_prose else "right", width=width)
         for place, row in enumerate(rows):
             table.add_row(*(row[number] for number in numbers), end_section=place in sections)
         OUT.print(table)
