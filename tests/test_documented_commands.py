@@ -3,7 +3,7 @@
 Each page begins in a fresh folder and depends on nothing but itself. A block runs by its language: the lines of
 ``bash`` one by one, those of ``console`` too, whose shown output must come; ``python`` in one namespace a page;
 ``toml``, ``yaml`` and ``json`` are parsed. A block whose first line is a comment with a file's name is also written to
-that file. ``text`` is what a program prints or draws and is not run.
+that file. ``text`` is what a program prints or draws and is not run, nor is ``bibtex``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "CONT
 
 SLOW = {"tutorial"}  # pages that take longer than a minute
 
-LANGUAGES = {"bash", "console", "python", "toml", "yaml", "json", "text"}
+LANGUAGES = {"bash", "console", "python", "toml", "yaml", "json", "text", "bibtex"}
 
 # what is put in the place of large numbers: an option or setting that is given again wins
 SHORTER = {
@@ -70,8 +70,6 @@ NOT_RUN = {
     "hf download": "needs the hub",
     "persist weights fetch": "downloads",
     "persist doctor": "takes half a minute for a published model; tests/doctor runs it on them",
-    "persist memorize --merge runs/upstairs": "the files stand for those of the reader; docs/data.md joins two",
-    "persist eval --compare runs/eval/metrics.json runs/other": "as before; docs/evaluation.md compares two",
     "persist --install-completion": "changes the files of the shell",
     "sbatch ": "needs Slurm",
     "open ": "opens a window",
@@ -81,7 +79,6 @@ NOT_RUN = {
 
 # programs that are only compiled, by their first line, with the reason
 SKETCHES = {
-    'pipe = persist_backbones.load("runs/voxel")': "image, depth and cameras are the reader's; docs/python.md runs all",
     "class LastFrame(Memory):  # from persist_cli.api.memory": "its imports are left out; docs/plugins.md runs all",
 }
 
@@ -98,7 +95,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 # what a page may take as given, by the word for it
 GIVEN: dict[str, Callable[[Path], object]] = {
-    "captures/kitchen": lambda path: write_sequence(path, 24, (48, 64)),
+    "captures/kitchen": lambda path: write_sequence(path, 48, (48, 64)),  # twice around, so that clips return
     "DATA": write_walks,
     "DIR": lambda path: write_twin("5b-i2v", path),
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,8 @@ from persist_cli.cli.app import main
 
 FENCE = re.compile(r"^(?P<indent> *)```(?P<language>[a-z]*|{[a-z]+})\n(?P<text>.*?)^(?P=indent)```$", re.M | re.S)
 FILE_NAME = re.compile(r"^# (?P<name>[\w./-]+\.(?:py|toml|yaml|sh))$")  # a first line that says where a block belongs
+
+COMMENT = re.compile(r"(^|\s)#.*")  # shlex would begin one within sample#0 too
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def read_blocks(page: Path) -> list[Block]:
 def commands(block: Block) -> list[str]:
     """The commands of a ``bash`` block: comments are left out, lines that end in a backslash are joined."""
     joined = re.sub(r"\\\n *", "", block.text)
-    lines = (" ".join(shlex.split(line, comments=True)) and line.strip() for line in joined.splitlines())
+    lines = (COMMENT.sub("", line).strip() for line in joined.splitlines())
     return [line for line in lines if line]
 
 

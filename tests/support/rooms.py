@@ -97,11 +97,11 @@ def walk(frames: int = 24) -> np.ndarray:
 
 
 def write_sequence(folder: Path, frames: int = 4, size: tuple[int, int] = (48, 64), suffix: str = "png") -> Path:
-    """Write a 7-Scenes sequence of a walk through the room; every depth image lacks two pixels.
+    """Write a 7-Scenes sequence of a walk round and round in the room; every depth image lacks two pixels.
 
     Args:
         folder: the folder to make.
-        frames: number of frames.
+        frames: number of frames; 24 are once around.
         size: height and width in pixels.
         suffix: of the colour images.
     """
@@ -110,7 +110,7 @@ def write_sequence(folder: Path, frames: int = 4, size: tuple[int, int] = (48, 6
     matrix = room.intrinsics
     matrix[:2, 2] -= 0.5  # as 7-Scenes counts
     np.savetxt(folder / "camera-intrinsics.txt", matrix)
-    for number, frame in enumerate(room.frames(walk(24)[:frames])):
+    for number, frame in enumerate(room.frames(walk(24)[np.arange(frames) % 24])):
         stem = folder / f"frame-{3 * number:06d}"
         Image.fromarray(frame.rgb).save(f"{stem}.color.{suffix}")
         millimetres = np.round(frame.depth * 1000).astype(np.uint16)
