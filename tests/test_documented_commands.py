@@ -3,13 +3,15 @@
 Each page begins in a fresh folder and depends on nothing but itself. A block runs by its language: the lines of
 ``bash`` one by one, those of ``console`` too, whose shown output must come; ``python`` in one namespace a page;
 ``toml``, ``yaml`` and ``json`` are parsed. A block whose first line is a comment with a file's name is also written to
-that file. ``text`` is what a program prints or draws and is not run, nor is ``bibtex``.
+that file; a script of the shell is only parsed. ``text`` is what a program prints or draws and is not run, nor is
+``bibtex``.
 """
 
 from __future__ import annotations
 
 import json
 import shlex
+import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
@@ -162,6 +164,7 @@ def run_block(block: Block, page: Path, names: dict[str, object]) -> None:
         Path(block.file).parent.mkdir(parents=True, exist_ok=True)
         Path(block.file).write_text(block.text, encoding="utf-8")
         if block.file.endswith(".sh"):
+            subprocess.run(["bash", "-n", block.file], check=True)
             return
     match block.language:
         case "bash":

@@ -14,7 +14,7 @@ from accelerate.state import AcceleratorState
 from persist_cli.cli.app import main
 
 FENCE = re.compile(r"^(?P<indent> *)```(?P<language>[a-z]*|{[a-z]+})\n(?P<text>.*?)^(?P=indent)```$", re.M | re.S)
-FILE_NAME = re.compile(r"^# (?P<name>[\w./-]+\.(?:py|toml|yaml|sh))$")  # a first line that says where a block belongs
+FILE_NAME = re.compile(r"(?:#!.*\n)?# (?P<name>[\w./-]+\.(?:py|toml|yaml|sh))\n")  # it says where a block belongs
 
 COMMENT = re.compile(r"(^|\s)#.*")  # shlex would begin one within sample#0 too
 
@@ -35,8 +35,8 @@ class Block:
 
     @property
     def file(self) -> str | None:
-        """The file that the block's first line, a comment, names; ``None`` when it names none."""
-        match = FILE_NAME.match(self.text.partition("\n")[0])
+        """The file that a comment in the first line, or below a script's interpreter, names; ``None`` without one."""
+        match = FILE_NAME.match(self.text)
         return None if match is None else match["name"]
 
 
@@ -61,10 +61,10 @@ def read_blocks(page: Path) -> list[Block]:
 
 
 def commands(block: Block) -> list[str]:
-    """The commands of a ``bash`` block: comments are left out, lines that end in a backslash are joined."""
+    """The commands of a ``bash`` block, those of ``A && B`` apart; lines that end in a backslash are joined."""
     joined = re.sub(r"\\\n *", "", block.text)
-    lines = (COMMENT.sub("", line).strip() for line in joined.splitlines())
-    return [line for line in lines if line]
+    parts = (part.strip() for line in joined.splitlines() for part in COMMENT.sub("", line).split("&&"))
+    return [part for part in parts if part]
 
 
 def shown_commands(block: Block) -> Iterator[ShownCommand]:
