@@ -42,8 +42,8 @@ def test_overrides_reach_nested_settings():
 
 
 def test_a_run_resumes_with_another_length_or_cost_of_its_steps_and_not_with_another_result():
-    training = ["steps", "cooldown", "accumulation", "checkpoint_every", "checkpoint_minutes", "workers", "threads"]
-    costs = ["tracker", "gradient_checkpointing", "compile", "ema_device", "vae_slicing"]
+    training = ["steps", "cooldown", "accumulation", "checkpoint_every", "checkpoint_minutes", "keep_checkpoints"]
+    costs = ["workers", "threads", "tracker", "gradient_checkpointing", "compile", "ema_device", "vae_slicing"]
     assert changeable_on_resume() == {f"training.{name}" for name in training + costs}
 
 

@@ -41,12 +41,12 @@ def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Pat
 @pytest.mark.parametrize(
     ("settings", "cause"),
     [
-        ({"dropout": 1.5}, "dropout: .*less than or equal to 1"),
-        ({"dropout": -0.1}, "dropout: .*greater than or equal to 0"),
-        ({"token_budget": 0}, "token_budget: .*greater than 0"),
-        ({"ff_factor": -1}, "ff_factor: .*greater than"),
-        ({"form": "cross", "ff_factor": 0}, "ff_factor: .*greater than 0"),
-        ({"form": "canvas", "ff_factor": -1}, "ff_factor: .*greater than or equal to 0"),
+        ({"dropout": 1.5}, "dropout must be .*at most 1, not 1.5"),
+        ({"dropout": -0.1}, "dropout must be .*at least 0 .*not -0.1"),
+        ({"token_budget": 0}, "token_budget must be a whole number above 0"),
+        ({"ff_factor": -1}, "ff_factor must be a number above 0"),
+        ({"form": "cross", "ff_factor": 0}, "ff_factor must be a number above 0"),
+        ({"form": "canvas", "ff_factor": -1}, "ff_factor must be a number of at least 0"),
         ({"width": 16, "heads": 3}, "3 heads do not divide a width of 16"),
         ({"form": "projected", "width": 16, "heads": 5}, "5 heads do not divide a width of 16"),
         ({"every": 3}, "every is 3, but the model has 2 layers"),

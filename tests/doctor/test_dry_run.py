@@ -79,4 +79,4 @@ def test_a_broken_base_is_not_taken_for_a_missing_one(persist, tmp_path):
     write_base(tmp_path / "stage1")
     shutil.rmtree(tmp_path / "stage1/vae")
     ended = persist("finetune", "tiny-stage2-voxel", "--dry-run", f"base={tmp_path / 'stage1'}")
-    assert (ended.code, "no vae/ folder" in ended.err) == (1, True)
+    assert (ended.code, "vae/config.json: no such file" in ended.err) == (1, True)

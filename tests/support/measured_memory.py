@@ -44,6 +44,7 @@ def trained_bytes(run: Run, peak: Callable[[], int]) -> int:
     with (
         tempfile.TemporaryDirectory() as folder,
         patch.object(RunFolder, "save", lambda _: peaks.append(peak())),
+        patch.object(RunFolder, "finish", lambda folder: folder.save() or []),
         contextlib.redirect_stdout(sys.stderr),
         contextlib.suppress(SystemExit),
     ):
