@@ -19,6 +19,7 @@ from persist_cli.cli.options import (
     DtypeOption,
     GuidanceOption,
     JsonOption,
+    MemoriesOption,
     SamplerOption,
     SaveMemoryOption,
     StepOption,
@@ -293,7 +294,7 @@ def evaluate(
     ] = None,
     data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
     protocol: Annotated[str, typer.Option(help="revisit, return, long or unseen.")] = "revisit",
-    memories: Annotated[str, typer.Option(help="Memories to compare, the first as reference.")] = "none,voxel",
+    memories: MemoriesOption = None,
     controls: ControlsOption = None,
     metrics: Annotated[str, typer.Option(help="Metrics separated by commas, or all.")] = "all",
     frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
@@ -329,7 +330,7 @@ def evaluate(
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
-        data=tuple(data), protocol=protocol, memories=split_names(memories), 
+        data=tuple(data), protocol=protocol, memories=None if memories is None else split_names(memories),
         controls=split_names(DEFAULT_CONTROLS if controls is None else controls), controls_named=controls is not None,
         metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=SamplingOverrides(steps, sampler, guidance), batch=batch, noise=pose_noise,

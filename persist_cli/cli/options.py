@@ -41,6 +41,13 @@ GuidanceOption = Annotated[
 
 DEFAULT_CONTROLS: Final = "copy,nearest,warp,codec,shuffled,emptied"
 
+MemoriesOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Memories to compare, separated by commas, the first as reference; stage1 is the model without any. By "
+        "default none, or stage1 where no checkpoint has it, and the memories of the checkpoints."
+    ),
+]
 ControlsOption = Annotated[
     str | None,
     typer.Option(

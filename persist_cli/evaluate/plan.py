@@ -19,7 +19,7 @@ from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, Protocol
 from persist_cli.evaluate.provenance import checkpoint_json, metric_json, scenes_of, trained_on, training_scenes
 from persist_cli.evaluate.report.remarks import contamination
-from persist_cli.evaluate.rows.build_rows import RowConfig, build_control_rows, build_model_rows
+from persist_cli.evaluate.rows.build_rows import RowConfig, build_control_rows, build_model_rows, default_memories
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
@@ -35,7 +35,7 @@ class EvalPlan:
 
     data: tuple[Path, ...]
     protocol: str
-    memories: tuple[str, ...]
+    memories: tuple[str, ...] | None  # ``None`` for those of ``default_memories``
     controls: tuple[str, ...]
     metrics: tuple[str, ...]
     frames: int
@@ -50,7 +50,7 @@ class EvalPlan:
     def without_repeats(self) -> EvalPlan:
         """This plan without repeated names, because a memory named twice would be two rows of one name."""
         data = {folder.resolve(): folder for folder in self.data}
-        return replace(self, data=tuple(data.values()), memories=tuple(dict.fromkeys(self.memories)))
+        return replace(self, data=tuple(data.values()), memories=tuple(dict.fromkeys(self.memories or ())))
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,12 @@ def prepare(
         PersistError: one line for whatever does not fit.
     """
     plan.placement.device()  # an impossible placement is reported before anything is loaded
-    plan, loader = plan.without_repeats(), BackboneLoader(plan.placement)
     checkpoints = list({checkpoint.folder.resolve(): checkpoint for checkpoint in map(find_checkpoint, paths)}.values())
+    if plan.memories is None:
+        plan = replace(plan, memories=default_memories(checkpoints))
+    plan, loader = plan.without_repeats(), BackboneLoader(plan.placement)
     sampling = common_sampling(checkpoints, plan.sampling)
-    config = RowConfig(plan.memories, plan.controls, sampling, plan.noise, plan.controls_named)
+    config = RowConfig(plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named)
     config.check()
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")

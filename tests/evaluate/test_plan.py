@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import pytest
 
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.evaluate.rows.build_rows import default_memories
 from persist_cli.io.files import read_json, write_json
 from tests.support.export_runs import write_adapter, write_base
 
@@ -131,3 +134,18 @@ def test_another_precision_is_another_evaluation_and_slicing_the_codec_is_not(pe
     assert "holds another evaluation (sampling dtype: None, now bfloat16)" in error
     assert persist(*run[:-1], tmp_path / "p", "--dtype", "bfloat16").code == 0
     assert read_json(tmp_path / "p/metrics.json")["sampling"]["dtype"] == "bfloat16"
+
+
+def test_without_names_a_baseline_and_the_memories_of_the_checkpoints_are_compared(persist, walks, tmp_path):
+    model = write_model(tmp_path / "a")
+    options = ("--metrics", "psnr", "--controls", "copy", "--seeds", 1, "--clips", 1, "--steps", 1)
+    ended = persist("eval", model, "--data", walks, *options, "--out", tmp_path / "o")
+    assert ended.code == 0, ended.err
+    assert list(columns(tmp_path / "o")) == ["stage1", "voxel", "copy of the first frame"]
+
+
+def test_the_baseline_is_none_where_a_checkpoint_has_it_beside_the_default_of_each(tmp_path):
+    model = find_checkpoint(write_model(tmp_path / "a"))
+    several = replace(model, adapters={name: model.folder for name in ("map2d", "none", "voxel")}, default="voxel")
+    assert default_memories([several]) == ("none", "voxel")
+    assert default_memories([replace(several, default=None), model]) == ("none", "map2d", "voxel")

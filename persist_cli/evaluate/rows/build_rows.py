@@ -89,6 +89,16 @@ class ControlRows:
     missing: list[tuple[Row, str]]
 
 
+def default_memories(checkpoints: Sequence[Checkpoint]) -> tuple[str, ...]:
+    """The memories to compare when none is named: a baseline, and what each checkpoint uses by itself.
+
+    The baseline is ``none`` where a checkpoint has that adapter, else ``stage1``.
+    """
+    own = [[one.default] if one.default in one.adapters else sorted(one.adapters) for one in checkpoints]
+    baseline = "none" if any("none" in one.adapters for one in checkpoints) else PLAIN
+    return tuple(dict.fromkeys([baseline, *(name for names in own for name in names)]))
+
+
 def build_model_rows(checkpoints: Sequence[Checkpoint], config: RowConfig, protocol: Protocol) -> list[ModelRow]:
     """Build a row for each memory and each checkpoint that has it.
 
