@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from rich.markup import escape
-
 from persist_cli.data.clips import check_batch_division
 from persist_cli.doctor.changes import (
     BITSANDBYTES,
@@ -165,8 +163,8 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     title = f"GiB on each of {machine}, of which {gib(machine.usable)} are planned with"
     print_table(title, ("strategy", *COLUMNS, "fits"), [_row(finding) for finding in findings])
     for change, cause in doctor.not_considered.items():
-        say(escape(f"not considered: {change} ({cause})"))
-    say(escape(_verdict(doctor, overrides, best)))
+        say(f"not considered: {change} ({cause})")
+    say(_verdict(doctor, overrides, best))
 
 
 def _verdict(doctor: Doctor, overrides: Sequence[str], best: Finding | None) -> str:

@@ -170,12 +170,12 @@ def progress() -> Progress:
         lines.disable = not main
         return lines
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         RateColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
         console=PROGRESS,
         transient=True,
         disable=not main,
@@ -217,7 +217,7 @@ def busy(description: str, bar_of_its_own: bool = False) -> Iterator[None]:
         if not isinstance(bar, ProgressLines):
             if bar_of_its_own:
                 bar.stop()
-            bar.columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+            bar.columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
         add_task(bar, description, None, "")
         yield
 
@@ -240,39 +240,33 @@ def print_table(
         rows: texts of each row.
         sections: numbers of the rows below which a line is drawn.
     """
-    cells = [[column, *(row[number] for row in rows)] for number, column in enumerate(columns)]
-    texts = [[Text.from_markup(cell).plain for cell in column] for column in cells]
+    texts = [[column, *(row[number] for row in rows)] for number, column in enumerate(columns)]
     full_widths = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
     word_widths = [max(len(word) for text in column for word in (*text.split(), "")) for column in texts]
     if full_widths[0] <= LONGEST_NAME:
         word_widths[0] = full_widths[0]
     for count, further in enumerate(_columns_by_table(word_widths, OUT.width)):
         numbers = [0, *further]
-        table = Table(title=None if count or not title else title, title_justify="left")
+        table = Table(title=None if count or not title else Text(title), title_justify="left")
         widths = _fit_widths(
             [full_widths[number] for number in numbers], [word_widths[number] for number in numbers], OUT.width
         )
         for number, width in zip(numbers, widths, strict=True):
             is_prose = number == 0 or full_widths[number] > LONGEST_NUMBER
-            table.add_column(columns[number], justify="left" if is_prose else "right", width=width)
+            table.add_column(Text(columns[number]), justify="left" if is_prose else "right", width=width)
         for place, row in enumerate(rows):
-            table.add_row(*(row[number] for number in numbers), end_section=place in sections)
+            table.add_row(*(Text(row[number]) for number in numbers), end_section=place in sections)
         OUT.print(table)
 
 
 def say(text: str) -> None:
-    """Print one line for people on standard output."""
-    OUT.print(text, highlight=False, soft_wrap=True)
-
-
-def print_text(text: str) -> None:
-    """Print text as it is on standard output, brackets and long lines too."""
+    """Print text for people on standard output as it is, brackets and long lines too."""
     OUT.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def warn(text: str) -> None:
     """Print one line for people on standard error, apart from the results on standard output."""
-    PROGRESS.print(text, highlight=False, soft_wrap=True)
+    PROGRESS.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def _columns_by_table(least_widths: Sequence[int], terminal_width: int) -> Iterator[list[int]]:

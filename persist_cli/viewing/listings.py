@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from rich.markup import escape
-
 from persist_cli.errors import PluginError
 from persist_cli.plugins import KINDS, Plugin, import_plugin, list_plugins
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
@@ -60,4 +58,4 @@ def _show(title: str, columns: Sequence[str], rows: list[list[str]], json: bool)
     if json:
         print_json([dict(zip(columns, row, strict=True)) for row in rows])
     else:
-        print_table(title, columns, [[escape(text) for text in row] for row in rows])
+        print_table(title, columns, rows)

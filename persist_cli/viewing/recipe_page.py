@@ -14,7 +14,7 @@ from persist_cli.io.setting_docs import Setting, settings_of
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_comment, to_plain
-from persist_cli.viewing.console import busy, print_json, print_text
+from persist_cli.viewing.console import busy, print_json, say
 
 WIDTH: Final = 80  # columns of a comment
 
@@ -58,7 +58,7 @@ def show_recipe(name: str, json: bool) -> None:
     if json:
         print_json({"recipe": name, "resolved": to_plain(recipe), "settings": [*_records(entries, "")]})
     else:
-        print_text(recipe_yaml(name, recipe, entries))
+        say(recipe_yaml(name, recipe, entries))
 
 
 def recipe_entries(recipe: Recipe) -> list[Entry]:

@@ -20,6 +20,8 @@ from persist_cli.viewing.console import (
     print_json,
     print_table,
     progress,
+    say,
+    warn,
     watched,
 )
 
@@ -44,6 +46,16 @@ def test_a_table_cuts_no_number_or_name_in_a_terminal_of_any_width(width, capsys
     assert max(map(len, printed.splitlines())) <= width
     assert all(f" {cell} " in printed for cell in rows[0][:-1])
     assert all(word in printed for word in rows[0][-1].split())
+
+
+def test_brackets_and_colons_in_names_are_printed_as_they_are(capsys):
+    say("runs/a[bold]b[/bold] :smile:")
+    warn("lora.targets=[to_q]")
+    print_table("of [to_q]", ["row [a]", "value"], [["runs/x[red]", "[1]"]])
+    printed = capsys.readouterr()
+    assert printed.out.startswith("runs/a[bold]b[/bold] :smile:\n")
+    assert printed.err == "lora.targets=[to_q]\n"
+    assert all(text in printed.out for text in ("of [to_q]", "row [a]", "runs/x[red]", "[1]"))
 
 
 def test_columns_that_fit_the_terminal_stand_in_one_table(capsys):

@@ -126,7 +126,6 @@ def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
         json: whether JSON is printed.
         out: folder that gets ``compare.json`` and ``compare.md``, ``None`` for none.
     """
-    from rich.markup import escape
 
     from persist_cli.io.files import write_json, write_text
     from persist_cli.viewing.console import OUT, print_json, print_table, say
@@ -141,14 +140,13 @@ def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
     shown = 0
     for title, heads, rows in comparison_tables(comparison, OUT.width):
         sections = range(2, len(rows), 3)
-        cells = [[escape(text) for text in row] for row in rows]
-        print_table(escape(title), [escape(head) for head in heads], cells, sections)
+        print_table(title, heads, rows, sections)
         shown = len(heads) - 2
     for line in _remarks(comparison):
-        say(escape(line))
+        say(line)
     more = len(comparison.columns) - len(comparison.left_out) - shown
     if out is not None:
-        say(escape(f"all columns: {out / 'compare.md'}; every figure: {out / 'compare.json'}"))
+        say(f"all columns: {out / 'compare.md'}; every figure: {out / 'compare.json'}")
     elif more > 0:
         say(f"{more} more columns: give --report FOLDER, or --json")
 

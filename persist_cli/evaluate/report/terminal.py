@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any
 
-from rich.markup import escape
-
 from persist_cli.evaluate.report.remarks import (
     all_left_out,
     contamination_lines,
@@ -68,11 +66,11 @@ def print_results(results: Mapping[str, Any]) -> None:
     """Print what was measured, one table, and what it leaves out and why."""
     checked = check_results(results, "results")
     table = terminal_table(checked, OUT.width)
-    say(escape(headline(checked, table)))
-    heads, *rows = ([escape(text) for text in line] for line in table.texts)
+    say(headline(checked, table))
+    heads, *rows = table.texts
     print_table("", heads, rows, table.sections)
     for line in lines_below(checked, table):
-        say(escape(line))
+        say(line)
 
 
 def headline(results: EvalResults, table: TerminalTable) -> str:
