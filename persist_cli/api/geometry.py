@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, invert_rigid
+
+NEAR_METRES, NEAR_DEGREES = 0.2, 10.0  # of poses whose pictures are almost the same; a step is 0.25 m, a turn 15°
 
 
 def pixel_centers(height: int, width: int, device: torch.device | None = None) -> Float[Tensor, "height width 2"]:
@@ -71,6 +73,28 @@ def pose_differences(
     relative = first[..., :3, :3].transpose(-1, -2) @ second[..., :3, :3]
     cosine = (relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return metres, torch.rad2deg(cosine.clamp(-1, 1).acos())
+
+
+def near_poses(
+    poses: Float[Tensor, "pose 4 4"],
+    others: Float[Tensor, "other 4 4"],
+    metres: float = NEAR_METRES,
+    degrees: float = NEAR_DEGREES,
+) -> Bool[Tensor, "pose other"]:
+    """Return whether each pose is near each of the others: under the distance and under the angle, both at once.
+
+    A frame from a near pose shows almost the same picture, so predicting one from the other is copying. Training leaves
+    such frames out of contexts, and evaluation does not count them.
+
+    Args:
+        poses: rigid transforms in metres.
+        others: rigid transforms in the same world.
+        metres: distance between the origins from which on two poses are not near; 0 makes none near.
+        degrees: angle from which on two poses are not near, of the whole rotation.
+    """
+    shape = (len(poses), len(others), 4, 4)
+    apart, turned = pose_differences(poses[:, None].expand(shape), others[None].expand(shape))
+    return (apart < metres) & (turned < degrees)
 
 
 def plucker(cameras: Cameras, printed: bool = False) -> Float[Tensor, "*batch height width 6"]:

@@ -9,7 +9,7 @@ import torch
 
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses, invert_rigid
-from persist_cli.api.geometry import nearest_at, pixel_centers, plucker, project, transform, unproject
+from persist_cli.api.geometry import near_poses, nearest_at, pixel_centers, plucker, project, transform, unproject
 from persist_cli.errors import DataError
 
 K = torch.tensor([[40.0, 0.0, 33.0], [0.0, 42.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -89,3 +89,13 @@ def test_a_z_buffer_has_the_nearest_depth_of_each_place_and_infinity_elsewhere()
     places, depth = torch.tensor([0, 2, 0, 2, 2]), torch.tensor([3.0, 1.0, 2.0, 4.0, 1.5])
     assert nearest_at(places, depth, 4).tolist() == [2.0, math.inf, 1.0, math.inf]
     assert nearest_at(places[:0], depth[:0], 2).tolist() == [math.inf] * 2
+
+
+def test_poses_are_near_only_if_both_distance_and_angle_are_small():
+    poses = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    poses[1, 0, 3] = poses[3, 0, 3] = 0.15
+    poses[2, 1, 3] = 0.25
+    poses[3, :3, :3] = rotation_about(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), math.radians(12))
+    assert near_poses(poses[:1], poses).tolist() == [[True, True, False, False]]
+    assert near_poses(poses[:1], poses, degrees=15.0).tolist() == [[True, True, False, True]]
+    assert not near_poses(poses, poses, metres=0.0).any()
