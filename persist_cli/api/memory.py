@@ -64,7 +64,7 @@ class MemoryFigures:
 
 @dataclass(frozen=True)
 class MapPoints:
-    """Coloured points that draw a memory; the model does not use them.
+    """Coloured points that draw a memory for people.
 
     Args:
         positions: world metres, float64.

@@ -1,13 +1,15 @@
-"""The tokens that a backbone reads from a memory, with features, positions and a mask."""
+"""The tokens that a backbone reads from a memory, with features, positions, colours and origins."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+
+from persist_cli.api.observations import Origin
 
 
 @dataclass(frozen=True)
@@ -18,40 +20,63 @@ class MemoryTokens:
         features: float32 features of the memory's encoder.
         positions: world metres, float64; the backbone moves them into the frame of the clip's first camera.
         mask: true for tokens, false for padding.
+        colors: uint8 RGB, 0…255, of the surface at each token; ``None`` for a memory that knows no colours.
+        origins: the ``Origin`` of each token, 0 for padding; without it all are observed.
     """
 
     features: Float[Tensor, "*batch token channel"]
     positions: Float[Tensor, "*batch token 3"]
     mask: Bool[Tensor, "*batch token"]
+    colors: UInt8[Tensor, "*batch token 3"] | None = None
+    origins: UInt8[Tensor, "*batch token"] = None  # type: ignore[assignment]  # set below
+
+    def __post_init__(self) -> None:
+        if self.origins is None:
+            object.__setattr__(self, "origins", torch.full_like(self.mask, Origin.OBSERVED, dtype=torch.uint8))
 
     def __len__(self) -> int:
         return self.features.shape[-2]
 
+    def tensors(self) -> dict[str, Tensor]:
+        """Return all tensors by name, without colours where there are none; ``MemoryTokens`` takes them back."""
+        named = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
     def to(self, device: torch.device | str) -> MemoryTokens:
         """Return these tokens on ``device``."""
-        return MemoryTokens(self.features.to(device), self.positions.to(device), self.mask.to(device))
+        return MemoryTokens(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod
-    def of(features: Float[Tensor, "token channel"], positions: Float[Tensor, "token 3"]) -> MemoryTokens:
+    def of(
+        features: Float[Tensor, "token channel"],
+        positions: Float[Tensor, "token 3"],
+        colors: UInt8[Tensor, "token 3"] | None = None,
+        origins: UInt8[Tensor, " token"] | None = None,
+    ) -> MemoryTokens:
         """Return tokens of one sample without padding; positions are in world metres."""
-        return MemoryTokens(
-            features.float(), positions.double(), torch.ones(len(features), dtype=torch.bool, device=features.device)
-        )
+        mask = torch.ones(len(features), dtype=torch.bool, device=features.device)
+        return MemoryTokens(features.float(), positions.double(), mask, colors, origins)  # type: ignore[arg-type]
 
     @staticmethod
     def empty(channels: int) -> MemoryTokens:
         """Return one sample without tokens, whose features would have ``channels`` channels."""
-        return MemoryTokens.of(torch.zeros(0, channels), torch.zeros(0, 3))
+        return MemoryTokens.of(torch.zeros(0, channels), torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
 
     @staticmethod
     def stack(samples: Sequence[MemoryTokens]) -> MemoryTokens:
-        """Return a batch of unbatched samples, padded to the longest one and to at least one token."""
+        """Return a batch of unbatched samples, padded to the longest one and to at least one token.
+
+        The batch has colours when all its samples have them.
+        """
         width = max(1, *(len(sample) for sample in samples))
-        features = samples[0].features.new_zeros(len(samples), width, samples[0].features.shape[-1])
-        positions = samples[0].positions.new_zeros(len(samples), width, 3)
-        mask = samples[0].mask.new_zeros(len(samples), width)
-        for row, sample in enumerate(samples):
-            features[row, : len(sample)] = sample.features
-            positions[row, : len(sample)] = sample.positions
-            mask[row, : len(sample)] = sample.mask
-        return MemoryTokens(features, positions, mask)
+        parts = [sample.tensors() for sample in samples]
+        names = [name for name in parts[0] if all(name in part for part in parts)]
+        return MemoryTokens(**{name: _padded([part[name] for part in parts], width) for name in names})
+
+
+def _padded(rows: Sequence[Tensor], width: int) -> Tensor:
+    """Stack tensors whose first axis is filled up with zeros to ``width``."""
+    stacked = rows[0].new_zeros(len(rows), width, *rows[0].shape[1:])
+    for sample, row in zip(stacked, rows, strict=True):
+        sample[: len(row)] = row
+    return stacked

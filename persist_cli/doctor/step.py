@@ -160,5 +160,6 @@ def _fake_clips(backbone: Backbone, channels: int | None, batch: int) -> Clips:
 
 
 def _all_tokens(batch: int, count: int, channels: int) -> MemoryTokens:
-    positions = torch.zeros(batch, count, 3, dtype=torch.float64)
-    return MemoryTokens(torch.zeros(batch, count, channels), positions, torch.ones(batch, count, dtype=torch.bool))
+    features, positions = torch.zeros(batch, count, channels), torch.zeros(batch, count, 3, dtype=torch.float64)
+    colors = torch.zeros(batch, count, 3, dtype=torch.uint8)
+    return MemoryTokens(features, positions, torch.ones(batch, count, dtype=torch.bool), colors)

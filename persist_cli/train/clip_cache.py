@@ -40,6 +40,8 @@ FORMAT: Final = 3  # of the entries; those of another format are not found
 
 SCANS: Final = 64  # how often at most the folder is measured while it fills up
 
+TOKENS: Final = 2  # format of memory tokens; those of 1 have neither colours nor origins and are not found
+
 STALE: Final = 3600.0  # seconds after which a file aside must be that of a killed writer
 
 
@@ -241,8 +243,7 @@ class ClipCache:
         """Store the memory tokens of a clip while there is room."""
         key = self.keys.of_clip(frames).tokens
         if key is not None:
-            tensors = {"features": tokens.features, "positions": tokens.positions, "mask": tokens.mask}
-            self.cache.put(key, tensors)
+            self.cache.put(key, tokens.tensors())
 
 
 @dataclass(frozen=True)
@@ -357,6 +358,7 @@ def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: 
     features = factory.encoder.encode(picture.to(torch.uint8)).float().cpu().contiguous().numpy().data
     plugins = [find_plugin("memory", memory.name), find_plugin("encoder", memory.encoder)]
     return {
+        "tokens": TOKENS,
         "memory": memory.name,
         "settings": dataclasses.asdict(factory.settings),
         "encoder": memory.encoder,

@@ -132,7 +132,7 @@ def memory_pairs(sample: ClipSample, folder: Path) -> list[Pair]:
     build = partial(with_memory, sample, factory, budget)
     tokens, cache = build().tokens, TensorCache(CacheSettings(folder, 1))
     assert tokens is not None
-    cache.put("tokens", {"features": tokens.features, "positions": tokens.positions, "mask": tokens.mask})
+    cache.put("tokens", tokens.tensors())
     return [Pair("tokens kept: memory alone", build, partial(cache.get, "tokens"))]
 
 

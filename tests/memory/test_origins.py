@@ -136,3 +136,19 @@ def test_of_an_imagined_image_only_patches_that_no_observed_image_shows_are_reca
     memory.write(views[1:].with_origin(Origin.IMAGINED))
     shown = stored_as(memory, Origin.IMAGINED)["depth"] > 0
     assert 8 <= int(shown.sum()) <= 48
+
+
+@of_every_kind
+def test_tokens_say_what_was_imagined_and_have_the_colours_of_the_points_that_people_see(name, settings):
+    walk = room_walk(6)
+    memory = written_memory(name, walk[:2], **settings)
+    memory.write(imagined(walk))
+    tokens, points = memory.read(walk.cameras, 100_000), memory.points()
+    read = rows_of(tokens.positions if name != "map2d" else tokens.colors, tokens.colors, tokens.origins)
+    assert {row[-1] for row in read} == {Origin.OBSERVED, Origin.IMAGINED}
+    assert read <= rows_of(points.positions if name != "map2d" else points.colors, points.colors, points.origins)
+
+
+def rows_of(positions, colors, origins) -> set[tuple[float, ...]]:
+    columns = (positions.double(), colors.double(), origins[:, None].double())
+    return {tuple(row) for row in torch.cat(columns, dim=-1).tolist()}

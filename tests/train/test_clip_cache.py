@@ -166,6 +166,22 @@ def test_another_version_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypa
     assert keys_of().tokens != before.tokens
 
 
+def test_another_format_of_tokens_changes_their_key_and_not_that_of_latents(keys_of, monkeypatch):
+    before = keys_of()
+    monkeypatch.setattr(clip_cache, "TOKENS", clip_cache.TOKENS - 1)
+    assert keys_of().latents == before.latents
+    assert keys_of().tokens != before.tokens
+
+
+def test_colours_and_origins_of_tokens_are_cached(walks, tmp_path):
+    clips = clips_in(walks, tmp_path)
+    more = {"colors": torch.tensor([[1, 2, 3], [4, 5, 6]], dtype=torch.uint8), "origins": torch.tensor([1, 2]).byte()}
+    clips.cache.put_tokens(clips[5].frames, MemoryTokens(**TOKENS, **more))
+    tokens = clips[5].sample.clip.tokens
+    assert torch.equal(tokens.colors, more["colors"])
+    assert torch.equal(tokens.origins, more["origins"])
+
+
 def clips_in(walks: Path, folder: Path, **changes: object) -> CachedClips:
     """Clips that look into a cache, whose keys depend on made-up values."""
     plan = {"frames": 9, "strides": (1, 2), "context_frames": 5, "seed": 3, "image_size": (SIZE, SIZE)} | changes

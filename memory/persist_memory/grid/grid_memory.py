@@ -47,8 +47,8 @@ PIXELS_ON_GPU = 1 << 24  # take some 2 GB of intermediate results
 class GridMemory(Memory):
     """A sparse grid of pooled features without bounds; it stores the cells that were seen and no others.
 
-    Cells are centred on multiples of their size. Besides its features a cell stores its origin and, for drawing only,
-    the colour of its nearest observation. Imagined frames change no bit of an observed cell, and the first observation
+    Cells are centred on multiples of their size. Besides its features a cell stores its origin and the colour of
+    its nearest observation. Imagined frames change no bit of an observed cell, and the first observation
     of an imagined cell replaces it.
     """
 
@@ -199,7 +199,8 @@ class GridMemory(Memory):
             features = features / self.grid.values("counts", cells)[:, None]
         centers = self._centers(self.grid.keys[cells])
         centers[:, 1] = self.heights(centers, cameras)
-        return MemoryTokens.of(features, self._in_world(centers))
+        colors, origins = unpack_colors(self.grid.values("colors", cells)), self.grid.values(ORIGINS, cells)
+        return MemoryTokens.of(features, self._in_world(centers), colors, origins)
 
     def _centers(self, keys: Tensor) -> Float[Tensor, "cell 3"]:
         """The cells' centres in the grid's axes, metres."""

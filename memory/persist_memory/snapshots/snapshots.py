@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from pydantic import PositiveInt
 from torch import Tensor
 
@@ -135,10 +135,7 @@ class Snapshots(Memory):
     def tensors(self) -> dict[str, Tensor]:
         """Return the images and their origins, the observed ones first, each sorted by the hashes of the images."""
         store = self.store
-        if not len(store):
-            return {}
-        origins = [origins_like(album.store.content, origin) for origin, album in self.albums.items()]
-        return store.tensors() | {ORIGINS: torch.cat([part.to(store.content.device) for part in origins])}
+        return store.tensors() | {ORIGINS: self._origins(store)} if len(store) else {}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Replace the images by what ``tensors()`` gave.
@@ -167,8 +164,7 @@ class Snapshots(Memory):
         """Return all patches that have depth."""
         store = self.store
         placed = store.depth > 0
-        origins = self.tensors()[ORIGINS] if len(store) else store.content.to(torch.uint8)
-        shown = origins[:, None].expand_as(placed)[placed]
+        shown = self._origins(store)[:, None].expand_as(placed)[placed]
         return MapPoints(store.points[placed], store.colors[placed], PATCH_SPREAD, shown)
 
     def figures(self) -> MemoryFigures:
@@ -195,7 +191,15 @@ class Snapshots(Memory):
         numbers = torch.tensor(greedy_cover(covered, distances, self.settings.count), dtype=torch.int64)
         chosen = store[numbers.to(centers.device)]
         placed = chosen.depth > 0
-        return MemoryTokens.of(chosen.features[placed][:budget], chosen.points[placed][:budget])
+        origins = self._origins(store)[numbers.to(centers.device)][:, None].expand_as(placed)
+        parts = (chosen.features, chosen.points, chosen.colors, origins)
+        return MemoryTokens.of(*(part[placed][:budget] for part in parts))
+
+    def _origins(self, store: SnapshotStore) -> UInt8[Tensor, " snapshot"]:
+        """The origin of each image of ``self.store``."""
+        origins = origins_like(store.content, Origin.IMAGINED)
+        origins[: len(self.albums[Origin.OBSERVED])] = Origin.OBSERVED
+        return origins
 
     def _add(self, snapshots: SnapshotStore, origin: Origin) -> None:
         """Add snapshots of one origin, and hide what is imagined behind what is observed."""
