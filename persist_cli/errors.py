@@ -52,5 +52,10 @@ def hint(name: str, known: Iterable[str], otherwise: str = "known") -> str:
         otherwise: the word before the list of all names.
     """
     names = list(known)
-    close = difflib.get_close_matches(name, names, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"{otherwise}: {', '.join(names) or 'none'}"
+    nearest = nearest_name(name, names)
+    return f"did you mean {nearest!r}?" if nearest else f"{otherwise}: {', '.join(names) or 'none'}"
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str | None:
+    """The known name that a misspelt one most likely stands for, ``None`` when no name is near it."""
+    return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.errors import DataError
+from persist_cli.errors import DataError, nearest_name
 
 FREE = "free"  # a motion that no named action describes; only the poses of the trajectory describe it
 STAY = "stay"
@@ -66,8 +65,8 @@ class ActionVocabulary:
         for action in self.actions:
             if action.name == name:
                 return action
-        close = difflib.get_close_matches(name, self.names, n=1)
-        meant = f"did you mean {close[0]!r}? " if close else ""
+        nearest = nearest_name(name, self.names)
+        meant = f"did you mean {nearest!r}? " if nearest else ""
         raise DataError(f"unknown action {name!r}; {meant}known: {self.listing()}")
 
     @property

@@ -85,9 +85,17 @@ class Checkpoint:
             check_sums(base, lambda name: name.endswith(WEIGHTS) and not name.startswith("adapters/"))
             base = lora_base(base)
         if adapter is not None:
-            folder = self.adapter_folder(adapter)
-            within = f"{folder.relative_to(self.folder).as_posix()}/"
-            check_sums(self.folder, lambda name: name.endswith(WEIGHTS) and name.startswith(within))
+            self.check_adapter(adapter)
+
+    def check_adapter(self, adapter: str) -> None:
+        """Verify the weights of an adapter alone, by ``SHA256SUMS`` where there is one; see ``check_sums``.
+
+        Raises:
+            CheckpointError: one line for the first file that is damaged or missing.
+        """
+        folder = self.adapter_folder(adapter)
+        within = f"{folder.relative_to(self.folder).as_posix()}/"
+        check_sums(self.folder, lambda name: name.endswith(WEIGHTS) and name.startswith(within))
 
     def sampling_with(self, overrides: SamplingOverrides) -> Sampling:
         """Return the card's sampling settings, or else 50 steps of DDIM without guidance, with these overrides."""
@@ -106,6 +114,17 @@ class Checkpoint:
         if len(self.adapters) > 1:
             raise CheckpointError(f"{self.folder}: choose an adapter of {', '.join(self.adapters)} with --adapter")
         return next(iter(self.adapters), None)
+
+    def chosen_adapter(self, name: str | None) -> str | None:
+        """Return the adapter's name that a command means, ``None`` for the model without an adapter.
+
+        Args:
+            name: what the command names: an adapter, ``stage1`` for none, or ``None`` for the default.
+
+        Raises:
+            CheckpointError: when it names none, and there are several adapters and no default.
+        """
+        return None if name == PLAIN else name or self.default_adapter()
 
 
 def find_checkpoint(path: Path) -> Checkpoint:

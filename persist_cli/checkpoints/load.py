@@ -46,7 +46,7 @@ def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None
     if adapter is None:
         backbone.use_adapter(None)
     else:
-        checkpoint.check_weights(adapter)
+        checkpoint.check_adapter(adapter)  # those of the base were verified when the backbone was loaded
         backbone.load_adapter(adapter, checkpoint.adapter_folder(adapter))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bisect
 import contextlib
-import difflib
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,7 +22,7 @@ from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses
 from persist_cli.api.observations import Frame, Observations, Trajectory, TrajectoryInfo
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
-from persist_cli.errors import DataError
+from persist_cli.errors import DataError, nearest_name
 from persist_cli.io.files import ASIDE, written_aside
 
 SUFFIX = ".parquet"
@@ -75,8 +74,8 @@ class Store:
     def __getitem__(self, key: int | str) -> TrajectoryFile:
         if isinstance(key, str):
             if key not in self._files:
-                close = difflib.get_close_matches(key, self.names, n=1)
-                hint = f"did you mean {close[0]!r}?" if close else f"the first is {self.names[0]!r}"
+                nearest = nearest_name(key, self.names)
+                hint = f"did you mean {nearest!r}?" if nearest else f"the first is {self.names[0]!r}"
                 raise DataError(f"{self.folder}: no trajectory {key!r}; {hint}")
             return self._files[key]
         if not -len(self) <= key < len(self):

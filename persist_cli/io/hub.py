@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import os
 import ssl
 from collections.abc import Iterator
@@ -46,17 +45,6 @@ def _connection_failure(endpoint: str) -> str | None:
             return None  # the hub's client has certificates of its own
         return f"{endpoint} does not answer ({reason})"
     return None
-
-
-@contextlib.contextmanager
-def silent(name: str) -> Iterator[None]:
-    """Within the block the logger of this name is silent."""
-    logger = logging.getLogger(name)
-    before, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = before
 
 
 @contextlib.contextmanager

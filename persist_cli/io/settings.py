@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from persist_cli.errors import RecipeError
+from persist_cli.errors import RecipeError, nearest_name
 from persist_cli.io.value_kinds import describe_kind, is_fixed_tuple, kind_at, plain_value, union_members
 
 if TYPE_CHECKING:
@@ -91,8 +90,8 @@ def _unknown_keys(kind: Any, values: Any, prefix: str) -> typing.Iterator[str]:
     known = [field.name for field in dataclasses.fields(kind) if field.init]
     for key, value in values.items():
         if key not in known:
-            close = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"did you mean '{prefix}{close[0]}'?" if close else f"known: {', '.join(known) or 'none'}"
+            nearest = nearest_name(str(key), known)
+            hint = f"did you mean '{prefix}{nearest}'?" if nearest else f"known: {', '.join(known) or 'none'}"
             yield f"unknown key '{prefix}{key}', {hint}"
         else:
             yield from _unknown_keys(_dataclass_in(types_of[key]), value, f"{prefix}{key}.")

@@ -51,14 +51,9 @@ def open_world(
         start, (), False, 0, None if memory is None else Path(memory), adapter, True, seed,
         sampling or SamplingOverrides(), InferenceOptions(),
     )  # fmt: skip
-    world = assemble_world(found, chosen_adapter(found, adapter), plan, frame.info)
+    world = assemble_world(found, found.chosen_adapter(adapter), plan, frame.info)
     world.reset([frame.observations], [frame.info])
     return world
-
-
-def chosen_adapter(checkpoint: Checkpoint, name: str | None) -> str | None:
-    """Return the adapter of this name, by default the checkpoint's; ``None`` for ``stage1`` and where there is none."""
-    return None if name == PLAIN else name or checkpoint.default_adapter()
 
 
 def assemble_world(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> WorldModel:

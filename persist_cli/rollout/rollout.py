@@ -19,7 +19,7 @@ from persist_cli.errors import PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import add_paths, load_paths
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
-from persist_cli.rollout.open_world import assemble_world, chosen_adapter
+from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.outputs import describe, path_of, summary, write_outputs
 from persist_cli.rollout.world_model import WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, progress, say, warn
@@ -31,7 +31,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
         raise PersistError("give either --actions TEXT or --follow")
     plan.placement.device()  # a missing accelerator is an error before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
-    adapter = chosen_adapter(checkpoint, plan.adapter)
+    adapter = checkpoint.chosen_adapter(plan.adapter)
     paths = plan_camera_paths(plan)
     folders = check_folders(out, len(paths))
     warn_of_short_path(plan, paths[0])

@@ -216,10 +216,6 @@ class House:
         low = min(ground.low_x for ground in grounds), min(ground.low_z for ground in grounds)
         return low, (max(ground.high_x for ground in grounds), max(ground.high_z for ground in grounds))
 
-    def room_at(self, ground: Ground) -> int | None:
-        """The number of the room around a position, ``None`` in doorways and outside."""
-        return next((number for number, room in enumerate(self.rooms) if room.ground.contains(ground)), None)
-
     def walkable(self, radius: float) -> list[Rectangle]:
         """The ground where the centre of a circle may be without touching a wall."""
         rooms = [room.ground.grown(-radius, -radius) for room in self.rooms]

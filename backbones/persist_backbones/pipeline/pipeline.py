@@ -25,7 +25,7 @@ from persist_backbones.pipeline.call_inputs import batch_of_images, make_clips
 from persist_backbones.pipeline.components import MemoryAdapter, WorldModules, assemble
 from persist_cli.api.backbone import Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
-from persist_cli.api.checkpoint import CARD, PLAIN, find_checkpoint
+from persist_cli.api.checkpoint import CARD, find_checkpoint
 from persist_cli.api.inference import Precision
 from persist_cli.api.meta_device import without_weights
 from persist_cli.api.tokens import MemoryTokens
@@ -262,8 +262,7 @@ def load_pipeline(folder: Path, adapter: str | None, dtype: Precision | None) ->
     with without_weights():  # weights come from the files
         backbone = ExtendedCogVideoX(parse_settings(CogVideoXSettings, checkpoint.settings, str(card)))
     backbone.name = NAME
-    adapter = adapter or checkpoint.default_adapter()
-    adapter = None if adapter == PLAIN else adapter
+    adapter = checkpoint.chosen_adapter(adapter)
     checkpoint.check_weights(adapter)
     backbone.load_base(checkpoint.base_folder)
     if adapter is not None:
