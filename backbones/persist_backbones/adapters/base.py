@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Annotated, ClassVar, Generic, Self, TypeVar
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import Field, NonNegativeFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from persist_cli.api.cameras import Cameras
@@ -35,6 +35,8 @@ class AdapterSettings:
         ff_factor: hidden width of the feed-forward as a multiple of the video's channels.
         token_budget: the largest number of tokens that is read from memory for a clip.
         dropout: share of the training samples that see no memory, for guidance over memory.
+        learned_tokens: number of tokens that are learned with the adapter and are there in every clip, with and without
+            a memory. They give an adapter of memory ``none`` something to learn.
     """
 
     form: str
@@ -43,6 +45,7 @@ class AdapterSettings:
     ff_factor: NonNegativeFloat = 2.0
     token_budget: PositiveInt = 256
     dropout: Annotated[float, Field(ge=0, le=1)] = 0.1
+    learned_tokens: NonNegativeInt = 0
 
 
 @dataclass(frozen=True)
@@ -86,19 +89,22 @@ class PreparedMemory:
     Args:
         tokens: embedded tokens, as the blocks of the form take them.
         mask: true for tokens that exist; all other tokens change nothing in the video.
+        learned: number of tokens at the end that are the adapter's own; they are never hidden.
     """
 
     tokens: Float[Tensor, "batch *group token width"]
     mask: Bool[Tensor, "batch *group token"]
+    learned: int = field(default=0, kw_only=True)
 
     def only(self, samples: Bool[Tensor, " batch"]) -> Self:
         """Return this memory, hidden from all samples but those that are true in ``samples``."""
         samples = samples.reshape(-1, *[1] * (self.mask.ndim - 1))
-        return dataclasses.replace(self, mask=self.mask & samples)
+        own = torch.arange(self.mask.shape[-1], device=self.mask.device) >= self.mask.shape[-1] - self.learned
+        return dataclasses.replace(self, mask=self.mask & (samples | own))
 
     def emptied(self) -> Self:
-        """Return this memory with all tokens masked out."""
-        return dataclasses.replace(self, mask=torch.zeros_like(self.mask))
+        """Return this memory with all tokens masked out but the adapter's own."""
+        return self.only(self.mask.new_zeros(len(self.mask)))
 
 
 Prepared = TypeVar("Prepared", bound=PreparedMemory)
@@ -119,6 +125,7 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
     settings_type: ClassVar[type[AdapterSettings]]
     settings: AdapterSettings
     blocks: nn.ModuleDict  # the key is the number of the transformer block
+    learned: nn.Parameter | None  # the learned tokens
 
     def __init__(self, channels: int, settings: AdapterSettings, video: VideoShape) -> None:
         super().__init__()
@@ -127,10 +134,31 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         self.channels = channels
         self.settings = settings
         self.video = video
+        count, size = settings.learned_tokens, self.learned_channels(settings)
+        self.register_parameter("learned", nn.Parameter(torch.randn(count, size)) if count else None)
+
+    @staticmethod
+    def learned_channels(settings: Any) -> int:
+        """Return the channels of a learned token, which are those of an embedded one."""
+        width: int = settings.width
+        return width
 
     @abstractmethod
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> Prepared:
         """Embed the tokens of a batch for the clips that the cameras see."""
+
+    def with_learned(self, memory: Prepared) -> Prepared:
+        """Append the learned tokens to the embedded ones; for forms that attend to tokens."""
+        if self.learned is None:
+            return memory
+        group = memory.mask.shape[:-1]
+        own = self.learned.to(memory.tokens.dtype).expand(*group, -1, -1)
+        return dataclasses.replace(
+            memory,
+            tokens=torch.cat([memory.tokens, own], dim=-2),
+            mask=torch.cat([memory.mask, memory.mask.new_ones(*group, len(self.learned))], dim=-1),
+            learned=len(self.learned),
+        )
 
     def block_at(self, layer: int) -> nn.Module | None:
         """Return the adapter's block at transformer block ``layer``, ``None`` where it has none."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, cast
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,7 @@ from persist_backbones.adapters.base import Adapter, AdapterSettings, PreparedMe
 from persist_backbones.adapters.splat import rasterize, splat
 from persist_backbones.tensors import fold_frames, tokens_of, zero_init
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import camera_rays
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 
@@ -131,9 +133,20 @@ class PreparedCanvas(PreparedMemory):
 
     Args:
         seen: the canvas embedded for the head, at the latents' size; ``None`` without a head.
+        blank: the canvas of learned tokens alone; ``None`` where there are none, since then it is hidden by the mask.
     """
 
     seen: Float[Tensor, "batch frame channel height width"] | None = None
+    blank: PreparedCanvas | None = None
+
+    def only(self, samples: Bool[Tensor, " batch"]) -> PreparedCanvas:
+        """Return this canvas, and for all samples that are false in ``samples`` the one without a memory."""
+        if self.blank is None:
+            return super().only(samples)
+        tokens, mask = _choose(samples, self.tokens, self.blank.tokens), _choose(samples, self.mask, self.blank.mask)
+        if self.seen is None or self.blank.seen is None:
+            return replace(self, tokens=tokens, mask=mask)
+        return replace(self, tokens=tokens, mask=mask, seen=_choose(samples, self.seen, self.blank.seen))
 
 
 class CanvasAdapter(Adapter[PreparedCanvas]):
@@ -164,9 +177,24 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         sizes = (pixel, video.inputs, video.outputs, video.time_channels, settings.head_width)
         self.head = CanvasHead(*sizes) if settings.head_width else None
 
+    @staticmethod
+    def learned_channels(settings: CanvasSettings) -> int:
+        """Return the channels of a learned token, which are those of a drawn one."""
+        return settings.canvas_channels
+
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedCanvas:
-        """Draw the tokens, fold frames, embed the patch of each video token, and mask patches without a token."""
-        views = fold_frames(self.draw(tokens, cameras), self.video.temporal, self.video.token_frames)
+        """Draw the tokens, and the learned ones where no token is."""
+        canvas = self.draw(tokens, cameras)
+        if self.learned is None:
+            return self.embed_canvas(canvas)
+        sky = self.draw_learned(cameras).to(canvas.dtype)
+        blank = torch.cat([sky, torch.zeros_like(canvas[:, :, -2:])], dim=2)
+        covered = canvas[:, :, -2:-1] > 0
+        return replace(self.embed_canvas(torch.where(covered, canvas, blank)), blank=self.embed_canvas(blank))
+
+    def embed_canvas(self, canvas: Float[Tensor, "batch frame channel height width"]) -> PreparedCanvas:
+        """Fold the frames of a drawn canvas, embed the patch of each video token, and mask empty patches."""
+        views = fold_frames(canvas, self.video.temporal, self.video.token_frames)
         folded = views.unflatten(1, (-1, self.video.token_frames)).flatten(2, 3)
         patches = tokens_of(F.pixel_unshuffle(folded, self.patch))
         embedded = self.head.look(F.pixel_unshuffle(views, self.settings.canvas_scale)) if self.head else None
@@ -180,6 +208,19 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         batch, frames = tokens.mask.shape[0], views.world_from_camera.shape[1]
         features = self.embed(tokens.features.to(self.patches.weight.dtype))
         return splat(features, splats, (batch, frames, views.height, views.width))
+
+    def draw_learned(self, cameras: Cameras) -> Float[Tensor, "batch frame channel height width"]:
+        """Draw the learned tokens behind all others: they lie on a sphere around the first camera, far away.
+
+        A latent pixel shows the token whose direction is nearest to its ray.
+        """
+        learned, scale = cast(Tensor, self.learned), self.settings.canvas_scale
+        views = cameras.resized(cameras.height // self.video.spatial, cameras.width // self.video.spatial)
+        rotations = views.world_from_camera[..., :3, :3].double()
+        rays = camera_rays(views) @ (rotations[:, :1].mT @ rotations)[:, :, None].mT
+        nearest = (rays.float() @ sphere(len(learned)).to(rays.device).T).argmax(dim=-1)
+        drawn = learned[nearest].permute(0, 1, 4, 2, 3)
+        return drawn.repeat_interleave(scale, dim=-2).repeat_interleave(scale, dim=-1)
 
     def before(self, block: nn.Module, video: Tensor, memory: PreparedCanvas) -> Tensor:
         """Return the video with the canvas added."""
@@ -196,3 +237,16 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         mask = mask.repeat_interleave(token_frames, 1).repeat_interleave(side, -2).repeat_interleave(side, -1)
         correction: Tensor = self.head(predicted, inputs, memory.seen, time) * mask
         return predicted + correction.to(predicted.dtype)
+
+
+def sphere(count: int) -> Float[Tensor, "point 3"]:
+    """Return unit vectors that are spread evenly over all directions (the Fibonacci lattice)."""
+    numbers = torch.arange(count) + 0.5
+    angles, heights = math.pi * (1 + math.sqrt(5)) * numbers, 1 - 2 * numbers / count
+    radii = (1 - heights.square()).sqrt()
+    return torch.stack([radii * angles.cos(), heights, radii * angles.sin()], dim=-1)
+
+
+def _choose(samples: Bool[Tensor, " batch"], chosen: Tensor, other: Tensor) -> Tensor:
+    """Return for each sample the tensor's row where ``samples`` is true, else the other's."""
+    return torch.where(samples.reshape(-1, *[1] * (chosen.ndim - 1)), chosen, other)

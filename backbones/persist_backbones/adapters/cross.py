@@ -47,7 +47,7 @@ class CrossAdapter(Adapter[PreparedMemory]):
             positions = transform(first_from_world, positions)
         code = position_code(positions, self.settings.frequencies)
         hidden = self.embed(torch.cat([tokens.features, code], dim=-1).to(self.embed.weight.dtype))
-        return PreparedMemory(hidden * tokens.mask[..., None], tokens.mask)
+        return self.with_learned(PreparedMemory(hidden * tokens.mask[..., None], tokens.mask))
 
     def after(
         self, block: nn.Module, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor

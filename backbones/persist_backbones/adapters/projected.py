@@ -68,7 +68,8 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         folded = fold_frames(code.transpose(2, 3), frames).transpose(2, 3)
         mask = fold_frames(seen[:, :, None], frames).any(dim=2)
         hidden = self.embed(tokens.features.to(dtype))[:, None] + self.place(folded.to(dtype))
-        return ProjectedMemory(hidden * mask[..., None], mask, self.query_places(cameras).to(dtype))
+        places = self.query_places(cameras).to(dtype)
+        return self.with_learned(ProjectedMemory(hidden * mask[..., None], mask, places))
 
     def after(
         self, block: nn.Module, video: Tensor, memory: ProjectedMemory, camera: Tensor, time: Tensor

@@ -23,9 +23,9 @@ from persist_cli.rollout.world_model import Agent, WorldModel
 
 NO_MEMORY = "none"  # name of the memory that never gives a token, so that no intervention can change anything
 
-IDLE = (
-    "which reads nothing; in the form canvas, that of the packaged model, it equals stage 1 to the bit, since without "
-    "tokens its parameters are idle"
+NOTHING = (
+    "which reads nothing: what it adds to stage 1 are learned tokens, the same in every clip; without them, as in the "
+    "packaged model, it equals stage 1 to the bit"
 )
 
 
@@ -71,7 +71,7 @@ class ModelRow(Row):
         if self.adapter is None:
             return f"{self.checkpoint.name} without an adapter (stage 1)"
         if self.adapter == NO_MEMORY:
-            return f"{self.checkpoint.name} with the adapter {NO_MEMORY!r}, {IDLE}"
+            return f"{self.checkpoint.name} with the adapter {NO_MEMORY!r}, {NOTHING}"
         return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.row_memory.intervention.definition}"
 
     def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
