@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import yaml
 from pydantic import BeforeValidator, Field
 
+from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES
 from persist_cli.api.stages import Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
@@ -34,6 +35,7 @@ Changeable = Annotated[Value, CHANGEABLE]
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 PositiveNumber = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Settings = Annotated[  # YAML reads a key with nothing behind it as null
     dict[str, Any], BeforeValidator(lambda value: {} if value is None else value)
@@ -153,12 +155,19 @@ class DataSettings:
         context_frames: the most earlier frames that a clip's memory is made of (stage 2).
         clips_per_trajectory: how many fixed clips, with fixed contexts, each trajectory offers, so that clips come
             again and can be cached; 0 draws from all possible clips.
+        exclude_targets: share of the clips whose context has no frame near a frame to predict, so that memory does not
+            hold the answer; with strides of -1 and 0 here it holds the whole clip.
+        exclude_metres: such a frame is near when the two cameras are less than this apart …
+        exclude_degrees: … and turned by less than this. The clip's first frame always stays.
     """
 
     path: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
     strides: tuple[int, ...] = (1, 2, 3)
     context_frames: Count = 48
     clips_per_trajectory: Count = 0
+    exclude_targets: Share = 0.0
+    exclude_metres: PositiveNumber = NEAR_METRES
+    exclude_degrees: PositiveNumber = NEAR_DEGREES
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch.utils.data import BatchSampler, Dataset
 
 from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.backbone import Clip, Interactions
+from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, RecipeError
@@ -28,6 +29,9 @@ class ClipPlan:
         seed: seed of the draws.
         image_size: height and width in pixels that the frames must have.
         clips_per_trajectory: number of fixed clips that each trajectory offers; 0 draws from all possible clips.
+        exclude_targets: share of the clips whose context has no frame near a frame that is to be predicted.
+        exclude_metres: frames are near when their cameras are less than this apart, in metres, …
+        exclude_degrees: … and turned by less than this angle.
     """
 
     frames: int
@@ -36,6 +40,9 @@ class ClipPlan:
     seed: int
     image_size: tuple[int, int]
     clips_per_trajectory: int = 0
+    exclude_targets: float = 0.0
+    exclude_metres: float = NEAR_METRES
+    exclude_degrees: float = NEAR_DEGREES
 
 
 @dataclass(frozen=True)
@@ -135,13 +142,18 @@ class ClipDataset(Dataset[ClipSample]):
         stride = int(random.choice([stride for stride in self.plan.strides if steps * abs(stride) < len(file)]))
         start = int(random.integers(len(file) - steps * abs(stride)))
         frames = range(start, start + steps * abs(stride) + 1, abs(stride))[:: 1 if stride > 0 else -1]
-        return frames, tuple(self._context_frames(frames[0], random)) if self.plan.context_frames else ()
+        return frames, tuple(self._context_frames(file, frames, random)) if self.plan.context_frames else ()
 
-    def _context_frames(self, start: int, random: np.random.Generator) -> list[int]:
+    def _context_frames(self, file: TrajectoryFile, frames: range, random: np.random.Generator) -> list[int]:
         """The clip's first frame and a random choice of those before it, in order."""
-        count = min(start, self.plan.context_frames - 1)
-        earlier = random.permutation(start)[:count]
-        return [*sorted(int(frame) for frame in earlier), start]
+        start, plan = frames[0], self.plan
+        earlier = np.arange(start)
+        if plan.exclude_targets and random.random() < plan.exclude_targets:
+            poses = file.poses()
+            near = near_poses(poses[:start], poses[list(frames[1:])], plan.exclude_metres, plan.exclude_degrees)
+            earlier = earlier[~near.any(dim=1).numpy()]
+        chosen = random.permutation(earlier)[: plan.context_frames - 1]
+        return [*sorted(int(frame) for frame in chosen), start]
 
 
 class DistributedBatches(BatchSampler):

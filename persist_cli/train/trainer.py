@@ -105,6 +105,9 @@ class Trainer:
             seed=recipe.training.seed,
             image_size=backbone.image_size,
             clips_per_trajectory=recipe.data.clips_per_trajectory,
+            exclude_targets=recipe.data.exclude_targets,
+            exclude_metres=recipe.data.exclude_metres,
+            exclude_degrees=recipe.data.exclude_degrees,
         )
         return ClipDataset([data_folder(path) for path in recipe.data.path], plan)
 

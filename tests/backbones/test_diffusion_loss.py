@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
 
-from persist_backbones.cogvideox.diffusion import loss_weights, prediction_target
+from persist_backbones.cogvideox.diffusion import draw_timesteps, loss_weights, prediction_target, sample_generators
 from persist_cli.api.backbone import Sampling
 from persist_cli.errors import CheckpointError, RecipeError
 from tests.support.micro_model import micro, random_clips, shaken
@@ -31,6 +32,20 @@ def test_the_loss_of_an_error_is_the_same_for_velocities_and_clean_latents(weigh
     assert torch.allclose(losses["sample"].double(), losses["v_prediction"].double(), rtol=1e-3)
 
 
+def test_under_bfloat16_the_weakest_noise_levels_have_their_noise() -> None:
+    backbone, clips, inputs = micro(), random_clips(1), []
+    weakest = (seed for seed in range(10_000) if draw_timesteps(backbone.scheduler, sample_generators([seed])) < 2)
+    seed = next(weakest)
+    backbone.transformer.register_forward_pre_hook(lambda _, args: inputs.append(args[0].float()))
+    with torch.autocast("cpu", torch.bfloat16):
+        clean = backbone.encode(clips).video.float()
+        backbone(dataclasses.replace(clips, seeds=[seed]), "1")
+    signal = backbone.scheduler.alphas_cumprod[:2].mean()
+    color = slice(0, 4)
+    noise = (inputs[0][:, :, color] - signal.sqrt() * clean[:, :, color]) / (1 - signal).sqrt()
+    assert noise.std().item() == pytest.approx(1, abs=0.3)
+
+
 def test_the_prediction_of_clean_latents_survives_saving_and_loading(tmp_path: Path) -> None:
     backbone, clips = micro(prediction="sample"), random_clips(1)
     shaken(backbone)
@@ -48,7 +63,7 @@ def test_the_model_card_states_what_the_weights_predict(tmp_path: Path) -> None:
     assert loaded.checkpoint_settings()["prediction"] == "v_prediction"
     loaded.load_base(tmp_path)
     assert loaded.checkpoint_settings()["prediction"] == "sample"
-    assert micro(pretrained=str(tmp_path)).checkpoint_settings()["prediction"] == "sample"
+    assert micro(pretrained=str(tmp_path), prompt=None).checkpoint_settings()["prediction"] == "sample"
 
 
 def test_weights_trained_for_another_prediction_are_refused(tmp_path: Path) -> None:
@@ -57,7 +72,7 @@ def test_weights_trained_for_another_prediction_are_refused(tmp_path: Path) -> N
     with pytest.raises(CheckpointError, match=cause):
         micro(prediction="v_prediction").load_base(tmp_path)
     with pytest.raises(CheckpointError, match=cause):
-        micro(prediction="v_prediction", pretrained=str(tmp_path))
+        micro(prediction="v_prediction", pretrained=str(tmp_path), prompt=None)
 
 
 def test_a_scheduler_that_predicts_noise_is_refused(tmp_path: Path) -> None:
@@ -65,7 +80,7 @@ def test_a_scheduler_that_predicts_noise_is_refused(tmp_path: Path) -> None:
     config = tmp_path / "scheduler" / "scheduler_config.json"
     config.write_text(config.read_text().replace("v_prediction", "epsilon"))
     with pytest.raises(CheckpointError, match=r"^the scheduler predicts 'epsilon'; known: v_prediction, sample$"):
-        micro(pretrained=str(tmp_path))
+        micro(pretrained=str(tmp_path), prompt=None)
 
 
 @pytest.mark.parametrize(("name", "value"), [("snr_gamma", 0.0), ("snr_gamma", -5.0), ("kl_weight", -1e-6)])

@@ -13,6 +13,7 @@ from persist_backbones import write_prompt
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.plugins import make_backbone
+from tests.support.micro_model import micro
 from tests.support.twins import load_twin, write_snapshot, write_twin
 
 PROMPT = "a walk"
@@ -52,8 +53,19 @@ def test_a_prompt_is_embedded_as_diffusers_pipeline_embeds_it(folder):
     assert not torch.equal(load_twin(folder, prompt="").prompt, ours)
 
 
-def test_without_a_prompt_the_embedding_is_zeros(folder):
-    assert not load_twin(folder).prompt.any()
+def test_pretrained_weights_get_the_embedding_of_the_empty_prompt_unless_zeros_are_asked_for(folder, tmp_path):
+    size = {"frames": 17, "height": 32, "width": 48}
+    default = make_backbone("cogvideox", {"pretrained": str(folder)} | size)
+    assert torch.equal(default.prompt, load_twin(folder, prompt="").prompt)
+    assert default.prompt.any()
+    assert not load_twin(folder, prompt=None).prompt.any()
+    alone = shutil.copytree(folder, tmp_path / "alone", ignore=shutil.ignore_patterns("text_encoder"))
+    with pytest.raises(CheckpointError, match="no text_encoder/ to embed the prompt '' with; give .*prompt=null for"):
+        make_backbone("cogvideox", {"pretrained": str(alone)} | size)
+
+
+def test_a_model_that_starts_from_no_weights_knows_no_text_and_has_zeros():
+    assert not micro().prompt.any()
 
 
 def test_a_checkpoint_stores_the_embedding_of_its_prompt_and_needs_no_t5(folder, tmp_path):
@@ -100,7 +112,7 @@ def test_a_prompt_without_its_encoder_is_refused_with_another_way_to_go(folder, 
     with pytest.raises(CheckpointError, match=r"the text encoder cannot be loaded .*; give backbone.settings"):
         load_twin(tmp_path / "twin", prompt=PROMPT)
     shutil.rmtree(tmp_path / "twin" / part)
-    with pytest.raises(CheckpointError, match=f"no {part}/ to embed the prompt with; give .* zeros$"):
+    with pytest.raises(CheckpointError, match=f"no {part}/ to embed the prompt 'a walk' with; give .* zeros$"):
         load_twin(tmp_path / "twin", prompt=PROMPT)
 
 

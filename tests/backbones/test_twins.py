@@ -13,7 +13,7 @@ from diffusers import (
 )
 
 from persist_backbones.cogvideox.diffusion import noise_like, sample_generators
-from persist_backbones.cogvideox.inputs import ClipShape
+from persist_backbones.cogvideox.inputs import ClipShape, middle_region
 from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.api.backbone import Sampling
 from persist_cli.errors import CheckpointError
@@ -215,6 +215,19 @@ def test_a_learned_table_is_cut_to_the_clip_and_its_middle_resampled(twins):
     assert model.transformer.base.config.sample_frames == 9
     with pytest.raises(CheckpointError, match="learned positions are for clips of 17 frames at most; ask for fewer"):
         load_twin(twins["5b-i2v"], (25, 32, 48))
+
+
+@torch.no_grad()
+def test_rotary_positions_at_another_size_are_those_of_diffusers_for_the_middle_of_the_trained_grid(twins, tmp_path):
+    model = load_twin(twins["5b-i2v"], SHORTER)
+    pipe = plain_pipeline(twins["5b-i2v"], "5b-i2v")
+    expected = pipe._prepare_rotary_positional_embeddings(*SHORTER[1:], 3, torch.device("cpu"))
+    model.save_base(tmp_path)
+    loaded = make_backbone("cogvideox", model.checkpoint_settings())
+    loaded.load_base(tmp_path)
+    assert middle_region((32, 32), (30, 45)) == ((0, 8), (30, 38))  # 512x512 in the grid of 480x720
+    for twin in (model, loaded):
+        assert equal(twin.conditions(random_clips(1, size=SHORTER), torch.tensor([3])).rotary, expected)
 
 
 @every_model

@@ -25,7 +25,7 @@ def plain_folder(tmp_path):
 
 
 def test_a_plain_diffusers_directory_gives_the_widened_model(plain_folder):
-    model = make_backbone("cogvideox", {"pretrained": str(plain_folder), "height": SIZE, "width": SIZE})
+    model = make_backbone("cogvideox", {"pretrained": str(plain_folder), "height": SIZE, "width": SIZE, "prompt": None})
     stored = load_parts(plain_folder).transformer.state_dict()
     loaded = model.transformer.base.state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in stored.items())
@@ -33,7 +33,7 @@ def test_a_plain_diffusers_directory_gives_the_widened_model(plain_folder):
 
 
 def test_diffusers_loads_the_base_that_we_save(plain_folder, tmp_path):
-    model = make_backbone("cogvideox", {"pretrained": str(plain_folder), "height": SIZE, "width": SIZE})
+    model = make_backbone("cogvideox", {"pretrained": str(plain_folder), "height": SIZE, "width": SIZE, "prompt": None})
     model.save_base(tmp_path / "ours")
     reloaded = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "ours", subfolder="transformer")
     assert all(

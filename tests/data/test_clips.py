@@ -7,6 +7,7 @@ import shutil
 import pytest
 import torch
 
+from persist_cli.api.geometry import near_poses
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.errors import DataError, RecipeError
 from tests.support.micro_runs import SIZE
@@ -60,6 +61,22 @@ def test_a_negative_stride_plays_backwards_and_its_context_holds_the_frames_of_t
         forth = choice.file.read(sorted(choice.frames)).observations
         assert torch.equal(sample.clip.observations.rgb, forth.rgb.flip(0))
         assert torch.equal(sample.clip.observations.cameras.centers, forth.cameras.centers.flip(0))
+
+
+def test_a_context_without_targets_holds_no_frame_near_a_frame_to_predict_but_the_first(walks):
+    clips = ClipDataset([walks], plan(strides=(1, -1), context_frames=100, exclude_targets=1.0))
+    for choice in (clips.choose(number) for number in range(20)):
+        poses = choice.file.poses()
+        near = near_poses(poses[list(choice.context)], poses[list(choice.frames[1:])])
+        assert choice.context[-1] == choice.frames[0]
+        assert not near[:-1].any()
+
+
+def test_most_clips_go_without_their_targets_and_the_others_keep_them(walks):
+    clips = ClipDataset([walks], plan(strides=(-1,), context_frames=100, exclude_targets=0.9))
+    choices = [clips.choose(number) for number in range(300)]
+    kept = sum(set(choice.frames) <= set(choice.context) for choice in choices)
+    assert 15 <= kept <= 45
 
 
 def test_fixed_clips_come_again_with_their_context_and_with_new_noise(walks):

@@ -59,9 +59,9 @@ def write_snapshot(hub: Path, name: str) -> Path:
 
 
 def load_twin(folder: Path, size: tuple[int, int, int] = SIZE, **settings: Any) -> CogVideoX:
-    """Load a twin as our backbone."""
+    """Load a twin as our backbone, by default without a prompt, since a twin has no text encoder."""
     frames, height, width = size
-    clip_size = {"frames": frames, "height": height, "width": width}
-    backbone = make_backbone("cogvideox", {"pretrained": str(folder)} | clip_size | settings)
+    chosen = {"frames": frames, "height": height, "width": width, "prompt": None}
+    backbone = make_backbone("cogvideox", {"pretrained": str(folder)} | chosen | settings)
     assert isinstance(backbone, CogVideoX)
     return backbone.eval()

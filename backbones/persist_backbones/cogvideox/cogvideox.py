@@ -36,6 +36,7 @@ from persist_backbones.cogvideox.inputs import (
     fit_positions,
     interaction_rows,
     model_input,
+    rotary_grid,
     rotary_positions,
 )
 from persist_backbones.cogvideox.model import NO_MEMORY, Conditions, widen
@@ -104,6 +105,7 @@ class CogVideoX(Backbone):
         self.codec, self.scheduler = Codec(parts.vae), parts.scheduler
         check_fit(parts, self.settings)
         self.shape = clip_shape(parts.transformer, parts.vae, self.settings)
+        self.rotary_grid = self.settings.rotary_grid or rotary_grid(parts.transformer.config)
         fit_positions(parts.transformer, (self.shape.padded_frames, self.shape.height, self.shape.width))
         self.transformer = widen(parts.transformer, parts.vae, self.settings, self.shape)
         config = parts.transformer.config
@@ -118,7 +120,8 @@ class CogVideoX(Backbone):
 
         # encode
         latents = clips.latents or self.encode(clips)
-        clean, image = self.shape.pad(latents.video), self.image_condition(latents.image)
+        image = self.image_condition(latents.image)
+        clean = self.shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
         # noise
         timesteps = draw_timesteps(self.scheduler, generators).to(self.device)
         noise = noise_like(clean, generators)
@@ -127,7 +130,7 @@ class CogVideoX(Backbone):
         # condition
         conditions = self.conditions(clips, timesteps, self.memory_condition(clips, generators))
         # predict
-        predicted = self.predict(noisy, image, conditions)
+        predicted = self.predict(noisy.to(image.dtype), image, conditions)
         # weigh
         weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
         error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
@@ -273,7 +276,7 @@ class CogVideoX(Backbone):
             timestep=timesteps,
             interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(self.device),
             camera=camera_latents(clips.cameras, *rays),
-            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.device),
+            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.rotary_grid, self.device),
             memory=memory,
         )
 
@@ -371,9 +374,13 @@ class CogVideoX(Backbone):
         self.adapter_name = name
 
     def checkpoint_settings(self) -> dict[str, Any]:
-        """Return the settings without the sources of weights and prompt, and with the type of the prediction."""
-        predicts = self.scheduler.config.prediction_type
-        return super().checkpoint_settings() | dict.fromkeys(ORIGINS) | {"prediction": predicts}
+        """Return the settings without the sources of weights and prompt, and with what the weights were trained for."""
+        rotary = self.transformer.base.config.use_rotary_positional_embeddings
+        trained = {
+            "prediction": self.scheduler.config.prediction_type,
+            "rotary_grid": list(self.rotary_grid) if rotary else None,
+        }
+        return super().checkpoint_settings() | dict.fromkeys(ORIGINS) | trained
 
     def save_base(self, folder: Path) -> None:
         """Write diffusers' parts, each loadable by diffusers alone, and all other weights as ``world.safetensors``."""
@@ -382,7 +389,7 @@ class CogVideoX(Backbone):
 
     def load_base(self, folder: Path) -> None:
         """Load what ``save_base`` wrote, or merge what ``save_lora`` wrote into the weights that it changes."""
-        if self.settings.prompt is not None or self.settings.prompt_embedding is not None:
+        if self.settings.prompt or self.settings.prompt_embedding is not None:
             raise CheckpointError(
                 f"{folder}: the base was trained with a prompt of its own; leave prompt and prompt_embedding out"
             )

@@ -103,8 +103,11 @@ class CogVideoXSettings:
             or the name of one on the hub (``zai-org/CogVideoX-5b-I2V``), which is downloaded if it is not here; its
             configuration replaces the preset's. A learned table of positions (5b-I2V) is cut and resampled to the
             clips' size.
+        rotary_grid: rows and columns of video tokens for which rotary positions were trained; by default those of the
+            weights. A checkpoint remembers them, because a resampled table of positions takes their place in it.
         prompt: the constant prompt of the model, embedded once by the ``text_encoder/`` and ``tokenizer/`` of
-            ``pretrained``, which are never downloaded; without a prompt the embedding is zeros.
+            ``pretrained``, which are never downloaded. The empty prompt is embedded too, as CogVideoX was trained with
+            it; null gives zeros. A model that starts from no pretrained weights knows no text and has zeros.
         prompt_embedding: in place of ``prompt``, a safetensors file with the embedding as tensor ``prompt``.
         height: height of the images in pixels.
         width: width of the images in pixels.
@@ -126,7 +129,8 @@ class CogVideoXSettings:
 
     preset: Literal["tiny", "2b", "5b", "5b-i2v", "1.5-5b", "1.5-5b-i2v"] = "tiny"
     pretrained: str | None = None
-    prompt: str | None = None
+    rotary_grid: tuple[PositiveInt, PositiveInt] | None = None
+    prompt: str | None = ""
     prompt_embedding: str | None = None
     height: PositiveInt = 64
     width: PositiveInt = 64

@@ -199,21 +199,29 @@ def model_input(noisy: Tensor, image: Tensor, camera: Tensor, depth: bool) -> Te
 Region = tuple[tuple[int, int], tuple[int, int]]  # row and column of the first place, and one past the last
 
 
-def rotary_positions(config: Any, grid: tuple[int, int, int], device: torch.device) -> tuple[Tensor, Tensor] | None:
+def rotary_grid(config: Any) -> tuple[int, int]:
+    """Return the rows and columns of video tokens of a transformer's sample size, those of its training."""
+    return config.sample_height // config.patch_size, config.sample_width // config.patch_size
+
+
+def rotary_positions(
+    config: Any, grid: tuple[int, int, int], trained: tuple[int, int], device: torch.device
+) -> tuple[Tensor, Tensor] | None:
     """Return cosines and sines for every video token, ``None`` for models with absolute positions only.
 
     CogVideoX 1.0 fits a clip's grid into the middle of the training grid; 1.5 counts its rows and columns.
 
     Args:
-        config: configuration of diffusers' transformer, with the sample size of its training.
+        config: configuration of diffusers' transformer.
         grid: number of frames, rows and columns of video tokens.
+        trained: rows and columns of video tokens of the training grid, which ``fit_positions`` does not leave in the
+            configuration.
         device: device of the result.
     """
     if not config.use_rotary_positional_embeddings:
         return None
     if config.patch_size_t is not None:
         return _cached(_counted_positions, config.attention_head_dim, grid, str(device))
-    trained = (config.sample_height // config.patch_size, config.sample_width // config.patch_size)
     region = middle_region(grid[1:], trained)
     return _cached(_fitted_positions, config.attention_head_dim, grid, region, str(device))
 

@@ -19,14 +19,14 @@ from persist_cli.io.hub import without_bars
 
 ORIGINS = ("pretrained", "prompt", "prompt_embedding")  # settings that a checkpoint replaces by weights
 NAME = "prompt"  # of the tensor in files
-OTHERWISE = "give backbone.settings.prompt_embedding a file, or leave the prompt out: zeros"
+OTHERWISE = "give backbone.settings.prompt_embedding a file, or backbone.settings.prompt=null for zeros"
 
 
 def check_choice(settings: CogVideoXSettings) -> None:
     """Raise ``CheckpointError`` for settings with two prompts, or with a prompt but no text encoder."""
-    if settings.prompt is not None and settings.prompt_embedding is not None:
+    if settings.prompt and settings.prompt_embedding is not None:
         raise CheckpointError("give prompt or prompt_embedding, not both")
-    if settings.prompt is not None and settings.pretrained is None:
+    if settings.prompt and settings.pretrained is None:
         raise CheckpointError(f"a prompt needs pretrained weights with a text encoder; {OTHERWISE}")
 
 
@@ -37,19 +37,20 @@ def starting_prompt(
 
     Args:
         settings: settings with a prompt, an embedding's file, or neither.
-        zeros: the embedding without either, and in any case on the meta device.
+        zeros: the embedding of no prompt, and in any case on the meta device and of a model that knows no text.
 
     Raises:
         CheckpointError: one line when T5 is missing, or the embedding does not have the transformer's size.
     """
     check_choice(settings)
-    if zeros.is_meta or (settings.prompt is None and settings.prompt_embedding is None):
+    text = settings.prompt if settings.pretrained is not None else None
+    if zeros.is_meta or (text is None and settings.prompt_embedding is None):
         return zeros
     if settings.prompt_embedding is not None:
         source, embedding = settings.prompt_embedding, read_prompt(Path(settings.prompt_embedding))
     else:
         source = str(settings.pretrained)
-        embedding = embed_prompt(str(settings.prompt), pretrained_folder(source), zeros.shape[1])
+        embedding = embed_prompt(str(text), pretrained_folder(source), zeros.shape[1])
     size, wanted = tuple(embedding.shape), tuple(zeros.shape)
     if size != wanted:
         raise CheckpointError(f"{source}: a prompt's embedding of {size}, but the transformer takes {wanted}")
@@ -89,7 +90,7 @@ def embed_prompt(prompt: str, folder: Path, words: int) -> Float[Tensor, "1 word
 
     for name in ("text_encoder", "tokenizer"):
         if not (folder / name).is_dir():
-            raise CheckpointError(f"{folder}: no {name}/ to embed the prompt with; {OTHERWISE}")
+            raise CheckpointError(f"{folder}: no {name}/ to embed the prompt {prompt!r} with; {OTHERWISE}")
     _check_tokenizer(folder / "tokenizer")
     try:
         tokenizer = T5Tokenizer.from_pretrained(folder / "tokenizer", local_files_only=True)
