@@ -60,7 +60,7 @@ def test_pretrained_weights_get_the_embedding_of_the_empty_prompt_unless_zeros_a
     assert default.prompt.any()
     assert not load_twin(folder, prompt=None).prompt.any()
     alone = shutil.copytree(folder, tmp_path / "alone", ignore=shutil.ignore_patterns("text_encoder"))
-    with pytest.raises(CheckpointError, match="no text_encoder/ to embed the prompt '' with; give .*prompt=null for"):
+    with pytest.raises(CheckpointError, match=r"no text_encoder/ to embed the prompt '' with; give .*prompt=null for"):
         make_backbone("cogvideox", {"pretrained": str(alone)} | size)
 
 
@@ -123,7 +123,7 @@ def test_embedding_a_prompt_never_uses_the_network(tmp_path, monkeypatch):
     monkeypatch.setattr("socket.getaddrinfo", lambda host, *_, **__: hosts.append(host) or [])
     write_twin("2b", write_snapshot(tmp_path / "hub", name))
     assert not load_twin(name).prompt.any()
-    with pytest.raises(CheckpointError, match=r"no text_encoder/ to embed the prompt with; give .* zeros$"):
+    with pytest.raises(CheckpointError, match=r"no text_encoder/ to embed the prompt 'a walk' with; give .* zeros$"):
         load_twin(name, prompt=PROMPT)
     assert hosts == []
 
