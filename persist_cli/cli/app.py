@@ -308,6 +308,9 @@ def evaluate(
     verify: VerifyOption = False,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
+    resample: Annotated[
+        str, typer.Option(help="What intervals draw: scenes (houses), or clips where all are of one place.")
+    ] = "scenes",
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/eval"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html, tables, curves, clips.")] = None,
     compare: CompareOption = None,
@@ -334,7 +337,7 @@ def evaluate(
         controls=split_names(DEFAULT_CONTROLS if controls is None else controls), controls_named=controls is not None,
         metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=SamplingOverrides(steps, sampler, guidance), batch=batch, noise=pose_noise,
-        placement=InferenceOptions.of(dtype, save_memory),
+        placement=InferenceOptions.of(dtype, save_memory), resample=resample,
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

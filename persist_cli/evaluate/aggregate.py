@@ -16,7 +16,18 @@ from persist_cli.evaluate.journal import TRUTH
 from persist_cli.evaluate.metric_suite import FIGURES, MetricSuite
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
-from persist_cli.evaluate.statistics import Figure, difference, mean, mean_figure, number, set_figure
+from persist_cli.evaluate.statistics import (
+    RESAMPLES,
+    SET_RESAMPLES,
+    Counts,
+    Draws,
+    Figure,
+    difference,
+    mean,
+    mean_figure,
+    number,
+    set_figure,
+)
 from persist_cli.viewing.console import watched
 
 BINS = 10  # of the share of a view that was seen before
@@ -24,35 +35,62 @@ BINS = 10  # of the share of a view that was seen before
 
 @dataclass(frozen=True)
 class RowResults:
-    """The measured figures and features of one row.
+    """The measured figures and features of one row of the table.
 
     Args:
         run: the evaluation.
-        number: number of the row.
+        numbers: numbers of the rows that were measured for it, one for each training seed.
     """
 
     run: Evaluation
-    number: int
+    numbers: Sequence[int]
 
     @property
     def row(self) -> Row:
-        """The row that was measured."""
-        return self.run.rows[self.number]
+        """The row that was measured, of several training seeds the first."""
+        return self.run.rows[self.numbers[0]]
 
     @property
     def suite(self) -> MetricSuite:
         """The metrics that could be measured of the row."""
-        return self.run.suites[self.number]
+        return self.run.suites[self.numbers[0]]
+
+    @property
+    def models(self) -> list[str]:
+        """A name for each training seed, equal for rows of the same models."""
+        return [model_name(self.run.rows[number]) for number in self.numbers]
 
     @cached_property
     def figures(self) -> Tensor:
-        """Every figure ``[seed, clip, frame, metric]``, read once for all tables and curves."""
+        """Every figure ``[model, seed, clip, frame, metric]``, read once for all tables and curves."""
         return self.gather(FIGURES)
 
     def gather(self, name: str) -> Tensor:
-        """A tensor of the journal for every seed and clip, ``[seed, clip, …]``."""
-        seeds, batches = range(self.run.seeds(self.row)), self.run.batches
-        return torch.stack([self.run.journal.gather(self.number, seed, batches, name) for seed in seeds])
+        """A tensor of the journal for every training seed, sampling seed and clip, ``[model, seed, clip, …]``."""
+        return torch.stack(
+            [
+                torch.stack([self.run.journal.gather(number, seed, self.run.batches, name) for seed in self.seeds])
+                for number in self.numbers
+            ]
+        )
+
+    @property
+    def seeds(self) -> range:
+        """The sampling seeds of the row."""
+        return range(self.run.seeds(self.row))
+
+
+def model_name(row: Row) -> str:
+    """What a row's model is made of: base and adapter; rows of one model have one name, and controls none."""
+    return f"{row.base.fingerprint}/{row.base.folder}/{row.adapter}" if row.uses_model else ""
+
+
+def row_results(run: Evaluation) -> list[RowResults]:
+    """The rows of the table in order; rows of one group are one row of several training seeds."""
+    groups: dict[str, list[int]] = {}
+    for place, row in enumerate(run.rows):
+        groups.setdefault(row.group, []).append(place)
+    return [RowResults(run, numbers) for numbers in groups.values()]
 
 
 @dataclass(frozen=True)
@@ -79,10 +117,10 @@ class Table:
 
         A row that cannot be made of these clips has the reason in ``na``.
         """
-        figures = {results.row.name: self.figures(results) for results in watched(rows, "figures", "rows")}
+        figures = {results.row.group: self.figures(results) for results in watched(rows, "figures", "rows")}
         values: dict[str, Any] = {}
         for results in rows:
-            values[results.row.name] = self.row_json(results.row) | {
+            values[results.row.group] = self.row_json(results.row) | {
                 "columns": {column.name: self.cell(column, results, figures) for column in self.columns},
                 "curves": self.curves(results),
             }
@@ -92,7 +130,25 @@ class Table:
                 "columns": {column.name: {"na": reason} for column in self.columns},
                 "curves": {},
             }
-        return {"name": self.name, "clips": list(self.clips), "rows": values}
+        return {"name": self.name, "clips": list(self.clips), "scenes": self.scenes, "rows": values}
+
+    @cached_property
+    def clusters(self) -> Counts:
+        """For each clip the number of what is drawn with it: of its scene, or of the clip where clips are drawn."""
+        cases = [self.run.cases[clip] for clip in self.clips]
+        names = [(case.data, case.scene) for case in cases]
+        if self.run.plan.resample == "clips":
+            return np.arange(len(cases))
+        return np.array([names.index(name) for name in names])
+
+    @property
+    def scenes(self) -> int:
+        """Number of different scenes that the clips show."""
+        return len({(self.run.cases[clip].data, self.run.cases[clip].scene) for clip in self.clips})
+
+    def draws(self, results: RowResults, count: int = RESAMPLES) -> Draws:
+        """The bootstrap samples of a row."""
+        return Draws.of(self.clusters, results.models, count)
 
     def row_json(self, row: Row) -> dict[str, Any]:
         """What a row is, as JSON values."""
@@ -113,12 +169,12 @@ class Table:
         """
         if column.metric in results.suite.obstacles:
             return {"na": results.suite.obstacles[column.metric]}
-        figure = figures[results.row.name][column.name]
+        figure = figures[results.row.group][column.name]
         if not np.isfinite(figure.mean):
             return {"na": "not defined for any of these clips"}
         differences = {}
         for name, figures_by_column in figures.items():
-            if name != results.row.name:
+            if name != results.row.group:
                 reference = figures_by_column.get(column.name)
                 differences[name] = reference and difference(figure, reference)
         first = differences.get(next(iter(figures)))
@@ -126,37 +182,37 @@ class Table:
 
     def figures(self, results: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""
-        values, cases = results.figures[:, list(self.clips)], [self.run.cases[clip] for clip in self.clips]
+        values, cases = results.figures[:, :, list(self.clips)], [self.run.cases[clip] for clip in self.clips]
         frame_metrics, set_metrics = list(results.suite.frame_metrics), results.suite.set_metrics
         figures = {}
         for column in self.columns:
             if column.metric in frame_metrics:
                 metric_values = values[..., frame_metrics.index(column.metric)]
                 selected = torch.where(chosen_frames(cases, column.frames), metric_values, torch.nan).numpy()
-                figures[column.name] = mean_figure(mean(selected, axis=2))
+                figures[column.name] = mean_figure(mean(selected, axis=3), self.draws(results))
             elif column.metric in set_metrics:
                 figures[column.name] = self.set_figure(column.metric, results)
         return figures
 
     def set_figure(self, metric: str, results: RowResults) -> Figure:
         """The distance of the row's videos from the true ones."""
-        generated = results.gather(f"features/{metric}")[:, list(self.clips)]
+        generated = results.gather(f"features/{metric}")[:, :, list(self.clips)]
         truth = self.run.journal.gather(TRUTH, 0, self.run.batches, f"features/{metric}")[list(self.clips)]
         set_metric = results.suite.set_metrics[metric]
 
-        def distance(numbers: np.ndarray[Any, np.dtype[np.int64]], seed: int) -> float:
-            chosen = torch.from_numpy(numbers)
-            return set_metric.distance(generated[seed][chosen], truth[chosen])
+        def distance(counts: Counts, model: int, seed: int) -> float:
+            chosen = torch.from_numpy(np.repeat(np.arange(len(counts)), counts))
+            return set_metric.distance(generated[model, seed][chosen], truth[chosen])
 
-        return set_figure(distance, len(self.clips), self.run.seeds(results.row))
+        return set_figure(distance, self.draws(results, SET_RESAMPLES), len(results.seeds))
 
     def curves(self, results: RowResults) -> dict[str, Any]:
         """Each metric against frame number and against the share of the view seen before, as JSON values."""
-        values = results.figures[:, list(self.clips), 1:].numpy()
+        values = results.figures[:, :, list(self.clips), 1:].numpy()
         shares = np.array([self.run.cases[clip].seen_before[1:] for clip in self.clips], dtype=np.float64)
         curves = {}
         for place, name in enumerate(results.suite.frame_metrics):
-            by_clip = mean(values[..., place], axis=0)
+            by_clip = mean(mean(values[..., place], axis=1), axis=0)
             curves[name] = {
                 "per_frame": [number(value) for value in mean(by_clip, axis=0)],
                 "by_seen_before": seen_bins(by_clip, shares),

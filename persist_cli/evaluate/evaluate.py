@@ -9,7 +9,7 @@ from typing import Any
 
 from persist_cli.api.checkpoint import reference_checkpoint
 from persist_cli.data.reference import data_folder
-from persist_cli.evaluate.aggregate import RowResults, Table
+from persist_cli.evaluate.aggregate import Table, row_results
 from persist_cli.evaluate.cases import cases_json
 from persist_cli.evaluate.columns import column_json, make_columns
 from persist_cli.evaluate.example_clips import make_pictures
@@ -20,6 +20,7 @@ from persist_cli.evaluate.provenance import checkpoint_json, command, environmen
 from persist_cli.evaluate.report.page import PAGE, write_report
 from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
+from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
 from persist_cli.io.files import check_folder, write_json, write_text
 from persist_cli.viewing.console import print_json, say
 
@@ -65,7 +66,7 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
 def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
     """The results and all that is needed to measure them again, as JSON values."""
     info = run.cases[0].file.info
-    rows = [RowResults(run, number) for number in range(len(run.rows))]
+    rows = row_results(run)
     return {
         "format": "persist-evaluation",
         "version": 1,
@@ -89,6 +90,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
             "batch": run.plan.batch,
         }
         | run.plan.placement.changes(),
+        "statistics": {"resampled": run.plan.resample, "resamples": RESAMPLES, "least": LEAST_UNITS},
         "warnings": contamination_warnings(run.checkpoints, run.cases),
         "environment": environment(processes),
         "command": command(),
@@ -97,7 +99,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
         ],
         "columns": column_json(make_columns(run.metrics, run.protocol)),
         "tables": [Table(run, name, clips).to_json(rows) for name, clips in clips_by_domain(run).items()],
-        "first_row": run.rows[0].name,
+        "first_row": run.rows[0].group,
     }
 
 

@@ -21,6 +21,7 @@ from persist_cli.evaluate.provenance import checkpoint_json, metric_json, scenes
 from persist_cli.evaluate.report.remarks import contamination
 from persist_cli.evaluate.rows.build_rows import RowConfig, build_control_rows, build_model_rows, default_memories
 from persist_cli.evaluate.rows.row import Row
+from persist_cli.evaluate.statistics import RESAMPLE_UNITS
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
 from persist_cli.viewing.console import busy, warn
@@ -46,6 +47,7 @@ class EvalPlan:
     noise: tuple[float, float]
     placement: InferenceOptions
     controls_named: bool = True
+    resample: str = "scenes"  # one of ``RESAMPLE_UNITS``
 
     def without_repeats(self) -> EvalPlan:
         """This plan without repeated names, because a memory named twice would be two rows of one name."""
@@ -120,6 +122,8 @@ def prepare(
     sampling = common_sampling(checkpoints, plan.sampling)
     config = RowConfig(plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named)
     config.check()
+    if plan.resample not in RESAMPLE_UNITS:
+        raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
     protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
@@ -172,7 +176,8 @@ def identity(
     """JSON values of all that changes a figure, but for the data: an evaluation with equal values goes on."""
     options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
     options |= {"sampling": asdict(sampling) | plan.placement.changes()}
-    del options["placement"], options["controls_named"]  # what is left of them changes no figure
+    for name in ("placement", "controls_named", "resample"):
+        del options[name]  # what is left of them changes no measured figure
     values = options | {
         "checkpoints": [checkpoint_json(checkpoint) for checkpoint in checkpoints],
         "metric definitions": metric_json(metrics),

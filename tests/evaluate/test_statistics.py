@@ -6,70 +6,133 @@ import numpy as np
 import pytest
 
 from persist_cli.evaluate.aggregate import seen_bins
-from persist_cli.evaluate.statistics import LEAST_CLIPS, difference, mean_figure, set_figure
+from persist_cli.evaluate.statistics import (
+    LEAST_UNITS,
+    Draws,
+    Figure,
+    curve_figure,
+    difference,
+    mean_figure,
+    set_figure,
+)
 
 
 def clips(offset: float = 0.0, count: int = 50, seeds: int = 3) -> np.ndarray:
-    return np.random.default_rng(0).normal(20, 4, (seeds, count)) + offset
+    return np.random.default_rng(0).normal(20, 4, (1, seeds, count)) + offset
+
+
+def apart(values: np.ndarray, *models: str) -> Figure:
+    """The figure of clips that are each of a scene of its own."""
+    return mean_figure(values, Draws.of(range(values.shape[2]), models or ("",)))
+
+
+def in_houses(clips: int, houses: int) -> np.ndarray:
+    """The number of each clip's house, equally many in each."""
+    return np.arange(clips) % houses
 
 
 def test_a_figure_is_the_mean_over_clips_with_the_deviation_over_seeds():
     values = clips()
-    figure = mean_figure(values)
+    figure = apart(values)
     assert figure.mean == pytest.approx(values.mean())
-    assert figure.std == pytest.approx(values.mean(axis=1).std(ddof=1))
+    assert figure.std == pytest.approx(values[0].mean(axis=1).std(ddof=1))
     assert figure.low < figure.mean < figure.high
-    assert mean_figure(values[:1]).std is None
+    assert apart(values[:, :1]).std is None
 
 
 def test_the_bootstrap_interval_is_near_that_of_the_normal_approximation():
-    per_clip = clips(count=400).mean(axis=0)
-    figure = mean_figure(clips(count=400))
+    per_clip = clips(count=400)[0].mean(axis=0)
+    figure = apart(clips(count=400))
     assert figure.high - figure.low == pytest.approx(2 * 1.96 * per_clip.std(ddof=1) / 20, rel=0.1)
 
 
+def test_clips_of_one_house_are_drawn_together_so_that_their_likeness_widens_the_interval():
+    houses = in_houses(100, 20)
+    values = np.random.default_rng(0).normal(0, 4, 20)[houses][None, None] + clips(count=100)
+    width = 2 * 1.96 * values[0].mean(axis=0).reshape(5, 20).mean(axis=0).std(ddof=1) / 20**0.5
+    by_house, by_clip = mean_figure(values, Draws.of(houses)), apart(values)
+    assert by_house.high - by_house.low == pytest.approx(width, rel=0.15)
+    assert by_house.high - by_house.low > 1.5 * (by_clip.high - by_clip.low)
+    assert (by_house.units, by_clip.units, by_house.count) == (20, 100, 100)
+
+
+def test_every_bootstrap_sample_holds_all_clips_of_a_house_or_none():
+    draws = Draws.of(in_houses(12, 4))
+    counts = draws.clips.reshape(draws.count, 3, 4)
+    assert (counts == counts[:, :1]).all()
+    assert set(counts[:, 0].sum(axis=1)) == {3}  # one house fewer than there are
+
+
 def test_a_constant_difference_between_rows_has_an_interval_of_no_width():
-    changed = difference(mean_figure(clips(offset=0.5)), mean_figure(clips()))
+    changed = difference(apart(clips(offset=0.5)), apart(clips()))
     assert changed == pytest.approx({"mean": 0.5, "low": 0.5, "high": 0.5})
 
 
 def test_a_difference_that_is_noise_has_an_interval_around_zero():
-    independent = np.random.default_rng(1).normal(20, 4, (3, 50))
-    changed = difference(mean_figure(independent), mean_figure(clips()))
+    independent = np.random.default_rng(1).normal(20, 4, (1, 3, 50))
+    changed = difference(apart(independent), apart(clips()))
     assert changed["low"] < 0 < changed["high"]
 
 
-def test_fewer_than_six_clips_have_neither_interval_nor_paired_interval():
-    few, enough = (clips(count=count) for count in (LEAST_CLIPS - 1, LEAST_CLIPS))
-    assert (mean_figure(few).to_json()["low"], mean_figure(few).to_json()["high"]) == (None, None)
-    assert difference(mean_figure(few + 1), mean_figure(few)) == pytest.approx({"mean": 1.0, "low": None, "high": None})
-    assert set_figure(lambda numbers, seed: float(len(numbers)), LEAST_CLIPS - 1, 1).to_json()["low"] is None
-    assert mean_figure(enough).low < mean_figure(enough).high
+def test_a_difference_between_rows_that_only_their_training_seeds_make_is_not_clear():
+    lucky = np.array([0.6, 0.1, -0.4])[:, None, None] + clips()  # on average 0.1 better, by one lucky training
+    other = np.array([0.3, 0.0, -0.3])[:, None, None] + clips()
+    one_seed = difference(apart(lucky[:1]), apart(other[:1]))
+    changed = difference(apart(lucky, "a", "b", "c"), apart(other, "d", "e", "f"))
+    assert one_seed["low"] > 0
+    assert changed["mean"] == pytest.approx(0.1)
+    assert changed["low"] < 0 < changed["high"]
 
 
-def test_clips_that_both_rows_have_are_counted_for_a_paired_interval():
+def test_rows_of_the_same_models_are_paired_by_training_seed():
+    trained = np.array([0.6, 0.1, -0.4])[:, None, None] + clips()
+    changed = difference(apart(trained + 1.0, "a", "b", "c"), apart(trained, "a", "b", "c"))
+    assert changed == pytest.approx({"mean": 1.0, "low": 1.0, "high": 1.0})
+    assert apart(trained, "a", "b", "c").by_model == pytest.approx(trained.mean(axis=(1, 2)))
+
+
+def test_fewer_than_six_houses_have_neither_interval_nor_paired_interval():
+    few, enough = (Draws.of(in_houses(30, count)) for count in (LEAST_UNITS - 1, LEAST_UNITS))
+    values = clips(count=30)
+    figure = mean_figure(values, few)
+    assert (figure.to_json()["low"], figure.to_json()["high"]) == (None, None)
+    changed = difference(mean_figure(values + 1, few), figure)
+    assert changed == pytest.approx({"mean": 1.0, "low": None, "high": None})
+    assert set_figure(lambda counts, model, seed: float(counts.sum()), few, 1).to_json()["low"] is None
+    assert mean_figure(values, enough).low < mean_figure(values, enough).high
+
+
+def test_houses_that_both_rows_have_are_counted_for_a_paired_interval():
     one, two = clips(count=10), clips(count=10)
-    one[:, :3], two[:, -3:] = np.nan, np.nan
-    assert mean_figure(one).to_json()["low"] is not None
-    assert difference(mean_figure(one), mean_figure(two))["low"] is None
+    one[..., :3], two[..., -3:] = np.nan, np.nan
+    assert apart(one).to_json()["low"] is not None
+    assert difference(apart(one), apart(two))["low"] is None
 
 
 def test_clips_without_a_figure_are_left_out():
     values = clips()
-    values[:, :10] = np.nan
-    figure = mean_figure(values)
-    assert figure.count == 40
-    assert figure.mean == pytest.approx(values[:, 10:].mean())
-    assert np.isnan(mean_figure(np.full((1, 4), np.nan)).mean)
+    values[..., :10] = np.nan
+    figure = apart(values)
+    assert (figure.count, figure.units) == (40, 40)
+    assert figure.mean == pytest.approx(values[..., 10:].mean())
+    assert np.isnan(apart(np.full((1, 1, 4), np.nan)).mean)
 
 
 def test_the_interval_of_a_distance_between_sets_lies_around_it():
-    values = clips(count=40, seeds=2)
-    figure = set_figure(lambda numbers, seed: float(values[seed][numbers].var()), 40, 2)
+    values = clips(count=40, seeds=2)[0]
+    draws = Draws.of(in_houses(40, 20), count=200)
+    figure = set_figure(lambda counts, model, seed: float(np.repeat(values[seed], counts).var()), draws, 2)
     assert figure.mean == pytest.approx(values.var(axis=1).mean())
     assert figure.low < figure.mean < figure.high
     assert figure.resampled.mean() == pytest.approx(figure.mean)
     assert figure.per_clip is None
+
+
+def test_the_least_value_of_a_mean_curve_has_an_interval():
+    values = clips(count=40, seeds=1)[..., None] + np.array([0.0, -3.0, 1.0])
+    figure = curve_figure(values, lambda curves: curves.min(axis=1), Draws.of(range(40)))
+    assert figure.mean == pytest.approx(values.mean(axis=(0, 1, 2)).min())
+    assert figure.low < figure.mean < figure.high
 
 
 def test_frames_are_binned_by_the_share_of_their_view_seen_before():

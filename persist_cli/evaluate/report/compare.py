@@ -11,21 +11,19 @@ import numpy as np
 
 from persist_cli.errors import DataError
 from persist_cli.evaluate.report.agreement import differing_notes, measured_differently
-from persist_cli.evaluate.report.remarks import few_clips
+from persist_cli.evaluate.report.remarks import too_few
 from persist_cli.evaluate.report.result_file import Cell, ColumnRecord, Difference, EvalResults, read_results
 from persist_cli.evaluate.report.tables import NOT_AVAILABLE, difference_texts, digits_of, heading, number_text
 from persist_cli.evaluate.report.terminal import ordered_columns
 from persist_cli.evaluate.report.text import fit_columns, markdown_table
-from persist_cli.evaluate.statistics import LEAST_CLIPS
+from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, Counts, Draws, mean_figure, number
 
 PrintedTable = tuple[str, list[str], list[list[str]]]  # title, headings, and the texts of each row
-
-RESAMPLES = 1000
 
 MEAN_LEGEND = "B − A: paired over clips where both have them"
 
 INTERVAL_LEGEND = (
-    f"{MEAN_LEGEND}, with its 95 % interval ({RESAMPLES:,} bootstrap resamples of the clips); * the interval leaves "
+    f"{MEAN_LEGEND}, with its 95 % interval ({RESAMPLES:,} bootstrap resamples of the {{unit}}); * the interval leaves "
     "zero out"
 )
 
@@ -34,7 +32,8 @@ INTERVAL_LEGEND = (
 class ComparedCell:
     """One figure in both runs with the difference B − A.
 
-    ``pairs`` counts the clips behind the difference; it is 0 where only the means could be subtracted.
+    ``pairs`` counts the scenes, or clips where these are drawn, behind the difference; it is 0 where only the means
+    could be subtracted.
     """
 
     a: float | None
@@ -57,7 +56,8 @@ class ComparedTable:
 class Comparison:
     """Two runs that measured the same clips; ``notes`` say in what else they differ.
 
-    ``columns`` has the most important for the protocol first.
+    ``columns`` has the most important for the protocol first. ``unit`` names what intervals draw: clips only where
+    both runs drew clips.
     """
 
     a: str
@@ -65,6 +65,7 @@ class Comparison:
     columns: dict[str, ColumnRecord]
     tables: list[ComparedTable]
     notes: list[str]
+    unit: str
 
     @property
     def cells(self) -> list[ComparedCell]:
@@ -75,9 +76,9 @@ class Comparison:
     def legend(self) -> str:
         """What a difference is, and that there is no interval where the clips are too few."""
         if any(cell.low is not None for cell in self.cells):
-            return INTERVAL_LEGEND
-        few = max((cell.pairs for cell in self.cells if cell.pairs < LEAST_CLIPS), default=0)
-        return f"{MEAN_LEGEND}; {few_clips(few)}" if few else MEAN_LEGEND
+            return INTERVAL_LEGEND.format(unit=self.unit)
+        few = max((cell.pairs for cell in self.cells if cell.pairs < LEAST_UNITS), default=0)
+        return f"{MEAN_LEGEND}; {too_few(few, self.unit)}" if few else MEAN_LEGEND
 
     @property
     def left_out(self) -> list[str]:
@@ -114,7 +115,7 @@ def compare_runs(a: Path, b: Path) -> Comparison:
     tables = list(_compared_tables(one, two, columns))
     if not any(table.rows for table in tables) or not columns:
         raise DataError(f"{a} and {b} have no {'row' if columns else 'column'} in common")
-    return Comparison(str(a), str(b), columns, tables, differing_notes(one, two))
+    return Comparison(str(a), str(b), columns, tables, differing_notes(one, two), _drawn_unit(one, two))
 
 
 def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
@@ -170,26 +171,41 @@ def comparison_text(comparison: Comparison) -> str:
     return "\n\n".join(["# Two runs compared", *tables, "\n".join(remarks)]) + "\n"
 
 
-def compare_cells(a: Cell | None, b: Cell | None) -> ComparedCell:
-    """Compare a figure of two runs clip by clip, or by their means where figures of single clips are missing."""
+def compare_cells(a: Cell | None, b: Cell | None, clusters: Counts) -> ComparedCell:
+    """Compare a figure of two runs clip by clip, or by their means where figures of single clips are missing.
+
+    Args:
+        a: figure of the first run.
+        b: figure of the second run.
+        clusters: for each clip the number of what is drawn with it, its scene or itself.
+    """
     first, second = (cell.mean if cell else None for cell in (a, b))
     if a is None or b is None or first is None or second is None:
         return ComparedCell(first, second, None)
-    pairs = zip(a.per_clip or [], b.per_clip or [], strict=False)
-    gaps = np.array([in_b - in_a for in_a, in_b in pairs if in_a is not None and in_b is not None])
-    if not len(gaps):
+    in_a, in_b = (np.array(cell.per_clip or [], dtype=np.float64) for cell in (a, b))
+    gaps = in_b - in_a if len(in_a) == len(in_b) else np.array([])
+    if not np.isfinite(gaps).any():
         return ComparedCell(first, second, second - first)
-    if len(gaps) < LEAST_CLIPS:
-        return ComparedCell(first, second, float(gaps.mean()), pairs=len(gaps))
-    draws = np.random.default_rng(0).integers(0, len(gaps), (RESAMPLES, len(gaps)))
-    low, high = np.percentile(gaps[draws].mean(axis=1), [2.5, 97.5])
-    return ComparedCell(first, second, float(gaps.mean()), float(low), float(high), len(gaps))
+    gap = mean_figure(gaps[None, None], Draws.of(clusters))
+    return ComparedCell(first, second, gap.mean, number(gap.low), number(gap.high), gap.units)
+
+
+def _drawn_unit(one: EvalResults, two: EvalResults) -> str:
+    """What intervals draw: clips where both runs drew these, else scenes."""
+    return "clips" if {one.statistics.resampled, two.statistics.resampled} == {"clips"} else "scenes"
 
 
 def _compared_tables(one: EvalResults, two: EvalResults, columns: dict[str, ColumnRecord]) -> Iterator[ComparedTable]:
     for table_a, table_b in zip(one.tables, two.tables, strict=True):
+        clips = [one.measured.clips[number] for number in table_a.clips]
+        names = [(clip.data, clip.scene) for clip in clips]
+        scenes = np.array([names.index(name) for name in names])
+        clusters = scenes if _drawn_unit(one, two) == "scenes" else np.arange(len(clips))
         rows = {
-            name: {key: compare_cells(row.columns.get(key), table_b.rows[name].columns.get(key)) for key in columns}
+            name: {
+                key: compare_cells(row.columns.get(key), table_b.rows[name].columns.get(key), clusters)
+                for key in columns
+            }
             for name, row in table_a.rows.items()
             if name in table_b.rows
         }

@@ -5,7 +5,14 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Callable, Sequence
 
-from persist_cli.evaluate.report.remarks import contamination_lines, left_out_line, too_few_lines, without_command
+from persist_cli.evaluate.report.remarks import (
+    contamination_lines,
+    counted,
+    drawn_units,
+    left_out_line,
+    too_few_lines,
+    without_command,
+)
 from persist_cli.evaluate.report.result_file import EvalResults
 from persist_cli.evaluate.report.tables import CellView, CompactTable, RowView, TableView, compact_tables
 from persist_cli.evaluate.report.text import fit_columns
@@ -41,7 +48,8 @@ def latex_tables(results: EvalResults) -> str:
         if rows:
             caption = f"Paired difference to {escape(results.first_row or '')}"
             if table.has_intervals:
-                caption += " with 95\\,\\% interval (bootstrap over clips); $^*$ the interval leaves zero out"
+                caption += f" with 95\\,\\% interval (bootstrap over {drawn_units(results)})"
+                caption += "; $^*$ the interval leaves zero out"
             caption += "".join(f". {escape(line)}" for line in too_few_lines(view)) + "."
             groups = [(title, [row for row in group if row in rows]) for title, group in view.kind_groups()]
             groups = [(title, group) for title, group in groups if group]
@@ -84,6 +92,7 @@ def _caption(results: EvalResults, table: CompactTable) -> str:
     seeds = len(results.sampling.seeds)
     domain = f" ({view.name})" if len(results.tables) > 1 else ""
     clips = f"{view.clips} clips of {protocol.frames} frames at {height}×{width}"
+    clips += f", {counted(view.units, 'scenes')}" * (view.unit == "scenes")
     notes = [f"({number}) {without_command(note)}" for number, note in view.notes.items()]
     deviation = f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "one sampling seed"
     text = f"{protocol.title or protocol.name}{domain}: {clips}; {deviation}"

@@ -15,6 +15,7 @@ from persist_cli.evaluate.report.latex import latex_tables
 from persist_cli.evaluate.report.pictures import Pictures, RowClips, file_name, write_row_clips, write_sheets
 from persist_cli.evaluate.report.remarks import (
     contamination_lines,
+    drawn_units,
     known_scenes,
     left_out_line,
     seed_legend,
@@ -88,6 +89,7 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
         results=results, sections=sections, warnings=contamination_lines(results),
         unknown_scenes=unknown_scenes_lines(results), known_scenes=known_scenes,
         too_few_lines=too_few_lines, left_out_line=left_out_line, seed_legend=seed_legend(results),
+        drawn_units=drawn_units(results), scenes=len({(clip.data, clip.scene) for clip in results.measured.clips}),
         sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
         facts=_environment_facts(results), lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
         **common,

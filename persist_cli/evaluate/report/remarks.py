@@ -9,7 +9,7 @@ from pathlib import Path
 from persist_cli.api.checkpoint import name_ranges, run_folder
 from persist_cli.evaluate.report.result_file import CheckpointRecord, EvalResults
 from persist_cli.evaluate.report.tables import MARK, CompactTable, TableView, compact_tables
-from persist_cli.evaluate.statistics import LEAST_CLIPS
+from persist_cli.evaluate.statistics import LEAST_UNITS
 
 MOST_SCENES = 3  # names or ranges of scenes in a warning
 
@@ -20,7 +20,7 @@ def figure_legend(results: EvalResults, table: CompactTable) -> str:
     """A sentence that says what stands in a cell of the figures and of the differences."""
     parts = [seed_legend(results)]
     if table.has_intervals:
-        parts.append("[95 % interval, bootstrap over clips]")
+        parts.append(f"[95 % interval, bootstrap over {drawn_units(results)}]")
     if table.has_differences:
         parts.append(difference_legend(results, table.has_intervals))
     return "; ".join(parts)
@@ -36,21 +36,31 @@ def seed_legend(results: EvalResults) -> str:
 
 def difference_legend(results: EvalResults, intervals: bool) -> str:
     """Say what a difference is and, where there are intervals, what the mark behind it means."""
-    mark = f"; {MARK} its 95 % interval (bootstrap over clips) leaves zero out" if intervals else ""
+    mark = f"; {MARK} its 95 % interval (bootstrap over {drawn_units(results)}) leaves zero out" if intervals else ""
     return f"Δ: paired difference to {results.first_row}{mark}"
+
+
+def drawn_units(results: EvalResults) -> str:
+    """What every bootstrap sample draws anew."""
+    return results.statistics.resampled
 
 
 def too_few_lines(view: TableView) -> list[str]:
     """A line that says why a table has no intervals, or which of its columns have none."""
-    if view.clips < LEAST_CLIPS:
-        return [few_clips(view.clips)]
-    few = [column for column in view.columns if 0 < column.fewest < LEAST_CLIPS]
-    return [f"{column.heading}: defined for {few_clips(column.fewest)}" for column in few]
+    if view.units < LEAST_UNITS:
+        return [too_few(view.units, view.unit)]
+    few = [column for column in view.columns if 0 < column.fewest < LEAST_UNITS]
+    return [f"{column.heading}: defined for {too_few(column.fewest, view.unit)}" for column in few]
 
 
-def few_clips(clips: int) -> str:
-    """Say that so many clips are too few for an interval."""
-    return f"{clips} clip{'s' * (clips != 1)}: too few for an interval; give at least {LEAST_CLIPS}"
+def too_few(units: int, unit: str) -> str:
+    """Say that so many scenes, or clips, are too few for an interval."""
+    return f"{counted(units, unit)}: too few for an interval; give at least {LEAST_UNITS}"
+
+
+def counted(number: int, plural: str) -> str:
+    """A number with its noun, as in ``1 clip`` and ``2 clips``."""
+    return f"{number} {plural if number != 1 else plural.removesuffix('s')}"
 
 
 def left_out_line(left_out: dict[str, list[str]], commands: bool = True) -> str:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 from persist_cli.errors import DataError
-from persist_cli.evaluate.statistics import LEAST_CLIPS
+from persist_cli.evaluate.statistics import LEAST_UNITS
 from persist_cli.io.settings import plain_problems
 
 FORMAT = "persist-evaluation"
@@ -111,7 +111,8 @@ class Difference(ResultModel):
 class Cell(ResultModel):
     """A figure with its spread, or in ``na`` the reason why there is none.
 
-    Intervals of fewer than ``LEAST_CLIPS`` clips, which earlier versions wrote, are left out on reading.
+    ``units`` counts the scenes, or clips, that its interval was drawn from. Intervals of fewer than ``LEAST_UNITS``
+    clips, which earlier versions wrote, are left out on reading.
     """
 
     na: str | None = None
@@ -120,6 +121,8 @@ class Cell(ResultModel):
     low: FiniteOrNone = None
     high: FiniteOrNone = None
     count: int | None = None
+    units: int | None = None
+    by_training_seed: list[FiniteOrNone] = []
     per_clip: list[FiniteOrNone] | None = None
     difference: Difference | None = None
     differences: dict[str, Difference | None] = {}
@@ -127,7 +130,7 @@ class Cell(ResultModel):
     @model_validator(mode="before")
     @classmethod
     def _drop_intervals_of_few_clips(cls, values: Any) -> Any:
-        if not isinstance(values, dict) or not isinstance(values.get("count"), int) or values["count"] >= LEAST_CLIPS:
+        if not isinstance(values, dict) or not isinstance(values.get("count"), int) or values["count"] >= LEAST_UNITS:
             return values
         gaps = values.get("differences")
         kept = {"difference": _without_interval(values.get("difference"))}
@@ -174,10 +177,11 @@ class RowRecord(ResultModel):
 
 
 class TableRecord(ResultModel):
-    """A table over some of the clips."""
+    """A table over some of the clips, which show so many scenes."""
 
     name: str
     clips: list[int]
+    scenes: int | None = None
     rows: dict[str, RowRecord]
 
 
@@ -215,11 +219,19 @@ class SamplingRecord(ResultModel):
     batch: int | None = None
 
 
+class StatisticsRecord(ResultModel):
+    """What bootstrap samples draw; results of earlier versions, which do not say it, drew clips."""
+
+    resampled: Literal["scenes", "clips"] = "clips"
+    resamples: int | None = None
+
+
 class EvalResults(ResultModel):
     """All results of one ``persist eval``."""
 
     measured: Measured
     sampling: SamplingRecord
+    statistics: StatisticsRecord = StatisticsRecord()
     environment: dict[str, Any] = {}
     command: list[str] = []
     checkpoints: list[CheckpointRecord] = []

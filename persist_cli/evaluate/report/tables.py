@@ -58,7 +58,7 @@ class ColumnView:
         heading: title with the arrow of the better direction.
         definition: what is measured.
         count: clips or videos behind its figures, as in ``32`` or ``30 to 32``.
-        fewest: the least of these numbers, 0 where there is no figure.
+        fewest: fewest scenes, or clips where these are drawn, behind an interval; 0 where there is no figure.
     """
 
     key: str
@@ -82,10 +82,15 @@ class RowView:
 
 @dataclass(frozen=True)
 class TableView:
-    """A table; ``notes`` are the reasons of its ``n/a`` cells by their number, which all tables share."""
+    """A table; ``notes`` are the reasons of its ``n/a`` cells by their number, which all tables share.
+
+    ``unit`` names what its intervals draw, ``scenes`` or ``clips``, and ``units`` says how many of these there are.
+    """
 
     name: str
     clips: int
+    unit: str
+    units: int
     columns: list[ColumnView]
     rows: list[RowView]
     notes: dict[int, str]
@@ -227,7 +232,16 @@ def _view_table(results: EvalResults, table: TableRecord, notes: list[str]) -> T
     ]
     columns = [_column_head(results, key, table) for key in results.columns]
     used_notes = sorted({cell.note for row in rows for cell in row.cells} - {0})
-    return TableView(table.name, len(table.clips), columns, rows, {number: notes[number - 1] for number in used_notes})
+    unit = results.statistics.resampled
+    units = len(table.clips) if unit == "clips" else table_scenes(results, table)
+    own_notes = {number: notes[number - 1] for number in used_notes}
+    return TableView(table.name, len(table.clips), unit, units, columns, rows, own_notes)
+
+
+def table_scenes(results: EvalResults, table: TableRecord) -> int:
+    """Number of different scenes that a table's clips show."""
+    clips = [results.measured.clips[number] for number in table.clips]
+    return table.scenes or len({(clip.data, clip.scene) for clip in clips})
 
 
 def _column_views(key: str, column: ColumnRecord, rows: Sequence[RowRecord], notes: list[str]) -> list[CellView]:
@@ -263,11 +277,12 @@ def _cell_view(cell: Cell, column: ColumnRecord, digits: int, notes: list[str], 
 def _column_head(results: EvalResults, key: str, table: TableRecord) -> ColumnView:
     column = results.columns[key]
     metric = results.measured.metrics.get(column.metric)
-    counts = sorted({cell.count for row in table.rows.values() if (cell := row.columns.get(key)) and cell.count})
+    cells = [cell for row in table.rows.values() if (cell := row.columns.get(key)) and cell.count]
+    counts = sorted({cell.count for cell in cells if cell.count})
     return ColumnView(
         key,
         heading(column.title, column.better),
         column.definition or (metric.definition if metric else ""),
         " to ".join(str(count) for count in dict.fromkeys([*counts[:1], *counts[-1:]])),
-        counts[0] if counts else 0,
+        min((cell.units or cell.count or 0 for cell in cells), default=0),
     )

@@ -10,6 +10,7 @@ from typing import Any
 from persist_cli.evaluate.report.remarks import (
     all_left_out,
     contamination_lines,
+    counted,
     difference_legend,
     left_out_line,
     too_few_lines,
@@ -77,7 +78,8 @@ def headline(results: EvalResults, table: TerminalTable) -> str:
     """One line with the protocol, the clips, the sampling, and what stands in a cell."""
     measured, sampling = results.measured, results.sampling
     height, width = measured.image_size
-    clips = f"{len(measured.clips)} clip{'s' * (len(measured.clips) != 1)} of {measured.protocol.frames} frames"
+    scenes = counted(len({(clip.data, clip.scene) for clip in measured.clips}), "scenes")
+    clips = f"{counted(len(measured.clips), 'clips')} of {measured.protocol.frames} frames in {scenes}"
     seeds = f"{len(sampling.seeds)} seed{'s' * (len(sampling.seeds) != 1)}"
     steps = f", {sampling.steps} step{'s' * (sampling.steps != 1)} of {sampling.sampler}" if sampling.steps else ""
     form = "mean ± deviation over seeds" if table.deviations else "means"

@@ -23,8 +23,9 @@ class Row(ABC):
     the videos, and ``adapter`` which of its memory adapters reads a memory for that.
 
     Args:
-        name: name in the table.
+        name: name among all rows that are measured.
         base: checkpoint whose backbone the row needs.
+        group: name in the table, where rows of one group are one row of several training seeds; ``None`` for its name.
     """
 
     kind: RowKind = "control"
@@ -32,8 +33,8 @@ class Row(ABC):
     uses_model: ClassVar[bool] = False
     adapter: str | None = None
 
-    def __init__(self, name: str, base: Checkpoint) -> None:
-        self.name, self.base = name, base
+    def __init__(self, name: str, base: Checkpoint, group: str | None = None) -> None:
+        self.name, self.base, self.group = name, base, group or name
 
     @property
     @abstractmethod

@@ -144,3 +144,22 @@ def test_the_latex_compiles_when_a_row_name_holds_special_characters(tmp_path):
     command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "paper.tex"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace", timeout=120)
     assert ended.returncode == 0, ended.stdout[-2000:]
+
+
+def in_scenes(results, scenes):
+    """The results as this version writes them, with figures of clips in so many scenes."""
+    results["statistics"] = {"resampled": "scenes", "resamples": 1000}
+    for clip, record in enumerate(results["measured"]["clips"]):
+        record["scene"] = f"house-{clip % scenes}"
+    for row in results["tables"][0]["rows"].values():
+        for cell in row["columns"].values():
+            cell |= {} if "na" in cell else {"units": scenes}
+    return results
+
+
+def test_intervals_over_scenes_say_so_and_too_few_scenes_are_counted():
+    enough, few = (in_scenes(example_results(clips=18), scenes) for scenes in (6, 5))
+    assert "[95 % interval, bootstrap over scenes]" in table_text(enough)
+    assert "5 scenes: too few for an interval; give at least 6" in table_text(few)
+    latex = latex_tables(check_results(enough, "example"))
+    assert r"18 clips of 9 frames at 64$\times$64, 6 scenes" in latex

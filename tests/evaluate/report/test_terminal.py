@@ -52,7 +52,9 @@ def test_the_protocol_decides_which_columns_come_first():
 
 def test_the_terminal_says_what_was_measured_and_what_is_left_out(monkeypatch):
     text = printed(monkeypatch, example_results(), 200)
-    assert "Revisit: 6 clips of 9 frames, 64×64, 3 seeds, 50 steps of ddim; mean ± deviation over seeds" in text
+    assert "Revisit: 6 clips of 9 frames in 3 scenes, 64×64, 3 seeds, 50 steps of ddim" in text
+    assert "mean ± deviation over seeds" in text
+
     assert "Δ: paired difference to none; * its 95 % interval (bootstrap over clips) leaves zero out" in text
     assert "left out: DreamSim (weights are not here: persist weights fetch dreamsim)" in text
     assert "what voxel is" not in text  # definitions are in the files
