@@ -218,11 +218,19 @@ def make_importer(name: str) -> Importer:
     return load_plugin("importer", name)()  # type: ignore[no-any-return]
 
 
-def _make(kind: str, name: str, settings: dict[str, Any], *rest: Any) -> Any:
+def make_settings(kind: str, name: str, settings: dict[str, Any]) -> Any:
+    """Make the settings of a plugin from plain values.
+
+    Raises:
+        PersistError: one line with all unknown keys and wrong values.
+    """
     from persist_cli.io.settings import parse_settings
 
-    plugin = load_plugin(kind, name)
-    return plugin(parse_settings(plugin.settings_type, settings, f"{kind} {name!r}"), *rest)
+    return parse_settings(load_plugin(kind, name).settings_type, settings, f"{kind} {name!r}")
+
+
+def _make(kind: str, name: str, settings: dict[str, Any], *rest: Any) -> Any:
+    return load_plugin(kind, name)(make_settings(kind, name, settings), *rest)
 
 
 def _describe(kind: str, entry: EntryPoint) -> Plugin:

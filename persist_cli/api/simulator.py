@@ -46,6 +46,13 @@ class Simulator(ABC):
         """Say what must be installed before this simulator can be used; empty when nothing is missing."""
         return ""
 
+    def with_settings(self, settings: Any) -> Simulator:
+        """Return a simulator of other settings, with no scene open; this one is not used any more.
+
+        A simulator that is slow to make overrides this, since each scene may have settings of its own.
+        """
+        return type(self)(settings)
+
     @abstractmethod
     def open_scene(self, scene: int) -> None:
         """Generate the scene of this seed, at least 0; ``place`` then puts the agent into it."""

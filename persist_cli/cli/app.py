@@ -78,20 +78,29 @@ def collect(
     seed: Annotated[int, typer.Option(help="Seed of the paths through the scenes.")] = 0,
     split: Annotated[str, typer.Option(help="train or test: scenes of one never appear in the other.")] = "train",
     policy: Annotated[str, typer.Option(help="explore, path or there-and-back.")] = "explore",
-    step: Annotated[float, typer.Option(min=0.01, help="Metres of a step.")] = 0.25,
-    turn: Annotated[float, typer.Option(min=0.1, max=180.0, help="Degrees of a turn.")] = 15.0,
+    step: Annotated[str, typer.Option(help="Metres of a step; LOW:HIGH: drawn for each scene.")] = "0.25",
+    turn: Annotated[str, typer.Option(help="Degrees of a turn.")] = "15",
+    fov: Annotated[str | None, typer.Option(help="Degrees of view from top to bottom; 75 in miniworld.")] = None,
+    height: Annotated[str | None, typer.Option(help="Metres of the camera above the floor; 1.25.")] = None,
+    pitch: Annotated[str | None, typer.Option(help="Degrees that the camera looks up: --pitch -25:10; 0.")] = None,
+    light: Annotated[str, typer.Option(help="Factor of the brightness, as in 0.6:1.2.")] = "1",
+    tint: Annotated[str, typer.Option(help="Largest change of a colour channel, as in 0.15.")] = "0",
+    depth_sensor: Annotated[str, typer.Option(help="exact, or kinect: noisy, in steps, with holes.")] = "exact",
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one a core.")] = 0,
     json: JsonOption = False,
 ) -> None:
     """Collect trajectories in a simulator.
 
     persist collect miniworld --out runs/houses --scenes 0:100 --frames 96 --size 64x64
+
+    persist collect miniworld --out runs/cameras --scenes 0:100 --fov 45:90 --height 0.6:1.7 --pitch -25:10 --turn 5:20
     """
     from persist_cli.simulators.collect import CollectPlan, run_collect
 
     plan = CollectPlan(
         simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split,
-        policy=policy, step=step, turn=turn,
+        policy=policy, step=step, turn=turn, fov=fov, height=height, pitch=pitch,
+        light=light, tint=tint, depth_sensor=depth_sensor,
     )  # fmt: skip
     run_collect(plan, out, workers, json)
 

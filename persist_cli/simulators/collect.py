@@ -13,24 +13,27 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from persist_cli.api.observations import Frame
+from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError, PluginError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
-from persist_cli.plugins import load_plugin, make_simulator, plugin_errors
+from persist_cli.plugins import load_plugin, make_settings, make_simulator, plugin_errors
 from persist_cli.simulators.policies import POLICIES, clear_distance, walk
+from persist_cli.simulators.ranges import Range
+from persist_cli.simulators.sensors import SENSORS, Look, sensed
 from persist_cli.viewing.console import add_task, print_json, progress, say
 
 PLAN_FILE = "collect.json"
@@ -40,6 +43,16 @@ FIRST_SEED = {"train": 0, "test": TEST_SEEDS}
 LARGEST_SIDE = 4096  # pixels
 START_TRIES = 100
 OPEN_WAY = 1.0  # metres that must be free in front of a start
+
+# options that become settings of the simulator, in the order in which they are drawn
+AGENT_OPTIONS = {"step": "step", "turn": "turn", "fov": "fov", "height": "camera_height", "pitch": "pitch"}
+
+# options that the plans of earlier versions lack, with the value that stands for their absence
+LATER = {"fov": None, "height": None, "pitch": None, "light": 1.0, "tint": 0.0, "depth_sensor": "exact"}
+
+LIMITS = {"step": (0.01, 10.0), "turn": (0.1, 180.0), "light": (0.05, 4.0), "tint": (0.0, 0.9)}  # of both ends
+
+AGENT_DRAWS, LOOK_DRAWS, SENSOR_DRAWS = 1, 2, 3  # streams of random numbers beside that of the path
 
 _worker: dict[str, Any] = {}  # this worker process's plan, and its simulator once it is needed
 
@@ -56,8 +69,14 @@ class CollectPlan:
         seed: seed of the paths through the scenes.
         split: train or test.
         policy: a name in ``POLICIES``.
-        step: metres.
+        step: metres; a range ``LOW:HIGH`` here and below is drawn from anew for each scene.
         turn: degrees.
+        fov: degrees from the top of the image to its bottom; ``None`` here and below leaves it to the simulator.
+        height: metres of the camera above the floor.
+        pitch: degrees that the camera looks up.
+        light: factor of the brightness.
+        tint: largest relative change of a colour channel.
+        depth_sensor: a name in ``SENSORS``.
     """
 
     simulator: str
@@ -67,12 +86,23 @@ class CollectPlan:
     seed: int = 0
     split: str = "train"
     policy: str = "explore"
-    step: float = 0.25
-    turn: float = 15.0
+    step: str = "0.25"
+    turn: str = "15"
+    fov: str | None = None
+    height: str | None = None
+    pitch: str | None = None
+    light: str = "1"
+    tint: str = "0"
+    depth_sensor: str = "exact"
 
     def check(self) -> None:
-        """Raise ``DataError`` with one line for the first option that cannot be used."""
-        for name, value, known in (("policy", self.policy, POLICIES), ("split", self.split, FIRST_SEED)):
+        """Raise ``PersistError`` with one line for the first option that cannot be used."""
+        choices = (
+            ("policy", self.policy, POLICIES),
+            ("split", self.split, FIRST_SEED),
+            ("depth sensor", self.depth_sensor, SENSORS),
+        )
+        for name, value, known in choices:
             if value not in known:
                 raise DataError(f"unknown {name} {value!r}; known: {', '.join(known)}")
         if self.seed < 0:
@@ -80,6 +110,35 @@ class CollectPlan:
         if self.frames < 2:
             raise DataError(f"frames {self.frames}: a trajectory has 2 or more")
         _ = self.generator_seeds, self.image_size
+        for name, (low, high) in LIMITS.items():
+            wanted = Range.parse(f"--{name}", getattr(self, name))
+            if not low <= wanted.low <= wanted.high <= high:
+                raise DataError(f"--{name} {getattr(self, name)!r}: it must lie between {low:g} and {high:g}")
+        for end in (attrgetter("low"), attrgetter("high")):  # what the simulator allows at both it allows between them
+            make_settings("simulator", self.simulator, self.agent_settings(end))
+
+    def agent_settings(self, value: Callable[[Range], float]) -> dict[str, Any]:
+        """Settings of the simulator, each range by the value that ``value`` gives of it.
+
+        Raises:
+            DataError: naming the option that is neither a number nor a range.
+        """
+        height, width = self.image_size
+        drawn = {}
+        for option, setting in AGENT_OPTIONS.items():
+            text = getattr(self, option)
+            if text is not None:
+                drawn[setting] = value(Range.parse(f"--{option}", text))
+        return {"height": height, "width": width} | drawn
+
+    def to_json(self) -> dict[str, Any]:
+        """The settings that a folder keeps: scenes may grow, and what is left at its default is as it always was."""
+        values = dataclasses.asdict(self)
+        del values["scenes"]
+        for option in (*AGENT_OPTIONS, "light", "tint"):
+            if values[option] is not None:
+                values[option] = Range.parse(f"--{option}", values[option]).to_json()
+        return {name: value for name, value in values.items() if name not in LATER or value != LATER[name]}
 
     @property
     def generator_seeds(self) -> list[int]:
@@ -135,8 +194,7 @@ def claim_folder(plan: CollectPlan, out: Path) -> None:
         DataError: when it holds trajectories of another split, of other settings, or not collected ones.
     """
     file = out / PLAN_FILE
-    settings = {"version": VERSION, **dataclasses.asdict(plan)}
-    del settings["scenes"]  # these may grow
+    settings = {"version": VERSION, **plan.to_json()}
     if out.exists() and not out.is_dir():
         raise DataError(f"{out}: is no folder")
     if file.exists():
@@ -163,14 +221,54 @@ def collect_scene(seed: int, path: Path) -> int:
         The number of frames.
     """
     plan: CollectPlan = _worker["plan"]
-    if "simulator" not in _worker:
-        height, width = plan.image_size
-        settings = {"height": height, "width": width, "step": plan.step, "turn": plan.turn}
-        _worker["simulator"] = make_simulator(plan.simulator, settings)
-    simulator: Simulator = _worker["simulator"]
+    simulator = _worker["simulator"] = scene_simulator(plan, seed, _worker.get("simulator"))
     frames = collect_frames(simulator, plan, seed)
     source = {**simulator.info.source, "split": plan.split, "policy": plan.policy, "seed": plan.seed}
-    return write_trajectory(path, replace(simulator.info, source=source), frames)
+    info = replace(simulator.info, source=source | camera_source(plan, seed, simulator))
+    return write_trajectory(path, info, recorded(frames, plan, seed, info))
+
+
+def scene_simulator(plan: CollectPlan, seed: int, last: Simulator | None) -> Simulator:
+    """The simulator with the settings that the plan draws for a scene.
+
+    Args:
+        plan: gives the ranges.
+        seed: generator seed of the scene.
+        last: the simulator of another scene of this plan, which is used again where it can be.
+    """
+    draws = np.random.default_rng([plan.seed, seed, AGENT_DRAWS])
+    values = plan.agent_settings(lambda wanted: wanted.draw(draws))
+    if last is None:
+        return make_simulator(plan.simulator, values)
+    settings = make_settings("simulator", plan.simulator, values)
+    return last if settings == last.settings else last.with_settings(settings)
+
+
+def scene_look(plan: CollectPlan, seed: int) -> Look:
+    """The light and colours that the plan draws for a scene."""
+    draws = np.random.default_rng([plan.seed, seed, LOOK_DRAWS])
+    light, tint = (Range.parse(name, text).draw(draws) for name, text in (("light", plan.light), ("tint", plan.tint)))
+    return Look.draw(light, tint, draws)
+
+
+def camera_source(plan: CollectPlan, seed: int, simulator: Simulator) -> dict[str, Any]:
+    """What a trajectory's source says of its camera beyond intrinsics and actions; nothing where all is default."""
+    drawn = [setting for option, setting in AGENT_OPTIONS.items() if option in LATER and getattr(plan, option)]
+    camera = {setting: getattr(simulator.settings, setting) for setting in drawn}
+    look = scene_look(plan, seed)
+    if look != Look():
+        camera |= {"light": look.light, "gains": [round(gain, 4) for gain in look.gains]}
+    if plan.depth_sensor != "exact":
+        camera["depth_sensor"] = plan.depth_sensor
+    return {"camera": camera} if camera else {}
+
+
+def recorded(frames: Iterator[Frame], plan: CollectPlan, seed: int, info: TrajectoryInfo) -> Iterator[Frame]:
+    """The frames as the scene's camera records them."""
+    look = scene_look(plan, seed)
+    for number, frame in enumerate(frames):
+        draws = np.random.default_rng([plan.seed, seed, SENSOR_DRAWS, number])
+        yield sensed(frame, look, plan.depth_sensor, info.intrinsics, draws)
 
 
 def collect_frames(simulator: Simulator, plan: CollectPlan, seed: int) -> Iterator[Frame]:
@@ -194,10 +292,11 @@ def _compare(settings: dict[str, Any], stored: Any, file: Path) -> None:
     """Raise ``DataError`` unless the settings stored in the file are these."""
     if not isinstance(stored, dict):
         raise DataError(f"{file}: holds no plan of `persist collect`")
-    for name, value in settings.items():
-        if stored.get(name) != value:
+    ours, theirs = LATER | settings, LATER | stored
+    for name, value in ours.items():
+        if theirs.get(name) != value:
             raise DataError(
-                f"{file.parent}: was collected with {name} {stored.get(name)!r}, not {value!r}; choose another folder"
+                f"{file.parent}: was collected with {name} {theirs.get(name)!r}, not {value!r}; choose another folder"
             )
 
 

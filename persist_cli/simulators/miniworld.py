@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 
@@ -29,11 +30,13 @@ class MiniWorldSettings(AgentSettings):
     Args:
         fov: degrees from the top of the image to its bottom.
         camera_height: metres above the floor.
+        pitch: degrees that the camera looks up; negative values look down.
         radius: metres of the agent's body.
     """
 
     fov: float = 75.0
     camera_height: float = 1.25
+    pitch: float = 0.0
     radius: float = 0.2
 
     def __post_init__(self) -> None:
@@ -45,6 +48,8 @@ class MiniWorldSettings(AgentSettings):
             raise ValueError(f"radius {self.radius} is not between 0.1 and 0.25 m, for which the houses are furnished")
         if not 0.1 <= self.camera_height <= 2.5:
             raise ValueError(f"camera_height {self.camera_height} is not between 0.1 and 2.5 m")
+        if not -60.0 <= self.pitch <= 60.0:
+            raise ValueError(f"pitch {self.pitch} is not between -60 and 60 degrees")
 
 
 class MiniWorld(Simulator):
@@ -66,6 +71,15 @@ class MiniWorld(Simulator):
         self._stale = True  # whether the renderer draws an earlier state of the house
         self._ground: Ground = (0.0, 0.0)
         self._start_heading, self._turned = 0.0, 0.0  # radians and degrees to the left
+
+    def with_settings(self, settings: MiniWorldSettings) -> MiniWorld:
+        """A MiniWorld of other settings, which draws with this one's OpenGL where images keep their size."""
+        if (settings.height, settings.width) != (self.settings.height, self.settings.width):
+            return MiniWorld(settings)
+        world = copy.copy(self)
+        world.settings, world.vocabulary = settings, walking_actions(settings.step, settings.turn)
+        world._house, world._carried = None, None
+        return world
 
     @classmethod
     def missing(cls) -> str:
@@ -179,6 +193,8 @@ class MiniWorld(Simulator):
         pose[:3, 0] = -forward_z, 0.0, forward_x
         pose[:3, 1] = 0.0, -1.0, 0.0
         pose[:3, 2] = forward_x, 0.0, forward_z
+        if self.settings.pitch:
+            pose[:3, :3] @= _turned_up(math.radians(self.settings.pitch))
         pose[:3, 3] = self._ground[0], self.settings.camera_height, self._ground[1]
         return pose
 
@@ -255,6 +271,12 @@ class MiniWorld(Simulator):
         self._things = [toggled if other is thing else other for other in self._things]
         self._stale = True
         return True
+
+
+def _turned_up(angle: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """The rotation of a camera in OpenCV axes that looks up by an angle in radians."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
 
 
 def _exact(metres: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
@@ -73,6 +75,45 @@ def test_scenes_can_be_added_to_a_folder_later(collected: Path, capsys: pytest.C
     assert len(Store(collected)) == 4
 
 
+def test_each_scene_draws_its_own_camera_steps_and_turns(tmp_path: Path) -> None:
+    make_world()
+    plan = replace(SMALL, fov="45:90", height="0.6:1.7", pitch="-25:10", turn="5:20", step="0.05:0.3")
+    run_collect(plan, tmp_path, 1, json=True)
+    infos = [file.info for file in Store(tmp_path)]
+    assert len({float(info.intrinsics[0, 0]) for info in infos}) == 3
+    assert len({info.vocabulary["forward"].forward for info in infos}) == 3
+    for info, file in zip(infos, Store(tmp_path), strict=True):
+        camera = info.source["camera"]
+        assert 12 / math.tan(math.radians(camera["fov"] / 2)) == pytest.approx(1.5 * info.intrinsics[1, 1])
+        assert file.poses()[:, 1, 3].tolist() == pytest.approx([camera["camera_height"]] * 6)
+        assert float(file.poses()[0, 1, 2]) == pytest.approx(math.sin(math.radians(camera["pitch"])))
+
+
+def test_a_scene_has_the_same_camera_whichever_process_collects_it(tmp_path: Path) -> None:
+    make_world()
+    plan = replace(SMALL, fov="45:90", turn="5:20", light="0.6:1.2", tint="0.2", depth_sensor="kinect")
+    run_collect(plan, tmp_path / "one", 1, json=True)
+    run_collect(replace(plan, scenes="2:3"), tmp_path / "two", 1, json=True)
+    name = "house-000002.parquet"
+    assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_one_value_in_place_of_a_range_changes_no_byte(collected: Path, tmp_path: Path) -> None:
+    run_collect(replace(SMALL, scenes="0:1", fov="75", height="1.25", pitch="0"), tmp_path, 1, json=True)
+    before, after = (Store(folder)[0].read() for folder in (collected, tmp_path))
+    assert torch.equal(before.observations.rgb, after.observations.rgb)
+    assert torch.equal(before.observations.depth, after.observations.depth)
+    assert before.info.vocabulary == after.info.vocabulary
+
+
+def test_a_folder_collected_before_there_were_ranges_goes_on(tmp_path: Path) -> None:
+    claim_folder(SMALL, tmp_path)
+    stored = json.loads((tmp_path / "collect.json").read_text())
+    assert set(stored) == {"version", "simulator", "frames", "size", "seed", "split", "policy", "step", "turn"}
+    assert (stored["step"], stored["turn"]) == (0.25, 15.0)
+    claim_folder(SMALL, tmp_path)
+
+
 def test_test_scenes_never_share_a_seed_with_training_scenes() -> None:
     train, test = (replace(SMALL, split=split, scenes="0:5000").generator_seeds for split in ("train", "test"))
     assert not set(train) & set(test)
@@ -85,7 +126,9 @@ def test_test_scenes_never_share_a_seed_with_training_scenes() -> None:
     ("change", "message"),
     [
         ({"split": "test"}, "was collected with split 'train', not 'test'"),
-        ({"turn": 10.0}, "was collected with turn 15.0, not 10.0"),
+        ({"turn": "10"}, "was collected with turn 15.0, not 10.0"),
+        ({"fov": "45:90"}, r"was collected with fov None, not \[45.0, 90.0\]"),
+        ({"depth_sensor": "kinect"}, "was collected with depth_sensor 'exact', not 'kinect'"),
         ({"seed": 3}, "was collected with seed 0, not 3"),
         ({"policy": "path"}, "was collected with policy 'explore', not 'path'"),
     ],
@@ -116,6 +159,10 @@ def test_a_folder_of_trajectories_that_were_not_collected_is_refused(tmp_path: P
         {"split": "val"},
         {"seed": -1},
         {"simulator": "minworld"},
+        {"step": "0:0.3"},
+        {"turn": "5:270"},
+        {"tint": "-0.5:0"},
+        {"depth_sensor": "lidar"},
     ],
 )
 def test_bad_options_are_reported_in_one_line_and_write_nothing(tmp_path: Path, change: dict[str, object]) -> None:
@@ -125,6 +172,11 @@ def test_bad_options_are_reported_in_one_line_and_write_nothing(tmp_path: Path, 
     assert len(str(caught.value).splitlines()) == 1
     assert str(next(iter(change.values()))) in str(caught.value)
     assert not out.exists()
+
+
+def test_a_camera_that_the_simulator_does_not_allow_is_refused_by_the_name_of_its_setting(tmp_path: Path) -> None:
+    with pytest.raises(PersistError, match=r"fov 170\.0 is not between 10 and 150 degrees"):
+        run_collect(replace(SMALL, fov="45:170"), tmp_path / "out", 1, json=False)
 
 
 def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from persist_cli.api.observations import Frame
 from persist_cli.errors import DataError, RecipeError
 from persist_cli.plugins import make_simulator
 from persist_cli.simulators.building import build_house
-from persist_cli.simulators.miniworld import MiniWorld
+from persist_cli.simulators.miniworld import MiniWorld, MiniWorldSettings
 from persist_cli.simulators.rendering import Renderer
 from tests.support.miniworlds import make_world, put_somewhere
 
@@ -106,6 +106,21 @@ def test_two_views_agree_within_a_millimetre(world: MiniWorld) -> None:
         inside = ((pixels > 1) & (pixels < 63)).all(-1) & (depth > 0)
         errors.append((depth_at(torch.from_numpy(second.depth), pixels[inside]) - depth[inside]).abs())
     assert float(torch.cat(errors).median()) < 1e-3  # 0.007 mm when this was written
+
+
+def test_views_of_a_camera_that_looks_down_agree_within_a_millimetre(world: MiniWorld) -> None:
+    low = world.with_settings(MiniWorldSettings(fov=50.0, camera_height=0.8, pitch=-20.0, turn=5.0))
+    low.open_scene(3)
+    put_somewhere(low)
+    first = low.observe()
+    assert low.act("left")
+    second = low.observe()
+    points = unproject(torch.from_numpy(first.depth)[None], camera(low, first)).reshape(1, -1, 3)
+    pixels, depth = (value[0] for value in project(points, camera(low, second)))
+    inside = ((pixels > 1) & (pixels < 63)).all(-1) & (depth > 0)
+    assert float((depth_at(torch.from_numpy(second.depth), pixels[inside]) - depth[inside]).abs().median()) < 1e-3
+    floor = points[0, -64:, 1]
+    assert float(floor.abs().min()) < 1e-3
 
 
 def test_the_heading_is_the_optical_axis_and_left_is_left(world: MiniWorld) -> None:
