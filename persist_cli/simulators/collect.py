@@ -31,15 +31,16 @@ from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError, PluginError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
 from persist_cli.plugins import load_plugin, make_settings, make_simulator, plugin_errors
-from persist_cli.simulators.policies import POLICIES, clear_distance, walk
+from persist_cli.simulators.free_grid import clear_distance
+from persist_cli.simulators.policies import POLICIES, walk
 from persist_cli.simulators.ranges import Range
 from persist_cli.simulators.sensors import SENSORS, Look, sensed
 from persist_cli.viewing.console import add_task, print_json, progress, say
 
 PLAN_FILE = "collect.json"
 VERSION = 1
-TEST_SEEDS = 1_000_000  # generator seeds of test scenes begin here; those of training scenes stay below
-FIRST_SEED = {"train": 0, "test": TEST_SEEDS}
+SPLIT_SCENES = 1_000_000  # of each split
+FIRST_SEED = {"train": 0, "validation": 2 * SPLIT_SCENES, "test": SPLIT_SCENES}  # generator seeds of the splits
 LARGEST_SIDE = 4096  # pixels
 START_TRIES = 100
 OPEN_WAY = 1.0  # metres that must be free in front of a start
@@ -67,7 +68,7 @@ class CollectPlan:
         frames: number of frames of each trajectory.
         size: ``HxW`` in pixels.
         seed: seed of the paths through the scenes.
-        split: train or test.
+        split: train, validation or test.
         policy: a name in ``POLICIES``.
         step: metres; a range ``LOW:HIGH`` here and below is drawn from anew for each scene.
         turn: degrees.
@@ -147,8 +148,8 @@ class CollectPlan:
         low, high = (int(number) for number in match.groups()) if match else (0, 0)
         if low >= high:
             raise DataError(f"scenes {self.scenes!r}: write A:B with A less than B, as in 0:20 for scenes 0 to 19")
-        if high > TEST_SEEDS:
-            raise DataError(f"scenes {self.scenes!r}: a split has {TEST_SEEDS} scenes, numbered from 0")
+        if high > SPLIT_SCENES:
+            raise DataError(f"scenes {self.scenes!r}: a split has {SPLIT_SCENES} scenes, numbered from 0")
         return [FIRST_SEED[self.split] + scene for scene in range(low, high)]
 
     @property

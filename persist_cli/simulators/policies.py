@@ -1,8 +1,7 @@
-"""Policies: how an agent walks through a scene, at random, to random goals, or there and back."""
+"""Policies: how an agent walks through a scene, at random, to random goals, there and back, or round a loop."""
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
@@ -14,6 +13,8 @@ from persist_cli.api.actions import STAY
 from persist_cli.api.observations import Frame
 from persist_cli.api.simulator import Simulator
 from persist_cli.errors import DataError
+from persist_cli.simulators.free_grid import FreeGrid, Ground, clear_distance
+from persist_cli.simulators.way_back import Pose, WayBack
 
 MOST_REFUSALS = 200  # in a row
 
@@ -28,12 +29,10 @@ NEAR_GOAL = 0.4  # metres at which a goal counts as reached
 LOOK_AROUND = 0.3  # how often it looks around before it sets out
 PATIENCE = 4  # steps without getting nearer, after which it gives up a goal
 
-SPACING = 0.2  # metres between places of the grid
-FINE = 0.1  # metres between the places that are checked along a straight way
-NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+# of loop
+OUTWARD = 0.35  # of the actions that it goes away at least, before it asks how long the way back is
+SPARE = 6  # actions that it may have left when it is back
 
-Ground = tuple[float, float]
-Cell = tuple[int, int]
 ActionStream = Generator[str, bool, None]  # yields the next action, and is sent whether the world allowed it
 Policy = Callable[[Simulator, np.random.Generator, int], ActionStream]
 
@@ -67,13 +66,19 @@ def explore(simulator: Simulator, random: np.random.Generator, count: int) -> Ac
 
 def path(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
     """Shortest paths between random places, one after another, sometimes with a look around before setting out."""
+    yield from _paths(simulator, random, lambda turns: round(360 / _gait(simulator)[1]))
+
+
+def _paths(simulator: Simulator, random: np.random.Generator, look_around: Callable[[int], int]) -> ActionStream:
+    """Shortest paths; ``look_around`` gives the turns of a look around, of those towards the way."""
     grid = FreeGrid(simulator)
     reachable = sorted(grid.distances(simulator.agent[0]))
     _, turn = _gait(simulator)
     while True:
-        if random.random() < LOOK_AROUND:
-            yield from _turned(round(360 / turn))
+        looks = random.random() < LOOK_AROUND
         goal = grid.place(reachable[int(random.integers(len(reachable)))]) if reachable else simulator.agent[0]
+        if looks:
+            yield from _turned(look_around(_nearer_turn(simulator, grid, grid.distances(goal)) or 0))
         steps = yield from _go_to(simulator, grid, goal)
         if steps == 0:
             yield from _turned(int(random.choice([-1, 1])) * int(random.integers(1, max(2, round(90 / turn)))))
@@ -95,80 +100,54 @@ def there_and_back(simulator: Simulator, random: np.random.Generator, count: int
         yield action
 
 
-POLICIES: dict[str, Policy] = {"explore": explore, "path": path, "there-and-back": there_and_back}
+def loop(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
+    """Out along paths or a random walk, and back to the start by another way.
 
-
-class FreeGrid:
-    """The free places of the open scene on a square grid.
-
-    Args:
-        simulator: has an open scene, of which the places that are free now count.
+    On the way back hardly any pose is near one of the way out (``near_poses`` of ``api.geometry``), yet most of what it
+    looks at was seen on the way out.
     """
-
-    def __init__(self, simulator: Simulator) -> None:
-        low, high = simulator.bounds
-        self._low = low
-        counts = [max(1, math.ceil((b - a) / SPACING)) for a, b in zip(low, high, strict=True)]
-        cells = ((i, j) for i in range(counts[0]) for j in range(counts[1]))
-        self.free = {cell for cell in cells if simulator.is_free(self.place(cell))}
-        self._beside = {cell: list(self._neighbours(cell)) for cell in self.free}
-
-    def place(self, cell: Cell) -> Ground:
-        """The middle of a cell in metres."""
-        return self._low[0] + (cell[0] + 0.5) * SPACING, self._low[1] + (cell[1] + 0.5) * SPACING
-
-    def cell(self, ground: Ground) -> Cell:
-        """The cell around a place."""
-        x, z = ((value - low) / SPACING for value, low in zip(ground, self._low, strict=True))
-        return math.floor(x), math.floor(z)
-
-    def distances(self, goal: Ground) -> dict[Cell, float]:
-        """Metres of the shortest way from each cell to the goal (Dijkstra); cells without a way are missing."""
-        distances: dict[Cell, float] = {}
-        queue = [(offset, cell) for cell, offset in self.around(goal)]
-        heapq.heapify(queue)
-        while queue:
-            distance, cell = heapq.heappop(queue)
-            if cell in distances:
-                continue
-            distances[cell] = distance
-            for neighbour, length in self._beside[cell]:
-                if neighbour not in distances:
-                    heapq.heappush(queue, (distance + length, neighbour))
-        return distances
-
-    def around(self, ground: Ground) -> list[tuple[Cell, float]]:
-        """The free cells at and beside a place, nearest first, with the metres to their middles.
-
-        A free place may lie in a cell whose middle is not free.
-        """
-        i, j = self.cell(ground)
-        cells = [(i + by_i, j + by_j) for by_i, by_j in [(0, 0), *NEIGHBOURS]]
-        near = [(cell, math.dist(ground, self.place(cell))) for cell in cells if cell in self.free]
-        return sorted(near, key=lambda item: item[1])
-
-    def remaining(self, ground: Ground, distances: dict[Cell, float]) -> float:
-        """Metres from a place to the goal of ``distances``, infinite without a way."""
-        return min((distances.get(cell, math.inf) + offset for cell, offset in self.around(ground)), default=math.inf)
-
-    def _neighbours(self, cell: Cell) -> Iterator[tuple[Cell, float]]:
-        """Free cells beside a cell, and diagonal ones when no corner stands in between."""
-        i, j = cell
-        for by_i, by_j in NEIGHBOURS:
-            beside = (i + by_i, j) in self.free and (i, j + by_j) in self.free
-            if (i + by_i, j + by_j) in self.free and beside:
-                yield (i + by_i, j + by_j), SPACING * math.hypot(by_i, by_j)
+    back = WayBack(simulator)
+    out = paths_without_copies if random.random() < 0.5 else explore
+    way = yield from _go_out(simulator, out(simulator, random, count), count, back)
+    while True:
+        for action in way:
+            allowed = yield action
+            if not allowed:
+                back.block(action)
+                break
+            back.visited.add(Pose(*simulator.agent))
+        else:
+            way = [back.linger()]
+            continue
+        way = back.plan()
 
 
-def clear_distance(simulator: Simulator, start: Ground, heading: float, longest: float, stride: float) -> float:
-    """Metres that the agent could walk straight ahead from a place, in whole strides."""
-    x, z = simulator.ahead(heading)
-    parts = max(1, math.ceil(stride / FINE))
-    for number in range(1, parts * math.floor(longest / stride + 1e-9) + 1):
-        walked = number * stride / parts
-        if not simulator.is_free((start[0] + walked * x, start[1] + walked * z)):
-            return (number - 1) // parts * stride
-    return math.floor(longest / stride + 1e-9) * stride
+def paths_without_copies(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
+    """As ``path``, but a look around is a turn the long way round to where it goes, which shows nothing twice."""
+    whole = round(360 / _gait(simulator)[1])
+    yield from _paths(simulator, random, lambda turns: turns - int(math.copysign(whole, turns)) if turns else 0)
+
+
+POLICIES: dict[str, Policy] = {
+    "explore": explore, "path": path, "there-and-back": there_and_back, "loop": loop,
+}  # fmt: skip
+
+
+def _go_out(simulator: Simulator, outward: ActionStream, count: int, back: WayBack) -> Generator[str, bool, list[str]]:
+    """Go out until no more actions are left than the way back takes, and return the way back."""
+    action, taken, leave = next(outward), 0, OUTWARD * count
+    while True:
+        allowed = yield action
+        if allowed:
+            taken += 1
+            back.visited.add(Pose(*simulator.agent))
+        if allowed and taken >= leave:
+            way = back.plan()
+            spare = count - taken - len(way)
+            if spare <= SPARE:
+                return way
+            leave = taken + max(2, spare // 3)
+        action = outward.send(allowed)
 
 
 def _next_allowed(simulator: Simulator, actions: ActionStream, first: bool) -> str:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ import torch
 
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
-from persist_cli.simulators.collect import TEST_SEEDS, CollectPlan, claim_folder, run_collect
+from persist_cli.simulators.collect import FIRST_SEED, SPLIT_SCENES, CollectPlan, claim_folder, run_collect
 from tests.support.miniworlds import make_world
 
 SMALL = CollectPlan("miniworld", "0:3", frames=6, size="16x24")
@@ -114,12 +115,13 @@ def test_a_folder_collected_before_there_were_ranges_goes_on(tmp_path: Path) -> 
     claim_folder(SMALL, tmp_path)
 
 
-def test_test_scenes_never_share_a_seed_with_training_scenes() -> None:
-    train, test = (replace(SMALL, split=split, scenes="0:5000").generator_seeds for split in ("train", "test"))
-    assert not set(train) & set(test)
-    assert max(replace(SMALL, scenes=f"0:{TEST_SEEDS}").generator_seeds) < min(test)
+def test_no_two_splits_share_a_seed() -> None:
+    every = {split: replace(SMALL, split=split, scenes=f"0:{SPLIT_SCENES}").generator_seeds for split in FIRST_SEED}
+    assert sorted(every) == ["test", "train", "validation"]
+    ranges = sorted((min(seeds), max(seeds)) for seeds in every.values())
+    assert all(last < first for (_, last), (first, _) in pairwise(ranges))
     with pytest.raises(DataError, match="a split has 1000000 scenes"):
-        _ = replace(SMALL, scenes=f"0:{TEST_SEEDS + 1}").generator_seeds
+        _ = replace(SMALL, scenes=f"0:{SPLIT_SCENES + 1}").generator_seeds
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from persist_cli.api.geometry import near_poses, pose_differences
 from persist_cli.api.observations import Frame
+from persist_cli.data.store import TrajectoryFile, write_trajectory
 from persist_cli.errors import DataError
+from persist_cli.evaluate.coverage import seen_share
 from persist_cli.simulators.collect import CollectPlan, collect_frames
+from persist_cli.simulators.free_grid import FreeGrid, clear_distance
 from persist_cli.simulators.miniworld import MiniWorld
-from persist_cli.simulators.policies import POLICIES, FreeGrid, clear_distance, walk
+from persist_cli.simulators.policies import POLICIES, walk
 from tests.support.miniworlds import make_world, put_somewhere
 
 MOVES = ("forward", "backward")
@@ -99,6 +105,25 @@ def test_there_and_back_returns_to_the_first_frame_pixel_for_pixel(world: MiniWo
 def test_there_and_back_takes_the_reversed_actions_back(world: MiniWorld) -> None:
     actions = [frame.action for frame in collect(world, "there-and-back", 6, 41)][:-1]
     assert tuple(actions[20:]) == world.vocabulary.reversed([str(action) for action in actions[:20]])
+
+
+def test_a_loop_comes_back_through_poses_that_the_way_out_does_not_come_near(world: MiniWorld) -> None:
+    for scene in (2, 6):
+        poses = torch.from_numpy(np.stack([frame.world_from_camera for frame in collect(world, "loop", scene, 49)]))
+        metres, degrees = pose_differences(poses, poses[:1].expand_as(poses))
+        farthest = int(metres.argmax())
+        assert metres[farthest] > 1.5
+        assert float(metres[-1]) < 1.0
+        assert float(degrees[-1]) <= 45.1
+        copies = near_poses(poses[farthest + 1 :], poses[: farthest - 4]).any(dim=1)
+        assert float(copies.double().mean()) < 0.1
+
+
+def test_a_loop_shows_on_its_way_back_what_it_saw_on_its_way_out(world: MiniWorld, tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "a.parquet", world.info, collect(world, "loop", 6, 49))
+    seen = TrajectoryFile(tmp_path / "a.parquet").read().observations
+    shares = [seen_share(seen, number, range(25)) or 0.0 for number in range(30, 49)]
+    assert float(np.mean(shares)) > 0.6
 
 
 def test_policies_work_with_large_turns_and_steps() -> None:
