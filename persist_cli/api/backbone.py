@@ -132,11 +132,13 @@ class Sampling:
         steps: number of denoising steps, at least 1.
         sampler: name of one of the backbone's samplers.
         memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
+        context_noise: noise level that given frame and memory are declared to have, at least 0; nothing is added.
     """
 
     steps: int = 50
     sampler: str = "ddim"
     memory_guidance: float = 1.0
+    context_noise: float = 0.0
 
 
 class Backbone(nn.Module, ABC):
@@ -186,6 +188,8 @@ class Backbone(nn.Module, ABC):
             raise PersistError(f"{sampling.steps} denoising steps; it must be at least 1")
         if not 0 <= sampling.memory_guidance < math.inf:
             raise PersistError(f"guidance over memory of {sampling.memory_guidance}; it must be a number of at least 0")
+        if not 0 <= sampling.context_noise < math.inf:
+            raise PersistError(f"context noise of {sampling.context_noise}; it must be a number of at least 0")
 
     @property
     def gives_depth(self) -> bool:

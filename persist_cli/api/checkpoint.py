@@ -30,7 +30,12 @@ STEP: Final = "step-"  # start of the names of the folders of a run's checkpoint
 PLAIN: Final = "stage1"  # name of the base without any adapter
 REFERENCE: Final = "reference"  # names the model that comes with the package
 STARTED_FROM: Final = "started_from"  # the key of a card for the base of a run that holds all weights itself
-SAMPLING_TYPES: Final = {"steps": (int,), "sampler": (str,), "memory_guidance": (int, float)}  # a bool is no int here
+SAMPLING_TYPES: Final = {  # a bool is no int here
+    "steps": (int,),
+    "sampler": (str,),
+    "memory_guidance": (int, float),
+    "context_noise": (int, float),
+}
 SHOWN: Final = 12  # digits of a fingerprint in messages
 NUMBERED: Final = re.compile(r"(?P<prefix>.*?)(?P<number>[0-9]+)", re.DOTALL)
 
@@ -360,10 +365,11 @@ def _sampling(card: dict[str, Any], path: Path) -> Sampling | None:
     if value is None or value == {}:
         return None
     valid = isinstance(value, dict) and all(type(item) in SAMPLING_TYPES.get(key, ()) for key, item in value.items())
-    if not valid or value.get("steps", 1) < 1 or not 0 <= value.get("memory_guidance", 1) < float("inf"):
+    numbers = [value.get(name, 1) for name in ("memory_guidance", "context_noise")] if valid else []
+    if not valid or value.get("steps", 1) < 1 or not all(0 <= number < float("inf") for number in numbers):
         raise CheckpointError(
-            f"{path}: its sampling is {value}; it holds steps, at least 1, the name of a sampler and memory_guidance, "
-            "at least 0"
+            f"{path}: its sampling is {value}; it holds steps, at least 1, the name of a sampler, memory_guidance and "
+            "context_noise, at least 0"
         )
     return Sampling(**value)
 

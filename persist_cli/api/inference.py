@@ -87,11 +87,13 @@ class SamplingOverrides:
         steps: number of denoising steps, at least 1.
         sampler: name of one of the backbone's samplers.
         memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
+        context_noise: noise level that given frame and memory are declared to have, at least 0.
     """
 
     steps: int | None = None
     sampler: str | None = None
     memory_guidance: float | None = None
+    context_noise: float | None = None
 
     def requested(self) -> dict[str, Any]:
         """Return the options that are not ``None`` by name."""

@@ -15,6 +15,7 @@ from persist_cli.cli.options import (
     ActionsOption,
     Commands,
     CompareOption,
+    ContextNoiseOption,
     ControlsOption,
     DtypeOption,
     GuidanceOption,
@@ -194,6 +195,7 @@ def export(
     steps: Annotated[int | None, typer.Option(min=1, help="Denoising steps when none are named.")] = None,
     sampler: Annotated[str | None, typer.Option(help="Sampler when none is named.")] = None,
     guidance: Annotated[float | None, typer.Option(min=0, help="Guidance over memory when none is named.")] = None,
+    context_noise: Annotated[float | None, typer.Option(min=0, help="Declared noise when none is named.")] = None,
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -203,7 +205,7 @@ def export(
     """
     from persist_cli.checkpoints.export import ExportPlan, run_export
 
-    sampling = SamplingOverrides(steps, sampler, guidance)
+    sampling = SamplingOverrides(steps, sampler, guidance, context_noise)
     run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling), out, json)
 
 
@@ -273,6 +275,7 @@ def rollout(
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
+    context_noise: ContextNoiseOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
@@ -290,7 +293,7 @@ def rollout(
 
     plan = RolloutPlan(
         start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
-        write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance),
+        write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
         placement=InferenceOptions.of(dtype, save_memory), step=step, turn=turn,
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
@@ -312,6 +315,7 @@ def evaluate(
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
+    context_noise: ContextNoiseOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
@@ -345,7 +349,7 @@ def evaluate(
         data=tuple(data), protocol=protocol, memories=None if memories is None else split_names(memories),
         controls=split_names(DEFAULT_CONTROLS if controls is None else controls), controls_named=controls is not None,
         metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
-        sampling=SamplingOverrides(steps, sampler, guidance), batch=batch, noise=pose_noise,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), batch=batch, noise=pose_noise,
         placement=InferenceOptions.of(dtype, save_memory), resample=resample,
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)

@@ -39,6 +39,15 @@ GuidanceOption = Annotated[
     typer.Option("--guidance", min=0, help="Of guidance over memory; the checkpoint's, else 1: none."),
 ]
 
+ContextNoiseOption = Annotated[
+    float | None,
+    typer.Option(
+        "--context-noise",
+        min=0,
+        help="How noisy the model shall take frame and memory to be; the checkpoint's, else 0.",
+    ),
+]
+
 DEFAULT_CONTROLS: Final = "copy,nearest,warp,codec,shuffled,emptied"
 
 MemoriesOption = Annotated[

@@ -92,7 +92,9 @@ def common_sampling(checkpoints: Sequence[Checkpoint], overrides: SamplingOverri
         samplings = " and ".join(
             f"{checkpoint.folder} means {sampling.steps} steps of {sampling.sampler} with guidance "
             f"{sampling.memory_guidance:g}"
+            + f" and context noise {sampling.context_noise:g}"
+            * (sampling.context_noise > 0)
             for sampling, checkpoint in checkpoints_by_sampling.items()
         )
-        raise CheckpointError(f"{samplings}; name --steps, --sampler and --guidance")
+        raise CheckpointError(f"{samplings}; name --steps, --sampler, --guidance and --context-noise")
     return next(iter(checkpoints_by_sampling))

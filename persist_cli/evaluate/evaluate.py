@@ -86,6 +86,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
             "steps": run.sampling.steps,
             "sampler": run.sampling.sampler,
             "memory_guidance": run.sampling.memory_guidance,
+            "context_noise": run.sampling.context_noise,
             "seeds": list(range(run.plan.seeds)),
             "batch": run.plan.batch,
         }

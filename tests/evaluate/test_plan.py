@@ -45,7 +45,7 @@ def test_checkpoints_whose_cards_give_different_samplings_need_options_that_name
         error = refused(persist, "eval", *pair, "--data", walks, *ONE, "--out", tmp_path / "o")
         assert "a/voxel means 1 steps of ddim with guidance 1" in error
         assert "b/voxel means 2 steps of unipc with guidance 1.5" in error
-        assert error.endswith("; name --steps, --sampler and --guidance")
+        assert error.endswith("; name --steps, --sampler, --guidance and --context-noise")
     assert not (tmp_path / "o").exists()
     named = ["--steps", 1, "--sampler", "unipc", "--guidance", 1]
     assert persist("eval", a, b, "--data", walks, *ONE, *named, "--out", tmp_path / "o").code == 0

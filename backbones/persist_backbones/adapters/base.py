@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
+from persist_backbones.noise_levels import LevelEmbedding, add_level
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
@@ -37,6 +38,8 @@ class AdapterSettings:
         dropout: share of the training samples that see no memory, for guidance over memory.
         learned_tokens: number of tokens that are learned with the adapter and are there in every clip, with and without
             a memory. They give an adapter of memory ``none`` something to learn.
+        noise: largest level of the noise that training adds to the features of the tokens, where 1 is as strong as
+            the features themselves; the model is told the level. 0 for neither.
     """
 
     form: str
@@ -46,6 +49,7 @@ class AdapterSettings:
     token_budget: PositiveInt = 256
     dropout: Annotated[float, Field(ge=0, le=1)] = 0.1
     learned_tokens: NonNegativeInt = 0
+    noise: NonNegativeFloat = 0.0
 
 
 @dataclass(frozen=True)
@@ -90,11 +94,13 @@ class PreparedMemory:
         tokens: embedded tokens, as the blocks of the form take them.
         mask: true for tokens that exist; all other tokens change nothing in the video.
         learned: number of tokens at the end that are the adapter's own; they are never hidden.
+        level: noise level of each sample's tokens, ``None`` for 0.
     """
 
     tokens: Float[Tensor, "batch *group token width"]
     mask: Bool[Tensor, "batch *group token"]
     learned: int = field(default=0, kw_only=True)
+    level: Float[Tensor, " batch"] | None = field(default=None, kw_only=True)
 
     def only(self, samples: Bool[Tensor, " batch"]) -> Self:
         """Return this memory, hidden from all samples but those that are true in ``samples``."""
@@ -136,6 +142,7 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         self.video = video
         count, size = settings.learned_tokens, self.learned_channels(settings)
         self.register_parameter("learned", nn.Parameter(torch.randn(count, size)) if count else None)
+        self.level = LevelEmbedding(video.time_channels) if settings.noise else None
 
     @staticmethod
     def learned_channels(settings: Any) -> int:
@@ -159,6 +166,24 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
             mask=torch.cat([memory.mask, memory.mask.new_ones(*group, len(self.learned))], dim=-1),
             learned=len(self.learned),
         )
+
+    def noisy(
+        self, tokens: MemoryTokens, level: Float[Tensor, " batch"], generators: list[torch.Generator]
+    ) -> MemoryTokens:
+        """Return the tokens of a batch with noise of a level on their features; see ``AdapterSettings.noise``."""
+        mask = tokens.mask[..., None].to(tokens.features.dtype)
+        count = (mask.sum((1, 2)) * tokens.features.shape[-1]).clamp_min(1)
+        unit = ((tokens.features * mask).square().sum((1, 2)) / count).sqrt()
+        return dataclasses.replace(tokens, features=add_level(tokens.features, level, generators, unit))
+
+    def time(self, time: Float[Tensor, "batch time"], memory: Prepared) -> Float[Tensor, "batch time"]:
+        """Return the time embedding with that of the memory's noise level, unchanged for samples without a token."""
+        if self.level is None:
+            return time
+        level = time.new_zeros(len(time)) if memory.level is None else memory.level
+        has_tokens = memory.mask.flatten(1).any(dim=1)
+        embedded: Tensor = self.level(level) * has_tokens[:, None]
+        return time + embedded.to(time.dtype)
 
     def block_at(self, layer: int) -> nn.Module | None:
         """Return the adapter's block at transformer block ``layer``, ``None`` where it has none."""
@@ -203,6 +228,10 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
 class MemoryCondition:
     """The memory as the transformer uses it around its blocks; this base class is no memory and changes nothing."""
 
+    def time(self, time: Tensor) -> Tensor:
+        """Return the time embedding, which may say how noisy the memory is."""
+        return time
+
     def before(self, layer: int, video: Tensor) -> Tensor:
         """Return the input of transformer block ``layer``."""
         return video
@@ -227,6 +256,10 @@ class AdapterCondition(MemoryCondition, Generic[Prepared]):
 
     adapter: Adapter[Prepared]
     memory: Prepared
+
+    def time(self, time: Tensor) -> Tensor:
+        """Return the time embedding, which may say how noisy the memory is."""
+        return self.adapter.time(time, self.memory)
 
     def before(self, layer: int, video: Tensor) -> Tensor:
         """Return the input of transformer block ``layer``."""

@@ -52,6 +52,7 @@ from persist_backbones.cogvideox.parts import (
     starting_parts,
 )
 from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
+from persist_backbones.noise_levels import add_level, draw_levels
 from persist_cli.api.backbone import Backbone, ClipLatents, Clips, Sampling
 from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.stages import ParameterGroup, Stage
@@ -120,7 +121,9 @@ class CogVideoX(Backbone):
 
         # encode
         latents = clips.latents or self.encode(clips)
-        image = self.image_condition(latents.image)
+        image_noise = draw_levels(generators, self.settings.image_noise)
+        given = latents.image if not image_noise.any() else add_level(latents.image, image_noise, generators)
+        image = self.image_condition(given)
         clean = self.shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
         # noise
         timesteps = draw_timesteps(self.scheduler, generators).to(self.device)
@@ -128,7 +131,7 @@ class CogVideoX(Backbone):
         target = prediction_target(self.scheduler, clean, noise, timesteps)
         noisy = self.scheduler.add_noise(clean, noise, timesteps)
         # condition
-        conditions = self.conditions(clips, timesteps, self.memory_condition(clips, generators))
+        conditions = self.conditions(clips, timesteps, self.memory_condition(clips, generators), image_noise)
         # predict
         predicted = self.predict(noisy.to(image.dtype), image, conditions)
         # weigh
@@ -164,7 +167,8 @@ class CogVideoX(Backbone):
         latents = noise_like(image, generators) if noise is None else noise.to(image)
         schedule = SamplingSchedule(self.scheduler.config, sampling.sampler, sampling.steps, generators)
         unset = torch.zeros(len(first.seeds), dtype=torch.long)
-        conditions = self.conditions(first, unset, self.memory_condition(first))
+        declared = torch.full((len(first.seeds),), sampling.context_noise)
+        conditions = self.conditions(first, unset, self.memory_condition(first, level=declared), declared)
         guidance = sampling.memory_guidance
         for number, timestep in enumerate(schedule.timesteps):
             self.current_timestep = timestep
@@ -245,12 +249,15 @@ class CogVideoX(Backbone):
         """Scale latents of the first frame alone for the model, and add zeros for all other latent frames."""
         return self.shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
 
-    def memory_condition(self, clips: Clips, dropout: list[torch.Generator] | None = None) -> MemoryCondition:
+    def memory_condition(
+        self, clips: Clips, generators: list[torch.Generator] | None = None, level: Tensor | None = None
+    ) -> MemoryCondition:
         """Embed the batch's tokens with the adapter in use; without an adapter there is no memory.
 
         Args:
             clips: the batch; without tokens its memory is empty.
-            dropout: generators that draw which samples see no memory, for training.
+            generators: generators that draw, for training, noise and which samples see no memory.
+            level: noise level that each sample's memory is declared to have, in sampling; ``None`` for 0.
 
         Raises:
             CheckpointError: when the tokens do not come from the encoder that the adapter was trained with.
@@ -264,11 +271,23 @@ class CogVideoX(Backbone):
                 f"the memory gives features of {tokens.features.shape[-1]} channels, adapter {self.adapter_name!r} was "
                 f"trained with {adapter.channels}; use the encoder it was trained with"
             )
-        memory = adapter.prepare(tokens.to(self.device), clips.cameras)
-        return AdapterCondition(adapter, memory if dropout is None else adapter.dropped(memory, dropout))
+        tokens = tokens.to(self.device)
+        if generators is not None and adapter.settings.noise:
+            level = draw_levels(generators, adapter.settings.noise)
+            tokens = adapter.noisy(tokens, level.to(self.device), generators)
+        memory = adapter.prepare(tokens, clips.cameras)
+        if level is not None and adapter.settings.noise:
+            memory = dataclasses.replace(memory, level=level.to(self.device))
+        return AdapterCondition(adapter, memory if generators is None else adapter.dropped(memory, generators))
 
-    def conditions(self, clips: Clips, timesteps: Tensor, memory: MemoryCondition = NO_MEMORY) -> Conditions:
-        """Collect prompt, interactions, cameras and memory of a batch."""
+    def conditions(
+        self,
+        clips: Clips,
+        timesteps: Tensor,
+        memory: MemoryCondition = NO_MEMORY,
+        image_noise: Tensor | None = None,
+    ) -> Conditions:
+        """Collect prompt, interactions, cameras, memory and the noise level of the given frames of a batch."""
         printed, steps = self.settings.rays == "printed", self.settings.frames - 1
         rays = (self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
         return Conditions(
@@ -278,6 +297,7 @@ class CogVideoX(Backbone):
             camera=camera_latents(clips.cameras, *rays),
             rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.rotary_grid, self.device),
             memory=memory,
+            image_noise=None if image_noise is None else image_noise.to(self.device),
         )
 
     @property
@@ -306,6 +326,13 @@ class CogVideoX(Backbone):
         levels = self.scheduler.config.num_train_timesteps
         if sampling.steps > levels:
             raise PersistError(f"{sampling.steps} denoising steps; it must be 1 to {levels}")
+        adapters = [adapter.settings.noise for adapter in self.adapters.values() if isinstance(adapter, Adapter)]
+        known = max(self.settings.image_noise, *adapters, 0.0)
+        if sampling.context_noise > known:
+            raise PersistError(
+                f"context noise of {sampling.context_noise:g}; this model was trained with levels up to {known:g}, see "
+                "backbone.settings.image_noise and adapter.noise"
+            )
 
     @property
     def gives_depth(self) -> bool:

@@ -17,6 +17,7 @@ from persist_backbones.adapters.base import MemoryCondition, VideoShape
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
 from persist_backbones.diffusers_models import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
+from persist_backbones.noise_levels import LevelEmbedding
 from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches, zero_init
 
 OFFSET = 2.0  # the value of ``ofs`` in the training of CogVideoX 1.5 image-to-video
@@ -34,6 +35,7 @@ class Conditions:
         camera: camera embedding at each video token, for the queries of memory blocks.
         rotary: cosines and sines, for models with rotary positions.
         memory: an adapter with the tokens that it prepared, or no memory.
+        image_noise: noise level of each sample's given frame, ``None`` for 0.
     """
 
     text: Float[Tensor, "batch word channel"]
@@ -42,6 +44,7 @@ class Conditions:
     camera: Float[Tensor, "batch token camera"]
     rotary: tuple[Tensor, Tensor] | None = None
     memory: MemoryCondition = NO_MEMORY
+    image_noise: Float[Tensor, " batch"] | None = None
 
 
 class WorldTransformer(nn.Module):
@@ -52,7 +55,7 @@ class WorldTransformer(nn.Module):
         latent_channels: number of latent channels of RGB, and as many of depth.
         temporal: factor of the codec's compression in time.
         shape: shape of a clip.
-        interactions: rows of the interaction embedding without the first, which means none.
+        settings: the interactions, and whether noise levels of the given frame are embedded.
     """
 
     def __init__(
@@ -61,7 +64,7 @@ class WorldTransformer(nn.Module):
         latent_channels: int,
         temporal: int,
         shape: ClipShape,
-        interactions: int,
+        settings: CogVideoXSettings,
     ) -> None:
         super().__init__()
         config = base.config
@@ -77,9 +80,11 @@ class WorldTransformer(nn.Module):
         else:
             self.extra_in = nn.Linear(new * frames * patch**2, inner, bias=False)
         self.extra_out = nn.Linear(inner, frames * patch**2 * (out_channels - config.out_channels))
+        interactions = (settings.frames - 1) * len(settings.interactions)
         self.interactions = nn.Embedding(1 + interactions, config.time_embed_dim, padding_idx=0)
         self.camera_channels = camera * shape.token_frames  # at a video token
         self.in_channels, self.out_channels = in_channels, out_channels
+        self.image_level = LevelEmbedding(config.time_embed_dim) if settings.image_noise else None
         zero_init(self.extra_in, self.extra_out, self.interactions)
 
     def video_shape(self, spatial: int, temporal: int) -> VideoShape:
@@ -102,7 +107,7 @@ class WorldTransformer(nn.Module):
         self, latents: Float[Tensor, "batch frame channel height width"], conditions: Conditions
     ) -> Float[Tensor, "batch frame out height width"]:
         """Predict RGB and depth latents, concatenated on channels."""
-        time = self.embed_time(conditions, latents.dtype)
+        time = conditions.memory.time(self.embed_time(conditions, latents.dtype))
         text, video = self.embed_patches(latents, conditions.text.to(latents.dtype))
         for layer, block in enumerate(self.base.transformer_blocks):
             video = conditions.memory.before(layer, video)
@@ -116,13 +121,18 @@ class WorldTransformer(nn.Module):
         return conditions.memory.correct(predicted, latents, time)
 
     def embed_time(self, conditions: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
-        """Return the sum of time embedding, ``ofs`` embedding (CogVideoX 1.5 image-to-video) and interactions."""
+        """Return the sum of the embeddings of time, ``ofs`` (CogVideoX 1.5 image-to-video), interactions and noise."""
         time: Tensor = self.base.time_embedding(self.base.time_proj(conditions.timestep).to(dtype))
         if self.base.ofs_embedding is not None:
             offset = torch.full((1,), OFFSET, device=time.device)
             time = time + self.base.ofs_embedding(self.base.ofs_proj(offset).to(dtype))
         interactions: Tensor = self.interactions(conditions.interactions).sum(dim=1)
-        return time + interactions.to(time.dtype)
+        time = time + interactions.to(time.dtype)
+        if self.image_level is None:
+            return time
+        level = time.new_zeros(len(time)) if conditions.image_noise is None else conditions.image_noise
+        embedded: Tensor = self.image_level(level)
+        return time + embedded.to(time.dtype)
 
     def embed_patches(self, latents: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
         """Embed text and video: diffusers' patch embedding of the published channels plus that of the new ones."""
@@ -151,6 +161,5 @@ def widen(
     base: CogVideoXTransformer3DModel, vae: AutoencoderKLCogVideoX, settings: CogVideoXSettings, shape: ClipShape
 ) -> WorldTransformer:
     """Add zero-initialised inputs and outputs for RGB-D, cameras and interactions to diffusers' transformer."""
-    interactions = (settings.frames - 1) * len(settings.interactions)
     temporal = int(vae.config.temporal_compression_ratio)
-    return WorldTransformer(base, vae.config.latent_channels, temporal, shape, interactions)
+    return WorldTransformer(base, vae.config.latent_channels, temporal, shape, settings)

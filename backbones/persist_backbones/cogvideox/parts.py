@@ -52,6 +52,7 @@ PUBLISHED = {  # preset of each of their repositories
 INITIAL_LOG_VARIANCE = -6.0  # of fresh latents, whose noise must not hide them
 PREFIX = "transformer."  # of the names in a pipeline's LoRA file
 DOWN, UP = ".lora_A.weight", ".lora_B.weight"
+LEVEL = "image_level."  # begins the names of the embedding of noise levels, which starts at zero
 SAMPLED = 256  # values of a tensor that enter its digest
 MAY_BE_ZERO = {"dropout", "freq_shift", "ofs_embed_dim", "norm_eps", "shift_factor"}  # of numbers in configurations
 
@@ -182,8 +183,10 @@ def load_world(transformer: nn.Module, folder: Path) -> Tensor:
     prompt = tensors.pop("prompt", None)
     if prompt is None:
         raise CheckpointError(f"{path}: no prompt embedding in it")
-    widening = {name for name in transformer.state_dict() if not name.startswith("base.")}
-    load_exactly(transformer, tensors, widening, path)
+    widening = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
+    fresh = {name: value for name, value in widening.items() if name.startswith(LEVEL) and name not in tensors}
+    tensors |= {name: torch.zeros(value.shape) for name, value in fresh.items()}  # a base that was told no noise levels
+    load_exactly(transformer, tensors, set(widening), path)
     return prompt.to(next(transformer.parameters()).dtype)
 
 

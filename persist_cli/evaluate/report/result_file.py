@@ -213,6 +213,7 @@ class SamplingRecord(ResultModel):
     steps: int | None = None
     sampler: str | None = None
     memory_guidance: float | None = None
+    context_noise: float = 0.0
     dtype: str | None = None
     tiling: bool = False
     seeds: list[int] = []

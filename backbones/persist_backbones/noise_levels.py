@@ -1,0 +1,64 @@
+"""Noise with a level on what a model is given: it learns how far to trust a frame or a memory that is not quite true.
+
+In training each sample's condition gets Gaussian noise of a level of its own, and the level is embedded and added to
+the time embedding (GameNGen, 2408.14837). A rollout reads what it imagined itself; without such noise it takes every
+small error for the truth, and the errors add up. In sampling nothing is added, but a small level may be declared, as
+diffusion forcing does (2407.01392).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from persist_backbones.tensors import zero_init
+
+WAVES = 16  # sines, and as many cosines, of a level
+
+
+class LevelEmbedding(nn.Module):
+    """The embedding of a noise level, which is added to the time embedding; it starts at zero.
+
+    Args:
+        channels: channels of the time embedding.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.out = nn.Linear(2 * WAVES, channels, bias=False)
+        zero_init(self.out)
+
+    def forward(self, level: Float[Tensor, " batch"]) -> Float[Tensor, "batch channel"]:
+        """Return the embedding of the level of each sample."""
+        angles = level.float()[:, None] * math.pi * torch.arange(1, WAVES + 1, device=level.device)
+        embedded: Tensor = self.out(torch.cat([angles.sin(), angles.cos()], dim=1).to(self.out.weight.dtype))
+        return embedded
+
+
+def draw_levels(generators: list[torch.Generator], largest: float) -> Float[Tensor, " batch"]:
+    """Draw uniform levels between 0 and the largest, each sample from its own generator; none is drawn for 0."""
+    if largest == 0:
+        return torch.zeros(len(generators))
+    return torch.cat([torch.rand(1, generator=generator) for generator in generators]) * largest
+
+
+def add_level(
+    values: Float[Tensor, batch * rest],
+    level: Float[Tensor, " batch"],
+    generators: list[torch.Generator],
+    unit: Float[Tensor, " batch"] | float = 1.0,
+) -> Float[Tensor, batch * rest]:
+    """Add noise of a level to each sample, from its own generator, in the values' precision.
+
+    Args:
+        values: what gets noise.
+        level: standard deviation of the noise of each sample, in units.
+        generators: one generator a sample.
+        unit: what a level of 1 means, by default for latents, whose standard deviation is about 1.
+    """
+    noise = torch.stack([torch.randn(values.shape[1:], generator=generator) for generator in generators])
+    scale = (level.to(values.device) * unit).reshape(-1, *[1] * (values.ndim - 1))
+    return (values.float() + scale * noise.to(values.device)).to(values.dtype)

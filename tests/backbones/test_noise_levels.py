@@ -1,0 +1,98 @@
+"""Noise with a level on the given frame and the memory: the model is told the level, and old models stay the same."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_backbones.noise_levels import add_level, draw_levels
+from persist_cli.api.backbone import Sampling
+from persist_cli.errors import PersistError
+from tests.support.micro_model import equal, micro, predicted_of, random_clips, random_tokens, shaken, with_adapter
+
+FORMS = ["cross", "projected", "canvas"]
+
+
+def generators() -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in (1, 2)]
+
+
+def test_each_sample_gets_noise_as_strong_as_its_level() -> None:
+    values, levels = torch.zeros(2, 50, 50), torch.tensor([0.0, 0.5])
+    noisy = add_level(values, levels, generators(), unit=torch.tensor([1.0, 3.0]))
+    assert torch.equal(noisy[0], values[0])
+    assert noisy[1].std().item() == pytest.approx(1.5, rel=0.1)
+
+
+def test_levels_lie_below_the_largest_and_a_sample_draws_its_own() -> None:
+    both, one = draw_levels(generators(), 0.7), draw_levels(generators()[1:], 0.7)
+    assert 0 < both.min() < both.max() < 0.7
+    assert torch.equal(both[1:], one)
+
+
+def test_a_base_without_levels_becomes_one_with_levels_and_first_predicts_the_same(tmp_path: Path) -> None:
+    old, clips = micro(), random_clips()
+    shaken(old)
+    old.save_base(tmp_path)
+    new = micro(image_noise=0.5)
+    new.load_base(tmp_path)
+    sampling = Sampling(2)
+    assert equal(new.generate(clips, sampling), old.generate(clips, sampling))
+    assert equal(new.generate(clips, dataclasses.replace(sampling, context_noise=0.3)), old.generate(clips, sampling))
+
+
+def test_a_trained_model_hears_the_declared_level_and_keeps_it_when_saved(tmp_path: Path) -> None:
+    model, clips = micro(image_noise=0.5), random_clips(1)
+    shaken(model)
+    quiet, noisy = (model.generate(clips, Sampling(2, context_noise=level))[0] for level in (0.0, 0.3))
+    assert not torch.equal(quiet, noisy)
+    model.save_base(tmp_path)
+    loaded = micro(image_noise=0.5)
+    loaded.load_base(tmp_path)
+    assert torch.equal(loaded.generate(clips, Sampling(2, context_noise=0.3))[0], noisy)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_memory_is_told_to_be_noisy_but_an_empty_one_says_nothing(form: str) -> None:
+    backbone, clips = with_adapter(micro(), form=form, noise=0.5), random_clips(1)
+    tokens = random_tokens(1, 40)
+    shaken(backbone)
+    level = torch.tensor([0.4])
+    with torch.no_grad():
+        for held, differs in ((tokens, True), (None, False)):
+            seen = dataclasses.replace(clips, tokens=held)
+            quiet, noisy = (
+                predicted_of(backbone, clips, backbone.memory_condition(seen, level=at)) for at in (None, level)
+            )
+            assert torch.equal(quiet, noisy) != differs
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_training_with_noise_on_the_memory_reaches_the_embedding_of_its_level(form: str) -> None:
+    backbone, clips = with_adapter(micro(), form=form, noise=0.5), random_clips(2, random_tokens(2, 40))
+    shaken(backbone)
+    parameters = backbone.trained_parameters("2")
+    backbone(clips, "2")["loss"].backward()
+    assert parameters["adapters.voxel.level.out.weight"].grad.any()
+
+
+def test_the_given_frame_of_each_training_sample_is_noisy_and_the_target_is_not() -> None:
+    inputs, clips = {}, random_clips(2)
+    for largest in (0.0, 0.5):
+        model = micro(image_noise=largest)
+        model.transformer.register_forward_pre_hook(lambda _, args, key=largest: inputs.update({key: args[0]}))
+        model(clips, "1")
+    given = slice(4, 8)  # colours of the given frame, behind the noisy ones
+    assert not torch.equal(inputs[0.5][:, :1, given], inputs[0.0][:, :1, given])
+    assert torch.equal(inputs[0.5][:, 1:, given], inputs[0.0][:, 1:, given])
+
+
+def test_a_level_that_was_never_trained_is_refused() -> None:
+    with pytest.raises(PersistError, match=r"^context noise of 0.3; this model was trained with levels up to 0, see"):
+        micro().check_sampling(Sampling(context_noise=0.3))
+    with pytest.raises(PersistError, match=r"^context noise of -1.0; it must be a number of at least 0$"):
+        micro().check_sampling(Sampling(context_noise=-1.0))
+    with_adapter(micro(), noise=0.5).check_sampling(Sampling(context_noise=0.3))
