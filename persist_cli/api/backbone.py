@@ -261,6 +261,9 @@ class Backbone(nn.Module, ABC):
         """
         return False
 
+    def begin_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
+        """Begin a stage that has no base by setting fresh weights from some clips; nothing by default."""
+
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """End a stage by measuring on some clips what training does not learn, such as a scale; nothing by default."""
 

@@ -98,9 +98,7 @@ class RunFolder:
     def _write_model(self, backbone: Backbone, folder: Path, home: Path) -> None:
         trainer, recipe = self.trainer, self.trainer.recipe
         folder.mkdir()
-        size = recipe.training.batch
-        batches = ([trainer.clips[number * size + row] for row in range(size)] for number in range(CODEC_BATCHES))
-        backbone.finish_stage(recipe.stage, (trainer.to_batch(samples) for samples in batches))
+        backbone.finish_stage(recipe.stage, trainer.first_batches(CODEC_BATCHES))
         write_text(folder / RECIPE, to_yaml(recipe))
         save_stage_recipes(folder, self.recipes)
         if recipe.memory is not None and self.base is not None:

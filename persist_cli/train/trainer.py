@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any
+from typing import Any, Final
 
 import torch
 from accelerate import Accelerator
@@ -28,6 +28,8 @@ from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import make_average, make_optimizer, requested_savings, update_average
 from persist_cli.train.state import TrainingState
 from persist_cli.viewing.console import add_task, progress
+
+START_BATCHES: Final = 16  # from which fresh weights are set at the beginning of a stage
 
 
 @dataclass
@@ -83,6 +85,8 @@ class Trainer:
         self.encoder = self.clip_encoder(cache)
         if self.encoder is not None:
             self.clips = CachedClips(clips, self.encoder.cache)
+        if recipe.base is None:
+            backbone.begin_stage(recipe.stage, self.first_batches(START_BATCHES))
         optimizer = make_optimizer(parameters.values(), settings)
         self.sharding = Sharding(backbone, recipe, accelerator) if accelerator.is_fsdp2 else None
         self.model, self.optimizer = accelerator.prepare(backbone, optimizer)
@@ -131,6 +135,12 @@ class Trainer:
             )
         keys = CacheKeys.of(recipe, backbone, self.factory, self.accelerator.device.type)
         return ClipEncoder(backbone, self.factory, self.accelerator, ClipCache(TensorCache(settings), keys))
+
+    def first_batches(self, count: int) -> Iterator[Clips]:
+        """So many batches of the first samples, of which something is measured before or after training."""
+        size = self.recipe.training.batch
+        for number in range(count):
+            yield self.to_batch([self.clips[number * size + row] for row in range(size)])
 
     def loader(self) -> Iterator[Clips]:
         """Batches of this process from the state's step to the last."""

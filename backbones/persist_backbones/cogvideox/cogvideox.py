@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCondition, VideoShape
 from persist_backbones.adapters.forms import adapter_settings, load_adapter, make_adapter, save_adapter
-from persist_backbones.cogvideox.codec import Codec, to_uint8
+from persist_backbones.cogvideox.codec import Codec, frames_to_batch, to_uint8
+from persist_backbones.cogvideox.codec_start import start_as_components
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import (
     SAMPLERS,
@@ -379,6 +380,12 @@ class CogVideoX(Backbone):
     def encoding(self) -> str:
         """Return a fingerprint of the codec."""
         return self.codec.fingerprint()
+
+    def begin_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
+        """Let a fresh codec begin as the settings say, before the codec's stage only."""
+        if stage == "codec" and self.settings.codec_start == "components":
+            images = [self.codec.images(batch.rgb, batch.depth) for batch in clips]
+            start_as_components(self.codec, torch.cat([frames_to_batch(image) for image in images]).to(self.device))
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """Measure the scale of the latents on these clips, after the codec's stage only."""

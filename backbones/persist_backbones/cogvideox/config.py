@@ -125,6 +125,8 @@ class CogVideoXSettings:
         kl_weight: weight of the codec's latent prior in its loss.
         codec_window: frames (a valid number of ``frames``, or 1), height and width of the random windows that the codec
             is trained on; a quarter of the pixels costs a quarter of the time.
+        codec_start: weights of a fresh codec: ``random``, or the principal ``components`` of the training images'
+            squares of pixels, for a VAE of one block that codes every frame alone.
         transformer: changes to the preset's transformer configuration.
         vae: changes to the preset's VAE configuration.
     """
@@ -146,5 +148,6 @@ class CogVideoXSettings:
     snr_gamma: PositiveFloat = 5.0
     kl_weight: NonNegativeFloat = 1e-6
     codec_window: tuple[int, PositiveInt, PositiveInt] | None = None
+    codec_start: Literal["random", "components"] = "random"
     transformer: dict[str, Any] = field(default_factory=dict)
     vae: dict[str, Any] = field(default_factory=dict)
