@@ -1,4 +1,4 @@
-"""The memory that remembers nothing: the baseline of every other memory (the row "NWM" of the paper's Table 1)."""
+"""The memory that remembers nothing: the baseline of every other memory."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from persist_memory.validation import check_mergeable, check_tensors
 
 class NoMemory(Memory):
     """A memory that never gives a token, so that an adapter of the same size can be trained without one."""
+
+    reads_depth = False
 
     def write(self, observations: Observations) -> None:
         """Ignore the frames."""

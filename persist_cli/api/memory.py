@@ -93,6 +93,7 @@ class Memory(ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
+    reads_depth: ClassVar[bool] = True  # where it is false, ``memorize`` hides all depth from ``write``
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any, encoder: Encoder, reference: FrameOfReference) -> None:
@@ -110,6 +111,16 @@ class Memory(ABC):
         Raises:
             DataError: when a pose is not finite and rigid, or sizes differ; then nothing is written.
         """
+
+    def memorize(self, observations: Observations) -> None:
+        """Write frames as this memory may see them: with depth 0 when it says that it reads none.
+
+        All of persist writes memories by this method, so that "without depth" is no promise of a memory.
+
+        Raises:
+            DataError: as ``write`` does.
+        """
+        self.write(observations if self.reads_depth else observations.without_depth())
 
     @abstractmethod
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:

@@ -101,6 +101,10 @@ class Observations:
         """Return these frames, all of one origin."""
         return replace(self, origins=origins_like(self.rgb, origin))
 
+    def without_depth(self) -> Observations:
+        """Return these frames with all depth missing (0)."""
+        return replace(self, depth=torch.zeros_like(self.depth))
+
     def by_origin(self) -> list[tuple[Origin, Observations]]:
         """Return the frames of each origin that there is, in their order, the observed ones first."""
         values = sorted(set(self.origins.tolist()), reverse=True)

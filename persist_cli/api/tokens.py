@@ -16,12 +16,18 @@ from persist_cli.api.observations import Origin
 class MemoryTokens:
     """Memory tokens of one sample, or of a batch of samples.
 
+    A token is a point with features, or a whole frame: then it has an image and a camera, and stands at its centre.
+
     Args:
         features: float32 features of the memory's encoder.
         positions: world metres, float64; the backbone moves them into the frame of the clip's first camera.
         mask: true for tokens, false for padding.
         colors: uint8 RGB, 0…255, of the surface at each token; ``None`` for a memory that knows no colours.
         origins: the ``Origin`` of each token, 0 for padding; without it all are observed.
+        images: uint8 RGB, 0…255, of tokens that are frames; ``None`` for points.
+        world_from_camera: the pose of each image, float64, metres.
+        intrinsics: the intrinsics of each image in its pixels, float64.
+        latents: what a backbone made of the images, which it then needs no longer.
     """
 
     features: Float[Tensor, "*batch token channel"]
@@ -29,6 +35,10 @@ class MemoryTokens:
     mask: Bool[Tensor, "*batch token"]
     colors: UInt8[Tensor, "*batch token 3"] | None = None
     origins: UInt8[Tensor, "*batch token"] = None  # type: ignore[assignment]  # set below
+    images: UInt8[Tensor, "*batch token height width 3"] | None = None
+    world_from_camera: Float[Tensor, "*batch token 4 4"] | None = None
+    intrinsics: Float[Tensor, "*batch token 3 3"] | None = None
+    latents: Float[Tensor, "*batch token channel rows columns"] | None = None
 
     def __post_init__(self) -> None:
         if self.origins is None:

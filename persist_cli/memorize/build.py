@@ -73,7 +73,7 @@ def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
         for source in sources:
             bar.update(task, note=source.file.name)
             for piece in source.pieces():
-                memory.write(piece)
+                memory.memorize(piece)
                 bar.advance(task, len(piece))
     return time.perf_counter() - start
 

@@ -53,6 +53,6 @@ def with_memory(sample: ClipSample, factory: MemoryFactory | None, budget: int) 
         return sample.clip
     memory = factory.empty(sample.info)
     if sample.context is not None:
-        memory.write(sample.context.to(factory.device))
+        memory.memorize(sample.context.to(factory.device))
     tokens = memory.read(sample.clip.observations.cameras, budget).to(factory.device)
     return replace(sample.clip, tokens=tokens)

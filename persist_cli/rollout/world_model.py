@@ -63,7 +63,7 @@ class Agent:
             return
         if self.shared:
             self.memory, self.shared = self.memory.copy(), False
-        self.memory.write(self.disturb(seen).to(device))
+        self.memory.memorize(self.disturb(seen).to(device))
 
 
 class WorldModel:

@@ -15,7 +15,7 @@ FORM_KEYS = {
     "projected": {"heads", "frequencies"},
     "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
 }
-SHARED_KEYS = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dropout"}
+SHARED_KEYS = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dropout", "learned_tokens"}
 
 
 @pytest.mark.parametrize("form", FORM_KEYS)

@@ -103,5 +103,5 @@ class ModelRow(Row):
         memory = self.row_memory.factory.empty(clip.info)
         context = self.row_memory.intervention.context(clip)
         if context is not None:
-            memory.write(disturb(context))
+            memory.memorize(disturb(context))
         return memory

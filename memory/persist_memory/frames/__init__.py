@@ -1,0 +1,1 @@
+"""Memories of whole frames with their cameras, which never see depth."""
