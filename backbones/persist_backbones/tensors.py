@@ -1,4 +1,4 @@
-"""Tensor operations that model and adapters share: order of video tokens, folding into channels, zero weights."""
+"""Tensor operations that model and adapters share: order of video tokens, folding, zero weights, holes of images."""
 
 from __future__ import annotations
 
@@ -65,3 +65,21 @@ def tokens_of(
     """Flatten the places of all frames in the order of the transformer's video tokens."""
     tokens: Tensor = latents.flatten(3).transpose(2, 3).flatten(1, 2)
     return tokens
+
+
+def push_pull(
+    total: Float[Tensor, "image channel height width"], weight: Float[Tensor, "image 1 height width"]
+) -> Float[Tensor, "image channel height width"]:
+    """Fill holes: the mean of known values at each pixel, on the finest scale that has any (Gortler et al., push-pull).
+
+    Args:
+        total: sum of the known values at each pixel, 0 in holes.
+        weight: how many values that sum is of, 0 in holes.
+    """
+    mean = total / weight.clamp_min(1e-6)
+    size = total.shape[-2:]
+    if size == (1, 1):
+        return mean
+    pooled = (F.avg_pool2d(part, 2, ceil_mode=True) for part in (total, weight))
+    coarse = F.interpolate(push_pull(*pooled), size=size, mode="bilinear")
+    return torch.where(weight > 0, mean, coarse)

@@ -310,6 +310,15 @@ class Backbone(nn.Module, ABC):
     def token_budget(self) -> int:
         """The number of memory tokens that the adapter in use reads at most."""
 
+    def keep_tokens(self, clips: Clips) -> MemoryTokens:
+        """Return what the adapter in use needs of the tokens of clips, which a cache keeps; by default all of them."""
+        assert clips.tokens is not None
+        return clips.tokens
+
+    def token_encoding(self) -> str:
+        """Return a text with all that ``keep_tokens`` depends on besides the clips; empty when it keeps all tokens."""
+        return ""
+
     def checkpoint_settings(self) -> dict[str, Any]:
         """Return the settings, as JSON values, of a backbone into which ``load_base`` loads this one's weights."""
         return dataclasses.asdict(self.settings)

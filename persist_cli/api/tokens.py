@@ -28,6 +28,8 @@ class MemoryTokens:
         world_from_camera: the pose of each image, float64, metres.
         intrinsics: the intrinsics of each image in its pixels, float64.
         latents: what a backbone made of the images, which it then needs no longer.
+        rendered: what ``Backbone.keep_tokens`` made of all tokens for the cameras of a clip, and which then stands for
+            those that are not here; ``None`` for tokens as a memory gives them.
     """
 
     features: Float[Tensor, "*batch token channel"]
@@ -39,6 +41,7 @@ class MemoryTokens:
     world_from_camera: Float[Tensor, "*batch token 4 4"] | None = None
     intrinsics: Float[Tensor, "*batch token 3 3"] | None = None
     latents: Float[Tensor, "*batch token channel rows columns"] | None = None
+    rendered: Float[Tensor, "*batch frame channel height width"] | None = None
 
     def __post_init__(self) -> None:
         if self.origins is None:
@@ -47,8 +50,11 @@ class MemoryTokens:
     def __len__(self) -> int:
         return self.features.shape[-2]
 
+    def __getitem__(self, sample: int) -> MemoryTokens:
+        return MemoryTokens(**{name: tensor[sample] for name, tensor in self.tensors().items()})
+
     def tensors(self) -> dict[str, Tensor]:
-        """Return all tensors by name, without colours where there are none; ``MemoryTokens`` takes them back."""
+        """Return all tensors by name, without those that are ``None``; ``MemoryTokens`` takes them back."""
         named = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: tensor for name, tensor in named.items() if tensor is not None}
 
@@ -76,12 +82,14 @@ class MemoryTokens:
     def stack(samples: Sequence[MemoryTokens]) -> MemoryTokens:
         """Return a batch of unbatched samples, padded to the longest one and to at least one token.
 
-        The batch has colours when all its samples have them.
+        The batch has colours when all its samples have them; all samples or none are rendered.
         """
         width = max(1, *(len(sample) for sample in samples))
         parts = [sample.tensors() for sample in samples]
+        rendered = [part.pop("rendered") for part in parts if "rendered" in part]
         names = [name for name in parts[0] if all(name in part for part in parts)]
-        return MemoryTokens(**{name: _padded([part[name] for part in parts], width) for name in names})
+        padded = {name: _padded([part[name] for part in parts], width) for name in names}
+        return MemoryTokens(**padded, rendered=torch.stack(rendered) if rendered else None)
 
 
 def _padded(rows: Sequence[Tensor], width: int) -> Tensor:

@@ -183,6 +183,8 @@ class CacheKeys:
         tokens = None
         if factory is not None and recipe.memory is not None:
             tokens = encoded_by | _token_dependencies(recipe.memory, factory, backbone)
+            if kept := backbone.token_encoding():
+                tokens |= {"kept": kept, "precision": recipe.training.precision}
         return CacheKeys(latents, tokens, backbone.framewise)
 
     def of_clip(self, frames: ClipFrames) -> ClipKeys:
@@ -314,9 +316,11 @@ class ClipEncoder:
         if self.factory is None or cached.sample.clip.tokens is not None:
             return cached.sample.clip
         clip = with_memory(cached.sample, self.factory, self.backbone.token_budget)
-        if self.cache is not None and clip.tokens is not None:
-            self.cache.put_tokens(cached.frames, clip.tokens)
-        return clip
+        with torch.no_grad(), self.accelerator.autocast():
+            tokens = self.backbone.keep_tokens(Clips.stack([clip]))[0]
+        if self.cache is not None:
+            self.cache.put_tokens(cached.frames, tokens)
+        return replace(clip, tokens=tokens)
 
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip

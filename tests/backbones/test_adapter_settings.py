@@ -14,8 +14,13 @@ FORM_KEYS = {
     "cross": {"heads", "frequencies", "positions"},
     "projected": {"heads", "frequencies"},
     "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
-}
-SHARED_KEYS = {"channels", "form", "every", "width", "ff_factor", "token_budget", "dropout", "learned_tokens"}
+    "rendered": {
+        "heads", "frequencies", "token_size", "splat_pixels", "head_width", "head_layers", "attention_tokens",
+    },
+}  # fmt: skip
+SHARED_KEYS = {
+    "channels", "form", "every", "width", "ff_factor", "token_budget", "dropout", "learned_tokens", "noise",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("form", FORM_KEYS)
@@ -52,7 +57,8 @@ def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Pat
         ({"every": 3}, "every is 3, but the model has 2 layers"),
         ({"form": "canvas", "every": 3}, "every is 3, but the model has 2 layers"),
         ({"form": "canvas", "splat_pixels": 4}, "splat_pixels must be odd, not 4"),
-        ({"form": "splat"}, "unknown adapter form 'splat'; known: cross, projected, canvas"),
+        ({"form": "rendered", "splat_pixels": 4}, "splat_pixels must be odd, not 4"),
+        ({"form": "splat"}, "unknown adapter form 'splat'; known: cross, projected, canvas, rendered"),
     ],
 )
 def test_adapter_settings_that_cannot_work_are_refused(settings: dict, cause: str) -> None:

@@ -22,7 +22,7 @@ from tests.support.micro_model import (
 
 FINE = {"form": "canvas", "canvas_scale": 2, "ff_factor": 0}  # drawn larger than the latents, without feed-forward
 every_variant = pytest.mark.parametrize("form", [*FORMS, "fine canvas"])
-forms_of_visible_tokens = pytest.mark.parametrize("form", ["projected", "canvas"])
+forms_of_visible_tokens = pytest.mark.parametrize("form", ["projected", "canvas", "rendered"])
 
 
 def trained(form, **settings):
@@ -35,14 +35,15 @@ def trained(form, **settings):
 def token_at(*position):
     """One token at a position, the same in two samples."""
     place = torch.tensor(position, dtype=torch.float64).expand(2, 1, 3)
-    return MemoryTokens(torch.full((2, 1, CHANNELS), 0.7), place, torch.ones(2, 1, dtype=torch.bool))
+    features, colors = torch.full((2, 1, CHANNELS), 0.7), torch.full((2, 1, 3), 90, dtype=torch.uint8)
+    return MemoryTokens(features, place, torch.ones(2, 1, dtype=torch.bool), colors)
 
 
 @every_variant
 def test_the_order_of_tokens_changes_nothing(form):
     backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-    shuffled = MemoryTokens(tokens.features[:, order], tokens.positions[:, order], tokens.mask[:, order])
+    shuffled = MemoryTokens(**{name: part[:, order] for name, part in tokens.tensors().items()})
     assert torch.allclose(predicted(backbone, clips, tokens), predicted(backbone, clips, shuffled), atol=1e-5)
 
 
@@ -50,14 +51,17 @@ def test_the_order_of_tokens_changes_nothing(form):
 def test_the_order_of_tokens_at_one_place_changes_nothing(form):
     backbone, clips, twice = trained(form), random_clips(), random_tokens(2, 8)
     twice.positions[:, 4:] = twice.positions[:, :4]
-    swapped = dataclasses.replace(twice, features=twice.features.roll(4, dims=1))
+    parts = {"features": twice.features.roll(4, dims=1), "colors": twice.colors.roll(4, dims=1)}
+    swapped = dataclasses.replace(twice, **parts)
     assert torch.allclose(predicted(backbone, clips, twice), predicted(backbone, clips, swapped), atol=1e-5)
 
 
 @every_variant
 def test_a_sample_does_not_see_the_memory_of_another(form):
     backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
-    changed = dataclasses.replace(tokens, features=tokens.features * torch.tensor([1.0, 2.0])[:, None, None])
+    parts = {"features": tokens.features.clone(), "colors": tokens.colors.clone()}
+    parts["features"][1], parts["colors"][1] = parts["features"][1] * 2, 255 - parts["colors"][1]
+    changed = dataclasses.replace(tokens, **parts)
     before, after = predicted(backbone, clips, tokens), predicted(backbone, clips, changed)
     assert torch.allclose(before[0], after[0], atol=1e-5)
     assert not torch.allclose(before[1], after[1], atol=1e-5)

@@ -60,7 +60,8 @@ def random_tokens(batch: int, count: int, seed: int = 3) -> MemoryTokens:
     draw = torch.Generator().manual_seed(seed)
     features = torch.randn(batch, count, CHANNELS, generator=draw)
     positions = torch.randn(batch, count, 3, generator=draw, dtype=torch.float64) * 2
-    return MemoryTokens(features, positions, torch.ones(batch, count, dtype=torch.bool))
+    colors = torch.randint(0, 256, (batch, count, 3), generator=draw, dtype=torch.uint8)
+    return MemoryTokens(features, positions, torch.ones(batch, count, dtype=torch.bool), colors)
 
 
 def random_clips(

@@ -54,9 +54,11 @@ def share_cached(run: Path) -> float:
     return json.loads((run / "speed.jsonl").read_text().splitlines()[-1])["latents_found"]
 
 
-@pytest.mark.parametrize("number", ["stage1", "stage2-voxel"])
-def test_cached_steps_equal_uncached_ones_to_the_bit(persist, walks, stage1, tmp_path, number):
-    changes = [f"base={stage1}", FEW]
+@pytest.mark.parametrize(
+    ("number", "adapter"), [("stage1", []), ("stage2-voxel", []), ("stage2-voxel", ["adapter={form: rendered}"])]
+)
+def test_cached_steps_equal_uncached_ones_to_the_bit(persist, walks, stage1, tmp_path, number, adapter):
+    changes = [f"base={stage1}", FEW, *adapter]
     assert persist(*stage(number, walks, tmp_path / "without", *changes)).code == 0
     for name in ("cold", "warm"):
         assert persist(*stage(number, walks, tmp_path / name, *changes, "--cache", tmp_path / "cache")).code == 0

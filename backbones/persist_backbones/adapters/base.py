@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
 
@@ -30,7 +31,8 @@ class AdapterSettings:
 
     Args:
         form: the way of the tokens to the video: ``cross`` (attention to tokens at their places in space, as in the
-            paper), ``projected`` (attention to their places in the views) or ``canvas`` (tokens drawn into the views).
+            paper), ``projected`` (attention to their places in the views), ``canvas`` (tokens drawn into the views) or
+            ``rendered`` (views rendered from the tokens, encoded by the codec).
         every: the adapter has a block at every n-th transformer block; this is n.
         width: channels of a memory token inside the blocks, or of the canvas at a video token.
         ff_factor: hidden width of the feed-forward as a multiple of the video's channels.
@@ -38,8 +40,8 @@ class AdapterSettings:
         dropout: share of the training samples that see no memory, for guidance over memory.
         learned_tokens: number of tokens that are learned with the adapter and are there in every clip, with and without
             a memory. They give an adapter of memory ``none`` something to learn.
-        noise: largest level of the noise that training adds to the features of the tokens, where 1 is as strong as
-            the features themselves; the model is told the level. 0 for neither.
+        noise: largest level of the noise that training adds to the features of the tokens, and to the latents of
+            rendered ones, where 1 is as strong as these themselves; the model is told the level. 0 for neither.
     """
 
     form: str
@@ -84,6 +86,32 @@ class VideoShape:
     def folded(self) -> int:
         """Number of frames of the clip that a video token stands for."""
         return self.temporal * self.token_frames
+
+
+Encode = Callable[[Tensor, Tensor], Tensor]  # uint8 RGB and metres of clips to latents of both, as ``Codec.encode``
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """The noise level of each sample of a prediction, x_t = signal · x₀ + noise · ε.
+
+    Args:
+        signal: √ᾱ_t of each sample.
+        noise: √(1 − ᾱ_t) of each sample.
+        velocity: whether the model predicts the velocity signal · ε − noise · x₀; else it predicts x₀.
+    """
+
+    signal: Float[Tensor, "batch 1 1 1 1"]
+    noise: Float[Tensor, "batch 1 1 1 1"]
+    velocity: bool
+
+    def clean(self, predicted: Tensor, noisy: Tensor) -> Tensor:
+        """Return x₀ as the model predicts it from ``noisy``, x_t."""
+        return self.signal * noisy - self.noise * predicted if self.velocity else predicted
+
+    def moved(self, predicted: Tensor, change: Tensor) -> Tensor:
+        """Return the prediction whose x₀ differs by ``change``."""
+        return predicted - change / self.noise if self.velocity else predicted + change
 
 
 @dataclass(frozen=True)
@@ -150,6 +178,20 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         width: int = settings.width
         return width
 
+    def render(self, tokens: MemoryTokens, cameras: Cameras, encode: Encode) -> MemoryTokens:
+        """Return what ``prepare`` needs of the tokens of clips; by default all of them, nothing is rendered.
+
+        Args:
+            tokens: the tokens of a batch.
+            cameras: axes ``batch frame``.
+            encode: the frozen codec.
+        """
+        return tokens
+
+    def rendering(self) -> Mapping[str, Any] | None:
+        """Return the settings that ``render`` depends on, as JSON values; ``None`` when it keeps all tokens."""
+        return None
+
     @abstractmethod
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> Prepared:
         """Embed the tokens of a batch for the clips that the cameras see."""
@@ -197,6 +239,12 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         draws = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         return memory.only((draws >= self.settings.dropout).to(memory.mask.device))
 
+    def begin(
+        self, video: Float[Tensor, "batch token channel"], memory: Prepared
+    ) -> Float[Tensor, "batch token channel"]:
+        """Return the embedded video tokens, before the first transformer block; by default unchanged."""
+        return video
+
     def before(
         self, block: nn.Module, video: Float[Tensor, "batch token channel"], memory: Prepared
     ) -> Float[Tensor, "batch token channel"]:
@@ -220,6 +268,7 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         inputs: Float[Tensor, "batch frame in height width"],
         memory: Prepared,
         time: Float[Tensor, "batch time"],
+        level: NoiseLevel,
     ) -> Float[Tensor, "batch frame out height width"]:
         """Correct the model's prediction by the memory; by default it stays."""
         return predicted
@@ -232,6 +281,10 @@ class MemoryCondition:
         """Return the time embedding, which may say how noisy the memory is."""
         return time
 
+    def begin(self, video: Tensor) -> Tensor:
+        """Return the embedded video tokens, before the first transformer block."""
+        return video
+
     def before(self, layer: int, video: Tensor) -> Tensor:
         """Return the input of transformer block ``layer``."""
         return video
@@ -240,7 +293,7 @@ class MemoryCondition:
         """Return the hidden states after transformer block ``layer``."""
         return video
 
-    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
+    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor, level: NoiseLevel) -> Tensor:
         """Return the prediction, corrected by the memory."""
         return predicted
 
@@ -261,6 +314,10 @@ class AdapterCondition(MemoryCondition, Generic[Prepared]):
         """Return the time embedding, which may say how noisy the memory is."""
         return self.adapter.time(time, self.memory)
 
+    def begin(self, video: Tensor) -> Tensor:
+        """Return the embedded video tokens, before the first transformer block."""
+        return self.adapter.begin(video, self.memory)
+
     def before(self, layer: int, video: Tensor) -> Tensor:
         """Return the input of transformer block ``layer``."""
         block = self.adapter.block_at(layer)
@@ -271,9 +328,9 @@ class AdapterCondition(MemoryCondition, Generic[Prepared]):
         block = self.adapter.block_at(layer)
         return video if block is None else self.adapter.after(block, video, self.memory, camera, time)
 
-    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
+    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor, level: NoiseLevel) -> Tensor:
         """Return the prediction, corrected by the memory."""
-        return self.adapter.correct(predicted, inputs, self.memory, time)
+        return self.adapter.correct(predicted, inputs, self.memory, time, level)
 
     def emptied(self) -> AdapterCondition[Prepared]:
         """Return the adapter with an empty memory, for guidance."""

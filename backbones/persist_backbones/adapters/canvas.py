@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, AdapterSettings, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import Adapter, AdapterSettings, NoiseLevel, PreparedMemory, VideoShape
 from persist_backbones.adapters.splat import rasterize, splat
 from persist_backbones.tensors import fold_frames, tokens_of, zero_init
 from persist_cli.api.cameras import Cameras
@@ -53,13 +53,19 @@ class CanvasHead(nn.Module):
         time: Float[Tensor, "batch time"],
     ) -> Float[Tensor, "batch frame out height width"]:
         """Return the correction, which is added to the prediction; ``canvas`` is what ``look`` returned."""
+        correction: Tensor = self.out(F.gelu(self.hidden(predicted, inputs, canvas, time), approximate="tanh"))
+        return torch.unflatten(correction, 0, predicted.shape[:2])
+
+    def hidden(
+        self, predicted: Tensor, inputs: Tensor, canvas: Tensor, time: Tensor
+    ) -> Float[Tensor, "image channel height width"]:
+        """Return what the last layer takes, frames on the batch axis; the arguments are those of ``forward``."""
         frames = predicted.shape[1]
         both = torch.cat([inputs, predicted], dim=2).flatten(0, 1)
         scale, shift = self.modulation(F.silu(time)).repeat_interleave(frames, 0)[..., None, None].chunk(2, dim=1)
         hidden = (canvas.flatten(0, 1) + self.guess(both)) * (1 + scale) + shift
-        hidden = hidden + self.mix(F.gelu(hidden, approximate="tanh"))
-        correction: Tensor = self.out(F.gelu(hidden, approximate="tanh"))
-        return torch.unflatten(correction, 0, predicted.shape[:2])
+        mixed: Tensor = hidden + self.mix(F.gelu(hidden, approximate="tanh"))
+        return mixed
 
     def look(self, canvas: Tensor) -> Float[Tensor, "batch frame width height width"]:
         """Embed the canvas, once for all denoising steps.
@@ -227,7 +233,9 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         changed: Tensor = block(video, memory.tokens, memory.mask)
         return changed
 
-    def correct(self, predicted: Tensor, inputs: Tensor, memory: PreparedCanvas, time: Tensor) -> Tensor:
+    def correct(
+        self, predicted: Tensor, inputs: Tensor, memory: PreparedCanvas, time: Tensor, level: NoiseLevel
+    ) -> Tensor:
         """Add the head's correction to the prediction, on the pixels of video tokens that a memory token covers."""
         if self.head is None or memory.seen is None:
             return predicted

@@ -11,13 +11,16 @@ from persist_backbones.adapters.base import Adapter, VideoShape
 from persist_backbones.adapters.canvas import CanvasAdapter
 from persist_backbones.adapters.cross import CrossAdapter
 from persist_backbones.adapters.projected import ProjectedAdapter
+from persist_backbones.adapters.rendered import RenderedAdapter
 from persist_cli.errors import CheckpointError, hint
 from persist_cli.io.files import load_exactly, read_json, read_tensors, write_json, write_tensors
 from persist_cli.io.setting_docs import Setting, settings_of
 from persist_cli.io.settings import parse_settings
 from persist_cli.io.value_kinds import join_words
 
-FORMS: dict[str, type[Adapter[Any]]] = {"cross": CrossAdapter, "projected": ProjectedAdapter, "canvas": CanvasAdapter}
+FORMS: dict[str, type[Adapter[Any]]] = {
+    "cross": CrossAdapter, "projected": ProjectedAdapter, "canvas": CanvasAdapter, "rendered": RenderedAdapter,
+}  # fmt: skip
 DEFAULT = "cross"
 # the paper's blocks on CogVideoX-5B, one after every transformer block; the paper says only that they have about 1 B
 # parameters together; here a third of the video's width, heads of its size, and a feed-forward of half its width

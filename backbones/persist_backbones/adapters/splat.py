@@ -30,6 +30,18 @@ class Splats(NamedTuple):
     depth: Float[Tensor, " splat"]
 
 
+def hide_covered(splats: Splats, pixels: int) -> tuple[Splats, Float[Tensor, " pixel"]]:
+    """Return the splats at the depth of the nearest at their pixel, and that depth at each pixel, infinite without any.
+
+    Args:
+        splats: the pixels that the tokens cover.
+        pixels: number of pixels of all frames of the batch.
+    """
+    nearest = nearest_at(splats.pixel, splats.depth, pixels)
+    visible = splats.depth <= nearest[splats.pixel] * (1 + TIE)
+    return Splats(*(column[visible] for column in splats)), nearest
+
+
 def splat(
     features: Float[Tensor, "batch token channel"], splats: Splats, shape: tuple[int, int, int, int]
 ) -> Float[Tensor, "batch frame channel+2 height width"]:
@@ -42,15 +54,13 @@ def splat(
         splats: the pixels that the tokens cover.
         shape: batch, frames, height and width of the canvas.
     """
-    pixels = shape[0] * shape[1] * shape[2] * shape[3]
-    nearest = nearest_at(splats.pixel, splats.depth, pixels)
-    visible = splats.depth <= nearest[splats.pixel] * (1 + TIE)
-    pixel, token = splats.pixel[visible], splats.token[visible]
+    visible, nearest = hide_covered(splats, shape[0] * shape[1] * shape[2] * shape[3])
+    pixel, token = visible.pixel, visible.token
     # index_select rather than brackets, whose gradient several threads add up in no fixed order
     drawn = features.flatten(0, 1).index_select(0, token)
     # on CUDA the order of this sum, and so its last bit, is not fixed for three or more tokens at one depth
-    total = features.new_zeros(pixels, features.shape[-1]).index_add(0, pixel, drawn)
-    count = features.new_zeros(pixels).index_add(0, pixel, features.new_ones(len(pixel)))
+    total = features.new_zeros(len(nearest), features.shape[-1]).index_add(0, pixel, drawn)
+    count = features.new_zeros(len(nearest)).index_add(0, pixel, features.new_ones(len(pixel)))
     covered = count > 0
     logs = torch.where(covered, nearest, torch.ones_like(nearest)).log().to(features.dtype)
     canvas = torch.cat(

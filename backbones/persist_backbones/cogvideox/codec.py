@@ -18,6 +18,7 @@ from persist_backbones.diffusers_models import (
     CogVideoXSafeConv3d,
     DiagonalGaussianDistribution,
 )
+from persist_backbones.tensors import push_pull
 from persist_cli.errors import CheckpointError
 
 HALF_RANGE = 2.0  # the depth in metres whose code is 0
@@ -45,18 +46,7 @@ def fill_missing(depth: Float[Tensor, "frame height width"]) -> Float[Tensor, "f
     known = (depth > 0).to(depth.dtype)
     if bool(known.all()):
         return depth
-    return torch.where(known > 0, depth, _push_pull(depth * known, known))
-
-
-def _push_pull(total: Tensor, weight: Tensor) -> Tensor:
-    """Return the mean of known values at each pixel, on the finest scale that has any (Gortler et al., push-pull)."""
-    mean = total / weight.clamp_min(1e-6)
-    height, width = total.shape[-2:]
-    if height == 1 and width == 1:
-        return mean
-    pooled = (F.avg_pool2d(part[:, None], 2, ceil_mode=True)[:, 0] for part in (total, weight))
-    coarse = F.interpolate(_push_pull(*pooled)[:, None], size=(height, width), mode="bilinear")[:, 0]
-    return torch.where(weight > 0, mean, coarse)
+    return torch.where(known > 0, depth, push_pull((depth * known)[:, None], known[:, None])[:, 0])
 
 
 class SingleFrameConv(CogVideoXSafeConv3d):  # type: ignore[misc]

@@ -6,6 +6,7 @@ Start reading here: ``forward`` is the training loss, ``sample`` the sampling lo
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ from persist_backbones.cogvideox.diffusion import (
     SamplingSchedule,
     draw_timesteps,
     loss_weights,
+    noise_level,
     noise_like,
     prediction_target,
     sample_generators,
@@ -174,7 +176,8 @@ class CogVideoX(Backbone):
         for number, timestep in enumerate(schedule.timesteps):
             self.current_timestep = timestep
             timesteps = timestep.expand(len(latents)).to(self.device)
-            conditions = dataclasses.replace(conditions, timestep=timesteps)
+            level = noise_level(self.scheduler, timesteps)
+            conditions = dataclasses.replace(conditions, timestep=timesteps, level=level)
             predicted = self.predict_guided(latents, image, conditions, guidance)
             latents = schedule.step(predicted, timestep, latents)
             if on_step is not None:
@@ -272,14 +275,28 @@ class CogVideoX(Backbone):
                 f"the memory gives features of {tokens.features.shape[-1]} channels, adapter {self.adapter_name!r} was "
                 f"trained with {adapter.channels}; use the encoder it was trained with"
             )
-        tokens = tokens.to(self.device)
+        cameras = clips.cameras.to(self.device)
+        with torch.no_grad():
+            tokens = adapter.render(tokens.to(self.device), cameras, self.codec.encode)
         if generators is not None and adapter.settings.noise:
             level = draw_levels(generators, adapter.settings.noise)
             tokens = adapter.noisy(tokens, level.to(self.device), generators)
-        memory = adapter.prepare(tokens, clips.cameras)
+        memory = adapter.prepare(tokens, cameras)
         if level is not None and adapter.settings.noise:
             memory = dataclasses.replace(memory, level=level.to(self.device))
         return AdapterCondition(adapter, memory if generators is None else adapter.dropped(memory, generators))
+
+    def keep_tokens(self, clips: Clips) -> MemoryTokens:
+        """Return what the adapter in use needs of the clips' tokens: the encoded views of a memory that it renders."""
+        tokens, adapter = super().keep_tokens(clips), self.adapter
+        if adapter is None:
+            return tokens
+        return adapter.render(tokens.to(self.device), clips.cameras.to(self.device), self.codec.encode)
+
+    def token_encoding(self) -> str:
+        """Return what ``keep_tokens`` depends on: the codec, and the adapter's settings of rendering."""
+        settings = None if self.adapter is None else self.adapter.rendering()
+        return "" if settings is None else json.dumps({"codec": self.encoding()} | dict(settings), sort_keys=True)
 
     def conditions(
         self,
@@ -294,6 +311,7 @@ class CogVideoX(Backbone):
         return Conditions(
             text=self.prompt.expand(len(clips.seeds), -1, -1),
             timestep=timesteps,
+            level=noise_level(self.scheduler, timesteps),
             interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(self.device),
             camera=camera_latents(clips.cameras, *rays),
             rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.rotary_grid, self.device),

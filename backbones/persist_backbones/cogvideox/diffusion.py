@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from persist_backbones.adapters.base import NoiseLevel
 from persist_backbones.diffusers_models import (
     CogVideoXDDIMScheduler,
     CogVideoXDPMScheduler,
@@ -53,6 +54,13 @@ def prediction_target(
         return latents
     velocity: Tensor = scheduler.get_velocity(latents, noise, timesteps)
     return velocity
+
+
+def noise_level(scheduler: CogVideoXDDIMScheduler, timesteps: Int[Tensor, " batch"]) -> NoiseLevel:
+    """Return the noise level of timesteps of training, float32, and what the scheduler's model predicts."""
+    signal = scheduler.alphas_cumprod.to(timesteps.device)[timesteps].float()[:, None, None, None, None]
+    noise = (1 - signal).clamp_min(1e-8)
+    return NoiseLevel(signal.sqrt(), noise.sqrt(), scheduler.config.prediction_type != "sample")
 
 
 def loss_weights(

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import MemoryCondition, VideoShape
+from persist_backbones.adapters.base import MemoryCondition, NoiseLevel, VideoShape
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
 from persist_backbones.diffusers_models import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
@@ -30,7 +30,8 @@ class Conditions:
 
     Args:
         text: the prompt's embedding.
-        timestep: noise level of each sample.
+        timestep: timestep of each sample.
+        level: the noise levels of the timesteps, by which the memory corrects the prediction.
         interactions: rows of the interaction embedding, 0 for none.
         camera: camera embedding at each video token, for the queries of memory blocks.
         rotary: cosines and sines, for models with rotary positions.
@@ -40,6 +41,7 @@ class Conditions:
 
     text: Float[Tensor, "batch word channel"]
     timestep: Int[Tensor, " batch"]
+    level: NoiseLevel
     interactions: Int[Tensor, "batch step"]
     camera: Float[Tensor, "batch token camera"]
     rotary: tuple[Tensor, Tensor] | None = None
@@ -109,6 +111,7 @@ class WorldTransformer(nn.Module):
         """Predict RGB and depth latents, concatenated on channels."""
         time = conditions.memory.time(self.embed_time(conditions, latents.dtype))
         text, video = self.embed_patches(latents, conditions.text.to(latents.dtype))
+        video = conditions.memory.begin(video)
         for layer, block in enumerate(self.base.transformer_blocks):
             video = conditions.memory.before(layer, video)
             video, text = block(
@@ -118,7 +121,7 @@ class WorldTransformer(nn.Module):
         video = self.base.norm_out(self.base.norm_final(video), temb=time)
         outputs = (self.base.proj_out(video), self.extra_out(video))
         predicted = torch.cat([self.unpatchify(tokens, latents) for tokens in outputs], dim=2)
-        return conditions.memory.correct(predicted, latents, time)
+        return conditions.memory.correct(predicted, latents, time, conditions.level)
 
     def embed_time(self, conditions: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
         """Return the sum of the embeddings of time, ``ofs`` (CogVideoX 1.5 image-to-video), interactions and noise."""

@@ -24,7 +24,7 @@ from diffusers.hooks.taylorseer_cache import _TAYLORSEER_CACHE_HOOK, TaylorSeerS
 from diffusers.models.cache_utils import CacheMixin
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import MemoryCondition
+from persist_backbones.adapters.base import MemoryCondition, NoiseLevel
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_cli.errors import PersistError
 
@@ -155,6 +155,10 @@ class SkippedMemory(MemoryCondition):
     memory: MemoryCondition
     blocks: nn.ModuleList
 
+    def begin(self, video: Tensor) -> Tensor:
+        """Return the embedded video tokens, before the first transformer block."""
+        return self.memory.begin(video)
+
     def before(self, layer: int, video: Tensor) -> Tensor:
         """Return the input of transformer block ``layer``."""
         if layer and _rest_is_cached(self.blocks[0]):
@@ -167,9 +171,9 @@ class SkippedMemory(MemoryCondition):
             return video
         return self.memory.after(layer, video, camera, time)
 
-    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor) -> Tensor:
+    def correct(self, predicted: Tensor, inputs: Tensor, time: Tensor, level: NoiseLevel) -> Tensor:
         """Return the prediction, corrected by the memory."""
-        return self.memory.correct(predicted, inputs, time)
+        return self.memory.correct(predicted, inputs, time, level)
 
 
 def _rest_is_cached(block: nn.Module) -> bool:

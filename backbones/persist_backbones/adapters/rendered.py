@@ -1,0 +1,321 @@
+"""The adapter ``rendered``: point-cloud renders of the memory, encoded by the frozen codec, are inputs of the model.
+
+Known from ViewCrafter (2409.02048), See3D (2412.06699), TrajectoryCrafter (2503.05638) and GEN3C (2503.03751): what the
+memory shows in each target view is drawn as an RGB-D image, holes are filled, and the clip of these images goes through
+the video model's own frozen VAE. Its latents and the mask of what was drawn are further input channels of the
+transformer. Here they also correct the prediction at each latent pixel, and ``projected`` attention brings in what is
+not drawn.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int64, Shaped, UInt8
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from torch import Tensor, nn
+
+from persist_backbones.adapters.base import Adapter, Encode, NoiseLevel, PreparedMemory, VideoShape
+from persist_backbones.adapters.canvas import CanvasHead
+from persist_backbones.adapters.memory_block import AttentionSettings
+from persist_backbones.adapters.projected import ProjectedAdapter, ProjectedMemory, ProjectedSettings, image_places
+from persist_backbones.adapters.splat import hide_covered, rasterize, splat
+from persist_backbones.noise_levels import add_level
+from persist_backbones.tensors import fold_frames, fold_patches, push_pull, zero_init
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.observations import Origin
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import CheckpointError
+
+ERROR = 0.05  # variance of rendered latents about the true ones, where those of the codec have about 1
+COVERED = 8.0  # steepness of a fresh gate in the share of a latent pixel that is covered; it is half open at a half
+
+
+@dataclass(frozen=True)
+class RenderedSettings(AttentionSettings):
+    """Settings of the adapter that renders its tokens; those of attention are for the tokens that are not rendered.
+
+    Args:
+        token_size: edge in metres of the square that a token is drawn as, somewhat more than the edge of a cell.
+        splat_pixels: the largest edge of a drawn token in pixels, odd; 1 draws points.
+        head_width: hidden channels of the layers that correct the prediction by the rendered views.
+        head_layers: number of those layers that look at neighbouring latent pixels.
+        attention_tokens: tokens that ``projected`` attention reads of those that no view shows; 0 leaves attention out
+            where there are no learned tokens either.
+    """
+
+    form: Literal["rendered"] = "rendered"
+    token_budget: PositiveInt = 65536
+    token_size: PositiveFloat = 0.05
+    splat_pixels: PositiveInt = 9
+    head_width: PositiveInt = 96
+    head_layers: PositiveInt = 2
+    attention_tokens: NonNegativeInt = 256
+
+
+class Views(NamedTuple):
+    """What a memory shows in the views of clips; holes are filled from around them.
+
+    Args:
+        rgb: uint8 RGB.
+        depth: planar z in metres.
+        covered: whether a pixel shows what was observed, and whether it shows what was imagined: 0 or 1, and between
+            them where both kinds meet; both are 0 in holes.
+        shown: for each token whether a view shows it.
+    """
+
+    rgb: UInt8[Tensor, "batch frame height width 3"]
+    depth: Float[Tensor, "batch frame height width"]
+    covered: Float[Tensor, "batch frame origin height width"]
+    shown: Bool[Tensor, "batch token"]
+
+
+def render_views(tokens: MemoryTokens, cameras: Cameras, token_size: float, most: int) -> Views:
+    """Draw tokens with a z-buffer into the views of cameras, at the images' full size.
+
+    Args:
+        tokens: the tokens of a batch, with colours.
+        cameras: axes ``batch frame``.
+        token_size: edge in metres of a token's square, facing the camera.
+        most: largest edge of a square in pixels.
+
+    Raises:
+        CheckpointError: when the tokens have no colours.
+    """
+    if tokens.colors is None:
+        raise CheckpointError(
+            "the adapter form 'rendered' draws tokens in their colours, but this memory's tokens have none; use the "
+            "memory voxel, map2d or snapshots, or another form"
+        )
+    shape = (*cameras.world_from_camera.shape[:2], cameras.height, cameras.width)
+    splats, _ = hide_covered(rasterize(tokens.positions, tokens.mask, cameras, token_size, most), math.prod(shape))
+    shown = torch.zeros_like(tokens.mask).flatten().index_fill(0, splats.token, True).view_as(tokens.mask)
+    observed = (tokens.origins == Origin.OBSERVED)[..., None].float()
+    drawn = splat(torch.cat([tokens.colors.float(), observed], dim=-1), splats, shape)
+    color, observed, covered, logs = drawn.split([3, 1, 1, 1], dim=2)
+    pictures = torch.cat([color, logs.exp()], dim=2) * covered
+    filled = push_pull(pictures.flatten(0, 1), covered.flatten(0, 1)).unflatten(0, shape[:2])
+    rgb, depth = filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3]
+    return Views(rgb, depth, torch.cat([observed, covered - observed], dim=2), shown)
+
+
+def tokens_not_shown(tokens: MemoryTokens, shown: Bool[Tensor, "batch token"], cameras: Cameras, most: int) -> Tensor:
+    """Return numbers of tokens that no view shows although they lie in or beside one: hidden, or just out of sight.
+
+    They are spread evenly over the order of the tokens, which begins with the most relevant.
+
+    Args:
+        tokens: the tokens of a batch.
+        shown: the tokens that a view shows.
+        cameras: the cameras of the views.
+        most: largest number of tokens of a sample.
+
+    Returns:
+        For each sample ``most`` numbers, -1 where there are fewer such tokens.
+    """
+    rows = []
+    for sample in range(len(shown)):  # one at a time: the places of all would take much memory
+        one = MemoryTokens(*(part[sample : sample + 1] for part in (tokens.features, tokens.positions, tokens.mask)))
+        poses, matrices = cameras.world_from_camera[sample : sample + 1], cameras.intrinsics[sample : sample + 1]
+        _, beside = image_places(one, dataclasses.replace(cameras, world_from_camera=poses, intrinsics=matrices))
+        count = (beside.any(dim=1)[0] & ~shown[sample]).cumsum(0)
+        wanted = torch.arange(most, device=count.device)
+        spread = wanted * count[-1].clamp_min(most) // most
+        rows.append(torch.where(spread < count[-1], torch.searchsorted(count, spread + 1), -1))
+    return torch.stack(rows)
+
+
+class RenderedHead(CanvasHead):
+    """A network that moves the prediction towards the rendered views at each latent pixel and channel.
+
+    Let r be the latents of the rendered views and x the clean latents as predicted. The new ones are x + g (r − x), and
+    a correction is added to the prediction. A fresh head corrects nothing, and its gate g is open where a latent pixel
+    is covered: g = 1 / (1 + SNR · ``ERROR``) is the weight of r in the mean of two measurements of x, one by the noisy
+    latents, with errors of variance 1 / SNR, and one by the rendered views, with errors of variance ``ERROR``.
+
+    Args:
+        drawn: channels of latents and mask of the rendered views.
+        video: sizes of the video model.
+        width: hidden channels.
+        layers: number of convolutions of 3×3 before the last.
+    """
+
+    def __init__(self, drawn: int, video: VideoShape, width: int, layers: int) -> None:
+        super().__init__(drawn, video.inputs, video.outputs, video.time_channels, width)
+        self.more = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(layers - 1))
+        self.gate = nn.Conv2d(width, video.outputs, 3, padding=1)
+        zero_init(self.gate)
+
+    def hidden(self, predicted: Tensor, inputs: Tensor, canvas: Tensor, time: Tensor) -> Tensor:
+        """Return what the last layers take, frames on the batch axis."""
+        hidden: Tensor = super().hidden(predicted, inputs, canvas, time)
+        for layer in self.more:
+            hidden = hidden + layer(F.gelu(hidden, approximate="tanh"))
+        return hidden
+
+    def moved(
+        self, predicted: Tensor, inputs: Tensor, memory: PreparedRendering, time: Tensor, level: NoiseLevel
+    ) -> Float[Tensor, "batch frame out height width"]:
+        """Return the prediction, moved towards the rendered views and corrected; see ``Adapter.correct``."""
+        hidden = F.gelu(self.hidden(predicted, inputs, memory.seen, time), approximate="tanh")
+        correction, gate = (layer(hidden).unflatten(0, predicted.shape[:2]) for layer in (self.out, self.gate))
+        color, _, depth, _ = inputs[:, :, : 2 * predicted.shape[2]].chunk(4, dim=2)
+        clean = level.clean(predicted, torch.cat([color, depth], dim=2))
+        snr = (level.signal / level.noise).square()
+        opened = torch.sigmoid(gate - ((-COVERED * (memory.share - 0.5)).exp() + snr * ERROR).log())
+        opened = opened * (memory.share > 0)
+        moved: Tensor = level.moved(predicted, opened * (memory.latents - clean)) + correction
+        return moved
+
+
+@dataclass(frozen=True)
+class PreparedRendering(PreparedMemory):
+    """The rendered views of a batch: their patch embedding at each video token, masked where no view shows anything.
+
+    Args:
+        latents: latents of the rendered views.
+        share: share of the pixels of a latent pixel that are covered.
+        seen: latents and mask, embedded for the head.
+        blank: what the head sees where nothing is rendered.
+        attention: the tokens that no view shows, ``None`` without attention.
+    """
+
+    latents: Float[Tensor, "batch frame out height width"]
+    share: Float[Tensor, "batch frame 1 height width"]
+    seen: Float[Tensor, "batch frame hidden height width"]
+    blank: Float[Tensor, " hidden"]
+    attention: ProjectedMemory | None = None
+
+    def only(self, samples: Bool[Tensor, " batch"]) -> Self:
+        """Return this memory, hidden from all samples but those that are true in ``samples``."""
+        shown = samples[:, None, None, None, None]
+        return dataclasses.replace(
+            super().only(samples),
+            latents=self.latents * shown,
+            share=self.share * shown,
+            seen=torch.where(shown, self.seen, self.blank[:, None, None]),
+            attention=None if self.attention is None else self.attention.only(samples),
+        )
+
+
+class RenderedAdapter(Adapter[PreparedRendering]):
+    """The form that renders tokens into the views and encodes them by the frozen codec, once for all denoising steps.
+
+    Latents and mask are embedded like the model's own input, without a bias and starting at zero, and added to the
+    video tokens before the first transformer block; after the last one a head corrects the prediction by them. The
+    mask has for each latent pixel and frame the shares of its pixels that show what was observed, and what was
+    imagined. Video tokens of which no pixel is covered stay as they are, as do latent frames without a token to attend
+    to: a clip whose views show nothing equals that of stage 1 to the bit, before and after training, unless the adapter
+    has learned tokens.
+    """
+
+    settings_type = RenderedSettings
+    settings: RenderedSettings
+
+    def __init__(self, channels: int, settings: RenderedSettings, video: VideoShape) -> None:
+        super().__init__(channels, settings, video)
+        if settings.splat_pixels % 2 == 0:
+            raise CheckpointError(f"splat_pixels must be odd, not {settings.splat_pixels}")
+        drawn = video.outputs + 2 * video.temporal
+        self.patches = nn.Linear(drawn * video.token_frames * video.patch**2, video.channels, bias=False)
+        zero_init(self.patches)
+        self.head = RenderedHead(drawn, video, settings.head_width, settings.head_layers)
+        self.register_parameter("learned", None)  # learned tokens are those of attention
+        shared = {field.name: getattr(settings, field.name) for field in dataclasses.fields(AttentionSettings)}
+        attention = ProjectedSettings(**shared | {"form": "projected"})
+        reads = settings.attention_tokens or settings.learned_tokens
+        self.attention = ProjectedAdapter(channels, attention, video) if reads else None
+
+    @property
+    def blocks(self) -> nn.ModuleDict:  # type: ignore[override]
+        """The memory blocks of ``projected`` attention."""
+        return nn.ModuleDict() if self.attention is None else self.attention.blocks
+
+    def render(self, tokens: MemoryTokens, cameras: Cameras, encode: Encode) -> MemoryTokens:
+        """Return latents and mask of the rendered views, float16, with the tokens for attention."""
+        if tokens.rendered is not None:
+            return tokens
+        settings, spatial = self.settings, self.video.spatial
+        views = render_views(tokens, cameras, settings.token_size, settings.splat_pixels)
+        shares = F.avg_pool2d(views.covered.flatten(0, 1), spatial).unflatten(0, views.covered.shape[:2])
+        mask = fold_frames(shares, self.video.temporal)
+        latents = encode(views.rgb, views.depth) * mask.any(dim=2, keepdim=True)
+        numbers = tokens_not_shown(tokens, views.shown, cameras, settings.attention_tokens)
+        rest = {name: _chosen(part, numbers.clamp_min(0)) for name, part in tokens.tensors().items()}
+        rest |= {"mask": numbers >= 0, "rendered": torch.cat([latents, mask.to(latents)], dim=2).half()}
+        return MemoryTokens(**rest)
+
+    def rendering(self) -> Mapping[str, Any]:
+        """Return the settings that ``render`` depends on."""
+        settings = self.settings
+        names = ("token_size", "splat_pixels", "attention_tokens")
+        return {name: getattr(settings, name) for name in names}
+
+    def noisy(
+        self, tokens: MemoryTokens, level: Float[Tensor, " batch"], generators: list[torch.Generator]
+    ) -> MemoryTokens:
+        """Return rendered tokens with noise of a level on their latents, where they cover anything, and features."""
+        assert tokens.rendered is not None
+        latents, mask = tokens.rendered.split([self.video.outputs, 2 * self.video.temporal], dim=2)
+        noisy = add_level(latents, level, generators) * mask.any(dim=2, keepdim=True)
+        tokens = super().noisy(tokens, level, generators)
+        return dataclasses.replace(tokens, rendered=torch.cat([noisy, mask], dim=2))
+
+    def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedRendering:
+        """Embed what ``render`` returned."""
+        assert tokens.rendered is not None
+        video, weights = self.video, self.patches.weight
+        drawn = fold_frames(tokens.rendered.to(weights.dtype), 1, video.token_frames)
+        latents, mask = drawn.split([video.outputs, 2 * video.temporal], dim=2)
+        covered = fold_patches(mask, video.patch, video.token_frames).any(dim=-1)
+        return PreparedRendering(
+            tokens=self.patches(fold_patches(drawn, video.patch, video.token_frames)),
+            mask=covered,
+            latents=latents,
+            share=mask.sum(dim=2, keepdim=True) / video.temporal,
+            seen=self.head.look(drawn),
+            blank=self.head.look(torch.zeros_like(drawn[:1, :1, :, :1, :1])).flatten(),
+            attention=None if self.attention is None else self.attention.prepare(tokens, cameras),
+        )
+
+    def begin(self, video: Tensor, memory: PreparedRendering) -> Tensor:
+        """Return the video tokens with the patches of the rendered views added."""
+        return video + (memory.tokens * memory.mask[..., None]).to(video.dtype)
+
+    def after(
+        self, block: nn.Module, video: Tensor, memory: PreparedRendering, camera: Tensor, time: Tensor
+    ) -> Float[Tensor, "batch token channel"]:
+        """Return the video after the memory block, unchanged in latent frames without a token to attend to."""
+        assert self.attention is not None
+        assert memory.attention is not None
+        changed = self.attention.after(block, video, memory.attention, camera, time)
+        attends = memory.attention.mask.any(dim=-1)
+        return torch.where(attends.repeat_interleave(video.shape[1] // attends.shape[1], 1)[..., None], changed, video)
+
+    def correct(
+        self, predicted: Tensor, inputs: Tensor, memory: PreparedRendering, time: Tensor, level: NoiseLevel
+    ) -> Tensor:
+        """Return the prediction, moved towards the rendered views where they cover something of a video token.
+
+        An adapter with learned tokens corrects it everywhere.
+        """
+        moved = self.head.moved(predicted, inputs, memory, time, level).to(predicted.dtype)
+        if self.settings.learned_tokens:
+            return moved
+        batch, frames, _, height, width = predicted.shape
+        side, token_frames = self.video.patch, self.video.token_frames
+        mask = memory.mask.reshape(batch, frames // token_frames, 1, height // side, width // side)
+        mask = mask.repeat_interleave(token_frames, 1).repeat_interleave(side, -2).repeat_interleave(side, -1)
+        return torch.where(mask, moved, predicted)
+
+
+def _chosen(part: Shaped[Tensor, "batch token *rest"], numbers: Int64[Tensor, "batch chosen"]) -> Tensor:
+    """Return some rows of each sample."""
+    index = numbers.reshape(*numbers.shape, *[1] * (part.ndim - 2)).expand(-1, -1, *part.shape[2:])
+    return part.gather(1, index)
