@@ -52,6 +52,12 @@ class StopSignal:
         self.signal = number
 
 
+def outlive_signals(_worker: int) -> None:
+    """Let a process that reads data go on when all processes get a signal: the run ends it, after its checkpoint."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 class Trainer:
     """Trains one stage of a backbone.
 
@@ -154,6 +160,7 @@ class Trainer:
             batch_sampler=batches,
             num_workers=settings.workers,
             collate_fn=list,
+            worker_init_fn=outlive_signals,
             generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
         )
         remaining = iter(loader)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 import signal
@@ -190,14 +191,16 @@ def test_a_run_trains_on_the_bundled_sample_data(persist, walks, codec, tmp_path
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_ctrl_c_and_preemption_save_a_checkpoint_and_say_how_to_resume(walks, codec, tmp_path, sent, code):
-    arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=100000")
-    child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    changes = ["training.steps=100000", "training.workers=1"]
+    command = [*PERSIST, *stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)]
+    outputs = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    child = subprocess.Popen(command, **outputs, text=True, start_new_session=True)
     try:
         deadline = time.monotonic() + 300
         log = tmp_path / "run/log.jsonl"
         while not (log.is_file() and log.stat().st_size) and time.monotonic() < deadline:
             time.sleep(0.05)
-        child.send_signal(sent)
+        os.killpg(child.pid, sent)  # its process that reads data gets it too, as from a terminal or a scheduler
         out, _ = child.communicate(timeout=300)
     finally:
         child.kill()  # the run has no end of its own
