@@ -20,6 +20,7 @@ class Encoder(ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
+    costly: ClassVar[bool] = False  # features are kept by frame, since finding them again is quicker than encoding
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:

@@ -153,7 +153,7 @@ def finetune(
     out: Annotated[Path | None, typer.Option(help="Run folder.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on from the run's last checkpoint.")] = False,
     cache: Annotated[
-        Path | None, typer.Option(help="Folder for latents and memory tokens; set data.clips_per_trajectory too.")
+        Path | None, typer.Option(help="Folder for latents, features and memory tokens of clips that come again.")
     ] = None,
     cache_gigabytes: Annotated[float | None, typer.Option(min=0, help="Most that the cache may hold; 20.")] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Say where the time of a step goes.")] = False,
@@ -174,8 +174,8 @@ def finetune(
         return
     if json:
         raise PersistError("--json prints the table of --dry-run; give both, or read the run folder's log.jsonl")
-    from persist_cli.train.clip_cache import CacheSettings
     from persist_cli.train.finetune import FinetunePlan, run_finetune
+    from persist_cli.train.tensor_cache import CacheSettings
 
     if cache is None and cache_gigabytes is not None:
         raise PersistError("--cache-gigabytes bounds a cache; give --cache DIR too")

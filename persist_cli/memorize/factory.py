@@ -11,6 +11,7 @@ from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.data.clips import ClipSample
 from persist_cli.io.settings import parse_settings
+from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.plugins import load_plugin, make_encoder
 from persist_cli.recipe import MemoryConfig
 
@@ -25,7 +26,7 @@ class MemoryFactory:
     Args:
         kind: class of the memories.
         settings: an instance of the class's settings type.
-        encoder: the encoder that all memories share.
+        encoder: the encoder that all memories share; a costly one keeps the features of frames.
         device: device on which encoder and memories compute.
     """
 
@@ -40,7 +41,7 @@ class MemoryFactory:
         kind = load_plugin("memory", config.name)
         settings = parse_settings(kind.settings_type, config.settings, f"memory {config.name!r}")
         encoder = make_encoder(config.encoder, config.encoder_settings).to(device)
-        return MemoryFactory(kind, settings, encoder, device)
+        return MemoryFactory(kind, settings, KeptFeatures(encoder) if encoder.costly else encoder, device)
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """Return an empty memory in the world of a trajectory."""

@@ -1,19 +1,9 @@
-"""A cache of the latents and memory tokens of clips, in a folder that processes and runs share.
-
-An entry is a safetensors file. Its name is its key: a hash of data, weights, settings and versions of packages, on
-which its content depends. When code changes and its version does not, the folder must be removed by hand. Two processes
-may write an entry at once, because both write the same, aside, and then rename it. Once the folder is full nothing more
-is stored; entries are never replaced.
-"""
+"""A cache of what is made of clips: their latents and memory tokens, and the features of whole trajectories."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
-import shutil
-import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -28,116 +18,20 @@ from persist_cli.api.backbone import Backbone, Clip, ClipLatents, Clips
 from persist_cli.api.observations import Observations
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import ClipDataset, ClipFrames, ClipSample
-from persist_cli.errors import CheckpointError, PersistError
-from persist_cli.io.files import ASIDE, file_sha256, read_tensors, write_tensors
+from persist_cli.io.files import file_sha256
 from persist_cli.memorize.factory import MemoryFactory, with_memory
+from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.memorize.sources import Source
 from persist_cli.plugins import find_plugin
 from persist_cli.recipe import MemoryConfig, Recipe
-from persist_cli.viewing.console import say
-
-FORMAT: Final = 3  # of the entries; those of another format are not found
-
-SCANS: Final = 64  # how often at most the folder is measured while it fills up
+from persist_cli.train.feature_cache import FeatureCache
+from persist_cli.train.tensor_cache import TensorCache, cache_key
 
 TOKENS: Final = 2  # format of memory tokens; those of 1 have neither colours nor origins and are not found
 
-STALE: Final = 3600.0  # seconds after which a file aside must be that of a killed writer
 
-
-@dataclass(frozen=True)
-class CacheSettings:
-    """The place and size of a cache.
-
-    Args:
-        folder: the folder of the entries; it is made when missing.
-        gigabytes: the size that all entries together may have, in 10⁹ bytes.
-    """
-
-    folder: Path
-    gigabytes: float
-
-
-class TensorCache:
-    """Keeps tensors by key in a folder, up to a number of bytes.
-
-    The folder is measured at the beginning and whenever this process has added a 64th of the limit. Each of several
-    processes can therefore exceed the limit by as much.
-
-    Args:
-        settings: the folder and its limit.
-
-    Raises:
-        PersistError: when the folder cannot be made or the limit is not a number of at least 0.
-    """
-
-    def __init__(self, settings: CacheSettings) -> None:
-        self.folder, self.limit = settings.folder, settings.gigabytes * 1e9
-        if not self.limit >= 0:
-            raise PersistError(f"--cache-gigabytes is {settings.gigabytes}; it must be a number of at least 0")
-        self.full = False
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise PersistError(f"{self.folder}: no folder for a cache can be made there ({error.strerror})") from error
-        for aside in self.folder.glob(f"*/{ASIDE}*"):
-            _remove_stale(aside)
-        self.measure()
-
-    def measure(self) -> None:
-        """Count the bytes in the folder anew."""
-        self.used = sum(_size(path) for path in self.folder.glob("*/*.safetensors"))
-        self.added = 0
-
-    def path(self, key: str) -> Path:
-        """The file of an entry, which need not exist; entries are spread over 256 folders."""
-        return self.folder / key[:2] / f"{key}.safetensors"
-
-    def get(self, key: str) -> dict[str, Tensor] | None:
-        """The tensors of an entry, ``None`` when there is none; a damaged one is removed, and a line says so."""
-        path = self.path(key)
-        if not path.is_file():
-            return None
-        try:
-            tensors, _ = read_tensors(path)
-        except CheckpointError as error:
-            self._remove(path, str(error))
-            return None
-        return tensors
-
-    def put(self, key: str, tensors: Mapping[str, Tensor]) -> None:
-        """Store an entry while there is room; once the folder cannot be written, nothing more is stored."""
-        if self.full:
-            return
-        path = self.path(key)
-        size = sum(tensor.nbytes for tensor in tensors.values())
-        if self.added + size > self.limit / SCANS:
-            self.measure()
-        if self.used + size > self.limit:
-            return self._stop(f"full ({self.used / 1e9:.3g} GB)")
-        before = _size(path)  # another process may have written the same entry already
-        try:
-            path.parent.mkdir(exist_ok=True)
-            write_tensors(path, tensors)
-        except OSError as error:
-            return self._stop(f"not writable ({error})")
-        grown = _size(path) - before
-        self.used, self.added = self.used + grown, self.added + grown
-
-    def _stop(self, cause: str) -> None:
-        self.full = True
-        say(f"{self.folder}: {cause}; what is not in it is made anew each time")
-
-    def _remove(self, path: Path, cause: str) -> None:
-        if path.is_file():  # another process may have removed it
-            path.unlink(missing_ok=True)
-            say(f"{cause}; removed, made anew")
-
-
-def cache_key(values: Mapping[str, Any]) -> str:
-    """The key of an entry: a hash of the JSON values that it depends on."""
-    text = json.dumps(dict(values) | {"format": FORMAT}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:40]
+# what the features of a frame depend on, among all that tokens depend on
+FEATURES: Final = frozenset(("persist", "torch", "device", "encoder", "encoder_settings", "features", "packages"))
 
 
 @dataclass(frozen=True)
@@ -145,11 +39,11 @@ class ClipKeys:
     """The keys of the entries of one clip.
 
     Args:
-        latents: the key of its latents, or of those of its whole trajectory.
-        tokens: the key of its memory tokens, ``None`` without a memory.
+        latents: the key of its latents, or of those of its whole trajectory; ``None`` where neither comes again.
+        tokens: the key of its memory tokens, ``None`` without a memory or where the clip does not come again.
     """
 
-    latents: str
+    latents: str | None
     tokens: str | None
 
 
@@ -161,11 +55,13 @@ class CacheKeys:
         latents: the JSON values that latents depend on besides the clip.
         tokens: the JSON values that memory tokens depend on besides the clip, ``None`` without a memory.
         whole_trajectories: whether an entry has the latents of a whole trajectory instead of a clip.
+        repeats: whether clips come again, with the same contexts.
     """
 
     latents: dict[str, Any]
     tokens: dict[str, Any] | None
     whole_trajectories: bool
+    repeats: bool = True
     hashes: dict[Path, str] = field(default_factory=dict)  # of the trajectories' files, each computed once
 
     @staticmethod
@@ -185,17 +81,22 @@ class CacheKeys:
             tokens = encoded_by | _token_dependencies(recipe.memory, factory, backbone)
             if kept := backbone.token_encoding():
                 tokens |= {"kept": kept, "precision": recipe.training.precision}
-        return CacheKeys(latents, tokens, backbone.framewise)
+        return CacheKeys(latents, tokens, backbone.framewise, recipe.data.clips_per_trajectory > 0)
 
     def of_clip(self, frames: ClipFrames) -> ClipKeys:
         """The keys of a clip."""
-        clip = {"trajectory": self._file_hash(frames.file.path), "frames": list(frames.frames)}
-        latents = cache_key((clip | {"frames": "all"} if self.whole_trajectories else clip) | self.latents)
-        if self.tokens is None:
-            return ClipKeys(latents, None)
-        return ClipKeys(latents, cache_key(clip | {"context": list(frames.context)} | self.tokens))
+        clip = {"trajectory": self.file_hash(frames.file.path), "frames": list(frames.frames)}
+        latents = tokens = None
+        if self.whole_trajectories:
+            latents = cache_key(clip | {"frames": "all"} | self.latents)
+        elif self.repeats:
+            latents = cache_key(clip | self.latents)
+        if self.repeats and self.tokens is not None:
+            tokens = cache_key(clip | {"context": list(frames.context)} | self.tokens)
+        return ClipKeys(latents, tokens)
 
-    def _file_hash(self, path: Path) -> str:
+    def file_hash(self, path: Path) -> str:
+        """The SHA-256 of a trajectory's file."""
         if path not in self.hashes:
             self.hashes[path] = file_sha256(path)
         return self.hashes[path]
@@ -203,15 +104,26 @@ class CacheKeys:
 
 @dataclass(frozen=True)
 class ClipCache:
-    """A cache of the latents and memory tokens of a run's clips.
+    """A cache of the latents and memory tokens of a run's clips, and of the features of their trajectories.
 
     Args:
         cache: the tensors by key.
         keys: makes the keys of the clips.
+        features: the features of whole trajectories, ``None`` where frames are encoded as quickly as they are read.
     """
 
     cache: TensorCache
     keys: CacheKeys
+    features: FeatureCache | None = None
+
+    @staticmethod
+    def of(cache: TensorCache, keys: CacheKeys, factory: MemoryFactory | None) -> ClipCache:
+        """The cache of a run; a costly encoder's features are kept in it too."""
+        encoder = None if factory is None else factory.encoder
+        if not isinstance(encoder, KeptFeatures) or keys.tokens is None:
+            return ClipCache(cache, keys)
+        depends = {name: value for name, value in keys.tokens.items() if name in FEATURES}
+        return ClipCache(cache, keys, FeatureCache(cache, depends, encoder))
 
     @property
     def whole_trajectories(self) -> bool:
@@ -220,7 +132,8 @@ class ClipCache:
 
     def latents(self, frames: ClipFrames) -> ClipLatents | None:
         """The latents of a clip, ``None`` where the cache has none."""
-        tensors = self.cache.get(self.keys.of_clip(frames).latents)
+        key = self.keys.of_clip(frames).latents
+        tensors = None if key is None else self.cache.get(key)
         if tensors is None:
             return None
         return self.clip_latents(tensors["video"], frames) if self.whole_trajectories else ClipLatents(**tensors)
@@ -238,8 +151,10 @@ class ClipCache:
 
     def put_latents(self, frames: ClipFrames, latents: ClipLatents) -> None:
         """Store the latents of a clip, or of its whole trajectory, while there is room."""
-        tensors = {"video": latents.video} | ({} if self.whole_trajectories else {"image": latents.image})
-        self.cache.put(self.keys.of_clip(frames).latents, tensors)
+        key = self.keys.of_clip(frames).latents
+        if key is not None:
+            tensors = {"video": latents.video} | ({} if self.whole_trajectories else {"image": latents.image})
+            self.cache.put(key, tensors)
 
     def put_tokens(self, frames: ClipFrames, tokens: MemoryTokens) -> None:
         """Store the memory tokens of a clip while there is room."""
@@ -315,6 +230,9 @@ class ClipEncoder:
         """The clip with the tokens that a memory of its context gives for its cameras, where there is a memory."""
         if self.factory is None or cached.sample.clip.tokens is not None:
             return cached.sample.clip
+        if self.cache is not None and self.cache.features is not None:
+            file = cached.frames.file
+            self.cache.features.bring(file, self.cache.keys.file_hash(file.path))
         clip = with_memory(cached.sample, self.factory, self.backbone.token_budget)
         with torch.no_grad(), self.accelerator.autocast():
             tokens = self.backbone.keep_tokens(Clips.stack([clip]))[0]
@@ -338,21 +256,6 @@ class ClipEncoder:
         """Latents of these frames, on the CPU."""
         with torch.no_grad(), self.accelerator.autocast():
             return self.backbone.encode(Clips.stack([clip]))[0].to("cpu")
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:  # another process may have removed it
-        return 0
-
-
-def _remove_stale(aside: Path) -> None:
-    try:
-        if time.time() - aside.stat().st_mtime > STALE:
-            shutil.rmtree(aside, ignore_errors=True)
-    except FileNotFoundError:  # its writer may have renamed it
-        return
 
 
 def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: Backbone) -> dict[str, Any]:

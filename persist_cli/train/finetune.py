@@ -36,7 +36,6 @@ from persist_cli.recipe import (
     recipe_names,
     to_plain,
 )
-from persist_cli.train.clip_cache import CacheSettings
 from persist_cli.train.distributed import (
     explain_lost_processes,
     fsdp_plugin,
@@ -46,6 +45,7 @@ from persist_cli.train.distributed import (
 )
 from persist_cli.train.run_folder import RunFolder
 from persist_cli.train.state import load_state
+from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import StopSignal, Trainer
 from persist_cli.viewing.console import busy, say, warn
 

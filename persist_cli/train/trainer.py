@@ -22,11 +22,12 @@ from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import Recipe, TrainingSettings
-from persist_cli.train.clip_cache import CachedClips, CacheKeys, CacheSettings, ClipCache, ClipEncoder, TensorCache
+from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import make_average, make_optimizer, requested_savings, update_average
 from persist_cli.train.state import TrainingState
+from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 from persist_cli.viewing.console import add_task, progress
 
 START_BATCHES: Final = 16  # from which fresh weights are set at the beginning of a stage
@@ -134,13 +135,15 @@ class Trainer:
             raise RecipeError(
                 f"--cache: in stage {recipe.stage} backbone {backbone.name!r} keeps nothing of a clip; leave it out"
             )
-        if not repeats and (recipe.stage == "2" or not backbone.framewise):
+        keeps_features = self.factory is not None and self.factory.encoder.costly
+        if not repeats and not keeps_features and (recipe.stage == "2" or not backbone.framewise):
             raise RecipeError(
                 "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
                 "data.clips_per_trajectory=32, or leave --cache out"
             )
         keys = CacheKeys.of(recipe, backbone, self.factory, self.accelerator.device.type)
-        return ClipEncoder(backbone, self.factory, self.accelerator, ClipCache(TensorCache(settings), keys))
+        kept = ClipCache.of(TensorCache(settings), keys, self.factory)
+        return ClipEncoder(backbone, self.factory, self.accelerator, kept)
 
     def first_batches(self, count: int) -> Iterator[Clips]:
         """So many batches of the first samples, of which something is measured before or after training."""

@@ -23,16 +23,8 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import find_plugin, make_backbone
 from persist_cli.recipe import Recipe, TrainingSettings
 from persist_cli.train import clip_cache
-from persist_cli.train.clip_cache import (
-    STALE,
-    CachedClips,
-    CacheKeys,
-    CacheSettings,
-    ClipCache,
-    ClipEncoder,
-    TensorCache,
-    cache_key,
-)
+from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
+from persist_cli.train.tensor_cache import STALE, CacheSettings, TensorCache, cache_key
 from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO, MICRO_SETTINGS, SIZE, equal_runs, losses, run_persist_process, stage
 
@@ -90,6 +82,31 @@ def test_a_long_trajectory_is_encoded_in_pieces_to_the_same_latents(walks, tmp_p
         latents.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["video"])
     assert len(latents[0]) == 24
     assert torch.equal(*latents)
+
+
+@pytest.fixture(scope="module")
+def costly(tmp_path_factory) -> list[str]:
+    """Settings of a memory of features of a small vision transformer."""
+    from transformers import Dinov2Config, Dinov2Model
+
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("vit")
+    sizes = {"hidden_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2, "mlp_ratio": 2}
+    Dinov2Model(Dinov2Config(image_size=56, patch_size=14, **sizes)).save_pretrained(folder)
+    return ["memory.encoder=dinov2", f"memory.encoder_settings={{weights: {folder}}}", "data.clips_per_trajectory=0"]
+
+
+def test_each_trajectory_is_encoded_once_and_contexts_that_never_come_again_have_the_same_tokens(
+    persist, walks, stage1, tmp_path, costly
+):
+    changes = [f"base={stage1}", *costly]
+    assert persist(*stage("stage2-voxel", walks, tmp_path / "without", *changes)).code == 0
+    for name in ("cold", "warm"):
+        cached = stage("stage2-voxel", walks, tmp_path / name, *changes, "--cache", tmp_path / "cache")
+        assert persist(*cached).code == 0
+        assert equal_runs(tmp_path / "without", tmp_path / name)
+    names = [sorted(read_tensors(path)[0]) for path in entries(tmp_path / "cache")]
+    assert names == [["features", "frames"]] * 2  # trajectories; no clip's latents or tokens
 
 
 def test_with_a_full_cache_only_the_clip_is_encoded_and_not_its_trajectory(persist, walks, tmp_path):

@@ -61,6 +61,7 @@ class EfficientNetLite0(Encoder):
     """Features of a frozen EfficientNet-Lite0; its fetched weights are opened when first needed."""
 
     settings_type = EfficientNetLite0Settings
+    costly = True
     settings: EfficientNetLite0Settings
 
     def __init__(self, settings: EfficientNetLite0Settings) -> None:
