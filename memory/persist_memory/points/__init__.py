@@ -1,0 +1,1 @@
+"""A memory of points that are not pooled."""
