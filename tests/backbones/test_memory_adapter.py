@@ -5,11 +5,13 @@ import dataclasses
 import pytest
 import torch
 
+from persist_backbones.adapters.cross import token_rays
 from persist_backbones.adapters.forms import FORMS
 from persist_backbones.adapters.memory_block import position_code
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import plucker, unproject
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from tests.support.micro_model import (
@@ -24,6 +26,11 @@ from tests.support.micro_model import (
 
 QUICK = Sampling(steps=2)
 every_form = pytest.mark.parametrize("form", FORMS)
+
+
+CROSS = [{"normalize": True}, {"key_positions": True}, {"key_camera": True}, {"positions": "none"},
+         {"normalize": True, "key_positions": True, "key_camera": True}]  # fmt: skip
+every_option_of_cross = pytest.mark.parametrize("options", CROSS, ids=lambda options: "+".join(options))
 
 
 def padded(tokens: MemoryTokens, extra: int) -> MemoryTokens:
@@ -117,6 +124,56 @@ def test_moving_the_whole_world_changes_no_prediction(form):
     original = predicted(backbone, clips, tokens)
     moved = predicted(backbone, dataclasses.replace(clips, cameras=moved_cameras), moved_tokens)
     assert torch.allclose(original, moved, atol=1e-4)
+
+
+@every_option_of_cross
+def test_every_option_of_cross_begins_as_the_identity_and_depends_on_its_tokens_when_trained(options):
+    backbone, clips = micro(), random_clips()
+    shaken(backbone.transformer)
+    bare = backbone.generate(clips, QUICK)
+    with_adapter(backbone, **options)
+    remembered = backbone.generate(dataclasses.replace(clips, tokens=random_tokens(2, 9)), QUICK)
+    assert all(torch.equal(*pair) for pair in zip(bare, remembered, strict=True))
+    shaken(backbone.adapters)
+    one, other = (predicted(backbone, clips, random_tokens(2, 9, seed)) for seed in (3, 4))
+    assert not torch.allclose(one, other)
+    assert torch.allclose(one, predicted(backbone, clips, padded(random_tokens(2, 9), 20)), atol=1e-5)
+
+
+@every_option_of_cross
+def test_no_option_of_cross_but_absolute_positions_depends_on_the_worlds_origin(options):
+    backbone, clips, tokens = with_adapter(micro(), **options), random_clips(), random_tokens(2, 9)
+    shaken(backbone)
+    poses = clips.cameras.world_from_camera.clone()
+    poses[..., :3, 3] += 40.0
+    moved_clips = dataclasses.replace(clips, cameras=dataclasses.replace(clips.cameras, world_from_camera=poses))
+    moved = dataclasses.replace(tokens, positions=tokens.positions + 40.0)
+    assert torch.allclose(predicted(backbone, clips, tokens), predicted(backbone, moved_clips, moved), atol=1e-4)
+
+
+@pytest.mark.parametrize(("options", "matters"), [({"positions": "none"}, False), ({"positions": "relative"}, True),
+                                                  ({"positions": "none", "key_camera": True}, True)])  # fmt: skip
+def test_tokens_without_positions_are_a_set_of_features_unless_keys_have_rays(options, matters):
+    backbone, clips, tokens = with_adapter(micro(), **options), random_clips(), random_tokens(2, 9)
+    shaken(backbone)
+    moved = dataclasses.replace(tokens, positions=tokens.positions.flip(1))
+    same = torch.allclose(predicted(backbone, clips, tokens), predicted(backbone, clips, moved), atol=1e-6)
+    assert same is not matters
+
+
+def test_the_ray_to_a_token_has_the_direction_of_the_pixel_that_sees_it():
+    clips = random_clips(batch=1)
+    cameras = dataclasses.replace(clips.cameras, world_from_camera=clips.cameras.world_from_camera.clone())
+    depth = torch.full((1, 9, 32, 32), 2.0)
+    place = unproject(depth, cameras)[:, 5, 7, 11]
+    tokens = MemoryTokens(torch.zeros(1, 1, CHANNELS), place[:, None], torch.ones(1, 1, dtype=torch.bool))
+    ray, pixel = token_rays(tokens, cameras)[0, 5, 0], plucker(cameras)[0, 5, 7, 11]
+    torch.testing.assert_close(ray, pixel / pixel[3:].norm(), atol=1e-9, rtol=0)
+
+
+def test_positions_in_the_keys_need_positions():
+    with pytest.raises(CheckpointError, match="key_positions needs positions"):
+        with_adapter(micro(), positions="none", key_positions=True)
 
 
 def test_absolute_positions_depend_on_the_origin_of_the_world():

@@ -92,7 +92,12 @@ class MemoryBlock(nn.Module):
         self.norm2 = nn.LayerNorm(video_channels)
         hidden = int(video_channels * ff_factor)
         self.ff = nn.Sequential(nn.Linear(video_channels, hidden), nn.GELU("tanh"), nn.Linear(hidden, video_channels))
+        self.key_code: nn.Linear | None = None
         zero_init(self.modulation, self.to_out, self.ff[2])
+
+    def add_key_code(self, channels: int) -> None:
+        """Concatenate a code of so many channels to M in the keys, not in the values; a fresh one is not zero."""
+        self.key_code = nn.Linear(channels, self.to_key.out_features, bias=False)
 
     def forward(
         self,
@@ -101,26 +106,38 @@ class MemoryBlock(nn.Module):
         mask: Bool[Tensor, "batch place"],
         camera: Float[Tensor, "batch token camera"],
         time: Float[Tensor, "batch time"],
+        codes: Float[Tensor, "batch frame place code"] | None = None,
     ) -> Float[Tensor, "batch token channel"]:
         """Return H + α_M · CrossAttn(H_n, M_n), then H + α_H · FF(norm2(H)); nothing is attended to without tokens."""
         parts = Modulation(*self.modulation(F.silu(time))[:, None].split(self.sizes, dim=-1))
         query = self.video_norm(video) * (1 + parts.video_scale) + parts.video_shift
         context = self.memory_norm(memory) * (1 + parts.memory_scale) + parts.memory_shift
-        attended = self.attend(torch.cat([query, camera.to(query.dtype)], dim=-1), context, mask)
+        attended = self.attend(torch.cat([query, camera.to(query.dtype)], dim=-1), context, mask, codes)
         video = video + (1 + parts.memory_gate) * attended
         changed: Tensor = video + (1 + parts.video_gate) * self.ff(self.norm2(video))
         return changed
 
-    def attend(self, query: Tensor, context: Tensor, mask: Bool[Tensor, "batch place"]) -> Tensor:
-        """Attend to the tokens where the mask is true; the result is exactly zero for a sample that has none."""
+    def attend(
+        self, query: Tensor, context: Tensor, mask: Bool[Tensor, "batch place"], codes: Tensor | None = None
+    ) -> Tensor:
+        """Attend to the tokens where the mask is true; the result is exactly zero for a sample that has none.
+
+        Args:
+            query: ``[batch, token, channel]``, the tokens of one latent frame after the other.
+            context: ``[batch, place, width]``.
+            mask: true for tokens that exist.
+            codes: what ``add_key_code`` concatenates to the keys, for each latent frame, or one for all of them.
+        """
         has_tokens = mask.any(dim=1)
         allowed = mask | ~has_tokens[:, None]  # an all-masked softmax is NaN; these rows are zeroed below
-        q, k, v = (
-            part.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for part in (self.to_query(query), self.to_key(context), self.to_value(context))
-        )
+        q, k, v = self.to_query(query), self.to_key(context), self.to_value(context)
+        if codes is not None and self.key_code is not None:
+            frames = codes.shape[1]
+            q, k = q.unflatten(1, (frames, -1)).flatten(0, 1), (k[:, None] + self.key_code(codes)).flatten(0, 1)
+            v, allowed = v.repeat_interleave(frames, 0), allowed.repeat_interleave(frames, 0)
+        q, k, v = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in (q, k, v))
         out = F.scaled_dot_product_attention(q, k, v, attn_mask=allowed[:, None, None])
-        attended: Tensor = self.to_out(out.transpose(1, 2).flatten(2))
+        attended: Tensor = self.to_out(out.transpose(1, 2).flatten(2)).reshape(len(query), query.shape[1], -1)
         return attended * has_tokens[:, None, None]
 
 
