@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo demo-train table1 table1-reference test test-slow lint bench docs clean
+.PHONY: demo demo-train table1 table1-reference ablations gain-curve test test-slow lint bench docs clean
 
 demo: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.demo runs/demo
@@ -16,6 +16,13 @@ table1: $(STAMP)
 
 table1-reference: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.table1 runs/table1-reference --reference
+
+ablations: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.reproduce.ablations runs/ablations
+
+gain-curve: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.reproduce.ablations runs/gain-curve --only paper,key-camera \
+		--samples 1000,2000,5000,10000,20000,50000
 
 test: $(STAMP) lint
 	$(VENV)/bin/python -m pytest --durations=20 -m "not slow and not gpu"

@@ -63,6 +63,7 @@ REPLACED = {
 # commands that are not run, by how they begin, with the reason; those of persist are still parsed
 NOT_RUN = {
     "make ": "a target of the Makefile, which the tests of demos, tables and benchmarks hold to",
+    "python -m persist_cli.reproduce": "trains for hours, which tests/reproduce hold to",
     "git ": "changes the checkout that is tested",
     "sudo ": "needs a package manager",
     "apt ": "needs a package manager",

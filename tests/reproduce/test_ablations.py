@@ -1,0 +1,129 @@
+"""Ablations are trained and measured by commands that persist has, and their table says what was found."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from persist_cli.cli.app import app
+from persist_cli.errors import PersistError
+from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.reproduce import ablations
+from persist_cli.reproduce.ablations import (
+    PREFIX,
+    Plan,
+    ablation_names,
+    checkpoint_at,
+    chosen_recipes,
+    default_data,
+    default_held_out,
+    eval_command,
+    numbers,
+    preparations,
+    result_folder,
+    run_ablations,
+    steps_of,
+    train_command,
+    write_results,
+)
+from tests.support.example_results import example_results
+
+OUT = Path("my runs/ablations")
+
+PLAN = Plan(OUT, (1000, 5000), ablation_names(), "reference", default_data(OUT), default_held_out(OUT))
+
+LINES = [
+    *preparations(PLAN, 40),
+    *(train_command(PLAN, name, 63) for name in PLAN.recipes),
+    eval_command(PLAN, PREFIX, "voxel", 1000, Path("my run/step-63/model")),
+]
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_every_command_is_one_that_persist_takes(line):
+    name, *arguments = shlex.split(line)
+    command = typer.main.get_command(app).commands[name]
+    while hasattr(command, "commands"):
+        command = command.commands[arguments.pop(0)]
+    command.make_context(name, arguments)
+
+
+@pytest.mark.parametrize("name", ablation_names())
+def test_an_ablation_differs_from_the_papers_recipe_in_one_part_of_memory_or_adapter(name):
+    paper, changed = (make_recipe(read_recipe(recipe), recipe) for recipe in (PREFIX, name))
+    adapters = {key for key in paper.adapter | changed.adapter if paper.adapter.get(key) != changed.adapter.get(key)}
+    memories = dataclasses.replace(changed, memory=paper.memory, adapter=paper.adapter, description=paper.description)
+    assert memories == paper
+    assert (changed.memory != paper.memory) + len(adapters) == (name != PREFIX)
+
+
+def test_the_papers_recipe_has_what_the_paper_says():
+    recipe = make_recipe(read_recipe(PREFIX), PREFIX)
+    assert recipe.memory is not None
+    assert (recipe.memory.name, recipe.memory.encoder) == ("voxel", "dinov2")
+    assert recipe.memory.settings == {"cell": [0.25, 1.0, 0.25], "pooling": "max"}
+    assert (recipe.adapter["form"], recipe.adapter["every"]) == ("cross", 1)
+
+
+def test_names_may_be_given_without_their_beginning():
+    assert chosen_recipes(["paper", "tokens-64"]) == (PREFIX, f"{PREFIX}-tokens-64")
+    assert chosen_recipes([]) == ablation_names()
+    with pytest.raises(PersistError, match="did you mean 'tokens-64'"):
+        chosen_recipes(["tokens-46"])
+
+
+def test_samples_are_ascending_positive_numbers_and_fill_whole_batches():
+    assert numbers("5000,1000") == (1000, 5000)
+    with pytest.raises(ValueError, match="0"):
+        numbers("0,100")
+    assert steps_of(make_recipe(read_recipe(PREFIX), PREFIX), 1000) == 63
+
+
+def test_a_run_that_is_beyond_a_number_of_samples_is_not_measured_under_it(tmp_path):
+    (tmp_path / "step-0000313").mkdir()
+    assert checkpoint_at(tmp_path, 313, 5000) == tmp_path / "step-0000313/model"
+    with pytest.raises(PersistError, match="no checkpoint of step 63"):
+        checkpoint_at(tmp_path, 63, 1000)
+
+
+def measured(plan: Plan, name: str, samples: int) -> None:
+    """Write results of an evaluation whose second row is better by half a per cent."""
+    results = example_results(clips=8)
+    for table in results["tables"]:
+        table["rows"] = {"stage1": table["rows"]["none"], "voxel": table["rows"]["voxel"]}
+    folder = result_folder(plan, name, samples)
+    folder.mkdir(parents=True)
+    (folder / "metrics.json").write_text(json.dumps(results))
+
+
+def test_the_table_and_the_curves_say_what_was_measured_and_what_was_left_out(tmp_path):
+    plan = dataclasses.replace(PLAN, out=tmp_path, recipes=(PREFIX, f"{PREFIX}-clip"))
+    measured(plan, PREFIX, 1000)
+    measured(plan, PREFIX, 5000)
+    write_results(plan, {f"{PREFIX}-clip": "persist weights fetch clip-vit-large-patch14"})
+    values = json.loads((tmp_path / "ablations.json").read_text())
+    assert [(point["recipe"], point["samples"], point["steps"]) for point in values["points"]] == [
+        (PREFIX, 1000, 63), (PREFIX, 5000, 313)]  # fmt: skip
+    mean, low, high = values["points"][0]["gain"]["psnr"]
+    assert low < mean < high
+    table = (tmp_path / "ablations.md").read_text()
+    assert f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]" in table
+    assert "not trained: persist weights fetch clip-vit-large-patch14" in table
+    assert (tmp_path / "gain.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_measured_is_not_done_again_and_missing_weights_leave_one_ablation_out(tmp_path, monkeypatch):
+    lines: list[str] = []
+    monkeypatch.setattr(ablations, "run_line", lines.append)
+    monkeypatch.setattr(ablations, "cached_weight", lambda name: None if name.startswith("clip") else tmp_path)
+    plan = dataclasses.replace(PLAN, out=tmp_path, recipes=(PREFIX, f"{PREFIX}-clip"), samples=(1000,))
+    measured(plan, PREFIX, 1000)
+    run_ablations(dataclasses.replace(plan, data=(tmp_path,), held_out=(tmp_path,)))
+    assert [line.split()[0] for line in lines] == ["weights"]
+    assert "left out" not in (tmp_path / "ablations.md").read_text()
+    assert "not trained" in (tmp_path / "ablations.md").read_text()
