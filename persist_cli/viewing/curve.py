@@ -50,8 +50,8 @@ def draw_curves(curves: Sequence[Curve], across: str, along: str, out: Path) -> 
         means = [mean for _, mean, _, _ in known]
         below = [0 if low is None else mean - low for _, mean, low, _ in known]
         above = [0 if high is None else high - mean for _, mean, _, high in known]
-        style = {"fmt": "o", "linestyle": LINES[number // 10 % len(LINES)], "capsize": 3, "markersize": 4}
-        axes.errorbar([x for x, *_ in known], means, yerr=[below, above], label=curve.name, **style)
+        places, line = [x for x, *_ in known], LINES[number // 10 % len(LINES)]
+        axes.errorbar(places, means, yerr=[below, above], label=curve.name, fmt="o", linestyle=line, capsize=3)
     axes.set_xscale("log")
     axes.set_xlabel(across)
     axes.set_ylabel(along)

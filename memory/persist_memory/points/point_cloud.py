@@ -20,6 +20,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_memory.grid.occlusion import without_observed
 from persist_memory.validation import (
     ORIGINS,
+    Shape,
     check_mergeable,
     check_observations,
     check_origins,
@@ -106,8 +107,12 @@ class PointCloud(Memory):
         tensors = with_origins(tensors)
         if tensors:
             where, width = f"memory {self.name!r}", self.encoder.channels
-            expected = {"positions": (torch.float64, (None, 3)), "features": (torch.float32, (None, width))}
-            expected |= {"colors": (torch.uint8, (None, 3)), ORIGINS: (torch.uint8, (None,))}
+            expected: dict[str, tuple[torch.dtype, Shape]] = {
+                "positions": (torch.float64, (None, 3)),
+                "features": (torch.float32, (None, width)),
+                "colors": (torch.uint8, (None, 3)),
+                ORIGINS: (torch.uint8, (None,)),
+            }
             check_tensors(tensors, expected, where)
             check_origins(tensors, where)
         self._stored = {}
