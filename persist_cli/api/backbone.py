@@ -319,6 +319,10 @@ class Backbone(nn.Module, ABC):
         """Return a text with all that ``keep_tokens`` depends on besides the clips; empty when it keeps all tokens."""
         return ""
 
+    def count_tokens(self, tokens: MemoryTokens, cameras: Cameras) -> int:
+        """Return how many tokens the adapter in use makes of one sample's memory tokens for a path of cameras."""
+        return int(tokens.mask.sum())
+
     def checkpoint_settings(self) -> dict[str, Any]:
         """Return the settings, as JSON values, of a backbone into which ``load_base`` loads this one's weights."""
         return dataclasses.asdict(self.settings)

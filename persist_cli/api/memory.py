@@ -182,6 +182,15 @@ class Memory(ABC):
         size = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
         return MemoryFigures(max((len(tensor) for tensor in tensors.values()), default=0), size, bounds)
 
+    def resolution(self, cameras: Cameras, distance: float = 2.5) -> float | None:
+        """Return the edge in metres of the smallest thing that it can tell apart; ``None`` when it does not know.
+
+        Args:
+            cameras: cameras such as those of the frames that are written.
+            distance: metres between camera and thing.
+        """
+        return None
+
     def header(self) -> dict[str, Any]:
         """Return the JSON values that a memory file holds beside its tensors: kind, settings, encoder, reference."""
         figures = self.figures()

@@ -53,6 +53,13 @@ class MemoryTokens:
     def __getitem__(self, sample: int) -> MemoryTokens:
         return MemoryTokens(**{name: tensor[sample] for name, tensor in self.tensors().items()})
 
+    @property
+    def bytes(self) -> int:
+        """The bytes of one sample's tokens as a memory gives them: numbers of 4 bytes, colours and pixels of 1."""
+        parts = [tensor for name, tensor in self.tensors().items() if name not in ("mask", "latents", "rendered")]
+        sizes = [tensor[0].numel() * min(tensor.element_size(), 4) for tensor in parts if len(self)]
+        return int(self.mask.sum()) * sum(sizes)
+
     def tensors(self) -> dict[str, Tensor]:
         """Return all tensors by name, without those that are ``None``; ``MemoryTokens`` takes them back."""
         named = {field.name: getattr(self, field.name) for field in fields(self)}

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from persist_cli.evaluate.columns import Column, chosen_frames, make_columns
 from persist_cli.evaluate.journal import TRUTH
-from persist_cli.evaluate.metric_suite import FIGURES, MetricSuite
+from persist_cli.evaluate.metric_suite import FIGURES, READS, MetricSuite
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.statistics import (
@@ -74,6 +74,11 @@ class RowResults:
             ]
         )
 
+    def measured(self, name: str) -> bool:
+        """Whether every batch has a tensor of this name in the journal."""
+        units = [unit for number in self.numbers for unit in self.run.units(number)]
+        return all(name in self.run.journal.read(unit) for unit in units)
+
     @property
     def seeds(self) -> range:
         """The sampling seeds of the row."""
@@ -121,6 +126,7 @@ class Table:
         values: dict[str, Any] = {}
         for results in rows:
             values[results.row.group] = self.row_json(results.row) | {
+                "reads": self.reads(results),
                 "columns": {column.name: self.cell(column, results, figures) for column in self.columns},
                 "curves": self.curves(results),
             }
@@ -158,6 +164,17 @@ class Table:
             "checkpoint": row.base.name if row.uses_model else None,
             "memory": row.adapter,
         }
+
+    def reads(self, results: RowResults) -> dict[str, Any] | None:
+        """What the row's memory stores, and the mean tokens and bytes of a read, as JSON values; ``None`` without one.
+
+        Batches that an earlier version measured do not say what was read.
+        """
+        stored = results.row.memory_json(self.run.cases[self.clips[0]].file.info)
+        if stored is None or not results.measured(READS):
+            return stored
+        tokens, size = results.gather(READS)[:, :, list(self.clips)].mean((0, 1, 2)).tolist()
+        return stored | {"tokens": tokens, "bytes": size}
 
     def cell(self, column: Column, results: RowResults, figures: Mapping[str, Mapping[str, Figure]]) -> dict[str, Any]:
         """One figure as JSON values, or the reason why there is none.

@@ -12,7 +12,7 @@ from persist_cli.api.backbone import Backbone
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.cases import CaseFrames, read_case
 from persist_cli.evaluate.journal import TRUTH, Processes, Unit
-from persist_cli.evaluate.metric_suite import VIDEO
+from persist_cli.evaluate.metric_suite import READS, VIDEO
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.rollout.world_model import clip_seed
@@ -60,6 +60,9 @@ def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> N
     clips = [read_case(case) for case in run.batch(unit.batch)]
     rgb, depth = predict(row, backbone, clips, unit.seed, unit.batch * run.plan.batch)
     tensors = run.suites[unit.row].measure(rgb, depth, clips, f"row {row.name!r}")
+    reads = row.reads()
+    if reads is not None:
+        tensors[READS] = reads
     videos = max(0, SHEET_CLIPS - unit.batch * run.plan.batch) if unit.seed == 0 else 0
     if videos:
         tensors[VIDEO] = rgb[:videos].cpu()

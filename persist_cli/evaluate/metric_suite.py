@@ -15,6 +15,8 @@ from persist_cli.metrics.metric import FrameMetric, Metric, Prediction, SetMetri
 
 FIGURES, VIDEO = "figures", "video"  # names of tensors in the journal
 
+READS = "reads"  # tokens and bytes that were read from memory for a clip, [clip, 2]
+
 
 def choose_metrics(names: Sequence[str], known: Mapping[str, Metric]) -> dict[str, Metric]:
     """Choose the metrics of these names, or ``all``, with the metrics that guard them.

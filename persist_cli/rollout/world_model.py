@@ -45,6 +45,7 @@ class Agent:
     write: bool = True
     disturb: Callable[[Observations], Observations] = unchanged
     shared: bool = False
+    reads: list[tuple[int, int]] = field(default_factory=list, init=False)  # tokens and bytes, of each clip
     now: Observations = field(init=False)
     info: TrajectoryInfo = field(init=False)
     clips: int = field(default=0, init=False)
@@ -187,6 +188,7 @@ class WorldModel:
             batch = memory.read_batch([paths[number] for number in readers], self.backbone.token_budget)
             for number, sample in zip(readers, batch, strict=True):
                 tokens[number] = sample
+                agents[number].reads.append((self.backbone.count_tokens(sample, paths[number]), sample.bytes))
         return tokens
 
 

@@ -274,3 +274,19 @@ def test_eval_prints_one_table_and_leaves_the_others_beside_the_results(persist,
     assert len(ended.out.splitlines()) <= 25
     assert f"{tmp_path / 'tables.md'}" in ended.out
     assert "difference to stage1" in (tmp_path / "tables.md").read_text()
+
+
+def test_the_results_say_what_each_memory_gave_for_a_clip(uninterrupted):
+    rows = tables(uninterrupted)[0]["rows"]
+    reads = rows["voxel"]["reads"]
+    assert 0 < reads["tokens"] <= 256
+    assert reads["bytes"] == pytest.approx(
+        reads["tokens"] * (32 * 4 + 3 * 4 + 3 + 1)
+    )  # features, place, colour, origin
+    assert (reads["reads_depth"], reads["distance"]) == (True, 2.5)
+    assert reads["resolution"] >= 0.25
+    assert rows["stage1"]["reads"] is None
+    assert rows["voxel, emptied"]["reads"]["tokens"] < reads["tokens"]
+    for table in ((uninterrupted / name).read_text() for name in ("tables.md", "report/report.html")):
+        assert f"{reads['tokens']:,.0f}" in table
+        assert "What a memory gives for a generated clip" in table

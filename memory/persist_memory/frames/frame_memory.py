@@ -17,6 +17,7 @@ from persist_cli.api.memory import Memory, MemoryFigures
 from persist_cli.api.observations import Observations, Origin
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import DataError
+from persist_memory.detail import pixels_across
 from persist_memory.validation import check_observations, check_origins, check_tensors
 
 
@@ -165,6 +166,10 @@ class FrameMemory(Memory):
         """Return the number of frames, their bytes, and how many were imagined; they have no bounds."""
         imagined = 0 if self._store is None else int((self._store.origins == Origin.IMAGINED).sum())
         return replace(super().figures(), imagined=imagined)
+
+    def resolution(self, cameras: Cameras, distance: float = 2.5) -> float:
+        """Return the edge of a pixel."""
+        return pixels_across(1, cameras, distance)
 
     def _add(self, frames: FrameStore) -> None:
         """Store more frames; ``DataError`` when they are of another size."""

@@ -17,6 +17,7 @@ from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
+from persist_memory.detail import feature_across
 from persist_memory.grid.occlusion import without_observed
 from persist_memory.grid.pooling import (
     GridSettings,
@@ -169,6 +170,10 @@ class GridMemory(Memory):
         bounds = tuple(low.tolist()), tuple(high.tolist())
         imagined = int((self.grid.values(ORIGINS) == Origin.IMAGINED).sum())
         return MemoryFigures(len(self.grid), size, bounds, imagined)
+
+    def resolution(self, cameras: Cameras, distance: float = 2.5) -> float:
+        """Return the edge of a cell, or of what one feature of the encoder shows where this is more."""
+        return max(self.lattice.across, feature_across(self.encoder, cameras, distance))
 
     def _unknown(self, imagined: Observations) -> Observations:
         """Imagined frames without the depth of pixels along whose rays an observed cell lies."""

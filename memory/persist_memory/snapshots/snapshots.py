@@ -22,6 +22,7 @@ from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
+from persist_memory.detail import feature_across, pixels_across
 from persist_memory.snapshots.album import Album
 from persist_memory.snapshots.cover import covered_view, greedy_cover, without_observed
 from persist_memory.snapshots.snapshot_store import SnapshotStore
@@ -170,6 +171,11 @@ class Snapshots(Memory):
     def figures(self) -> MemoryFigures:
         """Return the number of images, their bytes, the bounds of their patches, and how many were imagined."""
         return replace(super().figures(), imagined=len(self.albums[Origin.IMAGINED]))
+
+    def resolution(self, cameras: Cameras, distance: float = 2.5) -> float:
+        """Return the edge of a patch, or of what one feature of the encoder shows where this is more."""
+        patch = pixels_across(cameras.width / self.settings.grid[1], cameras, distance)
+        return max(patch, feature_across(self.encoder, cameras, distance))
 
     def _check(self, tensors: dict[str, Tensor], empty: SnapshotStore) -> None:
         where = f"memory {self.name!r}"

@@ -13,6 +13,7 @@ from persist_cli.errors import PersistError
 from persist_cli.evaluate.report.curves import COLORS, DARK_COLORS, HEIGHT, WIDTH, Plot, plots, row_styles
 from persist_cli.evaluate.report.latex import latex_tables
 from persist_cli.evaluate.report.pictures import Pictures, RowClips, file_name, write_row_clips, write_sheets
+from persist_cli.evaluate.report.reads import READS_HEADS, READS_TITLE, read_rows
 from persist_cli.evaluate.report.remarks import (
     contamination_lines,
     drawn_units,
@@ -87,6 +88,7 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
         sections.append(Section(view, table_plots, [row for row in rows if row.table == table.name]))
     return jinja.get_template("report.html.jinja").render(
         results=results, sections=sections, warnings=contamination_lines(results),
+        reads=read_rows(results), reads_heads=READS_HEADS, reads_title=READS_TITLE,
         unknown_scenes=unknown_scenes_lines(results), known_scenes=known_scenes,
         too_few_lines=too_few_lines, left_out_line=left_out_line, seed_legend=seed_legend(results),
         drawn_units=drawn_units(results), scenes=len({(clip.data, clip.scene) for clip in results.measured.clips}),

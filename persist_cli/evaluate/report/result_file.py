@@ -164,6 +164,19 @@ class Curve(ResultModel):
     by_seen_before: list[Bin] = []
 
 
+class ReadsRecord(ResultModel):
+    """What a row's memory stores, and what was read from it for a generated clip on average.
+
+    ``resolution`` is the edge in metres of the smallest thing that it can tell apart at ``distance`` metres.
+    """
+
+    resolution: float | None = None
+    distance: float
+    reads_depth: bool
+    tokens: float | None = None
+    bytes: float | None = None
+
+
 class RowRecord(ResultModel):
     """A row of the table, or in ``na`` the reason why it cannot be made of these clips."""
 
@@ -172,6 +185,7 @@ class RowRecord(ResultModel):
     na: str | None = None
     checkpoint: str | None = None
     memory: str | None = None
+    reads: ReadsRecord | None = None
     columns: dict[str, Cell]
     curves: dict[str, Curve] = {}
 

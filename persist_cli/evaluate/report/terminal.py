@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any
 
+from persist_cli.evaluate.report.reads import reads_line
 from persist_cli.evaluate.report.remarks import (
     all_left_out,
     contamination_lines,
@@ -97,6 +98,7 @@ def lines_below(results: EvalResults, table: TerminalTable) -> list[str]:
         *dict.fromkeys(line for part in tables for line in too_few_lines(part.view)),
         *(f"{mark}: {note}" for number, note in sorted(notes.items()) if (mark := f"n/a ({number})") in shown),
         *([left_out] if left_out else []),
+        *([reads_line(results)] if reads_line(results) else []),
         *(f"warning: {line}" for line in contamination_lines(results)),
     ]
 

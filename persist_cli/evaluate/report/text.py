@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from persist_cli.evaluate.report.reads import READS_HEADS, READS_TITLE, read_rows
 from persist_cli.evaluate.report.remarks import (
     all_left_out,
     contamination_lines,
@@ -31,6 +32,8 @@ def table_text(results: Mapping[str, Any] | EvalResults) -> str:
         heads = ["row", *(column.heading for column in columns)]
         cells = [[row.name + _kind(row), *map(cell_text, row.cells)] for row in rows]
         blocks.append(markdown_table(name, heads, cells, _best(rows) if cell_text is _figure else ()))
+    if reads := read_rows(checked):
+        blocks.append(markdown_table(READS_TITLE, READS_HEADS, reads))
     blocks.append("\n".join(f"- {_plain(line)}" for line in remark_lines(checked)))
     return "\n\n".join(blocks) + "\n"
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.memory import Memory
-from persist_cli.api.observations import Observations
+from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.checkpoints.load import load_adapter
 from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.rows.interventions import MemoryIntervention, Unmodified
@@ -22,6 +25,8 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.rollout.world_model import Agent, WorldModel
 
 NO_MEMORY = "none"  # name of the memory that never gives a token, so that no intervention can change anything
+
+DISTANCE = 2.5  # metres, at which the resolution of a memory is told
 
 NOTHING = (
     "which reads nothing: what it adds to stage 1 are learned tokens, the same in every clip; without them, as in the "
@@ -63,6 +68,7 @@ class ModelRow(Row):
     ) -> None:
         super().__init__(name, checkpoint)
         self.checkpoint, self.adapter, self.sampling, self.row_memory = checkpoint, adapter, sampling, row_memory
+        self.agents: list[Agent] = []
         self.kind = "model" if isinstance(row_memory.intervention, Unmodified) else "memory control"
 
     @property
@@ -82,6 +88,7 @@ class ModelRow(Row):
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Roll out each clip from its first frame along its cameras."""
         agents = [self.agent(clip, seed) for clip, seed in zip(clips, seeds, strict=True)]
+        self.agents = agents
         model = WorldModel(backbone, agents, self.sampling)
         model.reset([clip.observations[:1] for clip in clips], [clip.info for clip in clips])
         cameras = [clip.observations.cameras[1:] for clip in clips]
@@ -89,6 +96,21 @@ class ModelRow(Row):
         parts += model.imagine(cameras, [clip.interactions for clip in clips])
         videos = [Observations.concatenate(frames) for frames in zip(*parts, strict=True)]
         return torch.stack([video.rgb for video in videos]), torch.stack([video.depth for video in videos])
+
+    def reads(self) -> Float[Tensor, "clip 2"] | None:
+        """Mean tokens and bytes of the reads for each clip; ``None`` without a memory."""
+        if not all(agent.reads for agent in self.agents):
+            return None
+        return torch.stack([torch.tensor(agent.reads, dtype=torch.float64).mean(0) for agent in self.agents])
+
+    def memory_json(self, info: TrajectoryInfo) -> dict[str, Any] | None:
+        """Resolution at ``DISTANCE`` and whether depth is read, as JSON values."""
+        if self.row_memory.factory is None:
+            return None
+        memory = self.row_memory.factory.empty(info)
+        pose, matrix = torch.eye(4, dtype=torch.float64)[None], torch.from_numpy(info.intrinsics)[None]
+        resolution = memory.resolution(Cameras(pose, matrix, info.height, info.width), DISTANCE)
+        return {"resolution": resolution, "distance": DISTANCE, "reads_depth": memory.reads_depth}
 
     def agent(self, clip: CaseFrames, seed: int) -> Agent:
         """An agent that holds the clip's memory, before it is placed at the first frame."""

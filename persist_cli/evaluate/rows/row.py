@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
+from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.evaluate.cases import CaseFrames
 
 RowKind = Literal["model", "control", "memory control"]
@@ -40,6 +42,14 @@ class Row(ABC):
     @abstractmethod
     def definition(self) -> str:
         """A few words that say what the row shows."""
+
+    def memory_json(self, info: TrajectoryInfo) -> dict[str, Any] | None:
+        """What the row's memory stores of such a trajectory, as JSON values; ``None`` without a memory."""
+        return None
+
+    def reads(self) -> Float[Tensor, "clip 2"] | None:
+        """Tokens and bytes that were read from memory for a generated clip, of each clip of the last ``videos``."""
+        return None
 
     def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
         """Make the backbone ready for this row, with this device and precision."""
