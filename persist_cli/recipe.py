@@ -159,6 +159,10 @@ class DataSettings:
             hold the answer; with strides of -1 and 0 here it holds the whole clip.
         exclude_metres: such a frame is near when the two cameras are less than this apart …
         exclude_degrees: … and turned by less than this. The clip's first frame always stays.
+        crop: smallest height of a random window of the images, relative to the largest one that has the model's aspect;
+            clip and memory are cut alike, and intrinsics follow. Below 1, images may be larger than the model's.
+        mirror: share of the clips whose room is mirrored, with its cameras.
+        color_jitter: largest relative change of the brightness, and as much of each colour, of clip and memory alike.
     """
 
     path: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
@@ -168,6 +172,9 @@ class DataSettings:
     exclude_targets: Share = 0.0
     exclude_metres: PositiveNumber = NEAR_METRES
     exclude_degrees: PositiveNumber = NEAR_DEGREES
+    crop: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
+    mirror: Share = 0.0
+    color_jitter: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -182,6 +189,8 @@ class Recipe:
         backbone: the video model.
         memory: the memory that the adapter reads, stage 2 only.
         adapter: settings of the memory adapter, stage 2 only.
+        adapter_from: run or checkpoint whose adapter is trained on, as ``reference`` or ``reference#voxel``, instead of
+            a new one; memory and settings are those of that adapter.
         lora: train a change of low rank instead of all weights of the base, stage 1 only.
         data: the clips.
         training: steps, batch, optimizer and what else decides how long and how it is trained.
@@ -193,6 +202,7 @@ class Recipe:
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     memory: MemoryConfig | None = None
     adapter: Settings = field(default_factory=dict)
+    adapter_from: str | None = None
     lora: Lora | None = None
     data: DataSettings = field(default_factory=DataSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
@@ -360,8 +370,8 @@ def _contradictions(recipe: Recipe) -> list[str]:
             f"training.cooldown {training.cooldown} is more than training.steps {training.steps}; set both, as in "
             f"training.steps={training.steps} training.cooldown={training.steps // 3}"
         )
-    if (recipe.stage == "2") != (recipe.memory is not None):
-        problems.append("stage 2 needs a memory, the other stages take none")
+    if (recipe.stage == "2") != (recipe.memory is not None or recipe.adapter_from is not None):
+        problems.append("stage 2 needs a memory, or adapter_from, which has one; the other stages take neither")
     if recipe.stage == "2" and recipe.base is None:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
     if recipe.lora is not None and recipe.stage != "1":

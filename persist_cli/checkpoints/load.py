@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import Checkpoint
-from persist_cli.errors import RecipeError
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
@@ -54,6 +57,57 @@ def adapter_memory(checkpoint: Checkpoint, adapter: str) -> MemoryConfig:
     """The choice of the memory that an adapter of the checkpoint reads."""
     path = checkpoint.adapter_folder(adapter) / "memory.json"
     return parse_settings(MemoryConfig, read_json(path), str(path))
+
+
+def with_adapter(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values of a recipe, with the memory of the adapter that ``adapter_from`` names, where it names one.
+
+    Raises:
+        PersistError: when that adapter is not there, or the recipe has settings of its own for it or its memory.
+    """
+    if not values.get("adapter_from"):
+        return dict(values)
+    checkpoint, name = named_adapter(str(values["adapter_from"]))
+    memory = dataclasses.asdict(adapter_memory(checkpoint, name))
+    own = [key for key, its in (("memory", memory), ("adapter", {})) if values.get(key) not in (None, {}, its)]
+    if own:
+        raise RecipeError(
+            f"adapter_from {values['adapter_from']}: memory and settings come with that adapter; leave out "
+            f"{' and '.join(own)}"
+        )
+    return {**values, "memory": memory}
+
+
+def add_adapter(backbone: Backbone, recipe: Recipe, name: str, channels: int) -> None:
+    """Add the adapter that a stage-2 recipe trains and use it: a new one, or that of ``adapter_from``.
+
+    Args:
+        backbone: the backbone of the recipe's base.
+        recipe: the recipe.
+        name: name of the memory, which is that of the adapter.
+        channels: channels of the encoder's features.
+    """
+    if recipe.adapter_from is None:
+        backbone.add_adapter(name, channels, recipe.adapter)
+        return
+    checkpoint, chosen = named_adapter(recipe.adapter_from)
+    checkpoint.check_adapter(chosen)
+    backbone.load_adapter(name, checkpoint.adapter_folder(chosen))
+
+
+def named_adapter(text: str) -> tuple[Checkpoint, str]:
+    """The checkpoint and the adapter that ``CHECKPOINT`` or ``CHECKPOINT#ADAPTER`` means.
+
+    Raises:
+        CheckpointError: when there is none, or there are several and none is named.
+    """
+    place, _, name = text.partition("#")
+    checkpoint = find_checkpoint(Path(place))
+    chosen = name or checkpoint.default_adapter()
+    if chosen is None:
+        raise CheckpointError(f"{place}: has no memory adapter to train on")
+    checkpoint.adapter_folder(chosen)
+    return checkpoint, chosen
 
 
 def start_backbone(config: BackboneConfig, base: Checkpoint | None) -> Backbone:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.backbone import Clip, Interactions
 from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses
 from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.data.augment import Augmentation, View
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, RecipeError
 
@@ -32,6 +33,7 @@ class ClipPlan:
         exclude_targets: share of the clips whose context has no frame near a frame that is to be predicted.
         exclude_metres: frames are near when their cameras are less than this apart, in metres, …
         exclude_degrees: … and turned by less than this angle.
+        augmentation: random views of the clips.
     """
 
     frames: int
@@ -43,6 +45,7 @@ class ClipPlan:
     exclude_targets: float = 0.0
     exclude_metres: float = NEAR_METRES
     exclude_degrees: float = NEAR_DEGREES
+    augmentation: Augmentation = field(default_factory=Augmentation)
 
 
 @dataclass(frozen=True)
@@ -54,12 +57,14 @@ class ClipFrames:
         frames: numbers of the clip's frames.
         context: numbers of the context's frames; empty when the plan has no context.
         seed: seed of everything random about the sample.
+        view: how images and cameras are changed; ``None`` for not at all.
     """
 
     file: TrajectoryFile
     frames: range
     context: tuple[int, ...]
     seed: int
+    view: View | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,7 @@ class ClipDataset(Dataset[ClipSample]):
             where = " and ".join(map(str, folders))
             raise DataError(f"{where}: a clip needs {needed} frames, the longest trajectory has {longest}")
         for file in self.files:
-            check_size(file.info, plan.image_size, f"{file.path.parent}#{file.name}")
+            check_size(file.info, plan.image_size, f"{file.path.parent}#{file.name}", plan.augmentation.crop < 1)
 
     def __getitem__(self, number: int) -> ClipSample:
         return self.read(self.choose(number))
@@ -110,12 +115,12 @@ class ClipDataset(Dataset[ClipSample]):
         place = int(random.integers(len(self.files)))
         file = self.files[place]
         if not self.plan.clips_per_trajectory:
-            frames, context = self._draw(file, random)
-            return ClipFrames(file, frames, context, int(random.integers(2**31)))
+            frames, context, view = self._draw(file, random)
+            return ClipFrames(file, frames, context, int(random.integers(2**31)), view)
         clip = int(random.integers(self.plan.clips_per_trajectory))
         # plus one: numpy reads missing numbers as zeros, and (seed, place) is a sample's own
-        frames, context = self._draw(file, np.random.default_rng((self.plan.seed, place, clip + 1)))
-        return ClipFrames(file, frames, context, int(random.integers(2**31)))
+        frames, context, view = self._draw(file, np.random.default_rng((self.plan.seed, place, clip + 1)))
+        return ClipFrames(file, frames, context, int(random.integers(2**31)), view)
 
     def read(self, choice: ClipFrames, images: bool = True, context: bool = True) -> ClipSample:
         """The sample with these frame numbers.
@@ -125,24 +130,29 @@ class ClipDataset(Dataset[ClipSample]):
             images: false leaves the clip's images unread and gives its cameras only.
             context: false leaves the context unread.
         """
-        file, frames = choice.file, choice.frames
+        file, frames, view = choice.file, choice.frames, choice.view
         actions = file.actions()[frames[0] : frames[-1]]  # none backwards: what was done to the world is not undone
         interactions = strided_interactions(actions, abs(frames.step), file.info.vocabulary)
         context_frames = choice.context if context else ()
         observations = file.read(list(frames)).observations if images else cameras_only(file, frames)
+        earlier = file.read(context_frames).observations if context_frames else None
+        if view is not None:
+            observations = view.observations(observations, file.info.world_up)
+            earlier = None if earlier is None else view.observations(earlier, file.info.world_up)
         return ClipSample(
             clip=Clip(observations, interactions or (None,) * (len(frames) - 1), choice.seed),
-            context=file.read(context_frames).observations if context_frames else None,
+            context=earlier,
             info=file.info,
         )
 
-    def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...]]:
-        """Frame numbers of a random clip and of its context."""
+    def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...], View | None]:
+        """Frame numbers of a random clip and of its context, and the view of both."""
         steps = self.plan.frames - 1
         stride = int(random.choice([stride for stride in self.plan.strides if steps * abs(stride) < len(file)]))
         start = int(random.integers(len(file) - steps * abs(stride)))
         frames = range(start, start + steps * abs(stride) + 1, abs(stride))[:: 1 if stride > 0 else -1]
-        return frames, tuple(self._context_frames(file, frames, random)) if self.plan.context_frames else ()
+        context = tuple(self._context_frames(file, frames, random)) if self.plan.context_frames else ()
+        return frames, context, self.plan.augmentation.draw(file.info, self.plan.image_size, random)
 
     def _context_frames(self, file: TrajectoryFile, frames: range, random: np.random.Generator) -> list[int]:
         """The clip's first frame and a random choice of those before it, in order."""
@@ -211,10 +221,12 @@ def check_batch_division(batch: int, accumulation: int, processes: int) -> None:
     )
 
 
-def check_size(info: TrajectoryInfo, image_size: tuple[int, int], where: str) -> None:
-    """Raise ``DataError`` when images are not of the size that a model takes."""
+def check_size(info: TrajectoryInfo, image_size: tuple[int, int], where: str, crops: bool = False) -> None:
+    """Raise ``DataError`` when images are not of the size that a model takes; where it crops, they may be larger."""
+    height, width = image_size
+    if crops and info.height >= height and info.width >= width:
+        return
     if (info.height, info.width) != image_size:
-        height, width = image_size
         raise DataError(
             f"{where}: images are {info.height}x{info.width}, the model takes {height}x{width}; collect "
             f"or import them with --size {height}x{width}, or take a model of theirs (finetune: "

@@ -11,7 +11,13 @@ import torch
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, checkpoint_folder, find_checkpoint
-from persist_cli.checkpoints.load import start_backbone, starts_from_random_codec
+from persist_cli.checkpoints.load import (
+    add_adapter,
+    named_adapter,
+    start_backbone,
+    starts_from_random_codec,
+    with_adapter,
+)
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import warn
@@ -45,7 +51,7 @@ class MetaModel:
                 backbone.add_lora(recipe.lora)
             if recipe.memory is not None:
                 channels = MemoryFactory.of(recipe.memory).encoder.channels_by_name
-                backbone.add_adapter(recipe.memory.name, channels, recipe.adapter)
+                add_adapter(backbone, recipe, recipe.memory.name, channels)
         return MetaModel(name, recipe, backbone, channels, base)
 
     @property
@@ -63,10 +69,13 @@ def build_meta_model(name: str, overrides: Sequence[str]) -> MetaModel:
     Raises:
         PersistError: when the recipe is wrong or its parts do not go together.
     """
-    recipe = make_recipe(apply_overrides(read_recipe(name), overrides), name)
+    recipe = make_recipe(with_adapter(apply_overrides(read_recipe(name), overrides)), name)
     place = checkpoint_folder(Path(recipe.base)) if recipe.base else None
     base = find_checkpoint(place) if place and place.exists() else None
-    if recipe.base and base is None:
+    if recipe.base and base is None and recipe.adapter_from:
+        base, _ = named_adapter(recipe.adapter_from)
+        warn(f"{recipe.base}: no base there yet; planned with that of {recipe.adapter_from}")
+    elif recipe.base and base is None:
         warn(f"{recipe.base}: no base there yet; planned with the backbone settings of {name} and their defaults")
     return MetaModel.of(name, recipe, base)
 

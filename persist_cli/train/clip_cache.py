@@ -83,11 +83,17 @@ class CacheKeys:
                 tokens |= {"kept": kept, "precision": recipe.training.precision}
         return CacheKeys(latents, tokens, backbone.framewise, recipe.data.clips_per_trajectory > 0)
 
+    def whole(self, frames: ClipFrames) -> bool:
+        """Whether the entry of a clip has the latents of its whole trajectory; views of a clip have their own."""
+        return self.whole_trajectories and frames.view is None
+
     def of_clip(self, frames: ClipFrames) -> ClipKeys:
         """The keys of a clip."""
-        clip = {"trajectory": self.file_hash(frames.file.path), "frames": list(frames.frames)}
+        clip: dict[str, Any] = {"trajectory": self.file_hash(frames.file.path), "frames": list(frames.frames)}
+        if frames.view is not None:
+            clip["view"] = frames.view.to_json()
         latents = tokens = None
-        if self.whole_trajectories:
+        if self.whole(frames):
             latents = cache_key(clip | {"frames": "all"} | self.latents)
         elif self.repeats:
             latents = cache_key(clip | self.latents)
@@ -125,10 +131,9 @@ class ClipCache:
         depends = {name: value for name, value in keys.tokens.items() if name in FEATURES}
         return ClipCache(cache, keys, FeatureCache(cache, depends, encoder))
 
-    @property
-    def whole_trajectories(self) -> bool:
-        """Whether an entry has the latents of a whole trajectory instead of a clip."""
-        return self.keys.whole_trajectories
+    def whole(self, frames: ClipFrames) -> bool:
+        """Whether the entry of a clip has the latents of its whole trajectory."""
+        return self.keys.whole(frames)
 
     def latents(self, frames: ClipFrames) -> ClipLatents | None:
         """The latents of a clip, ``None`` where the cache has none."""
@@ -136,7 +141,7 @@ class ClipCache:
         tensors = None if key is None else self.cache.get(key)
         if tensors is None:
             return None
-        return self.clip_latents(tensors["video"], frames) if self.whole_trajectories else ClipLatents(**tensors)
+        return self.clip_latents(tensors["video"], frames) if self.whole(frames) else ClipLatents(**tensors)
 
     def clip_latents(self, trajectory: Tensor, frames: ClipFrames) -> ClipLatents:
         """The latents of a clip out of those of its whole trajectory, in which every frame was encoded alone."""
@@ -153,7 +158,7 @@ class ClipCache:
         """Store the latents of a clip, or of its whole trajectory, while there is room."""
         key = self.keys.of_clip(frames).latents
         if key is not None:
-            tensors = {"video": latents.video} | ({} if self.whole_trajectories else {"image": latents.image})
+            tensors = {"video": latents.video} | ({} if self.whole(frames) else {"image": latents.image})
             self.cache.put(key, tensors)
 
     def put_tokens(self, frames: ClipFrames, tokens: MemoryTokens) -> None:
@@ -230,7 +235,7 @@ class ClipEncoder:
         """The clip with the tokens that a memory of its context gives for its cameras, where there is a memory."""
         if self.factory is None or cached.sample.clip.tokens is not None:
             return cached.sample.clip
-        if self.cache is not None and self.cache.features is not None:
+        if self.cache is not None and self.cache.features is not None and cached.frames.view is None:
             file = cached.frames.file
             self.cache.features.bring(file, self.cache.keys.file_hash(file.path))
         clip = with_memory(cached.sample, self.factory, self.backbone.token_budget)
@@ -243,7 +248,7 @@ class ClipEncoder:
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip
             return self._encode(clip)
-        if not self.cache.whole_trajectories:
+        if not self.cache.whole(frames):
             latents = self._encode(clip)
             self.cache.put_latents(frames, latents)
             return latents

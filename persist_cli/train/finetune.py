@@ -20,7 +20,7 @@ from accelerate.utils import InitProcessGroupKwargs, broadcast_object_list, set_
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, base_pointer, find_checkpoint, read_card, step_folders
-from persist_cli.checkpoints.load import start_backbone, starts_from_random_codec
+from persist_cli.checkpoints.load import add_adapter, start_backbone, starts_from_random_codec, with_adapter
 from persist_cli.checkpoints.relink import run_base, weights_at
 from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
 from persist_cli.errors import PersistError, RecipeError
@@ -75,7 +75,7 @@ def run_finetune(plan: FinetunePlan) -> None:
     values = apply_overrides(read_recipe(plan.recipe), plan.overrides)
     if plan.data:
         values = apply_overrides(values, [f"data.path={json.dumps([str(folder) for folder in plan.data])}"])
-    recipe = make_recipe(values, plan.recipe)
+    recipe = make_recipe(with_adapter(values), plan.recipe)
     if not recipe.data.path:
         raise RecipeError(f"{plan.recipe}: no data set; give --data DIR")
     run = plan.out or Path("runs") / Path(plan.recipe).stem
@@ -238,7 +238,7 @@ def prepare_backbone(recipe: Recipe, base: Checkpoint | None, factory: MemoryFac
             raise RecipeError("lora changes weights that are there; give base=RUN, or pretrained backbone.settings")
         backbone.add_lora(recipe.lora)
     if recipe.memory is not None and factory is not None:
-        backbone.add_adapter(recipe.memory.name, factory.encoder.channels, recipe.adapter)
+        add_adapter(backbone, recipe, recipe.memory.name, factory.encoder.channels)
     return backbone
 
 

@@ -10,17 +10,23 @@ from safetensors import SafetensorError
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, step_folders
 from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
+from persist_cli.checkpoints.load import named_adapter
 from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept_checkpoints, remove_superseded
 from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
 from persist_cli.io.sha256sums import rewrite_files
-from persist_cli.recipe import to_yaml
+from persist_cli.recipe import Recipe, to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
 from persist_cli.train.state import save_state
 from persist_cli.train.trainer import Trainer
 
 CODEC_BATCHES: Final = 4  # for measuring the scale of the codec's latents at the end of its stage
+
+
+def adapter_scenes(recipe: Recipe) -> TrainingScenes:
+    """The scenes that the adapter of ``adapter_from`` was trained on; none without one."""
+    return training_scenes(named_adapter(recipe.adapter_from)[0]) if recipe.adapter_from else TrainingScenes()
 
 
 class RunFolder:
@@ -40,7 +46,7 @@ class RunFolder:
         if trainer.accelerator.is_main_process:
             remove_leftovers(path)
             if base is not None:
-                self.scenes |= training_scenes(base)
+                self.scenes |= training_scenes(base) | adapter_scenes(trainer.recipe)
                 self.recipes = stage_recipes(base.base_folder) if trainer.recipe.memory is None else {}
             path.mkdir(parents=True, exist_ok=True)
             write_text(path / RECIPE, to_yaml(trainer.recipe))

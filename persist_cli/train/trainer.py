@@ -17,11 +17,12 @@ from accelerate import Accelerator
 from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.api.backbone import Backbone, Clips
+from persist_cli.data.augment import Augmentation
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
-from persist_cli.recipe import Recipe, TrainingSettings
+from persist_cli.recipe import DataSettings, Recipe, TrainingSettings
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
@@ -119,6 +120,7 @@ class Trainer:
             exclude_targets=recipe.data.exclude_targets,
             exclude_metres=recipe.data.exclude_metres,
             exclude_degrees=recipe.data.exclude_degrees,
+            augmentation=augmentation_of(recipe.data),
         )
         return ClipDataset([data_folder(path) for path in recipe.data.path], plan)
 
@@ -140,6 +142,11 @@ class Trainer:
             raise RecipeError(
                 "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
                 "data.clips_per_trajectory=32, or leave --cache out"
+            )
+        if not repeats and augmentation_of(recipe.data) != Augmentation():
+            raise RecipeError(
+                "--cache: with data.crop, data.mirror or data.color_jitter no view of a clip comes twice; give "
+                "data.clips_per_trajectory, as in data.clips_per_trajectory=32, or leave --cache out"
             )
         keys = CacheKeys.of(recipe, backbone, self.factory, self.accelerator.device.type)
         kept = ClipCache.of(TensorCache(settings), keys, self.factory)
@@ -301,6 +308,11 @@ class Trainer:
                     save()
                     saved = time.monotonic()
         return None
+
+
+def augmentation_of(data: DataSettings) -> Augmentation:
+    """The random views that a recipe asks for."""
+    return Augmentation(data.crop, data.mirror, data.color_jitter)
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:

@@ -24,6 +24,7 @@ from tests.support.disk import file_limit
 from tests.support.micro_runs import (
     MICRO_SETTINGS,
     PERSIST,
+    SHORT,
     equal_runs,
     first_gradients,
     losses,
@@ -344,3 +345,36 @@ def test_the_next_stage_is_of_the_same_recipes(recipe, following):
     values = {"stage": "codec" if "codec" in recipe else "1", "data": {"path": "d"}}
     command = next_command(recipe, make_recipe(values, recipe), Path("run"))
     assert command == f"persist finetune {following} --data d base=run"
+
+
+@pytest.fixture
+def trained_on(persist, walks, stage1, voxel, tmp_path) -> Path:
+    """A run whose adapter is that of another run, trained on for a step that changes next to nothing."""
+    run = tmp_path / "on"
+    (tmp_path / "recipe.yaml").write_text(f"stage: '2'\nbase: {stage1}\nadapter_from: {voxel}\n")
+    small = ["training.steps=1", "training.learning_rate=1e-12", "training.ema=0", "training.precision=no"]
+    arguments = ["finetune", tmp_path / "recipe.yaml", "--data", walks, "--out", run, *SHORT, *small]
+    result = persist(*arguments)
+    assert result.code == 0, result.err
+    return run
+
+
+def test_an_adapter_can_be_trained_on_with_its_own_memory_and_settings(trained_on, voxel):
+    before, after = (find_checkpoint(run).adapter_folder("voxel") for run in (voxel, trained_on))
+    tensors, others = (read_tensors(folder / "adapter.safetensors")[0] for folder in (before, after))
+    assert all(torch.allclose(tensors[name], others[name], atol=1e-6) for name in tensors)
+    for name in ("memory.json", "adapter.json"):
+        assert (before / name).read_text() == (after / name).read_text()
+
+
+def test_a_recipe_with_settings_of_its_own_for_an_adapter_that_is_trained_on_is_refused(persist, walks, voxel):
+    result = persist(*stage("stage2-voxel", walks, "out", f"base={voxel}", f"adapter_from={voxel}"))
+    assert result.code == 1
+    assert "memory and settings come with that adapter; leave out" in result.err
+
+
+def test_views_that_come_only_once_are_not_cached(persist, walks, codec, tmp_path):
+    run = stage(
+        "stage1", walks, tmp_path / "run", f"base={codec}", "--cache", str(tmp_path / "cache"), "data.mirror=0.5"
+    )
+    assert "no view of a clip comes twice" in persist(*run).err
