@@ -70,6 +70,19 @@ def test_with_a_framewise_codec_the_latents_of_a_trajectory_serve_all_its_clips(
     assert share_cached(tmp_path / "warm") == 1
 
 
+def test_fixed_views_of_clips_are_cached_each_by_itself(persist, walks, tmp_path):
+    views = [*FRAMEWISE, "data.clips_per_trajectory=2", "data.crop=0.6", "data.mirror=0.5", "data.color_jitter=0.2"]
+    assert persist(*stage("stage1", walks, tmp_path / "without", *views)).code == 0
+    for name in ("cold", "warm"):
+        assert persist(*stage("stage1", walks, tmp_path / name, *views, "--cache", tmp_path / "cache")).code == 0
+        assert equal_runs(tmp_path / "without", tmp_path / name)
+
+
+def test_views_that_come_only_once_are_not_cached(persist, walks, tmp_path):
+    once = [*FRAMEWISE, "data.mirror=0.5", "--cache", tmp_path / "cache"]
+    assert "no view of a clip comes twice" in persist(*stage("stage1", walks, tmp_path / "run", *once)).err
+
+
 def test_a_long_trajectory_is_encoded_in_pieces_to_the_same_latents(walks, tmp_path, monkeypatch):
     backbone = make_backbone("cogvideox", MICRO | {"vae": MICRO["vae"] | {"temporal_compression_ratio": 1}})
     clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))

@@ -371,10 +371,3 @@ def test_a_recipe_with_settings_of_its_own_for_an_adapter_that_is_trained_on_is_
     result = persist(*stage("stage2-voxel", walks, "out", f"base={voxel}", f"adapter_from={voxel}"))
     assert result.code == 1
     assert "memory and settings come with that adapter; leave out" in result.err
-
-
-def test_views_that_come_only_once_are_not_cached(persist, walks, codec, tmp_path):
-    run = stage(
-        "stage1", walks, tmp_path / "run", f"base={codec}", "--cache", str(tmp_path / "cache"), "data.mirror=0.5"
-    )
-    assert "no view of a clip comes twice" in persist(*run).err
