@@ -310,6 +310,11 @@ class Backbone(nn.Module, ABC):
     def token_budget(self) -> int:
         """The number of memory tokens that the adapter in use reads at most."""
 
+    @property
+    def reads_frames(self) -> bool:
+        """Whether the adapter in use reads memories whose tokens are whole frames, and no others."""
+        return False
+
     def keep_tokens(self, clips: Clips) -> MemoryTokens:
         """Return what the adapter in use needs of the tokens of clips, which a cache keeps; by default all of them."""
         assert clips.tokens is not None

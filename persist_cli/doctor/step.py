@@ -149,6 +149,13 @@ def _fake_clips(backbone: Backbone, channels: int | None, batch: int) -> Clips:
     poses, pinhole = torch.eye(4, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
     cameras = Cameras(poses.expand(batch, frames, 4, 4), pinhole.expand(batch, frames, 3, 3), height, width)
     tokens = None if channels is None else _all_tokens(batch, backbone.token_budget, channels)
+    if tokens is not None and backbone.reads_frames:
+        tokens = dataclasses.replace(
+            tokens,
+            images=torch.zeros(batch, len(tokens), height, width, 3, dtype=torch.uint8),
+            world_from_camera=poses.expand(batch, len(tokens), 4, 4),
+            intrinsics=pinhole.expand(batch, len(tokens), 3, 3),
+        )
     return Clips(
         rgb=torch.zeros(batch, frames, height, width, 3, dtype=torch.uint8),
         depth=torch.zeros(batch, frames, height, width),

@@ -17,6 +17,7 @@ FORM_KEYS = {
     "rendered": {
         "heads", "frequencies", "token_size", "splat_pixels", "head_width", "head_layers", "attention_tokens",
     },
+    "frames": {"heads", "frequencies", "frame_patch"},
 }  # fmt: skip
 SHARED_KEYS = {
     "channels", "form", "every", "width", "ff_factor", "token_budget", "dropout", "learned_tokens", "noise",
@@ -58,7 +59,7 @@ def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Pat
         ({"form": "canvas", "every": 3}, "every is 3, but the model has 2 layers"),
         ({"form": "canvas", "splat_pixels": 4}, "splat_pixels must be odd, not 4"),
         ({"form": "rendered", "splat_pixels": 4}, "splat_pixels must be odd, not 4"),
-        ({"form": "splat"}, "unknown adapter form 'splat'; known: cross, projected, canvas, rendered"),
+        ({"form": "splat"}, "unknown adapter form 'splat'; known: cross, projected, canvas, rendered, frames"),
     ],
 )
 def test_adapter_settings_that_cannot_work_are_refused(settings: dict, cause: str) -> None:

@@ -8,13 +8,21 @@ import pytest
 import torch
 
 from persist_backbones.adapters.canvas import sphere
-from persist_backbones.adapters.forms import FORMS
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.backbone import Sampling
-from tests.support.micro_model import equal, micro, predicted, predicted_of, random_clips, random_tokens, shaken
+from tests.support.micro_model import (
+    POINT_FORMS,
+    equal,
+    micro,
+    predicted,
+    predicted_of,
+    random_clips,
+    random_tokens,
+    shaken,
+)
 from tests.support.micro_model import with_adapter as plain_adapter
 
-every_form = pytest.mark.parametrize("form", FORMS)
+every_form = pytest.mark.parametrize("form", POINT_FORMS)
 
 
 def with_adapter(backbone: CogVideoX, form: str, **settings: float) -> CogVideoX:

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from persist_backbones.adapters.cross import token_rays
-from persist_backbones.adapters.forms import FORMS
 from persist_backbones.adapters.memory_block import position_code
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.backbone import Sampling
@@ -16,6 +15,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from tests.support.micro_model import (
     CHANNELS,
+    POINT_FORMS,
     micro,
     predicted,
     random_clips,
@@ -25,7 +25,7 @@ from tests.support.micro_model import (
 )
 
 QUICK = Sampling(steps=2)
-every_form = pytest.mark.parametrize("form", FORMS)
+every_form = pytest.mark.parametrize("form", POINT_FORMS)
 
 
 CROSS = [{"normalize": True}, {"key_positions": True}, {"key_camera": True}, {"positions": "none"},

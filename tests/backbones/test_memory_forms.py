@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.adapters.forms import FORMS
 from persist_backbones.adapters.projected import image_places
 from persist_cli.api.stages import MemorySavings
 from persist_cli.api.tokens import MemoryTokens
 from tests.support.micro_model import (
     CHANNELS,
+    POINT_FORMS,
     micro,
     predicted,
     predicted_of,
@@ -21,7 +21,7 @@ from tests.support.micro_model import (
 )
 
 FINE = {"form": "canvas", "canvas_scale": 2, "ff_factor": 0}  # drawn larger than the latents, without feed-forward
-every_variant = pytest.mark.parametrize("form", [*FORMS, "fine canvas"])
+every_variant = pytest.mark.parametrize("form", [*POINT_FORMS, "fine canvas"])
 forms_of_visible_tokens = pytest.mark.parametrize("form", ["projected", "canvas", "rendered"])
 
 

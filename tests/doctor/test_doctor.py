@@ -169,7 +169,7 @@ def test_the_launch_command_has_the_users_options_and_the_pretrained_weights_to_
 
 def test_every_form_of_memory_can_be_estimated():
     peaks = {}
-    for form in ("cross", "projected", "canvas", "rendered"):
+    for form in ("cross", "projected", "canvas", "rendered", "frames"):
         changes = ["base=nowhere", f"adapter={{form: {form}, width: 16, token_budget: 64}}"]
         meta_model = micro_meta_model(*changes, recipe="tiny-stage2-voxel")
         copies = ShallowCopies(meta_model.backbone, meta_model.channels)
@@ -177,6 +177,7 @@ def test_every_form_of_memory_can_be_estimated():
     assert peaks["projected"] > peaks["cross"] > 0  # tokens for each latent frame
     assert peaks["canvas"] > 0
     assert peaks["rendered"] > 0
+    assert peaks["frames"] > 0
 
 
 def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():

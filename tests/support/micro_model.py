@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from persist_backbones.adapters.base import MemoryCondition
+from persist_backbones.adapters.forms import FORMS
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.backbone import Clips
 from persist_cli.api.cameras import Cameras
@@ -18,6 +19,8 @@ from persist_cli.plugins import make_backbone
 from tests.support.micro_runs import MICRO, SIZE
 
 CHANNELS = 6
+
+POINT_FORMS = [name for name, form in FORMS.items() if not form.reads_frames]  # of tokens that are points
 
 
 def micro(**settings: Any) -> CogVideoX:

@@ -31,8 +31,9 @@ class AdapterSettings:
 
     Args:
         form: the way of the tokens to the video: ``cross`` (attention to tokens at their places in space, as in the
-            paper), ``projected`` (attention to their places in the views), ``canvas`` (tokens drawn into the views) or
-            ``rendered`` (views rendered from the tokens, encoded by the codec).
+            paper), ``projected`` (attention to their places in the views), ``canvas`` (tokens drawn into the views),
+            ``rendered`` (views rendered from the tokens, encoded by the codec) or ``frames`` (attention to whole
+            frames, encoded by the codec).
         every: the adapter has a block at every n-th transformer block; this is n.
         width: channels of a memory token inside the blocks, or of the canvas at a video token.
         ff_factor: hidden width of the feed-forward as a multiple of the video's channels.
@@ -157,6 +158,7 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
     """
 
     settings_type: ClassVar[type[AdapterSettings]]
+    reads_frames: ClassVar[bool] = False  # whether tokens must be whole frames
     settings: AdapterSettings
     blocks: nn.ModuleDict  # the key is the number of the transformer block
     learned: nn.Parameter | None  # the learned tokens
@@ -191,6 +193,10 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
     def rendering(self) -> Mapping[str, Any] | None:
         """Return the settings that ``render`` depends on, as JSON values; ``None`` when it keeps all tokens."""
         return None
+
+    def count(self, tokens: MemoryTokens, cameras: Cameras) -> int:
+        """Return how many tokens the adapter makes of one sample's tokens for a path of cameras."""
+        return int(tokens.mask.sum())
 
     @abstractmethod
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> Prepared:

@@ -10,6 +10,7 @@ from typing import Any
 from persist_backbones.adapters.base import Adapter, VideoShape
 from persist_backbones.adapters.canvas import CanvasAdapter
 from persist_backbones.adapters.cross import CrossAdapter
+from persist_backbones.adapters.frames import FramesAdapter
 from persist_backbones.adapters.projected import ProjectedAdapter
 from persist_backbones.adapters.rendered import RenderedAdapter
 from persist_cli.errors import CheckpointError, hint
@@ -20,6 +21,7 @@ from persist_cli.io.value_kinds import join_words
 
 FORMS: dict[str, type[Adapter[Any]]] = {
     "cross": CrossAdapter, "projected": ProjectedAdapter, "canvas": CanvasAdapter, "rendered": RenderedAdapter,
+    "frames": FramesAdapter,
 }  # fmt: skip
 DEFAULT = "cross"
 # the paper's blocks on CogVideoX-5B, one after every transformer block; the paper says only that they have about 1 B

@@ -57,6 +57,7 @@ from persist_backbones.cogvideox.parts import (
 from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_backbones.noise_levels import add_level, draw_levels
 from persist_cli.api.backbone import Backbone, ClipLatents, Clips, Sampling
+from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
@@ -286,6 +287,7 @@ class CogVideoX(Backbone):
             memory = dataclasses.replace(memory, level=level.to(self.device))
         return AdapterCondition(adapter, memory if generators is None else adapter.dropped(memory, generators))
 
+    @torch.no_grad()
     def keep_tokens(self, clips: Clips) -> MemoryTokens:
         """Return what the adapter in use needs of the clips' tokens: the encoded views of a memory that it renders."""
         tokens, adapter = super().keep_tokens(clips), self.adapter
@@ -372,6 +374,15 @@ class CogVideoX(Backbone):
     def token_budget(self) -> int:
         """Largest number of tokens that the adapter in use takes for a clip; 0 without an adapter."""
         return self.adapter.settings.token_budget if self.adapter else 0
+
+    @property
+    def reads_frames(self) -> bool:
+        """Whether the adapter in use reads whole frames."""
+        return self.adapter is not None and self.adapter.reads_frames
+
+    def count_tokens(self, tokens: MemoryTokens, cameras: Cameras) -> int:
+        """Return how many tokens the adapter in use makes of one sample's memory tokens."""
+        return super().count_tokens(tokens, cameras) if self.adapter is None else self.adapter.count(tokens, cameras)
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """Return the parameters of VAE, transformer, LoRA, widening and each memory adapter, in this order."""
