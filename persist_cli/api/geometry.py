@@ -10,6 +10,8 @@ from persist_cli.api.cameras import Cameras, invert_rigid
 
 NEAR_METRES, NEAR_DEGREES = 0.2, 10.0  # of poses whose pictures are almost the same; a step is 0.25 m, a turn 15°
 
+SAME_SURFACE = 0.05  # relative depth within which two views show the same surface, plus as many metres
+
 
 def pixel_centers(height: int, width: int, device: torch.device | None = None) -> Float[Tensor, "height width 2"]:
     """Return the pixel centres (u, v) of an image in pixels, the top-left one at (0.5, 0.5), float64."""
@@ -58,6 +60,25 @@ def project(
     image = torch.einsum("...ij,...pj->...pi", cameras.intrinsics.double(), local)
     safe = torch.where(depth.abs() < 1e-9, torch.full_like(depth, 1e-9), depth)
     return image[..., :2] / safe[..., None], depth
+
+
+def find_in_views(
+    points: Float[Tensor, "view point 3"], depth: Float[Tensor, "view height width"], cameras: Cameras
+) -> tuple[Float[Tensor, "view point 2"], Bool[Tensor, "view point"]]:
+    """Return the pixel (u, v) of each world point in each view, and whether the view sees it: inside and not hidden.
+
+    Args:
+        points: positions in metres.
+        depth: planar z of the views in metres, 0 where it is missing.
+        cameras: cameras of the views.
+    """
+    height, width = depth.shape[1:]
+    pixels, distance = project(points, cameras)
+    columns, rows = pixels.nan_to_num().floor().clamp(-1, 10_000).long().unbind(-1)
+    inside = (distance > 0) & (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    views = torch.arange(len(depth))[:, None].expand_as(rows)
+    surface = depth[views, rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
+    return pixels, inside & (surface > 0) & ((distance - surface).abs() < SAME_SURFACE * (1 + distance))
 
 
 def nearest_at(places: Int64[Tensor, " point"], depth: Float[Tensor, " point"], count: int) -> Float[Tensor, " place"]:

@@ -16,7 +16,14 @@ import yaml
 from persist_cli import __version__
 from persist_cli.api.checkpoint import CARD, PLAIN, Checkpoint, find_checkpoint, lora_base
 from persist_cli.api.inference import SamplingOverrides
-from persist_cli.checkpoints.lineage import RECIPE, RECIPES, save_stage_recipes, stage_recipes, training_scenes
+from persist_cli.checkpoints.lineage import (
+    ADAPTERS,
+    RECIPE,
+    RECIPES,
+    save_stage_recipes,
+    stage_recipes,
+    training_scenes,
+)
 from persist_cli.checkpoints.load import empty_backbone, load_backbone
 from persist_cli.checkpoints.save import base_files, fingerprint, hash_weights, write_card
 from persist_cli.errors import CheckpointError, PersistError, hint
@@ -34,8 +41,6 @@ from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
 PRECISIONS: Final = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
-
-ADAPTERS: Final = "adapters"  # the folder of the adapters, and in the folder of recipes that of theirs
 
 MADE_ANEW: Final = {CARD, RECIPE, SUMS}  # files at the top of a checkpoint's folder that an export does not copy
 

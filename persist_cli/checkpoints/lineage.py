@@ -18,6 +18,8 @@ RECIPE: Final = "recipe.yaml"  # of the last stage, in the checkpoint folder of 
 
 RECIPES: Final = "recipes"  # the folder with those of the stages before
 
+ADAPTERS: Final = "adapters"  # the folder of an export's adapters, and in its folder of recipes that of theirs
+
 
 def stage_recipes(folder: Path) -> dict[str, str]:
     """Texts of the recipes behind a base by file name: ``codec.yaml``, ``stage1.yaml``, ``stage1-2.yaml``, ….

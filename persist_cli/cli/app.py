@@ -321,6 +321,9 @@ def evaluate(
     verify: VerifyOption = False,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
+    training_seeds: Annotated[
+        bool, typer.Option("--training-seeds", help="Checkpoints whose recipes differ in seeds alone are one row.")
+    ] = False,
     resample: Annotated[
         str, typer.Option(help="What intervals draw: scenes (houses), or clips where all are of one place.")
     ] = "scenes",
@@ -351,6 +354,7 @@ def evaluate(
         metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), batch=batch, noise=pose_noise,
         placement=InferenceOptions.of(dtype, save_memory), resample=resample,
+        training_seeds=training_seeds,
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

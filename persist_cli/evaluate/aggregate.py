@@ -13,21 +13,25 @@ from torch import Tensor
 
 from persist_cli.evaluate.columns import Column, chosen_frames, make_columns
 from persist_cli.evaluate.journal import TRUTH
-from persist_cli.evaluate.metric_suite import FIGURES, READS, MetricSuite
+from persist_cli.evaluate.metric_suite import CELLS, FEATURES, FIGURES, READS, WEIGHTS, MetricSuite
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
+from persist_cli.evaluate.rows.training_seeds import training_of
 from persist_cli.evaluate.statistics import (
     RESAMPLES,
     SET_RESAMPLES,
     Counts,
     Draws,
     Figure,
+    curve_figure,
     difference,
     mean,
     mean_figure,
     number,
     set_figure,
+    weighted_mean,
 )
+from persist_cli.evaluate.windows import CURVE_COLUMNS, SHOWN, window_values, windows_of
 from persist_cli.viewing.console import watched
 
 BINS = 10  # of the share of a view that was seen before
@@ -90,6 +94,15 @@ def model_name(row: Row) -> str:
     return f"{row.base.fingerprint}/{row.base.folder}/{row.adapter}" if row.uses_model else ""
 
 
+def training_json(results: RowResults) -> dict[str, Any]:
+    """The seeds that each model of a row was trained with, stage by stage, as JSON values; empty without a model."""
+    rows = [results.run.rows[number] for number in results.numbers]
+    if not results.row.uses_model:
+        return {}
+    seeds = [list(training_of(row.base, row.adapter).seeds) for row in rows]
+    return {"training_seeds": seeds, "bases": len({row.base.fingerprint for row in rows})}
+
+
 def row_results(run: Evaluation) -> list[RowResults]:
     """The rows of the table in order; rows of one group are one row of several training seeds."""
     groups: dict[str, list[int]] = {}
@@ -125,11 +138,12 @@ class Table:
         figures = {results.row.group: self.figures(results) for results in watched(rows, "figures", "rows")}
         values: dict[str, Any] = {}
         for results in rows:
-            values[results.row.group] = self.row_json(results.row) | {
+            values[results.row.group] = self.row_json(results.row) | training_json(results) | {
                 "reads": self.reads(results),
                 "columns": {column.name: self.cell(column, results, figures) for column in self.columns},
                 "curves": self.curves(results),
-            }
+                "windows": self.windows(results) if self.run.protocol.writes else {},
+            }  # fmt: skip
         for row, reason in self.run.missing:
             values[row.name] = self.row_json(row) | {
                 "na": reason,
@@ -199,22 +213,49 @@ class Table:
 
     def figures(self, results: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""
-        values, cases = results.figures[:, :, list(self.clips)], [self.run.cases[clip] for clip in self.clips]
-        frame_metrics, set_metrics = list(results.suite.frame_metrics), results.suite.set_metrics
-        figures = {}
+        suite, figures = results.suite, {}
         for column in self.columns:
-            if column.metric in frame_metrics:
-                metric_values = values[..., frame_metrics.index(column.metric)]
-                selected = torch.where(chosen_frames(cases, column.frames), metric_values, torch.nan).numpy()
-                figures[column.name] = mean_figure(mean(selected, axis=3), self.draws(results))
-            elif column.metric in set_metrics:
+            if column.metric in suite.frame_metrics:
+                figures[column.name] = self.frame_figure(column, results)
+            elif column.metric in suite.set_metrics:
                 figures[column.name] = self.set_figure(column.metric, results)
+            elif column.metric in suite.frame_set_metrics:
+                figures[column.name] = self.frame_set_figure(column.metric, results)
         return figures
+
+    def frame_figure(self, column: Column, results: RowResults) -> Figure:
+        """The figure of a metric that has one for each frame."""
+        values, weights = (tensor.numpy() for tensor in self.frame_values(column.metric, results))
+        draws = self.draws(results)
+        if column.frames == "windows":
+            curve = CURVE_COLUMNS[column.metric]
+            windows = curve.windows(self.run.cases[0].frames)
+            return curve_figure(*window_values(values, weights, windows), curve.figure, draws)
+        cases = [self.run.cases[clip] for clip in self.clips]
+        chosen = chosen_frames(cases, column.frames, self.run.clip_frames).numpy()
+        return mean_figure(weighted_mean(np.where(chosen, values, np.nan), weights, 3), draws)
+
+    def windows(self, results: RowResults) -> dict[str, list[float | None]]:
+        """Means of each window of frames along the clips, for the metrics that show how a rollout goes on."""
+        means: dict[str, list[float | None]] = {}
+        for metric in [name for name in SHOWN if name in results.suite.frame_metrics]:
+            values, weights = (tensor.numpy() for tensor in self.frame_values(metric, results))
+            values, weights = window_values(values, weights, windows_of(self.run.cases[0].frames))
+            means[metric] = [number(value) for value in weighted_mean(flat(values), flat(weights), 0)]
+        if results.measured(CELLS):
+            means[CELLS] = results.gather(CELLS)[:, :, list(self.clips)].double().mean((0, 1, 2)).tolist()
+        return means
+
+    def frame_values(self, metric: str, results: RowResults) -> tuple[Tensor, Tensor]:
+        """Figures ``[model, seed, clip, frame]`` of a metric and how much each frame counts in means of them."""
+        clips = list(self.clips)
+        values = results.figures[:, :, clips][..., list(results.suite.frame_metrics).index(metric)]
+        weighted = results.suite.is_weighted(metric)
+        return values, results.gather(WEIGHTS + metric)[:, :, clips] if weighted else torch.ones_like(values)
 
     def set_figure(self, metric: str, results: RowResults) -> Figure:
         """The distance of the row's videos from the true ones."""
-        generated = results.gather(f"features/{metric}")[:, :, list(self.clips)]
-        truth = self.run.journal.gather(TRUTH, 0, self.run.batches, f"features/{metric}")[list(self.clips)]
+        generated, truth = self.features(metric, results)
         set_metric = results.suite.set_metrics[metric]
 
         def distance(counts: Counts, model: int, seed: int) -> float:
@@ -223,26 +264,62 @@ class Table:
 
         return set_figure(distance, self.draws(results, SET_RESAMPLES), len(results.seeds))
 
+    def features(self, metric: str, results: RowResults) -> tuple[Tensor, Tensor]:
+        """Features of the row's videos ``[model, seed, clip, …]`` and of the true ones ``[clip, …]``."""
+        truth = self.run.journal.gather(TRUTH, 0, self.run.batches, FEATURES + metric)
+        return results.gather(FEATURES + metric)[:, :, list(self.clips)], truth[list(self.clips)]
+
+    def frame_set_figure(self, metric: str, results: RowResults) -> Figure:
+        """The distance of the row's frames from the true ones, from sums over pairs of scenes."""
+        generated, truth = self.features(metric, results)
+        draws = self.draws(results, SET_RESAMPLES)
+        taken = truth.isfinite().all(-1)
+        clusters = torch.from_numpy(draws.clusters)
+        places, scenes = torch.unique(clusters[:, None].expand_as(taken)[taken], return_inverse=True)
+        firsts = [draws.clusters.tolist().index(place) for place in places.tolist()]
+        frame_set_metric = results.suite.frame_set_metrics[metric]
+        sums = {
+            (model, seed): frame_set_metric.scene_sums(generated[model, seed][taken], truth[taken], scenes)
+            for model in range(len(generated))
+            for seed in results.seeds
+        }
+
+        def distance(counts: Counts, model: int, seed: int) -> float:
+            weights = torch.from_numpy(counts[firsts]).double()
+            total, pairs = (weights @ matrix @ weights for matrix in sums[model, seed])
+            return float(total / pairs) if pairs > 0 else float("nan")
+
+        known = np.where(taken.any(1).numpy(), draws.clusters, -1)
+        return set_figure(distance, draws, len(results.seeds), known)
+
     def curves(self, results: RowResults) -> dict[str, Any]:
         """Each metric against frame number and against the share of the view seen before, as JSON values."""
-        values = results.figures[:, :, list(self.clips), 1:].numpy()
         shares = np.array([self.run.cases[clip].seen_before[1:] for clip in self.clips], dtype=np.float64)
         curves = {}
-        for place, name in enumerate(results.suite.frame_metrics):
-            by_clip = mean(mean(values[..., place], axis=1), axis=0)
+        for name in results.suite.frame_metrics:
+            values, weights = (tensor[..., 1:].numpy() for tensor in self.frame_values(name, results))
+            by_clip, weights = mean(mean(values, axis=1), axis=0), weights[0, 0]
             curves[name] = {
-                "per_frame": [number(value) for value in mean(by_clip, axis=0)],
-                "by_seen_before": seen_bins(by_clip, shares),
+                "per_frame": [number(value) for value in weighted_mean(by_clip, weights, 0)],
+                "by_seen_before": seen_bins(by_clip, shares, weights),
             }
         return curves
 
 
-def seen_bins(values: np.ndarray[Any, Any], shares: np.ndarray[Any, Any]) -> list[dict[str, Any]]:
+def flat(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """All but the last axis as one."""
+    return values.reshape(-1, values.shape[-1])
+
+
+def seen_bins(
+    values: np.ndarray[Any, Any], shares: np.ndarray[Any, Any], weights: np.ndarray[Any, Any]
+) -> list[dict[str, Any]]:
     """Means of the frames whose view was seen before to between ``low`` and ``high``, empty bins left out.
 
     Args:
         values: figures ``[clip, frame]``, NaN where there is none.
         shares: shares of the views seen before ``[clip, frame]``.
+        weights: how much each frame counts ``[clip, frame]``.
     """
     bins = []
     for place in range(BINS):
@@ -250,5 +327,6 @@ def seen_bins(values: np.ndarray[Any, Any], shares: np.ndarray[Any, Any]) -> lis
         inside = (shares >= low) & ((shares < high) | (place == BINS - 1)) & np.isfinite(values)
         if inside.any():
             count = int(inside.sum())
-            bins.append({"low": low, "high": high, "mean": float(values[inside].mean()), "count": count})
+            average = float(weighted_mean(values[inside], weights[inside], 0))
+            bins.append({"low": low, "high": high, "mean": average, "count": count})
     return bins

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool
@@ -12,12 +12,14 @@ from torch import Tensor
 
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.protocols import FrameSelection, Protocol
+from persist_cli.evaluate.windows import CURVE_COLUMNS
 from persist_cli.metrics.metric import FrameMetric, Metric
 
 ENDS: tuple[FrameSelection, ...] = ("all", "last", "return")
 
 SELECTIONS: dict[str, tuple[FrameSelection, ...]] = {  # of metrics shown over more than all frames
-    "psnr": (*ENDS, "new"), "ssim": ENDS, "lpips-alex": ENDS, "lpips-vgg": ENDS, "dreamsim": ENDS,
+    "psnr": (*ENDS, "new"), "sharpness": (*ENDS, "new"), "ssim": ENDS, "lpips-alex": ENDS, "lpips-vgg": ENDS,
+    "dreamsim": ENDS,
 }  # fmt: skip
 
 FAMILIAR = 0.9  # share of a view seen before from which on nothing of it counts as new
@@ -25,7 +27,11 @@ FAMILIAR = 0.9  # share of a view seen before from which on nothing of it counts
 SUFFIXES: dict[FrameSelection, tuple[str, str, str]] = {
     "all": ("", "", "mean over the predicted frames"),
     "last": ("-last", " last", "at the last frame only"),
-    "return": ("-return", " at return", "at the frames that return to an earlier pose only"),
+    "return": (
+        "-return",
+        " at return",
+        "at the frames only that return to an earlier pose over more than one predicted clip",
+    ),
     "new": ("-new", " where new", f"at frames of whose view less than {FAMILIAR:.0%} was seen before only"),
 }
 
@@ -40,7 +46,7 @@ class Column:
         title: heading of the column in the table.
         better: ``higher``, ``lower`` or, where neither is, ``None``.
         definition: sentence that says what is measured over which frames.
-        frames: frames of a clip that the column is the mean over.
+        frames: frames of a clip that the column is the mean over; ``windows`` for a figure of the curve over these.
     """
 
     name: str
@@ -48,7 +54,7 @@ class Column:
     title: str
     better: str | None
     definition: str
-    frames: FrameSelection
+    frames: FrameSelection | Literal["windows"]
 
 
 def make_columns(metrics: Mapping[str, Metric], protocol: Protocol) -> list[Column]:
@@ -63,6 +69,11 @@ def make_columns(metrics: Mapping[str, Metric], protocol: Protocol) -> list[Colu
             if isinstance(metric, FrameMetric):
                 definition = f"{definition}; {words}" if selection == "all" else f"as {metric.title}, {words}"
             columns.append(Column(name + suffix, name, metric.title + title, metric.better, definition, selection))
+        curve = CURVE_COLUMNS.get(name)
+        if curve is not None and protocol.writes:
+            definition = f"{metric.title}: {curve.definition}"
+            title = metric.title + curve.title
+            columns.append(Column(name + curve.suffix, name, title, curve.better, definition, "windows"))
     return columns
 
 
@@ -71,13 +82,20 @@ def column_json(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
     return {column.name: {key: value for key, value in asdict(column).items() if key != "name"} for column in columns}
 
 
-def chosen_frames(cases: Sequence[Case], frames: FrameSelection) -> Bool[Tensor, "clip frame"]:
-    """A mask of the frames of each clip that a column is the mean over; the given first one never is."""
+def chosen_frames(cases: Sequence[Case], frames: FrameSelection, clip_frames: int = 0) -> Bool[Tensor, "clip frame"]:
+    """A mask of the frames of each clip that a column is the mean over; the given first one never is.
+
+    Args:
+        cases: the clips.
+        frames: which frames the column takes.
+        clip_frames: frames that are predicted at once; returns count only over more of them.
+    """
     chosen = torch.ones(len(cases), cases[0].frames, dtype=torch.bool)
     if frames == "last":
         chosen[:, :-1] = False
     if frames == "return":
-        chosen = torch.tensor([case.first_visits for case in cases]) >= 0
+        visits = torch.tensor([case.first_visits for case in cases])
+        chosen = (visits >= 0) & (torch.arange(visits.shape[1]) - visits > clip_frames)
     if frames == "new":
         shares = [[1.0 if share is None else share for share in case.seen_before] for case in cases]
         chosen = torch.tensor(shares) < FAMILIAR

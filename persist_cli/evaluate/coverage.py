@@ -8,12 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from persist_cli.api.geometry import project, unproject
+from persist_cli.api.geometry import find_in_views, unproject
 from persist_cli.api.observations import Observations
 
 GRID = 16  # a view is probed at a grid of 16 × 16 of its pixels
-
-TOLERANCE = 0.05  # relative depth within which a probe is the same surface, plus as many metres
 
 
 def seen_share(seen: Observations, frame: int, held: Sequence[int]) -> float | None:
@@ -43,13 +41,7 @@ def probe_points(seen: Observations, frame: int) -> Float[Tensor, "point 3"]:
 
 def visible(points: Float[Tensor, "point 3"], seen: Observations) -> Bool[Tensor, "frame point"]:
     """For each frame and point whether the frame sees the point, in view and not hidden."""
-    count, height, width = seen.depth.shape
-    pixels, depth = project(points.expand(count, -1, -1), seen.cameras)
-    columns, rows = pixels.nan_to_num().floor().clamp(-1, 10_000).long().unbind(-1)
-    inside = (depth > 0) & (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    frames = torch.arange(count)[:, None].expand_as(rows)
-    surface = seen.depth[frames, rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
-    return inside & (surface > 0) & ((depth - surface).abs() < TOLERANCE * (1 + depth))
+    return find_in_views(points.expand(len(seen), -1, -1), seen.depth, seen.cameras)[1]
 
 
 def held_frames(start: int, context: int, frame: int, predicted_at_once: int, writes: bool) -> list[int]:

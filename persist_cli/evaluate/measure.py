@@ -12,7 +12,7 @@ from persist_cli.api.backbone import Backbone
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.cases import CaseFrames, read_case
 from persist_cli.evaluate.journal import TRUTH, Processes, Unit
-from persist_cli.evaluate.metric_suite import READS, VIDEO
+from persist_cli.evaluate.metric_suite import CELLS, READS, VIDEO
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.rollout.world_model import clip_seed
@@ -47,7 +47,8 @@ def measure_truth(run: Evaluation, processes: Processes, bar: Progress) -> None:
     """Keep the features of the true videos, with which set metrics compare those of every row."""
     suite = run.suites[0]  # the features are of colours, which every row has
     units = [Unit(TRUTH, 0, batch) for batch in range(run.batches) if processes.owns(batch)]
-    todo = [unit for unit in units if suite.set_metrics and not run.journal.has(unit)]
+    needed = bool(suite.set_metrics or suite.frame_set_metrics)
+    todo = [unit for unit in units if needed and not run.journal.has(unit)]
     if todo:
         task = add_task(bar, "true videos", sum(len(run.batch(unit.batch)) for unit in todo), "clips")
     for unit in todo:
@@ -63,6 +64,9 @@ def measure_unit(run: Evaluation, row: Row, backbone: Backbone, unit: Unit) -> N
     reads = row.reads()
     if reads is not None:
         tensors[READS] = reads
+    cells = row.cells()
+    if cells is not None:
+        tensors[CELLS] = cells
     videos = max(0, SHEET_CLIPS - unit.batch * run.plan.batch) if unit.seed == 0 else 0
     if videos:
         tensors[VIDEO] = rgb[:videos].cpu()

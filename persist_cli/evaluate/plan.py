@@ -48,6 +48,7 @@ class EvalPlan:
     placement: InferenceOptions
     controls_named: bool = True
     resample: str = "scenes"  # one of ``RESAMPLE_UNITS``
+    training_seeds: bool = False
 
     def without_repeats(self) -> EvalPlan:
         """This plan without repeated names, because a memory named twice would be two rows of one name."""
@@ -87,6 +88,11 @@ class Evaluation:
         return self.suites[0].metrics
 
     @property
+    def clip_frames(self) -> int:
+        """Number of frames that the models predict at once."""
+        return self.suites[0].setup.clip_frames
+
+    @property
     def batches(self) -> int:
         """Number of batches of every row and seed."""
         return -(-len(self.cases) // self.plan.batch)
@@ -120,7 +126,9 @@ def prepare(
         plan = replace(plan, memories=default_memories(checkpoints))
     plan, loader = plan.without_repeats(), BackboneLoader(plan.placement)
     sampling = common_sampling(checkpoints, plan.sampling)
-    config = RowConfig(plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named)
+    config = RowConfig(
+        plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named, plan.training_seeds
+    )
     config.check()
     if plan.resample not in RESAMPLE_UNITS:
         raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
@@ -151,7 +159,8 @@ def prepare(
     if processes.main:
         warn_of_clips(cases, checkpoints, search)
     depths = [not (row.uses_model and row.base.fingerprint in bases.depthless) for row in rows]
-    suites = [MetricSuite(metrics, make_setup(cases, gives_depth)) for gives_depth in depths]
+    clip_frames = bases.frames_per_clip - 1
+    suites = [MetricSuite(metrics, make_setup(cases, gives_depth, clip_frames)) for gives_depth in depths]
     return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
 
 
@@ -176,7 +185,7 @@ def identity(
     """JSON values of all that changes a figure, but for the data: an evaluation with equal values goes on."""
     options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
     options |= {"sampling": asdict(sampling) | plan.placement.changes()}
-    for name in ("placement", "controls_named", "resample"):
+    for name in ("placement", "controls_named", "resample", "training_seeds"):
         del options[name]  # what is left of them changes no measured figure
     values = options | {
         "checkpoints": [checkpoint_json(checkpoint) for checkpoint in checkpoints],

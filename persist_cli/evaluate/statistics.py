@@ -160,32 +160,36 @@ def mean_figure(values: Array, draws: Draws) -> Figure:
     return make_figure(by_seed, drawn, np.where(np.isfinite(per_clip), draws.clusters, -1), per_clip)
 
 
-def curve_figure(values: Array, of_curve: Callable[[Array], Array], draws: Draws) -> Figure:
+def curve_figure(values: Array, weights: Array, of_curve: Callable[[Array], Array], draws: Draws) -> Figure:
     """A figure of a mean curve, such as its least value, with the interval of that figure.
 
     Args:
         values: ``[model, seed, clip, place]``, NaN where a clip has no value.
+        weights: how much each value counts.
         of_curve: takes mean curves ``[curve, place]`` and gives one number for each.
         draws: draws of the row's clips and models.
     """
-    by_seed = np.stack([of_curve(mean(model, axis=1)) for model in values])
+    by_seed = np.stack([of_curve(weighted_mean(*model, axis=1)) for model in zip(values, weights, strict=True)])
     known = np.isfinite(values).any(axis=(0, 1, 3))
-    return make_figure(by_seed, of_curve(resampled_means(values, draws)), np.where(known, draws.clusters, -1))
+    clusters = np.where(known, draws.clusters, -1)
+    return make_figure(by_seed, of_curve(resampled_means(values, draws, weights)), clusters)
 
 
-def resampled_means(values: Array, draws: Draws) -> Array:
+def resampled_means(values: Array, draws: Draws, weights: Array | None = None) -> Array:
     """Means ``[resample, place]`` over the models and clips of every bootstrap sample.
 
     Args:
         values: ``[model, seed, clip, place]``, NaN where a clip has no value.
         draws: draws of clips and models.
+        weights: how much each value counts; ``None`` when all count the same.
     """
     averaged = mean(values, axis=1)
     known = np.isfinite(averaged)
-    weights = (draws.models.astype(np.float64), draws.clips.astype(np.float64))
-    totals = np.einsum("rm,rc,mcp->rp", *weights, np.where(known, averaged, 0.0), optimize=True)
-    counts = np.einsum("rm,rc,mcp->rp", *weights, known.astype(np.float64), optimize=True)
-    return np.where(counts > 0, totals / np.maximum(counts, 1), np.nan)
+    counted = known.astype(np.float64) if weights is None else np.where(known, weights.mean(axis=1), 0.0)
+    drawn = (draws.models.astype(np.float64), draws.clips.astype(np.float64))
+    totals = np.einsum("rm,rc,mcp->rp", *drawn, np.nan_to_num(averaged) * counted, optimize=True)
+    counts = np.einsum("rm,rc,mcp->rp", *drawn, counted, optimize=True)
+    return np.where(counts > 0, totals / np.where(counts > 0, counts, 1.0), np.nan)
 
 
 def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | None = None) -> Figure:
@@ -269,6 +273,20 @@ def mean(values: Array, axis: int | None = None) -> Any:
     count = known.sum(axis=axis)
     total = np.where(known, values, 0.0).sum(axis=axis)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def weighted_mean(values: Array, weights: Array, axis: int) -> Any:
+    """The mean of the finite values, each counted by its weight; NaN where there is none.
+
+    Args:
+        values: the values.
+        weights: not negative, of the same shape.
+        axis: axis of the mean.
+    """
+    known = np.isfinite(values) & (weights > 0)
+    total = np.where(known, weights, 0.0).sum(axis=axis)
+    summed = np.where(known, np.nan_to_num(values) * weights, 0.0).sum(axis=axis)
+    return np.where(total > 0, summed / np.where(total > 0, total, 1.0), np.nan)
 
 
 def number(value: float | None) -> float | None:

@@ -5,14 +5,17 @@ from persist_cli.metrics.dreamsim import DreamSim
 from persist_cli.metrics.drift import Drift
 from persist_cli.metrics.frames import Psnr, Ssim
 from persist_cli.metrics.fvd import Fvd
+from persist_cli.metrics.kernel_distance import KernelDistance
 from persist_cli.metrics.lpips import LpipsAlex, LpipsVgg
 from persist_cli.metrics.metric import Metric
-from persist_cli.metrics.src import Src, SrcAway
+from persist_cli.metrics.own_visit import LpipsOwn, PsnrOwn
+from persist_cli.metrics.sharpness import Grain, Sharpness
+from persist_cli.metrics.src import Src, SrcAway, SrcPatch
 
 METRICS: dict[str, Metric] = {
     metric.name: metric
     for metric in (
-        Psnr(), Ssim(), LpipsAlex(), LpipsVgg(), DreamSim(), Fvd(), Src(), SrcAway(), AbsRel(), Rmse(), Delta1(),
-        Drift(),
+        Psnr(), Sharpness(), Grain(), Ssim(), LpipsAlex(), LpipsVgg(), DreamSim(), Fvd(), KernelDistance(), Src(),
+        SrcPatch(), SrcAway(), PsnrOwn(), LpipsOwn(), AbsRel(), Rmse(), Delta1(), Drift(),
     )
 }  # fmt: skip

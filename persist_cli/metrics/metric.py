@@ -22,13 +22,22 @@ class Prediction:
         rgb: generated frames; the first one is the input frame.
         depth: generated depth in metres, 0 where it is missing.
         truth: true frames, with the cameras of both videos.
-        first_visits: for each frame the number of the earlier frame whose pose it returns to, -1 for none.
+        first_visits: for each frame the number of the earlier frame that it returns to, -1 for none.
+        clip_frames: frames that the model predicts at once. To be like a frame not more than so many before needs no
+            memory, so such returns are left out of figures of returns.
     """
 
     rgb: UInt8[Tensor, "frame height width 3"]
     depth: Float[Tensor, "frame height width"]
     truth: Observations
     first_visits: Int64[Tensor, " frame"]
+    clip_frames: int = 0
+
+    @property
+    def returns(self) -> list[tuple[int, int]]:
+        """Each frame that returns over more than one predicted clip, with the frame of its first visit."""
+        visits = enumerate(self.first_visits.tolist())
+        return [(frame, first) for frame, first in visits if first >= 0 and frame - first > self.clip_frames]
 
     def check(self, where: str) -> None:
         """Raise ``DataError`` naming ``where`` when the generated frames do not match the true ones."""
@@ -57,7 +66,9 @@ class Setup:
         width: width of the images in pixels.
         depth: whether the data has true depth.
         generated_depth: whether the model or control gives depth.
-        returns: whether clips return to poses they had before.
+        returns: whether clips return to poses they had before, over more than one predicted clip.
+        unseen_scenes: number of scenes with frames of whose view most was never seen before.
+        clip_frames: frames that the model predicts at once, see ``Prediction``.
     """
 
     clips: int
@@ -67,6 +78,8 @@ class Setup:
     depth: bool
     generated_depth: bool
     returns: bool
+    unseen_scenes: int = 0
+    clip_frames: int = 0
 
 
 class Metric(ABC):
@@ -103,6 +116,10 @@ class FrameMetric(Metric):
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
         """Return the figure of every frame, the first one included, float64; NaN where it is not defined."""
 
+    def frame_weights(self, prediction: Prediction) -> Float[Tensor, " frame"]:
+        """Return how much each frame counts in means, by the truth alone; by default all count the same."""
+        return torch.ones(len(prediction.rgb), dtype=torch.float64)
+
 
 class SetMetric(Metric):
     """A metric that is a distance between two sets of videos, computed from features of each video."""
@@ -116,3 +133,23 @@ class SetMetric(Metric):
         self, features: Float[Tensor, "video channel"], true_features: Float[Tensor, "video channel"]
     ) -> float:
         """Return the distance between generated and true videos."""
+
+
+class FrameSetMetric(Metric):
+    """A metric that is a distance between two sets of single frames: those of whose view most was never seen before."""
+
+    @abstractmethod
+    def features(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame channel"]:
+        """Return the features of each frame."""
+
+    @abstractmethod
+    def scene_sums(
+        self,
+        features: Float[Tensor, "frame channel"],
+        true_features: Float[Tensor, "frame channel"],
+        scenes: Int64[Tensor, " frame"],
+    ) -> tuple[Float[Tensor, "scene scene"], Float[Tensor, "scene scene"]]:
+        """Return the sums over pairs of frames, and numbers of these pairs, between scenes numbered from 0.
+
+        The distance of a choice of scenes, each counted so often, is the weighted sum over the weighted number.
+        """

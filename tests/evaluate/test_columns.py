@@ -37,4 +37,11 @@ def test_psnr_has_a_column_for_new_views_only_where_the_protocol_selects_them():
 
 
 def test_choosing_scene_consistency_chooses_its_guard_too():
-    assert list(choose_metrics(("src",), METRICS)) == ["src", "src-away"]
+    guards = ["src-patch", "src-away", "psnr-own", "lpips-own"]
+    assert list(choose_metrics(("src",), METRICS)) == ["src", *guards]
+    assert list(choose_metrics(("sharpness",), METRICS)) == ["sharpness", "grain"]
+
+
+def test_returns_within_one_predicted_clip_are_no_returns():
+    cases = [case((0.0, 0.1, 0.89, 0.9), (-1, -1, 0, 0))]
+    assert chosen_frames(cases, "return", clip_frames=2)[0].tolist() == [False, False, False, True]

@@ -130,14 +130,14 @@ def test_the_interval_of_a_distance_between_sets_lies_around_it():
 
 def test_the_least_value_of_a_mean_curve_has_an_interval():
     values = clips(count=40, seeds=1)[..., None] + np.array([0.0, -3.0, 1.0])
-    figure = curve_figure(values, lambda curves: curves.min(axis=1), Draws.of(range(40)))
+    figure = curve_figure(values, np.ones_like(values), lambda curves: curves.min(axis=1), Draws.of(range(40)))
     assert figure.mean == pytest.approx(values.mean(axis=(0, 1, 2)).min())
     assert figure.low < figure.mean < figure.high
 
 
 def test_frames_are_binned_by_the_share_of_their_view_seen_before():
     values, shares = np.array([[1.0, 2.0, 3.0, np.nan]]), np.array([[0.05, 0.95, 1.0, 0.5]])
-    assert seen_bins(values, shares) == [
+    assert seen_bins(values, shares, np.ones_like(values)) == [
         {"low": 0.0, "high": 0.1, "mean": 1.0, "count": 1},
         {"low": 0.9, "high": 1.0, "mean": 2.5, "count": 2},
     ]

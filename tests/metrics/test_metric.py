@@ -9,18 +9,21 @@ import torch
 
 from persist_cli.errors import DataError
 from persist_cli.metrics import METRICS
-from persist_cli.metrics.metric import FrameMetric, SetMetric
+from persist_cli.metrics.metric import FrameMetric, FrameSetMetric, SetMetric
 from persist_cli.rollout.outputs import compare
 from tests.support.predictions import prediction, random_frames, setup, still_camera, there_and_back
 
 
 def test_every_metric_has_a_name_a_title_and_a_definition_of_one_line():
-    columns = "psnr ssim lpips-alex lpips-vgg dreamsim fvd src src-away absrel rmse delta1 drift"
+    columns = (
+        "psnr sharpness grain ssim lpips-alex lpips-vgg dreamsim fvd kd-dinov2 src src-patch src-away psnr-own "
+        "lpips-own absrel rmse delta1 drift"
+    )
     assert " ".join(METRICS) == columns
     for name, metric in METRICS.items():
         assert metric.name == name
-        assert metric.better in ("higher", "lower") or name == "src-away"
-        assert isinstance(metric, FrameMetric | SetMetric)
+        assert metric.better in ("higher", "lower") or name in ("sharpness", "grain", "src-away")
+        assert isinstance(metric, FrameMetric | FrameSetMetric | SetMetric)
         assert metric.title
         assert len(metric.definition) > 20
         assert "\n" not in metric.definition
@@ -29,7 +32,7 @@ def test_every_metric_has_a_name_a_title_and_a_definition_of_one_line():
 def test_metrics_without_their_weights_name_the_command_that_fetches_them(tmp_path, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     for name, metric in METRICS.items():
-        obstacle = metric.obstacle(setup())
+        obstacle = metric.obstacle(setup(unseen_scenes=2))
         assert bool(obstacle) == bool(metric.weights), name
         assert obstacle is None or f"persist weights fetch {metric.weights[0]}" in obstacle
 
@@ -65,11 +68,11 @@ def test_a_rollout_is_compared_by_the_frame_metrics_that_can_be_measured(tmp_pat
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     start, truth = there_and_back().truth[:1], there_and_back().truth[1:]
     figures = compare(start, replace(truth, depth=truth.depth * 1.1), truth)
-    assert list(figures) == ["psnr", "ssim", "absrel", "rmse", "delta1", "drift"]
+    assert list(figures) == ["psnr", "sharpness", "grain", "ssim", "absrel", "rmse", "delta1", "drift"]
     assert figures["psnr"] == [100.0] * 6
     assert figures["absrel"] == pytest.approx([0.1] * 6, rel=1e-5)
     assert "drift" not in compare(start, truth, replace(truth, depth=torch.zeros_like(truth.depth)))
-    assert list(compare(start, truth, truth, gives_depth=False)) == ["psnr", "ssim"]
+    assert list(compare(start, truth, truth, gives_depth=False)) == ["psnr", "sharpness", "grain", "ssim"]
 
 
 def test_a_single_imagined_frame_is_compared_as_well(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from persist_cli.metrics import METRICS
 from persist_cli.metrics.src import ENCODERS, farthest
 from tests.support.predictions import setup, there_and_back
 
-SRC, AWAY = METRICS["src"], METRICS["src-away"]
+SRC, PATCH, AWAY = METRICS["src"], METRICS["src-patch"], METRICS["src-away"]
 needs_encoder = pytest.mark.skipif(
     not any(cached_weight(encoder.name) for encoder in ENCODERS), reason="no weights of an encoder for SRC"
 )
@@ -48,6 +48,23 @@ def test_a_place_that_looks_different_on_return_has_less(encoder):
     assert figures[5] < figures[4] == pytest.approx(100)
 
 
+def test_patches_that_change_places_are_seen_patch_by_patch_and_not_in_their_mean(encoder):
+    clip = there_and_back()
+    assert PATCH.measure(clip)[4:].tolist() == pytest.approx([100.0] * 3)
+    frozen = replace(clip, rgb=clip.rgb[:1].expand_as(clip.rgb))
+    assert PATCH.measure(frozen)[4:].tolist() == pytest.approx([100.0] * 3)
+    turned = clip.rgb.clone()
+    turned[5] = turned[5].flip(0, 1)  # the same patches elsewhere, but for their own turn
+    figures = replace(clip, rgb=turned)
+    assert PATCH.measure(figures)[5] < SRC.measure(figures)[5]
+
+
+def test_a_return_within_one_predicted_clip_asks_for_no_memory_and_does_not_count(encoder):
+    for metric in (SRC, PATCH, AWAY):
+        figures = metric.measure(replace(there_and_back(), clip_frames=4))
+        assert figures.isfinite().tolist() == [False] * 6 + [True]
+
+
 def test_the_guard_of_a_frozen_video_is_100_and_that_of_the_truth_less(encoder):
     clip = there_and_back()
     frozen = replace(clip, rgb=clip.rgb[:1].expand_as(clip.rgb))
@@ -74,7 +91,8 @@ def test_the_definition_names_the_weights_that_are_used(tmp_path, monkeypatch):
     assert SRC.obstacle(setup()) == (
         "weights dinov2-small or dinov2-s-derived are not here: persist weights fetch dinov2-small"
     )
-    assert SRC.obstacle(setup(returns=False)) == "no clip returns to a pose it had before"
+    words = "no clip returns to a pose it had before over more than one predicted clip"
+    assert SRC.obstacle(setup(returns=False)) == words
     write_json(tmp_path / "weights/dinov2-s-derived/weight.json", {})
     assert SRC.obstacle(setup()) is None
     assert "DINOv2-S-derived, block 8" in SRC.definition

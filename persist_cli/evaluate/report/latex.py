@@ -112,7 +112,7 @@ def _difference(cell: CellView) -> list[str]:
 def _float(view: TableView, groups: Groups, write_cell: CellWriter, caption: str, label: str) -> str:
     """A LaTeX float; columns that do not fit the page's width go into further floats."""
     rows = [row for _, group in groups for row in group]
-    plain = [[row.name, *(_plain_text(cell, write_cell) for cell in row.cells)] for row in rows]
+    plain = [[row.label, *(_plain_text(cell, write_cell) for cell in row.cells)] for row in rows]
     heads = ["", *(column.heading for column in view.columns)]
     blocks = [[number - 1 for number in columns[1:]] for columns in fit_columns(heads, plain, PAGE)]
     form = "table" if next(fit_columns(heads, plain, HALF_PAGE)) == list(range(len(heads))) else "table*"
@@ -133,7 +133,7 @@ def _tabular(view: TableView, groups: Groups, write_cell: CellWriter, columns: S
         lines.append("\\midrule")
         for row in rows:  # the braces keep a name that begins with [ from being the argument of the line before
             texts = zip(*(write_cell(row.cells[number]) for number in columns), strict=True)
-            names = [f"{{{escape(row.name)}}}", ""]
+            names = [f"{{{escape(row.label)}}}", ""]
             filled = [(name, line) for name, line in zip(names, texts, strict=False) if any(line)]
             lines += [" & ".join([name, *line]) + LINE_END for name, line in filled]
             lines += ["\\addlinespace[2pt]"] if write_cell is _difference else []

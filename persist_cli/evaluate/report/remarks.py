@@ -9,7 +9,7 @@ from pathlib import Path
 from persist_cli.api.checkpoint import name_ranges, run_folder
 from persist_cli.evaluate.report.result_file import CheckpointRecord, EvalResults
 from persist_cli.evaluate.report.tables import MARK, CompactTable, TableView, compact_tables
-from persist_cli.evaluate.statistics import LEAST_UNITS
+from persist_cli.evaluate.statistics import LEAST_MODELS, LEAST_UNITS
 
 MOST_SCENES = 3  # names or ranges of scenes in a warning
 
@@ -29,8 +29,26 @@ def figure_legend(results: EvalResults, table: CompactTable) -> str:
 def seed_legend(results: EvalResults) -> str:
     """Say what a figure is the mean of."""
     seeds = len(results.sampling.seeds)
+    sampling = f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "one sampling seed"
+    if any(len(row.training_seeds) > 1 for table in results.tables for row in table.rows.values()):
+        return f"mean ± standard deviation over training seeds where a row has several; else {sampling}"
+    return sampling if seeds > 1 else f"mean over clips, {sampling}"
+
+
+def training_seed_line(results: EvalResults) -> str:
+    """Say which models have fewer training seeds than a claim needs; empty when there are none, or nothing is known.
+
+    An interval over scenes does not hold what another training of the same recipe would change.
+    """
+    rows = {name: len(row.training_seeds) for table in results.tables for name, row in table.rows.items()
+            if row.kind == "model" and row.training_seeds}  # fmt: skip
+    few = {name: count for name, count in rows.items() if count < LEAST_MODELS}
+    if not few:
+        return ""
+    counts = " and ".join("one training seed" if count == 1 else f"{count} training seeds" for count in {*few.values()})
     return (
-        f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "mean over clips, one sampling seed"
+        f"{counts} ({', '.join(few)}): a difference between two such models may be that of two trainings; "
+        f"give {LEAST_MODELS} of each with --training-seeds"
     )
 
 

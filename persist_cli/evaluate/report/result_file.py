@@ -178,7 +178,10 @@ class ReadsRecord(ResultModel):
 
 
 class RowRecord(ResultModel):
-    """A row of the table, or in ``na`` the reason why it cannot be made of these clips."""
+    """A row of the table, or in ``na`` the reason why it cannot be made of these clips.
+
+    ``training_seeds`` has the seeds of the stages of each model, which stand on so many different ``bases``.
+    """
 
     kind: Literal["model", "control", "memory control"]
     definition: str = ""
@@ -186,6 +189,8 @@ class RowRecord(ResultModel):
     checkpoint: str | None = None
     memory: str | None = None
     reads: ReadsRecord | None = None
+    training_seeds: list[list[int]] = []
+    bases: int | None = None
     columns: dict[str, Cell]
     curves: dict[str, Curve] = {}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from statistics import stdev
 
 from persist_cli.evaluate.report.result_file import Cell, ColumnRecord, Difference, EvalResults, RowRecord, TableRecord
 
@@ -70,7 +71,10 @@ class ColumnView:
 
 @dataclass(frozen=True)
 class RowView:
-    """A row with its cells; ``missing`` when the row cannot be made of these clips."""
+    """A row with its cells; ``missing`` when the row cannot be made of these clips.
+
+    ``trained`` counts the training seeds of a model's row; it is 1 for controls without a model.
+    """
 
     name: str
     kind: str
@@ -78,6 +82,12 @@ class RowView:
     reference: bool
     cells: list[CellView]
     missing: bool = False
+    trained: int = 1
+
+    @property
+    def label(self) -> str:
+        """The name, with the number of training seeds where there are several."""
+        return self.name if self.trained < 2 else f"{self.name} ({self.trained} training seeds)"
 
 
 @dataclass(frozen=True)
@@ -226,10 +236,12 @@ def _view_table(results: EvalResults, table: TableRecord, notes: list[str]) -> T
         views = _column_views(key, column, [table.rows[name] for name in names], notes)
         for name, cell in zip(names, views, strict=True):
             cells[name].append(cell)
-    rows = [
-        RowView(name, row.kind, row.definition, name == results.first_row, cells[name], row.na is not None)
-        for name, row in ((name, table.rows[name]) for name in names)
-    ]
+    rows = []
+    for name in names:
+        row = table.rows[name]
+        trained = len(row.training_seeds) or 1
+        reference = name == results.first_row
+        rows.append(RowView(name, row.kind, row.definition, reference, cells[name], row.na is not None, trained))
     columns = [_column_head(results, key, table) for key in results.columns]
     used_notes = sorted({cell.note for row in rows for cell in row.cells} - {0})
     unit = results.statistics.resampled
@@ -263,7 +275,8 @@ def _cell_view(cell: Cell, column: ColumnRecord, digits: int, notes: list[str], 
         if cell.na not in notes:
             notes.append(cell.na)
         return CellView(NOT_AVAILABLE, note=notes.index(cell.na) + 1)
-    spread = "" if cell.std is None or cell.mean is None else f" ± {number_text(cell.std, digits)}"
+    deviation = training_deviation(cell)
+    spread = "" if deviation is None or cell.mean is None else f" ± {number_text(deviation, digits)}"
     text = number_text(cell.mean, digits) + spread
     view = CellView(text, interval_text(cell.low, cell.high, digits), best=best, count=cell.count)
     gap = cell.difference
@@ -272,6 +285,12 @@ def _cell_view(cell: Cell, column: ColumnRecord, digits: int, notes: list[str], 
     text, interval = difference_texts(gap, digits)
     judgement = verdict(gap, column.better) if text.endswith(MARK) else "open"
     return replace(view, difference=text, difference_interval=interval, verdict=judgement)
+
+
+def training_deviation(cell: Cell) -> float | None:
+    """The standard deviation over training seeds where there are several, else over sampling seeds."""
+    known = [value for value in cell.by_training_seed if value is not None]
+    return stdev(known) if len(known) > 1 else cell.std
 
 
 def _column_head(results: EvalResults, key: str, table: TableRecord) -> ColumnView:

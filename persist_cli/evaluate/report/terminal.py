@@ -15,6 +15,7 @@ from persist_cli.evaluate.report.remarks import (
     difference_legend,
     left_out_line,
     too_few_lines,
+    training_seed_line,
 )
 from persist_cli.evaluate.report.result_file import EvalResults, check_results
 from persist_cli.evaluate.report.tables import CellView, CompactTable, compact_tables
@@ -99,6 +100,7 @@ def lines_below(results: EvalResults, table: TerminalTable) -> list[str]:
         *(f"{mark}: {note}" for number, note in sorted(notes.items()) if (mark := f"n/a ({number})") in shown),
         *([left_out] if left_out else []),
         *([reads_line(results)] if reads_line(results) else []),
+        *([seeds] if (seeds := training_seed_line(results)) else []),
         *(f"warning: {line}" for line in contamination_lines(results)),
     ]
 
@@ -142,7 +144,7 @@ def table_lines(tables: Sequence[CompactTable]) -> list[TableLine]:
             lines.append(TableLine(f"{table.view.name}: {table.view.clips} clips", "domain", {}))
         keys = [column.key for column in table.view.columns]
         for _, rows in table.view.kind_groups():
-            lines += [TableLine(row.name, row.kind, dict(zip(keys, row.cells, strict=True))) for row in rows]
+            lines += [TableLine(row.label, row.kind, dict(zip(keys, row.cells, strict=True))) for row in rows]
     return lines
 
 

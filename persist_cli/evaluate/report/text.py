@@ -13,6 +13,7 @@ from persist_cli.evaluate.report.remarks import (
     figure_legend,
     left_out_line,
     too_few_lines,
+    training_seed_line,
     unknown_scenes_lines,
 )
 from persist_cli.evaluate.report.result_file import EvalResults, check_results
@@ -30,7 +31,7 @@ def table_text(results: Mapping[str, Any] | EvalResults) -> str:
     blocks += [_plain(legend) for legend in legends]
     for name, rows, columns, cell_text in _text_tables(checked):
         heads = ["row", *(column.heading for column in columns)]
-        cells = [[row.name + _kind(row), *map(cell_text, row.cells)] for row in rows]
+        cells = [[row.label + _kind(row), *map(cell_text, row.cells)] for row in rows]
         blocks.append(markdown_table(name, heads, cells, _best(rows) if cell_text is _figure else ()))
     if reads := read_rows(checked):
         blocks.append(markdown_table(READS_TITLE, READS_HEADS, reads))
@@ -63,6 +64,7 @@ def remark_lines(results: EvalResults) -> list[str]:
         *(f"n/a ({number}): {note}" for number, note in sorted(notes.items())),
         *(f"{name}: {column.definition}{counts[name]}" for name, column in columns.items() if column.definition),
         *(f"{name}: {definition}" for name, definition in rows.items()),
+        *([seeds] if (seeds := training_seed_line(results)) else []),
         *unknown_scenes_lines(results),
     ]
 

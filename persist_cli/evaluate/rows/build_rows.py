@@ -23,6 +23,7 @@ from persist_cli.evaluate.rows.interventions import (
 )
 from persist_cli.evaluate.rows.model_rows import NO_MEMORY, ModelRow, RowMemory
 from persist_cli.evaluate.rows.row import Row, unique_bases
+from persist_cli.evaluate.rows.training_seeds import check_any_grouped, group_by_training
 from persist_cli.memorize.factory import MemoryFactory
 
 CONTROLS: dict[str, type[Control]] = {
@@ -56,6 +57,7 @@ class RowConfig:
         sampling: sampling of every row of a model.
         noise: centimetres and degrees of the control ``noisy``.
         named: whether the user named the controls, so that one that cannot be made is an error.
+        training_seeds: whether checkpoints whose recipes differ in their seeds alone are one row.
     """
 
     memories: Sequence[str]
@@ -63,6 +65,7 @@ class RowConfig:
     sampling: Sampling
     noise: tuple[float, float] = (5.0, 2.0)
     named: bool = True
+    training_seeds: bool = False
 
     def check(self) -> None:
         """Raise ``PersistError`` when no memory is named, for an unknown control, and for negative noise."""
@@ -105,16 +108,37 @@ def build_model_rows(checkpoints: Sequence[Checkpoint], config: RowConfig, proto
     Raises:
         CheckpointError: when no checkpoint has a memory.
     """
-    rows = []
+    rows, groups = [], []
     for memory in config.memories:
         adapter = None if memory == PLAIN else memory
-        owners = checkpoints_with(memory, checkpoints)
-        for owner, label in zip(owners, labels(owners), strict=True):
+        for name, group, owner in named_owners(memory, checkpoints_with(memory, checkpoints), config.training_seeds):
             factory = MemoryFactory.of(adapter_memory(owner, memory)) if adapter else None
-            name = memory if len(owners) == 1 else f"{memory} ({label})"
-            row_memory = RowMemory(factory, Unmodified(), protocol.writes)
-            rows.append(ModelRow(name, owner, adapter, config.sampling, row_memory))
+            row = ModelRow(name, owner, adapter, config.sampling, RowMemory(factory, Unmodified(), protocol.writes))
+            row.group = group
+            rows.append(row)
+            groups.append(group)
+    if config.training_seeds and len(set(groups)) == len(groups):
+        check_any_grouped([[row.checkpoint] for row in rows if row.adapter == rows[-1].adapter], rows[-1].adapter)
     return rows
+
+
+def named_owners(
+    memory: str, owners: Sequence[Checkpoint], training_seeds: bool
+) -> Iterator[tuple[str, str, Checkpoint]]:
+    """Name of the row and of its group, and checkpoint, for each checkpoint that has a memory or a control's base.
+
+    Args:
+        memory: name of the memory, or title of the control.
+        owners: the checkpoints.
+        training_seeds: whether checkpoints whose recipes differ in their seeds alone are one group.
+    """
+    adapter = memory if all(memory in owner.adapters for owner in owners) else None
+    groups = group_by_training(owners, adapter) if training_seeds else [[owner] for owner in owners]
+    names = {id(owner): label for owner, label in zip(owners, labels(owners), strict=True)}
+    for group in groups:
+        title = memory if len(groups) == 1 else f"{memory} ({names[id(group[0])]})"
+        for owner in group:
+            yield memory if len(owners) == 1 else f"{memory} ({names[id(owner)]})", title, owner
 
 
 def build_control_rows(
@@ -156,7 +180,9 @@ def intervention_rows(
                 intervention = make_intervention(config, cases)
                 row_memory = replace(row.row_memory, intervention=intervention)
                 row_name = f"{row.name}, {intervention.name}"
-                yield name, ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory)
+                changed = ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory)
+                changed.group = f"{row.group}, {intervention.name}"
+                yield name, changed
 
 
 def untrained_rows(
@@ -168,8 +194,10 @@ def untrained_rows(
         if name not in (*config.controls, *protocol.guards):
             continue
         if control.uses_model and len(bases) > 1:  # each base has a codec of its own
-            for base, label in zip(bases, labels(bases), strict=True):
-                yield name, control(f"{control.title} ({label})", base, protocol.writes)
+            for row_name, group, base in named_owners(control.title, bases, config.training_seeds):
+                row = control(row_name, base, protocol.writes)
+                row.group = group
+                yield name, row
         else:
             yield name, control(control.title, bases[0], protocol.writes)
 

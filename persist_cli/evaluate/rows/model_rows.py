@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone, Sampling
@@ -69,6 +69,7 @@ class ModelRow(Row):
         super().__init__(name, checkpoint)
         self.checkpoint, self.adapter, self.sampling, self.row_memory = checkpoint, adapter, sampling, row_memory
         self.agents: list[Agent] = []
+        self.growth: list[list[int]] = []
         self.kind = "model" if isinstance(row_memory.intervention, Unmodified) else "memory control"
 
     @property
@@ -93,7 +94,11 @@ class ModelRow(Row):
         model.reset([clip.observations[:1] for clip in clips], [clip.info for clip in clips])
         cameras = [clip.observations.cameras[1:] for clip in clips]
         parts = [[clip.observations[:1] for clip in clips]]
-        parts += model.imagine(cameras, [clip.interactions for clip in clips])
+        self.growth = []
+        for frames in model.imagine(cameras, [clip.interactions for clip in clips]):
+            parts.append(frames)
+            if self.row_memory.writes:
+                self.growth.append([0 if one.memory is None else one.memory.figures().cells for one in agents])
         videos = [Observations.concatenate(frames) for frames in zip(*parts, strict=True)]
         return torch.stack([video.rgb for video in videos]), torch.stack([video.depth for video in videos])
 
@@ -111,6 +116,12 @@ class ModelRow(Row):
         pose, matrix = torch.eye(4, dtype=torch.float64)[None], torch.from_numpy(info.intrinsics)[None]
         resolution = memory.resolution(Cameras(pose, matrix, info.height, info.width), DISTANCE)
         return {"resolution": resolution, "distance": DISTANCE, "reads_depth": memory.reads_depth}
+
+    def cells(self) -> Int64[Tensor, "clip step"] | None:
+        """Cells of each clip's memory after every predicted clip; ``None`` where nothing is written."""
+        if self.row_memory.factory is None or not self.row_memory.writes:
+            return None
+        return torch.tensor(self.growth).T.contiguous()
 
     def agent(self, clip: CaseFrames, seed: int) -> Agent:
         """An agent that holds the clip's memory, before it is placed at the first frame."""

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone
@@ -49,6 +49,10 @@ class Row(ABC):
 
     def reads(self) -> Float[Tensor, "clip 2"] | None:
         """Tokens and bytes that were read from memory for a generated clip, of each clip of the last ``videos``."""
+        return None
+
+    def cells(self) -> Int64[Tensor, "clip step"] | None:
+        """Cells of each clip's memory after every predicted clip of the last ``videos``; ``None`` without any."""
         return None
 
     def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
