@@ -320,7 +320,7 @@ def evaluate(
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
-    pose_noise: Annotated[tuple[float, float], typer.Option(help="Of the control noisy: σ in cm, degrees.")] = (5, 2),
+    pose_noise: Annotated[tuple[float, float], typer.Option(help="Of noisy and drifting: σ in cm, degrees.")] = (5, 2),
     training_seeds: Annotated[
         bool, typer.Option("--training-seeds", help="Checkpoints whose recipes differ in seeds alone are one row.")
     ] = False,

@@ -61,7 +61,7 @@ ControlsOption = Annotated[
     str | None,
     typer.Option(
         "--controls",
-        help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy.",
+        help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy, drifting.",
         show_default=DEFAULT_CONTROLS,
     ),
 ]

@@ -11,7 +11,10 @@ from persist_cli.api.geometry import pose_differences
 from persist_cli.data.store import Store
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
+from persist_cli.evaluate.rows.controls import NoisyWarp
 from persist_cli.evaluate.rows.interventions import (
+    DRIFT_FRAMES,
+    DriftingPoses,
     Emptied,
     NoisyPoses,
     Oracle,
@@ -61,6 +64,43 @@ def test_noise_of_no_deviation_changes_no_pose(walks):
     seen = Store(walks)[0].read().observations
     same = NoisyPoses(0.0, 0.0).disturb(seen, torch.Generator().manual_seed(0))
     assert torch.equal(same.cameras.world_from_camera, seen.cameras.world_from_camera)
+
+
+def test_drifting_poses_are_exact_where_the_clip_begins_and_off_by_the_deviation_after_32_frames(cases):
+    clip = read_case(cases[0])
+    still = clip.observations[[0] * (DRIFT_FRAMES + 1)]
+    far = []
+    for seed in range(200):
+        seen = DriftingPoses(5.0, 2.0).disturber(replace(clip, context=still), seed)(still)
+        metres, degrees = pose_differences(still.cameras.world_from_camera, seen.cameras.world_from_camera)
+        assert float(metres[-1]) + float(degrees[-1]) == pytest.approx(0, abs=1e-5)
+        far.append((float(metres[0]), float(metres[1] - metres[0])))
+    first, change = torch.tensor(far).square().mean(0).sqrt().tolist()
+    assert first == pytest.approx(0.05 * 3**0.5, rel=0.15)
+    assert change < first / 3  # the error of one frame is near that of the next
+
+
+def test_drift_goes_on_from_clip_to_clip_where_the_memory_begins_empty(cases):
+    clip = replace(read_case(cases[0]), context=None)
+    frames = clip.observations[[0] * 8]
+    disturb = DriftingPoses(5.0, 2.0).disturber(clip, 0)
+    poses = torch.cat([disturb(part).cameras.world_from_camera for part in (frames[:1], frames, frames)])
+    metres, _ = pose_differences(poses[:-1], poses[1:])
+    assert torch.equal(poses[0], frames.cameras.world_from_camera[0])
+    assert (metres < 0.05).all()
+
+
+@pytest.mark.parametrize("noise", [NoisyPoses(5.0, 2.0), DriftingPoses(5.0, 2.0)])
+def test_a_warp_beside_noisy_memories_has_the_same_errors(cases, noise):
+    clip = read_case(cases[0])
+    known = NoisyWarp(None, False, noise).earlier(clip, 8, 3)
+    written = noise.disturber(clip, 3)(clip.context)
+    assert torch.equal(known.cameras.world_from_camera[: len(written)], written.cameras.world_from_camera)
+    assert torch.equal(known.cameras.world_from_camera[len(written) :], clip.observations.cameras.world_from_camera)
+    empty, disturb = replace(clip, context=None), noise.disturber(replace(clip, context=None), 3)
+    parts = [disturb(clip.observations[:1]), disturb(clip.observations[1:])]
+    known = NoisyWarp(None, True, noise).earlier(empty, 8, 3)
+    assert torch.equal(known.cameras.world_from_camera, torch.cat([part.cameras.world_from_camera for part in parts]))
 
 
 def test_small_motions_are_rigid():

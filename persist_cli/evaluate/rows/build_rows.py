@@ -11,8 +11,9 @@ from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.protocols import Protocol
-from persist_cli.evaluate.rows.controls import CodecReconstruction, Control, Copy, Nearest, Truth, Warp
+from persist_cli.evaluate.rows.controls import CodecReconstruction, Control, Copy, Nearest, NoisyWarp, Truth, Warp
 from persist_cli.evaluate.rows.interventions import (
+    DriftingPoses,
     Emptied,
     MemoryIntervention,
     NoisyPoses,
@@ -35,6 +36,7 @@ INTERVENTIONS: dict[str, Callable[[RowConfig, Sequence[Case]], MemoryInterventio
     "emptied": lambda config, cases: Emptied(),
     "oracle": lambda config, cases: Oracle(),
     "noisy": lambda config, cases: NoisyPoses(*config.noise),
+    "drifting": lambda config, cases: DriftingPoses(*config.noise),
 }
 
 
@@ -43,6 +45,8 @@ def no_depth(cases: Sequence[Case]) -> str | None:
     missing = all(share is None for case in cases for share in case.seen_before)
     return "needs depth, which the data does not have" if missing else None
 
+
+NOISY_WARP = "warp of noisy poses"  # stands beside the controls of noisy memories, with the same errors
 
 OBSTACLES = {"shuffled": one_scene, "warp": no_depth}  # of controls that not all clips allow
 
@@ -55,7 +59,7 @@ class RowConfig:
         memories: names of adapters, or ``stage1``.
         controls: names of ``CONTROLS`` and ``INTERVENTIONS``.
         sampling: sampling of every row of a model.
-        noise: centimetres and degrees of the control ``noisy``.
+        noise: centimetres and degrees of the controls ``noisy`` and ``drifting``.
         named: whether the user named the controls, so that one that cannot be made is an error.
         training_seeds: whether checkpoints whose recipes differ in their seeds alone are one row.
     """
@@ -157,7 +161,9 @@ def build_control_rows(
     if config.named:
         for name, reason in reasons.items():
             raise DataError(f"the control {name!r} {reason}; leave it out of --controls")
-    named_rows = [*intervention_rows(models, config, cases), *untrained_rows(checkpoints, config, protocol)]
+    noisy = noisy_warps(checkpoints, config, protocol, cases)
+    reasons |= {NOISY_WARP: reason} if noisy and (reason := no_depth(cases)) else {}
+    named_rows = [*intervention_rows(models, config, cases), *untrained_rows(checkpoints, config, protocol), *noisy]
     return ControlRows(
         rows=[row for name, row in named_rows if name not in reasons],
         missing=[(row, reasons[name]) for name, row in named_rows if name in reasons],
@@ -200,6 +206,15 @@ def untrained_rows(
                 yield name, row
         else:
             yield name, control(control.title, bases[0], protocol.writes)
+
+
+def noisy_warps(
+    checkpoints: Sequence[Checkpoint], config: RowConfig, protocol: Protocol, cases: Sequence[Case]
+) -> list[tuple[str, Control]]:
+    """Name and row of a warp with the same pose errors, for each control that makes the poses of memories noisy."""
+    noises = [make(config, cases) for name, make in INTERVENTIONS.items() if name in config.controls]
+    base = checkpoints[0]
+    return [(NOISY_WARP, NoisyWarp(base, protocol.writes, noise)) for noise in noises if isinstance(noise, NoisyPoses)]
 
 
 def checkpoints_with(memory: str, checkpoints: Sequence[Checkpoint]) -> list[Checkpoint]:

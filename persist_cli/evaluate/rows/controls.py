@@ -18,6 +18,7 @@ from persist_cli.api.geometry import pose_differences
 from persist_cli.api.observations import Observations
 from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.coverage import held_frames
+from persist_cli.evaluate.rows.interventions import NoisyPoses
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.rows.warp import Surface, warp
 
@@ -93,14 +94,21 @@ class EarlierFramesControl(Control):
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Make each frame of the true frames that are held when it is predicted."""
-        videos = [self.video(clip, backbone.frames_per_clip - 1) for clip in clips]
+        length = backbone.frames_per_clip - 1
+        videos = [self.video(clip, length, seed) for clip, seed in zip(clips, seeds, strict=True)]
         return torch.stack([rgb for rgb, _ in videos]), torch.stack([depth for _, depth in videos])
 
-    def video(self, clip: CaseFrames, length: int) -> tuple[Tensor, Tensor]:
+    def earlier(self, clip: CaseFrames, length: int, seed: int) -> Observations:
+        """The frames of the context and of the clip itself, of which ``held`` says when each is known."""
+        return (
+            clip.observations if clip.context is None else Observations.concatenate([clip.context, clip.observations])
+        )
+
+    def video(self, clip: CaseFrames, length: int, seed: int) -> tuple[Tensor, Tensor]:
         """The video of one clip, where ``length`` frames are predicted at once."""
         truth = clip.observations
         rgb, depth = truth.rgb.clone(), truth.depth.clone()
-        earlier = truth if clip.context is None else Observations.concatenate([clip.context, truth])
+        earlier = self.earlier(clip, length, seed)
         render = self.renderer(earlier)
         for frame in range(1, len(rgb)):
             held = self.held(clip, frame, length)
@@ -150,6 +158,36 @@ class Warp(EarlierFramesControl):
     def renderer(self, earlier: Observations) -> ViewRenderer:
         """A function that warps the earlier frames into the view."""
         return partial(warp, Surface.of(earlier))
+
+
+class NoisyWarp(Warp):
+    """Earlier RGB-D frames with the pose errors that a memory of this clip and seed is written with.
+
+    Args:
+        base: checkpoint whose backbone says how many frames are predicted at once.
+        writes: whether the protocol writes predicted frames to the memory.
+        noise: makes the errors.
+    """
+
+    random = True
+
+    def __init__(self, base: Checkpoint, writes: bool, noise: NoisyPoses) -> None:
+        super().__init__(f"{Warp.title}, {noise.name}", base, writes)
+        self.noise = noise
+
+    @property
+    def definition(self) -> str:  # type: ignore[override]
+        """What is warped, and how its poses are off."""
+        return f"{Warp.definition}; {self.noise.definition}, with the same errors here as in the memories"
+
+    def earlier(self, clip: CaseFrames, length: int, seed: int) -> Observations:
+        """The frames with wrong poses, disturbed in the order in which a model's memory is written."""
+        disturb, truth = self.noise.disturber(clip, seed), clip.observations
+        parts = [] if clip.context is None else [disturb(clip.context)]
+        if not self.writes:
+            return Observations.concatenate([*parts, truth])
+        clips = [truth[first : first + length] for first in range(1, len(truth), length)]
+        return Observations.concatenate([*parts, disturb(truth[:1]), *map(disturb, clips)])
 
 
 def pose_distances(cameras: Cameras, view: Cameras) -> Float[Tensor, " frame"]:

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, invert_rigid
 from persist_cli.api.observations import Observations
 from persist_cli.evaluate.cases import Case, CaseFrames, read_case
+
+Disturb = Callable[[Observations], Observations]
+
+WRITTEN = "every pose written to its memory"
+
+DRIFT_FRAMES = 32  # after which drifting poses are off by their standard deviation
 
 
 class MemoryIntervention(ABC):
@@ -38,6 +45,10 @@ class MemoryIntervention(ABC):
     def disturb(self, seen: Observations, draws: torch.Generator) -> Observations:
         """Change frames on their way into the memory; by default they stay as they are."""
         return seen
+
+    def disturber(self, clip: CaseFrames, seed: int) -> Disturb:
+        """A function that changes the frames that are written into a clip's memory, called in their order."""
+        return partial(self.disturb, draws=torch.Generator().manual_seed(seed))
 
 
 class Unmodified(MemoryIntervention):
@@ -105,7 +116,7 @@ class Shuffled(MemoryIntervention):
 
 @dataclass(frozen=True)
 class NoisyPoses(MemoryIntervention):
-    """A memory that is written with wrong poses.
+    """A memory that is written with wrong poses: each has an error of its own, independent of the others (white noise).
 
     Args:
         centimetres: standard deviation of the error along each axis.
@@ -114,16 +125,18 @@ class NoisyPoses(MemoryIntervention):
 
     centimetres: float = 5.0
     degrees: float = 2.0
-    name = "noisy poses"
+    name = "noisy poses (white)"
     writes = True
 
     @property
     def definition(self) -> str:
         """A sentence with both standard deviations."""
-        return (
-            f"every pose written to its memory is off by σ = {self.centimetres:g} cm along and {self.degrees:g}° about "
-            "each camera axis"
-        )
+        return f"{WRITTEN} is off by σ = {self.amount}, in each frame independently (white noise)"
+
+    @property
+    def amount(self) -> str:
+        """Both standard deviations."""
+        return f"{self.centimetres:g} cm along and {self.degrees:g}° about each camera axis"
 
     def context(self, clip: CaseFrames) -> Observations | None:
         """The frames before the clip."""
@@ -131,10 +144,51 @@ class NoisyPoses(MemoryIntervention):
 
     def disturb(self, seen: Observations, draws: torch.Generator) -> Observations:
         """Move and turn each pose by an error of its own."""
-        errors = torch.randn(len(seen), 6, generator=draws, dtype=torch.float64)
+        return self.moved(seen, torch.randn(len(seen), 6, generator=draws, dtype=torch.float64))
+
+    def moved(self, seen: Observations, errors: Float[Tensor, "frame 6"]) -> Observations:
+        """The frames, each pose moved and turned in its camera's axes by so many standard deviations."""
         metres, radians = errors[:, :3] * self.centimetres / 100, errors[:, 3:] * math.radians(self.degrees)
         wrong = seen.cameras.world_from_camera @ small_motions(metres, radians)
         return replace(seen, cameras=replace(seen.cameras, world_from_camera=wrong))
+
+
+@dataclass(frozen=True)
+class DriftingPoses(NoisyPoses):
+    """A memory that is written with poses that drift as odometry does: the error is a random walk.
+
+    It is zero where the clip begins, since a model knows where it is by where it was just now. Frames before and after
+    are the farther off the longer ago, or later, they were seen.
+    """
+
+    name = "noisy poses (drift)"
+
+    @property
+    def definition(self) -> str:
+        """A sentence with both standard deviations and when they are reached."""
+        return (
+            f"{WRITTEN} is off by a random walk, zero where the clip begins and of σ = {self.amount} after "
+            f"{DRIFT_FRAMES} frames (drift)"
+        )
+
+    def disturber(self, clip: CaseFrames, seed: int) -> Disturb:
+        """A walk backward through the frames before the clip, and forward through those that are written then."""
+        draws, now = torch.Generator().manual_seed(seed), torch.zeros(6, dtype=torch.float64)
+        first = True
+
+        def drift(seen: Observations) -> Observations:
+            nonlocal now, first
+            steps = torch.randn(len(seen), 6, generator=draws, dtype=torch.float64) / math.sqrt(DRIFT_FRAMES)
+            backward = first and clip.context is not None
+            if first:
+                steps[0], first = 0.0, False
+            walk = now + steps.cumsum(0)
+            if backward:
+                return self.moved(seen, walk.flip(0))
+            now = walk[-1]
+            return self.moved(seen, walk)
+
+        return drift
 
 
 def one_scene(cases: Sequence[Case]) -> str | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -126,7 +125,7 @@ class ModelRow(Row):
     def agent(self, clip: CaseFrames, seed: int) -> Agent:
         """An agent that holds the clip's memory, before it is placed at the first frame."""
         intervention = self.row_memory.intervention
-        disturb = partial(intervention.disturb, draws=torch.Generator().manual_seed(seed))
+        disturb = intervention.disturber(clip, seed)
         return Agent(self.memory(clip, disturb), seed, self.row_memory.writes and intervention.writes, disturb)
 
     def memory(self, clip: CaseFrames, disturb: Callable[[Observations], Observations]) -> Memory | None:
