@@ -163,6 +163,15 @@ class DataSettings:
             clip and memory are cut alike, and intrinsics follow. Below 1, images may be larger than the model's.
         mirror: share of the clips whose room is mirrored, with its cameras.
         color_jitter: largest relative change of the brightness, and as much of each colour, of clip and memory alike.
+        own_writes: share of the samples that begin where the model's own prediction of the frames before ends: these
+            are written into the memory (stage 2), and the last of them is the given frame (stages 1 and 2), as in a
+            rollout. The prediction is made in one step from a random noise level.
+        own_warmup: steps of the training before the first such sample.
+        own_segments: clips of such a sample, one after the other; the last one counts, the others are predicted.
+        pose_drift: standard deviation in metres of a step of the drift of poses along each axis, from one written
+            frame to the next; after 100 frames it is ten times as much. The newest frame has its true pose.
+        pose_drift_degrees: the same for rotation about each axis, in degrees.
+        depth_noise: standard deviation of the error of written depth as a share of it, smooth over the image.
     """
 
     path: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
@@ -175,6 +184,12 @@ class DataSettings:
     crop: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
     mirror: Share = 0.0
     color_jitter: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0
+    own_writes: Share = 0.0
+    own_warmup: Count = 0
+    own_segments: Annotated[int, Field(ge=2)] = 2
+    pose_drift: Amount = 0.0
+    pose_drift_degrees: Amount = 0.0
+    depth_noise: Amount = 0.0
 
 
 @dataclass(frozen=True)
@@ -378,6 +393,8 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("lora is for stage 1 only; leave it out")
     if not recipe.data.strides or 0 in recipe.data.strides:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")
+    if recipe.data.own_writes and recipe.stage == "codec":
+        problems.append("data.own_writes is for stages 1 and 2; leave it out")
     if training.frozen_precision == "bf16" and training.precision == "no":
         problems.append("training.frozen_precision bf16 needs training.precision bf16")
     if training.batch % training.accumulation:

@@ -264,6 +264,22 @@ class Backbone(nn.Module, ABC):
     def begin_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """Begin a stage that has no base by setting fresh weights from some clips; nothing by default."""
 
+    def predict_once(self, clips: Clips) -> tuple[Tensor, Tensor]:
+        """Return the clips as the model predicts them in a single step from a random noise level, without gradients.
+
+        Training on own writes puts such frames in the place of true ones, as a rollout would.
+
+        Args:
+            clips: clips as for ``forward``, with the noise of their seeds.
+
+        Returns:
+            rgb and depth on the CPU, in the form of ``generate``'s result; the first frame is predicted too.
+
+        Raises:
+            PersistError: when this backbone cannot.
+        """
+        raise PersistError(f"backbone {self.name!r} predicts no clips in training; set data.own_writes=0")
+
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """End a stage by measuring on some clips what training does not learn, such as a scale; nothing by default."""
 

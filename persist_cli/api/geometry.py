@@ -96,6 +96,19 @@ def pose_differences(
     return metres, torch.rad2deg(cosine.clamp(-1, 1).acos())
 
 
+def small_motions(
+    translations: Float[Tensor, "frame 3"], rotations: Float[Tensor, "frame 3"]
+) -> Float[Tensor, "frame 4 4"]:
+    """Return rigid transforms of translations in metres and rotation vectors in radians."""
+    skew = rotations.new_zeros(len(rotations), 3, 3)
+    x, y, z = rotations.unbind(-1)
+    skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = x, y, z
+    motions = torch.eye(4, dtype=rotations.dtype).repeat(len(rotations), 1, 1)
+    motions[:, :3, :3] = torch.linalg.matrix_exp(skew - skew.transpose(1, 2))
+    motions[:, :3, 3] = translations
+    return motions
+
+
 def near_poses(
     poses: Float[Tensor, "pose 4 4"],
     others: Float[Tensor, "other 4 4"],

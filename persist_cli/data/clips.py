@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.utils.data import BatchSampler, Dataset
 
 from persist_cli.api.actions import ActionVocabulary
@@ -16,6 +17,7 @@ from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.augment import Augmentation, View
 from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.data.writing_noise import NO_ERRORS, WritingNoise
 from persist_cli.errors import DataError, RecipeError
 
 
@@ -34,6 +36,11 @@ class ClipPlan:
         exclude_metres: frames are near when their cameras are less than this apart, in metres, …
         exclude_degrees: … and turned by less than this angle.
         augmentation: random views of the clips.
+        own_writes: share of the samples that are chained: segments of a clip's length come before the clip, whose
+            frames the model predicts itself.
+        own_after: number of the first sample that may be chained.
+        segments: number of segments of a chained sample, the clip included.
+        noise: errors of the frames of contexts.
     """
 
     frames: int
@@ -46,6 +53,10 @@ class ClipPlan:
     exclude_metres: float = NEAR_METRES
     exclude_degrees: float = NEAR_DEGREES
     augmentation: Augmentation = field(default_factory=Augmentation)
+    own_writes: float = 0.0
+    own_after: int = 0
+    segments: int = 2
+    noise: WritingNoise = NO_ERRORS
 
 
 @dataclass(frozen=True)
@@ -56,8 +67,10 @@ class ClipFrames:
         file: the trajectory.
         frames: numbers of the clip's frames.
         context: numbers of the context's frames; empty when the plan has no context.
-        seed: seed of everything random about the sample.
+        seed: seed of everything random about the sample but its frames and their errors.
         view: how images and cameras are changed; ``None`` for not at all.
+        before: numbers of the frames of each segment before the clip; each ends where the next one begins.
+        noise_seed: seed of the errors of the context's frames.
     """
 
     file: TrajectoryFile
@@ -65,6 +78,14 @@ class ClipFrames:
     context: tuple[int, ...]
     seed: int
     view: View | None = None
+    before: tuple[range, ...] = ()
+    noise_seed: int = 0
+
+    def segments(self) -> tuple[ClipFrames, ...]:
+        """The frame numbers of each segment before the clip, and of the clip, as samples of their own."""
+        seeds = np.random.default_rng(self.seed).integers(2**31, size=len(self.before))
+        parts = [replace(self, frames=part, seed=int(seed)) for part, seed in zip(self.before, seeds, strict=True)]
+        return tuple(replace(part, context=(), before=()) for part in (*parts, self))
 
 
 @dataclass(frozen=True)
@@ -73,13 +94,18 @@ class ClipSample:
 
     Args:
         clip: its images may have been left unread, its cameras are always there.
-        context: earlier frames of the same trajectory and the clip's first one; ``None`` when left unread.
+        context: earlier frames of the same trajectory, the last of them the first frame of the clip or of the first
+            segment before it; ``None`` when left unread.
         info: what holds for every frame of the trajectory.
+        before: the segments before the clip, whose frames the model shall predict and write itself.
+        remembered: tensors of a memory that stand for the context; ``None`` when there are none.
     """
 
     clip: Clip
     context: Observations | None
     info: TrajectoryInfo
+    before: tuple[Clip, ...] = ()
+    remembered: dict[str, Tensor] | None = None
 
 
 class ClipDataset(Dataset[ClipSample]):
@@ -103,6 +129,12 @@ class ClipDataset(Dataset[ClipSample]):
             needed = (plan.frames - 1) * shortest + 1
             where = " and ".join(map(str, folders))
             raise DataError(f"{where}: a clip needs {needed} frames, the longest trajectory has {longest}")
+        self.shortest_chain = (plan.frames - 1) * plan.segments * shortest + 1
+        if plan.own_writes and not any(len(file) >= self.shortest_chain for file in self.files):
+            raise DataError(
+                f"{' and '.join(map(str, folders))}: {plan.segments} segments of a clip need {self.shortest_chain} "
+                f"frames, the longest trajectory has {max(map(len, self.files))}; set data.own_writes=0"
+            )
         for file in self.files:
             check_size(file.info, plan.image_size, f"{file.path.parent}#{file.name}", plan.augmentation.crop < 1)
 
@@ -113,46 +145,56 @@ class ClipDataset(Dataset[ClipSample]):
         """The frame numbers of sample ``number``, without reading images."""
         random = np.random.default_rng((self.plan.seed, number))
         place = int(random.integers(len(self.files)))
-        file = self.files[place]
-        if not self.plan.clips_per_trajectory:
-            frames, context, view = self._draw(file, random)
-            return ClipFrames(file, frames, context, int(random.integers(2**31)), view)
-        clip = int(random.integers(self.plan.clips_per_trajectory))
-        # plus one: numpy reads missing numbers as zeros, and (seed, place) is a sample's own
-        frames, context, view = self._draw(file, np.random.default_rng((self.plan.seed, place, clip + 1)))
-        return ClipFrames(file, frames, context, int(random.integers(2**31)), view)
+        file, plan = self.files[place], self.plan
+        chained = bool(plan.own_writes) and random.random() < plan.own_writes and number >= plan.own_after
+        segments = plan.segments if chained and len(file) >= self.shortest_chain else 1
+        if not plan.clips_per_trajectory:
+            frames = self._draw(file, random, segments)
+        else:
+            clip = int(random.integers(plan.clips_per_trajectory))
+            # plus one: numpy reads missing numbers as zeros, and (seed, place) is a sample's own
+            key = (plan.seed, place, clip + 1, *([segments] if segments > 1 else []))
+            frames = self._draw(file, np.random.default_rng(key), segments)
+        return replace(frames, seed=int(random.integers(2**31)))
 
     def read(self, choice: ClipFrames, images: bool = True, context: bool = True) -> ClipSample:
         """The sample with these frame numbers.
 
         Args:
             choice: frame numbers, as ``choose`` gives them.
-            images: false leaves the clip's images unread and gives its cameras only.
+            images: false leaves the clips' images unread and gives their cameras only.
             context: false leaves the context unread.
         """
-        file, frames, view = choice.file, choice.frames, choice.view
+        *before, clip = (self._clip(segment, images) for segment in choice.segments())
+        seen = choice.file.read(choice.context).observations if context and choice.context else None
+        if seen is not None and choice.view is not None:
+            seen = choice.view.observations(seen, choice.file.info.world_up)
+        if seen is not None and self.plan.noise:
+            seen = self.plan.noise.disturb(seen, torch.Generator().manual_seed(choice.noise_seed))
+        return ClipSample(clip, seen, choice.file.info, tuple(before))
+
+    def _clip(self, choice: ClipFrames, images: bool) -> Clip:
+        """The clip of these frames, without images where none are wanted."""
+        file, frames = choice.file, choice.frames
         actions = file.actions()[frames[0] : frames[-1]]  # none backwards: what was done to the world is not undone
         interactions = strided_interactions(actions, abs(frames.step), file.info.vocabulary)
-        context_frames = choice.context if context else ()
         observations = file.read(list(frames)).observations if images else cameras_only(file, frames)
-        earlier = file.read(context_frames).observations if context_frames else None
-        if view is not None:
-            observations = view.observations(observations, file.info.world_up)
-            earlier = None if earlier is None else view.observations(earlier, file.info.world_up)
-        return ClipSample(
-            clip=Clip(observations, interactions or (None,) * (len(frames) - 1), choice.seed),
-            context=earlier,
-            info=file.info,
-        )
+        if choice.view is not None:
+            observations = choice.view.observations(observations, file.info.world_up)
+        return Clip(observations, interactions or (None,) * (len(frames) - 1), choice.seed)
 
-    def _draw(self, file: TrajectoryFile, random: np.random.Generator) -> tuple[range, tuple[int, ...], View | None]:
-        """Frame numbers of a random clip and of its context, and the view of both."""
-        steps = self.plan.frames - 1
+    def _draw(self, file: TrajectoryFile, random: np.random.Generator, segments: int) -> ClipFrames:
+        """Frame numbers of a random clip, of the segments before it and of its context, and their view; seed 0."""
+        plan, length = self.plan, self.plan.frames - 1
+        steps = length * segments
         stride = int(random.choice([stride for stride in self.plan.strides if steps * abs(stride) < len(file)]))
         start = int(random.integers(len(file) - steps * abs(stride)))
         frames = range(start, start + steps * abs(stride) + 1, abs(stride))[:: 1 if stride > 0 else -1]
-        context = tuple(self._context_frames(file, frames, random)) if self.plan.context_frames else ()
-        return frames, context, self.plan.augmentation.draw(file.info, self.plan.image_size, random)
+        context = tuple(self._context_frames(file, frames, random)) if plan.context_frames else ()
+        view = plan.augmentation.draw(file.info, plan.image_size, random)
+        noise_seed = int(random.integers(2**31)) if context and plan.noise else 0
+        *before, clip = (frames[first : first + length + 1] for first in range(0, steps, length))
+        return ClipFrames(file, clip, context, 0, view, tuple(before), noise_seed)
 
     def _context_frames(self, file: TrajectoryFile, frames: range, random: np.random.Generator) -> list[int]:
         """The clip's first frame and a random choice of those before it, in order."""

@@ -48,12 +48,19 @@ class MemoryFactory:
         return self.kind(self.settings, self.encoder, FrameOfReference(info.scene, info.world_up))
 
 
+def memory_of(sample: ClipSample, factory: MemoryFactory) -> Memory:
+    """Return a memory of a sample's context, or the one that the sample remembers in its place."""
+    memory = factory.empty(sample.info)
+    if sample.remembered is not None:
+        memory.restore({name: tensor.to(factory.device) for name, tensor in sample.remembered.items()})
+    elif sample.context is not None:
+        memory.memorize(sample.context.to(factory.device))
+    return memory
+
+
 def with_memory(sample: ClipSample, factory: MemoryFactory | None, budget: int) -> Clip:
     """Return a training clip with at most ``budget`` tokens of a memory of its context; none without a factory."""
     if factory is None:
         return sample.clip
-    memory = factory.empty(sample.info)
-    if sample.context is not None:
-        memory.memorize(sample.context.to(factory.device))
-    tokens = memory.read(sample.clip.observations.cameras, budget).to(factory.device)
+    tokens = memory_of(sample, factory).read(sample.clip.observations.cameras, budget).to(factory.device)
     return replace(sample.clip, tokens=tokens)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +19,7 @@ from persist_cli.api.backbone import Backbone, Clip, ClipLatents, Clips
 from persist_cli.api.observations import Observations
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import ClipDataset, ClipFrames, ClipSample
+from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.io.files import file_sha256
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.kept_features import KeptFeatures
@@ -41,10 +43,12 @@ class ClipKeys:
     Args:
         latents: the key of its latents, or of those of its whole trajectory; ``None`` where neither comes again.
         tokens: the key of its memory tokens, ``None`` without a memory or where the clip does not come again.
+        memory: the key of the memory of its context, ``None`` like that of the tokens.
     """
 
     latents: str | None
     tokens: str | None
+    memory: str | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,8 @@ class CacheKeys:
             tokens = encoded_by | _token_dependencies(recipe.memory, factory, backbone)
             if kept := backbone.token_encoding():
                 tokens |= {"kept": kept, "precision": recipe.training.precision}
+            if noise := WritingNoise.of(recipe.data):
+                tokens |= {"noise": dataclasses.asdict(noise)}
         return CacheKeys(latents, tokens, backbone.framewise, recipe.data.clips_per_trajectory > 0)
 
     def whole(self, frames: ClipFrames) -> bool:
@@ -92,14 +98,16 @@ class CacheKeys:
         clip: dict[str, Any] = {"trajectory": self.file_hash(frames.file.path), "frames": list(frames.frames)}
         if frames.view is not None:
             clip["view"] = frames.view.to_json()
-        latents = tokens = None
+        latents = tokens = memory = None
         if self.whole(frames):
             latents = cache_key(clip | {"frames": "all"} | self.latents)
         elif self.repeats:
             latents = cache_key(clip | self.latents)
         if self.repeats and self.tokens is not None:
-            tokens = cache_key(clip | {"context": list(frames.context)} | self.tokens)
-        return ClipKeys(latents, tokens)
+            context = {"context": list(frames.context)} | ({"errors": frames.noise_seed} if frames.noise_seed else {})
+            tokens = cache_key(clip | context | self.tokens)
+            memory = cache_key(clip | {"frames": "memory"} | context | self.tokens)
+        return ClipKeys(latents, tokens, memory)
 
     def file_hash(self, path: Path) -> str:
         """The SHA-256 of a trajectory's file."""
@@ -154,6 +162,17 @@ class ClipCache:
         tensors = None if key is None else self.cache.get(key)
         return None if tensors is None else MemoryTokens(**tensors)
 
+    def memory(self, frames: ClipFrames) -> dict[str, Tensor] | None:
+        """The tensors of a memory of a clip's context, ``None`` where the cache has none."""
+        key = self.keys.of_clip(frames).memory
+        return None if key is None else self.cache.get(key)
+
+    def put_memory(self, frames: ClipFrames, tensors: Mapping[str, Tensor]) -> None:
+        """Store the tensors of a memory of a clip's context while there is room; an empty one is made at once."""
+        key = self.keys.of_clip(frames).memory
+        if key is not None and tensors:
+            self.cache.put(key, tensors)
+
     def put_latents(self, frames: ClipFrames, latents: ClipLatents) -> None:
         """Store the latents of a clip, or of its whole trajectory, while there is room."""
         key = self.keys.of_clip(frames).latents
@@ -196,9 +215,14 @@ class CachedClips(Dataset[CachedSample]):
         frames = self.clips.choose(number)
         if self.cache is None:
             return CachedSample(self.clips.read(frames), frames)
-        latents, tokens = self.cache.latents(frames), self.cache.tokens(frames)
-        sample = self.clips.read(frames, images=latents is None, context=tokens is None)
-        return CachedSample(replace(sample, clip=replace(sample.clip, latents=latents, tokens=tokens)), frames)
+        latents = [self.cache.latents(segment) for segment in frames.segments()]
+        # the memory of a chained sample gets more frames before it is read
+        tokens, memory = (None, self.cache.memory(frames)) if frames.before else (self.cache.tokens(frames), None)
+        sample = self.clips.read(frames, any(part is None for part in latents), tokens is None and memory is None)
+        clips = zip((*sample.before, sample.clip), latents, strict=True)
+        *before, clip = (replace(clip, latents=known) for clip, known in clips)
+        sample = replace(sample, clip=replace(clip, tokens=tokens), before=tuple(before), remembered=memory)
+        return CachedSample(sample, frames)
 
 
 class ClipEncoder:
@@ -222,42 +246,53 @@ class ClipEncoder:
         return {"latents_found": round(self.cached_clips / self.clips, 4)} if self.clips else {}
 
     def with_latents(self, cached: CachedSample) -> CachedSample:
-        """The clip with latents in the place of its images."""
+        """The clip, and the segments before it, with latents in the place of their images."""
         sample = cached.sample
         self.clips += 1
         self.cached_clips += sample.clip.latents is not None
-        latents = sample.clip.latents or self._new_latents(sample.clip, cached.frames)
-        images = sample.clip.observations
+        clips = zip((*sample.before, sample.clip), cached.frames.segments(), strict=True)
+        *before, clip = (self._encoded(clip, frames) for clip, frames in clips)
+        return replace(cached, sample=replace(sample, clip=clip, before=tuple(before)))
+
+    def _encoded(self, clip: Clip, frames: ClipFrames) -> Clip:
+        latents = clip.latents or self._new_latents(clip, frames)
+        images = clip.observations
         cameras = Observations(images.rgb[:0], images.depth[:0], images.cameras)
-        return replace(cached, sample=replace(sample, clip=replace(sample.clip, observations=cameras, latents=latents)))
+        return replace(clip, observations=cameras, latents=latents)
 
     def with_tokens(self, cached: CachedSample) -> Clip:
         """The clip with the tokens that a memory of its context gives for its cameras, where there is a memory."""
         if self.factory is None or cached.sample.clip.tokens is not None:
             return cached.sample.clip
-        if self.cache is not None and self.cache.features is not None and cached.frames.view is None:
-            file = cached.frames.file
-            self.cache.features.bring(file, self.cache.keys.file_hash(file.path))
+        self.bring_features(cached.frames)
         clip = with_memory(cached.sample, self.factory, self.backbone.token_budget)
         with torch.no_grad(), self.accelerator.autocast():
             tokens = self.backbone.keep_tokens(Clips.stack([clip]))[0]
-        if self.cache is not None:
+        if self.cache is not None and not cached.frames.before:
             self.cache.put_tokens(cached.frames, tokens)
         return replace(clip, tokens=tokens)
 
+    def bring_features(self, frames: ClipFrames) -> None:
+        """Let a costly encoder know the features of a clip's trajectory, where the cache keeps them."""
+        if self.cache is not None and self.cache.features is not None and frames.view is None:
+            self.cache.features.bring(frames.file, self.cache.keys.file_hash(frames.file.path))
+
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip
-            return self._encode(clip)
+            return self.encode(clip)
         if not self.cache.whole(frames):
-            latents = self._encode(clip)
+            latents = self.encode(clip)
             self.cache.put_latents(frames, latents)
             return latents
+        known = self.cache.latents(frames)  # those of its trajectory may be there by now
+        if known is not None:
+            return known
         pieces = Source(frames.file, range(len(frames.file)), str(frames.file.path)).pieces()
-        video = torch.cat([self._encode(replace(clip, observations=piece)).video for piece in pieces])
+        video = torch.cat([self.encode(replace(clip, observations=piece)).video for piece in pieces])
         self.cache.put_latents(frames, ClipLatents(video, video[:1]))
         return self.cache.clip_latents(video, frames)
 
-    def _encode(self, clip: Clip) -> ClipLatents:
+    def encode(self, clip: Clip) -> ClipLatents:
         """Latents of these frames, on the CPU."""
         with torch.no_grad(), self.accelerator.autocast():
             return self.backbone.encode(Clips.stack([clip]))[0].to("cpu")

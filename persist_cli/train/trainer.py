@@ -20,6 +20,7 @@ from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.data.augment import Augmentation
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.data.reference import data_folder
+from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import DataSettings, Recipe, TrainingSettings
@@ -27,6 +28,7 @@ from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, Clip
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import make_average, make_optimizer, requested_savings, update_average
+from persist_cli.train.own_writes import OwnWrites
 from persist_cli.train.state import TrainingState
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 from persist_cli.viewing.console import add_task, progress
@@ -93,6 +95,10 @@ class Trainer:
         self.encoder = self.clip_encoder(cache)
         if self.encoder is not None:
             self.clips = CachedClips(clips, self.encoder.cache)
+        self.own_writes: OwnWrites | None = None
+        if recipe.data.own_writes and self.encoder is not None:
+            check_own_writes(accelerator)
+            self.own_writes = OwnWrites(self.encoder, WritingNoise.of(recipe.data))
         if recipe.base is None:
             backbone.begin_stage(recipe.stage, self.first_batches(START_BATCHES))
         optimizer = make_optimizer(parameters.values(), settings)
@@ -121,16 +127,22 @@ class Trainer:
             exclude_metres=recipe.data.exclude_metres,
             exclude_degrees=recipe.data.exclude_degrees,
             augmentation=augmentation_of(recipe.data),
+            own_writes=recipe.data.own_writes,
+            own_after=recipe.data.own_warmup * recipe.training.batch,
+            segments=recipe.data.own_segments,
+            noise=WritingNoise.of(recipe.data),
         )
         return ClipDataset([data_folder(path) for path in recipe.data.path], plan)
 
     def clip_encoder(self, settings: CacheSettings | None) -> ClipEncoder | None:
-        """The encoder of clips that come again, with a cache where there is one; ``None`` when no clip comes again."""
+        """The encoder of clips that come again or are chained, with a cache where there is one; else ``None``."""
         recipe, backbone = self.recipe, self.backbone
         repeats = recipe.data.clips_per_trajectory > 0
-        if settings is None and not repeats:
+        if settings is None and not repeats and not recipe.data.own_writes:
             return None
         encodes = backbone.encodes(recipe.stage)
+        if recipe.data.own_writes and not encodes:
+            raise RecipeError(f"backbone {backbone.name!r} predicts no clips in training; set data.own_writes=0")
         if settings is None:
             return ClipEncoder(backbone, self.factory, self.accelerator, None) if encodes else None
         if not encodes:
@@ -190,6 +202,8 @@ class Trainer:
             with self.times.part("encode"):
                 encoded = [self.encoder.with_latents(sample) for sample in samples]
             with self.times.part("memory"):
+                if self.own_writes is not None:
+                    encoded = self.own_writes.written(encoded)
                 clips = [self.encoder.with_tokens(sample) for sample in encoded]
         return Clips.stack(clips).to(self.accelerator.device)
 
@@ -313,6 +327,14 @@ class Trainer:
 def augmentation_of(data: DataSettings) -> Augmentation:
     """The random views that a recipe asks for."""
     return Augmentation(data.crop, data.mirror, data.color_jitter)
+
+
+def check_own_writes(accelerator: Accelerator) -> None:
+    """Raise ``RecipeError`` where a process does not have the whole model, with which it could predict by itself."""
+    if accelerator.is_fsdp2 or uses_zero(accelerator):
+        raise RecipeError(
+            "data.own_writes needs the whole model in each process; launch with --multi_gpu, or set it to 0"
+        )
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:

@@ -13,7 +13,7 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.errors import PersistError
 from tests.support.micro_model import equal, micro, predicted_of, random_clips, random_tokens, shaken, with_adapter
 
-FORMS = ["cross", "projected", "canvas"]
+FORMS = ["cross", "projected", "canvas", "rendered"]
 
 
 def generators() -> list[torch.Generator]:

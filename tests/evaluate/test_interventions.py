@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from persist_cli.api.geometry import pose_differences
+from persist_cli.api.geometry import pose_differences, small_motions
 from persist_cli.data.store import Store
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
@@ -20,7 +20,6 @@ from persist_cli.evaluate.rows.interventions import (
     Oracle,
     Shuffled,
     one_scene,
-    small_motions,
 )
 
 

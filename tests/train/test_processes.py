@@ -32,6 +32,7 @@ from tests.support.micro_runs import (
 )
 from tests.support.two_processes import job, run_in_two
 from tests.train.test_clip_cache import FEW, share_cached
+from tests.train.test_own_writes import OWN
 
 FSDP = {"ACCELERATE_USE_FSDP": "true", "FSDP_VERSION": "2"}
 
@@ -88,6 +89,7 @@ def runs(walks, codec, stage1, tmp_path_factory):
     low_rank = [f"base={stage1}", "lora.rank=2"]
     run_persist(*of("stage1", "one-lora", *low_rank))
     run_persist(*of("stage2-voxel", "one-few", FEW))
+    run_persist(*of("stage2-voxel", "one-own", *OWN))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
@@ -97,9 +99,11 @@ def runs(walks, codec, stage1, tmp_path_factory):
     first.append(job(*of("stage1", "fsdp-offloaded", BF16), **FSDP, FSDP_OFFLOAD_PARAMS="true"))
     cached = [FEW, "--cache", str(folder / "cache")]
     first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
+    first.append(job(*of("stage2-voxel", "ddp-own", *OWN)))
     wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
-    ended = run_in_two(folder, *first, wrong)
-    assert [code for code, _ in ended[:-1]] == [0] * len(first), ended
+    ended = run_in_two(folder, *first, job(*of("stage2-voxel", "fsdp-own", *OWN), **FSDP), wrong)
+    assert [code for code, _ in ended[:-2]] == [0] * len(first), ended
+    (folder / "own.txt").write_text(ended[-2][1])
     shutil.copytree(folder / "fsdp-parts", folder / "fsdp-first")
     for kind in KINDS:
         run_persist(*of("stage1", f"{kind}-parts", "--resume", "training.steps=2"))
@@ -119,6 +123,10 @@ def test_two_processes_train_to_the_losses_and_weights_of_one(runs, kind, number
     one, two = runs / f"one-{number}", runs / f"{kind}-{number}"
     assert losses(two) == pytest.approx(losses(one), rel=1e-5)
     assert largest_difference(saved_model(one), saved_model(two)) < NEAR
+
+
+def test_two_processes_write_their_own_predictions_as_one_does(runs):
+    assert losses(runs / "ddp-own") == pytest.approx(losses(runs / "one-own"), rel=1e-4)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -204,6 +212,7 @@ def test_each_training_that_cannot_be_sharded_ends_in_one_line(persist, walks, c
     message = (runs / "wrong.txt").read_text()
     assert message.startswith("1 ")
     assert "stage codec trains codec, which is not sharded" in message
+    assert "data.own_writes needs the whole model in each process; launch with" in (runs / "own.txt").read_text()
     monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
     ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))
     assert (ended.code, "add --fsdp_version 2" in ended.err) == (1, True)

@@ -228,7 +228,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         self.head = RenderedHead(drawn, video, settings.head_width, settings.head_layers)
         self.register_parameter("learned", None)  # learned tokens are those of attention
         shared = {field.name: getattr(settings, field.name) for field in dataclasses.fields(AttentionSettings)}
-        attention = ProjectedSettings(**shared | {"form": "projected"})
+        attention = ProjectedSettings(**shared | {"form": "projected", "noise": 0.0})
         reads = settings.attention_tokens or settings.learned_tokens
         self.attention = ProjectedAdapter(channels, attention, video) if reads else None
 

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -84,6 +84,22 @@ class SamplingStep:
     stop: bool = False
 
 
+class NoisedPrediction(NamedTuple):
+    """A prediction of training.
+
+    Args:
+        predicted: the prediction.
+        target: what it should be.
+        noisy: the latents for which it was made.
+        timesteps: their noise levels.
+    """
+
+    predicted: Tensor
+    target: Tensor
+    noisy: Tensor
+    timesteps: Tensor
+
+
 class CogVideoX(Backbone):
     """diffusers' CogVideoX image-to-video, widened to RGB-D, cameras, interactions and memory (PEWM).
 
@@ -123,6 +139,17 @@ class CogVideoX(Backbone):
             window, kl_weight = self.settings.codec_window, self.settings.kl_weight
             return self.codec.loss(clips.rgb, clips.depth, window, kl_weight, generators)
 
+        predicted, target, _, timesteps = self.predict_noised(clips, generators)
+        # weigh
+        weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
+        error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
+        color, depth = error.chunk(2, dim=2)
+        if not self.settings.depth:
+            return {"loss": color.mean(), "rgb": color.mean()}
+        return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+
+    def predict_noised(self, clips: Clips, generators: list[torch.Generator]) -> NoisedPrediction:
+        """Predict from the clips' latents with noise of a random level, each sample's from its own generator."""
         # encode
         latents = clips.latents or self.encode(clips)
         image_noise = draw_levels(generators, self.settings.image_noise)
@@ -138,13 +165,16 @@ class CogVideoX(Backbone):
         conditions = self.conditions(clips, timesteps, self.memory_condition(clips, generators), image_noise)
         # predict
         predicted = self.predict(noisy.to(image.dtype), image, conditions)
-        # weigh
-        weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
-        error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
-        color, depth = error.chunk(2, dim=2)
-        if not self.settings.depth:
-            return {"loss": color.mean(), "rgb": color.mean()}
-        return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+        return NoisedPrediction(predicted, target, noisy, timesteps)
+
+    @torch.no_grad()
+    def predict_once(self, clips: Clips) -> tuple[Tensor, Tensor]:
+        """Return the clips as predicted in one step from the noise levels of training; see ``Backbone``."""
+        generators, clips = sample_generators(clips.seeds), clips.to(self.device)
+        predicted, _, noisy, timesteps = self.predict_noised(clips, generators)
+        latents = noise_level(self.scheduler, timesteps).clean(predicted.float(), noisy.float())
+        colors, depth = self.codec.decode_images(self.shape.drop_padding(latents), self.settings.depth)
+        return to_uint8(colors).cpu(), depth.float().cpu()
 
     @torch.no_grad()
     def sample(

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, invert_rigid
+from persist_cli.api.geometry import small_motions
 from persist_cli.api.observations import Observations
 from persist_cli.evaluate.cases import Case, CaseFrames, read_case
 
@@ -206,14 +207,3 @@ def next_in_another_scene(cases: Sequence[Case], number: int) -> Case:
 def move_cameras(cameras: Cameras, motion: Tensor) -> Cameras:
     """The cameras after a rigid motion ``[4, 4]`` of the world."""
     return replace(cameras, world_from_camera=motion @ cameras.world_from_camera)
-
-
-def small_motions(translations: Tensor, rotations: Tensor) -> Tensor:
-    """Rigid transforms of translations in metres and rotation vectors in radians, ``[frame, 4, 4]``."""
-    skew = rotations.new_zeros(len(rotations), 3, 3)
-    x, y, z = rotations.unbind(-1)
-    skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = x, y, z
-    motions = torch.eye(4, dtype=rotations.dtype).repeat(len(rotations), 1, 1)
-    motions[:, :3, :3] = torch.linalg.matrix_exp(skew - skew.transpose(1, 2))
-    motions[:, :3, 3] = translations
-    return motions
