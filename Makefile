@@ -21,7 +21,7 @@ ablations: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.ablations runs/ablations
 
 gain-curve: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.reproduce.ablations runs/gain-curve --only paper,key-camera \
+	$(VENV)/bin/python -m persist_cli.reproduce.ablations runs/gain-curve --only paper,improved \
 		--samples 1000,2000,5000,10000,20000,50000
 
 test: $(STAMP) lint

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from collections import OrderedDict
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.api.backbone import Clip
 from persist_cli.api.encoder import Encoder
@@ -17,6 +20,11 @@ from persist_cli.recipe import MemoryConfig
 
 if TYPE_CHECKING:
     import torch
+
+
+MOST_KEPT: Final = 2  # costly encoders that are kept with their features
+
+_KEPT: OrderedDict[str, KeptFeatures] = OrderedDict()  # by name, settings and device
 
 
 @dataclass(frozen=True)
@@ -40,8 +48,14 @@ class MemoryFactory:
         """Return the factory of a configuration, whose encoder and memories compute on ``device``."""
         kind = load_plugin("memory", config.name)
         settings = parse_settings(kind.settings_type, config.settings, f"memory {config.name!r}")
-        encoder = make_encoder(config.encoder, config.encoder_settings).to(device)
-        return MemoryFactory(kind, settings, KeptFeatures(encoder) if encoder.costly else encoder, device)
+        encoder = make_encoder(config.encoder, config.encoder_settings)
+        if encoder.costly:
+            key = json.dumps([config.encoder, dataclasses.asdict(encoder.settings), str(device)], default=str)
+            encoder = _KEPT.setdefault(key, KeptFeatures(encoder))  # memories of one process share weights and features
+            _KEPT.move_to_end(key)
+            while len(_KEPT) > MOST_KEPT:
+                _KEPT.popitem(last=False)
+        return MemoryFactory(kind, settings, encoder.to(device), device)
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """Return an empty memory in the world of a trajectory."""

@@ -62,7 +62,8 @@ class KeptFeatures(Encoder):
         if missing:
             encoded = self.encoder.encode(rgb[list(missing.values())])
             features |= dict(zip(missing, encoded, strict=True))
-            self.keep(missing, encoded)
+            if not encoded.is_meta:  # there is nothing to keep
+                self.keep(missing, encoded)
         for digest in digests:
             if digest in self._kept:
                 self._kept.move_to_end(digest)

@@ -25,7 +25,9 @@ from persist_backbones.tensors import fold_frames
 from persist_cli.api.backbone import Backbone, Clip, Clips
 from persist_cli.api.geometry import plucker
 from persist_cli.data.clips import ClipDataset, ClipPlan, ClipSample
+from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.factory import MemoryFactory, with_memory
+from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.plugins import make_backbone
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
@@ -136,6 +138,17 @@ def memory_pairs(sample: ClipSample, folder: Path) -> list[Pair]:
     return [Pair("tokens kept: memory alone", build, partial(cache.get, "tokens"))]
 
 
+def feature_pairs(sample: ClipSample) -> list[Pair]:
+    """The paper's memory of a clip whose frames DINOv2 encodes again, and whose features are kept."""
+    recipe = make_recipe(read_recipe("houses-64-paper"), "memory")
+    assert recipe.memory is not None
+    kept, budget = MemoryFactory.of(recipe.memory), int(recipe.adapter["token_budget"])
+    assert isinstance(kept.encoder, KeptFeatures)
+    again = dataclasses.replace(kept, encoder=kept.encoder.encoder)
+    runs = (partial(with_memory, sample, factory, budget) for factory in (again, kept))
+    return [Pair("features kept: memory of DINOv2 alone", *runs)]
+
+
 def main() -> None:
     """Time all pairs and print one table."""
     say_conditions(f"the reference model with untrained weights, 64×64, batches of {BATCH}")
@@ -149,6 +162,7 @@ def main() -> None:
             *codec_pairs(Clips.stack(clips)),
             *model_pairs(clips),
             *memory_pairs(longest, Path(folder) / "cache"),
+            *(feature_pairs(longest) if cached_weight("dinov2-s-derived") else ()),
         ]
         rows = []
         for pair in pairs:

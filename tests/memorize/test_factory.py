@@ -21,6 +21,14 @@ def test_an_encoder_computes_on_the_device_of_its_factory(tmp_path):
     assert not MemoryFactory.of(config).encoder.encode(images).is_meta
 
 
+def test_memories_of_one_costly_encoder_share_its_weights_and_features():
+    first, same = (MemoryFactory.of(MemoryConfig(name, {}, "efficientnet-lite0", {"block": 3})) for name in
+                   ("voxel", "map2d"))  # fmt: skip
+    other = MemoryFactory.of(MemoryConfig("voxel", {}, "efficientnet-lite0", {"block": 4}))
+    assert first.encoder is same.encoder is not other.encoder
+    assert MemoryFactory.of(MemoryConfig("voxel")).encoder is not MemoryFactory.of(MemoryConfig("voxel")).encoder
+
+
 def test_a_clip_has_tokens_only_when_its_memory_has_a_context(walks):
     clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
     with_context = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))

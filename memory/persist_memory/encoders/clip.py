@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -48,9 +47,14 @@ class Clip(PublishedTransformer):
     def load_model(self) -> Any:
         """Return the network up to the settings' block."""
         from transformers import CLIPVisionModel
+        from transformers.utils import logging
 
-        options = {"use_safetensors": True, "config": self.config, "dtype": torch.float32}
-        model = self.from_pretrained(CLIPVisionModel, **options)
+        before = logging.get_verbosity()
+        logging.set_verbosity_error()  # else it lists the weights of the text model, which are left unread
+        try:
+            model = self.load_weights(CLIPVisionModel)
+        finally:
+            logging.set_verbosity(before)
         layers = getattr(model, "vision_model", model).encoder.layers
         del layers[self.settings.layer or len(layers) :]  # their output is not used
         return model

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -49,8 +48,7 @@ class DinoV2(PublishedTransformer):
         """Return the network up to the settings' block."""
         from transformers import Dinov2Model
 
-        options = {"use_safetensors": True, "config": self.config, "dtype": torch.float32}
-        model = self.from_pretrained(Dinov2Model, **options)
+        model = self.load_weights(Dinov2Model)
         del model.encoder.layer[self.settings.layer or len(model.encoder.layer) :]  # their output is not used
         return model
 

@@ -186,6 +186,19 @@ class PublishedTransformer(VisionTransformer):
             cause = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise self._unavailable(f"{source} failed ({cause})") from error
 
+    def load_weights(self, kind: Any) -> Any:
+        """Load a model of transformers from the weights, whole.
+
+        Raises:
+            CheckpointError: when they are not there or not whole.
+        """
+        options = {"use_safetensors": True, "config": self.config, "dtype": torch.float32}
+        model, found = self.from_pretrained(kind, output_loading_info=True, **options)
+        if found["missing_keys"]:
+            missing = sorted(found["missing_keys"])
+            raise self._unavailable(f"they lack {len(missing)} tensors ({missing[0]})")
+        return model
+
     @cached_property
     def _source(self) -> tuple[str, bool]:
         """The argument of ``from_pretrained``, and whether it is on this machine already."""
