@@ -17,10 +17,11 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+import yaml
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
@@ -139,7 +140,8 @@ def measure(checkpoint: Checkpoint, adapter: str, options: argparse.Namespace) -
     """Print the tables of one adapter."""
     backbone = load_backbone(checkpoint, adapter=None)
     load_adapter(backbone, checkpoint, adapter)
-    factory = MemoryFactory.of(adapter_memory(checkpoint, adapter))
+    chosen = adapter_memory(checkpoint, adapter)
+    factory = MemoryFactory.of(replace(chosen, settings=chosen.settings | yaml.safe_load(options.memory_settings)))
     walks = [file.read(slice(0, len(file))) for file in Store(options.data)][: options.houses]
     sampling = checkpoint.sampling_with(SamplingOverrides(steps=options.steps))
     bench = Bench(backbone, factory, sampling, walks, options.seeds)
@@ -162,6 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--houses", type=int, default=10)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--steps", type=int)
+    parser.add_argument("--memory-settings", default="{}", help="changes to the memory, as in '{imagined: once}'")
     parser.add_argument("--only", default="known,unseen,partly")
     options = parser.parse_args(arguments)
     if options.data is None:

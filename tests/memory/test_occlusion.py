@@ -2,7 +2,7 @@ import torch
 
 from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Origin
-from persist_memory.grid.occlusion import covered, without_observed
+from persist_memory.grid.occlusion import covered, without_known
 from tests.support.room_views import observe, written_memory
 from tests.support.rooms import look
 
@@ -29,7 +29,7 @@ def test_a_cell_is_drawn_as_large_as_it_is_seen_and_one_behind_the_camera_is_not
 def test_an_imagined_frame_writes_only_pixels_that_show_no_observed_cell():
     views = observe([look((0.0, 1.4, 0.0), yaw) for yaw in (0.0, 40.0)])
     memory = written_memory("voxel", views[:1], **FINE)
-    left = without_observed(views, memory.points().positions, 0.1)
+    left = without_known(views, memory.points().positions, 0.1)
     assert (left.depth[0] > 0).float().mean() < 0.01
     assert 0.3 < (left.depth[1] > 0).float().mean() < 0.8
 

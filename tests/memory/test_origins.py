@@ -152,3 +152,51 @@ def test_tokens_say_what_was_imagined_and_have_the_colours_of_the_points_that_pe
 def rows_of(positions, colors, origins) -> set[tuple[float, ...]]:
     columns = (positions.double(), colors.double(), origins[:, None].double())
     return {tuple(row) for row in torch.cat(columns, dim=-1).tolist()}
+
+
+GRIDS = pytest.mark.parametrize("name", ["voxel", "map2d"])
+
+
+@GRIDS
+@pytest.mark.parametrize("pooling", ["max", "mean"])
+def test_written_once_the_first_imagined_view_of_a_place_stays(name, pooling):
+    walk = room_walk(3)
+    memory = written_memory(name, imagined(walk), pooling=pooling, imagined="once")
+    before = memory.tensors()
+    again = replace(imagined(walk), rgb=walk.rgb // 2)
+    memory.write(again)
+    kept = dict(zip(map(tuple, memory.tensors()["cells"].tolist()), memory.tensors()["colors"], strict=True))
+    assert all(
+        kept[tuple(cell)] == color for cell, color in zip(before["cells"].tolist(), before["colors"], strict=True)
+    )
+    merged = written_memory(name, imagined(walk), pooling=pooling)
+    merged.write(again)
+    assert len(memory.tensors()["cells"]) <= len(merged.tensors()["cells"])
+
+
+def test_written_once_an_observation_still_replaces_what_was_imagined():
+    walk = room_walk(2)
+    memory = written_memory("voxel", imagined(walk), imagined="once")
+    memory.write(walk)
+    observed = written_memory("voxel", walk, imagined="once")
+    assert equal(stored_as(memory, Origin.OBSERVED), observed.tensors())
+
+
+def test_an_imagined_frame_that_adds_too_little_is_not_written():
+    ahead, beside = (observe([look((0.0, 1.4, 0.0), yaw)]) for yaw in (0.0, 15.0))
+    sizes = {}
+    for least in (0.0, 0.6):
+        memory = written_memory("voxel", ahead, cell=(0.1, 0.1, 0.1), least_new=least)
+        before = len(memory.tensors()["cells"])
+        memory.write(imagined(beside))
+        sizes[least] = len(memory.tensors()["cells"]) - before
+    assert sizes[0.0] > 0
+    assert sizes[0.6] == 0
+
+
+def test_imagined_pixels_on_depth_edges_are_not_written():
+    view = observe([look((0.0, 1.4, 0.0), 0.0)]).with_origin(Origin.IMAGINED)
+    view.depth[:, :, 40:] *= 0.5
+    whole, cut = (written_memory("voxel", view, cell=(0.05,) * 3, edges=edges).figures().cells for edges in (0.0, 0.2))
+    none = written_memory("voxel", view, cell=(0.05,) * 3, edges=1e-9).figures().cells
+    assert none < cut < whole

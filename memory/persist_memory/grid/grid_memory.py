@@ -18,7 +18,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.detail import feature_across
-from persist_memory.grid.occlusion import without_observed
+from persist_memory.grid.occlusion import with_enough_new, without_edges, without_known
 from persist_memory.grid.pooling import (
     GridSettings,
     Lattice,
@@ -105,9 +105,11 @@ class GridMemory(Memory):
         on_cpu = observations.depth.device.type == "cpu"
         step = max(1, (PIXELS_ON_CPU if on_cpu else PIXELS_ON_GPU) // observations.depth[0].numel())
         for origin, frames in observations.by_origin():
-            for begin in range(0, len(frames), step):
-                part = frames[begin : begin + step]
-                self._pool(part if origin == Origin.OBSERVED else self._unknown(part), origin)
+            once = origin == Origin.IMAGINED and self.settings.imagined == "once"
+            length = 1 if once else step
+            for begin in range(0, len(frames), length):
+                part = frames[begin : begin + length]
+                self._pool(part if origin == Origin.OBSERVED else self._unknown(part), origin, once)
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """Return at most ``budget`` cells that reach into the view of a camera, the nearest to such a camera first."""
@@ -176,15 +178,18 @@ class GridMemory(Memory):
         return max(self.lattice.across, feature_across(self.encoder, cameras, distance))
 
     def _unknown(self, imagined: Observations) -> Observations:
-        """Imagined frames without the depth of pixels along whose rays an observed cell lies."""
-        if self.lattice.flat or not len(self.grid):
-            return imagined
-        cells = cells_in_view(self.grid, self.lattice, self.views(imagined.cameras.to(self.grid.device)))
-        cells = cells[self.grid.values(ORIGINS, cells) == Origin.OBSERVED]
-        centers = self._in_world(self._centers(self.grid.keys[cells])).to(imagined.depth.device)
-        return without_observed(imagined, centers, self.lattice.across)
+        """Imagined frames without the depth of what is not written: see ``GridSettings``."""
+        new = without_edges(imagined, self.settings.edges) if self.settings.edges else imagined
+        if len(self.grid) and not self.lattice.flat:
+            cells = cells_in_view(self.grid, self.lattice, self.views(imagined.cameras.to(self.grid.device)))
+            if self.settings.imagined == "merge":
+                cells = cells[self.grid.values(ORIGINS, cells) == Origin.OBSERVED]
+            centers = self._in_world(self._centers(self.grid.keys[cells])).to(imagined.depth.device)
+            new = without_known(new, centers, self.lattice.across)
+        return with_enough_new(imagined, new, self.settings.least_new) if self.settings.least_new else new
 
-    def _pool(self, observations: Observations, origin: Origin) -> None:
+    def _pool(self, observations: Observations, origin: Origin, once: bool) -> None:
+        """Pool frames into their cells; ``once`` leaves out those that there are."""
         features = self.encoder.encode(observations.rgb).to(observations.depth.device, torch.float32)
         runs = find_runs(observations, self.lattice, self.settings, features.shape[2])
         if not len(runs.keys):
@@ -195,7 +200,8 @@ class GridMemory(Memory):
             values["features"] = max_pool(runs, run_features)
         else:
             values["features"], values["counts"] = sum_pool(runs, run_features)
-        self.grid.absorb(runs.keys, values)
+        kept = ~self.grid.contains(runs.keys.to(self.grid.device)) if once else slice(None)
+        self.grid.absorb(runs.keys[kept], {name: value[kept] for name, value in values.items()})
 
     def _tokens(self, cells: Int64[Tensor, " token"], cameras: Cameras) -> MemoryTokens:
         """Tokens of the cells at these positions of the order of keys."""

@@ -19,16 +19,34 @@ from persist_cli.api.geometry import project
 from persist_cli.api.observations import Observations
 
 
-def without_observed(observations: Observations, centers: Float[Tensor, "cell 3"], edge: float) -> Observations:
-    """Frames without the depth of the pixels that show an observed cell, however deep, so that these are not written.
+def without_known(observations: Observations, centers: Float[Tensor, "cell 3"], edge: float) -> Observations:
+    """Frames without the depth of the pixels that show a known cell, however deep, so that these are not written.
 
     Args:
         observations: imagined frames.
-        centers: centres of the observed cells, world metres, float64.
+        centers: centres of the known cells, world metres, float64.
         edge: edge of a cell in metres.
     """
     known = covered(centers, edge, observations.cameras)
     return replace(observations, depth=torch.where(known, 0.0, observations.depth))
+
+
+def without_edges(observations: Observations, share: float) -> Observations:
+    """Frames without the depth of pixels that differs from a neighbour's by more than a share of the smaller one."""
+    depth = observations.depth
+    sharp = torch.zeros_like(depth, dtype=torch.bool)
+    for axis in (1, 2):
+        first, second = depth.narrow(axis, 0, depth.shape[axis] - 1), depth.narrow(axis, 1, depth.shape[axis] - 1)
+        jump = (first - second).abs() > share * torch.minimum(first, second)
+        sharp.narrow(axis, 0, jump.shape[axis]).logical_or_(jump)
+        sharp.narrow(axis, 1, jump.shape[axis]).logical_or_(jump)
+    return replace(observations, depth=torch.where(sharp, 0.0, depth))
+
+
+def with_enough_new(observations: Observations, new: Observations, least: float) -> Observations:
+    """The new frames without the depth of those that add less than a share of the pixels that they had."""
+    had, adds = ((frames.depth > 0).sum((1, 2)) for frames in (observations, new))
+    return replace(new, depth=new.depth * (adds >= least * had)[:, None, None])
 
 
 def covered(centers: Float[Tensor, "cell 3"], edge: float, cameras: Cameras) -> Bool[Tensor, "frame height width"]:

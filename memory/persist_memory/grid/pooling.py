@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float, Int64, UInt8
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from persist_cli.api.observations import Observations
@@ -43,11 +43,20 @@ class GridSettings:
             weighs more.
         stride: step between the sampled rows, and between the sampled columns, in pixels.
         max_depth: largest depth in metres; pixels that are farther are left out, none with ``None``.
+        imagined: what becomes of imagined frames that show a place which was imagined before: ``merge`` pools them
+            into its cells; ``once`` writes frame by frame, each only along rays on which no cell lies, so that the
+            first view of a place stays.
+        least_new: smallest share of the pixels of an imagined frame that must add something, or none is written.
+        edges: an imagined pixel is not written where depth changes by more than this share of it from one pixel to the
+            next; 0 writes all.
     """
 
     pooling: Literal["max", "mean"] = "max"
     stride: PositiveInt = 1
     max_depth: PositiveFloat | None = None
+    imagined: Literal["merge", "once"] = "merge"
+    least_new: Annotated[float, Field(ge=0, le=1)] = 0.0
+    edges: NonNegativeFloat = 0.0
 
 
 @dataclass(frozen=True)

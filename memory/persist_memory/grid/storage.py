@@ -141,6 +141,10 @@ class SparseGrid:
         if not bool(known.all()):
             self._append(keys[~known], positions[~known], values, ~known)
 
+    def contains(self, keys: Int64[Tensor, " cell"]) -> Bool[Tensor, " cell"]:
+        """Which of these keys the grid has."""
+        return self._contains(keys, torch.searchsorted(self.keys, keys))
+
     def values(self, name: str, positions: Tensor | None = None) -> Tensor:
         """A column's values in the order of keys: of all cells, or of the cells at these positions of that order."""
         rows = self._rows if positions is None else self._rows[positions]

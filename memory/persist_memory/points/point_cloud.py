@@ -17,7 +17,7 @@ from persist_cli.api.geometry import project, unproject
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
 from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
-from persist_memory.grid.occlusion import without_observed
+from persist_memory.grid.occlusion import without_known
 from persist_memory.validation import (
     ORIGINS,
     Shape,
@@ -72,7 +72,7 @@ class PointCloud(Memory):
         for origin, frames in observations.by_origin() if len(observations) else ():
             known = self._of(Origin.OBSERVED)
             if origin == Origin.IMAGINED and known:
-                frames = without_observed(frames, known["positions"].to(frames.depth.device), self.settings.spread)
+                frames = without_known(frames, known["positions"].to(frames.depth.device), self.settings.spread)
             self._absorb(self._points_of(frames, origin))
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
