@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -292,22 +292,27 @@ def read_card(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class TrainingScenes:
-    """Names of the scenes that a model was trained on.
+    """Names of the scenes that a model was trained on, and the views of its cameras.
 
     Args:
-        names: values of ``TrajectoryInfo.scene``.
+        names: values of ``TrajectoryInfo.scene``, or names of parts of scenes.
         complete: whether the model is known to have seen no other scene.
+        fov: least and greatest degrees of view from the top of the images to their bottom; ``None`` if unknown.
     """
 
     names: frozenset[str] = frozenset()
     complete: bool = True
+    fov: tuple[float, float] | None = field(default=None, compare=False)
 
     def __or__(self, other: TrainingScenes) -> TrainingScenes:
-        return TrainingScenes(self.names | other.names, self.complete and other.complete)
+        ends = [*(self.fov or ()), *(other.fov or ())]
+        fov = (min(ends), max(ends)) if ends else None
+        return TrainingScenes(self.names | other.names, self.complete and other.complete, fov)
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values, with the names as ``name_ranges`` returns them."""
-        return {"complete": self.complete, "names": name_ranges(self.names)}
+        values = {"complete": self.complete, "names": name_ranges(self.names)}
+        return values if self.fov is None else values | {"fov": list(self.fov)}
 
     @staticmethod
     def from_json(values: Any) -> TrainingScenes:
@@ -317,8 +322,9 @@ class TrainingScenes:
             ValueError: when the values are anything else.
         """
         match values:
-            case {"complete": bool(complete), "names": list(entries), **rest} if not rest:
-                return TrainingScenes(frozenset(name for entry in entries for name in _expand(entry)), complete)
+            case {"complete": bool(complete), "names": list(entries), **rest} if set(rest) <= {"fov"}:
+                names = frozenset(name for entry in entries for name in _expand(entry))
+                return TrainingScenes(names, complete, _fov(rest["fov"]) if rest else None)
         raise ValueError("not a list of scenes")
 
 
@@ -381,6 +387,13 @@ def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:
         return TrainingScenes.from_json(card["training_scenes"])
     except ValueError as error:
         raise CheckpointError(f"{path}: its training scenes cannot be read ({error})") from error
+
+
+def _fov(ends: Any) -> tuple[float, float]:
+    match ends:
+        case [float() | int() as low, float() | int() as high] if 0 < low <= high < 180:
+            return float(low), float(high)
+    raise ValueError(f"no two angles of view: {ends!r}")
 
 
 def _split_number(name: str) -> tuple[str, int, int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, find_checkpoint
+from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
@@ -71,7 +72,7 @@ def _scenes_of_data(paths: str | Sequence[str]) -> TrainingScenes:
     scenes = TrainingScenes(complete=bool(paths))
     for path in [paths] if isinstance(paths, str) else paths:
         try:
-            scenes |= TrainingScenes(frozenset(file.info.scene for file in Store(data_folder(path))))
+            scenes |= TrainingScenes(frozenset(trained_scene(file.info) for file in Store(data_folder(path))))
         except DataError:
             scenes |= TrainingScenes(complete=False)
     return scenes

@@ -120,6 +120,9 @@ def import_(
     skip_bad: Annotated[
         bool, typer.Option("--skip-bad", help="Leave out frames whose pose or images cannot be used, and count them.")
     ] = False,
+    hold_out: Annotated[
+        float, typer.Option(help="Share of frames at the end kept for tests: writes OUT/train and OUT/test.")
+    ] = 0.0,
     json: JsonOption = False,
 ) -> None:
     """Import posed RGB-D of another format.
@@ -130,7 +133,7 @@ def import_(
     """
     from persist_cli.data.importers.importing import ImportPlan, run_import
 
-    run_import(format, source, out, ImportPlan.of(size, every, step, turn, skip_bad), json)
+    run_import(format, source, out, ImportPlan.of(size, every, step, turn, skip_bad, hold_out), json)
 
 
 @app.command()
@@ -305,7 +308,7 @@ def evaluate(
         list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Runs or checkpoints; else the reference.")
     ] = None,
     data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
-    protocol: Annotated[str, typer.Option(help="revisit, return, long or unseen.")] = "revisit",
+    protocol: Annotated[str, typer.Option(help="revisit, return, long, unseen or later.")] = "revisit",
     memories: MemoriesOption = None,
     controls: ControlsOption = None,
     metrics: Annotated[str, typer.Option(help="Metrics separated by commas, or all.")] = "all",

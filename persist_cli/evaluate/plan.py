@@ -11,6 +11,8 @@ from typing import Any
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.checkpoints import lineage
+from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader, check_bases, common_sampling
 from persist_cli.evaluate.cases import Case
@@ -170,12 +172,16 @@ def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], sear
         warn(f"{len(cases)} clip{'s' * (len(cases) != 1)} found, {search.limit} asked for")
     for line in contamination_warnings(checkpoints, cases):
         warn(f"warning: {line}")
+    for checkpoint in checkpoints:
+        view = unfamiliar_view((file.info for file in search.trajectories()), lineage.training_scenes(checkpoint))
+        if view is not None:
+            warn(f"warning: {checkpoint.folder}: {view}")
 
 
 def contamination_warnings(checkpoints: Sequence[Checkpoint], cases: Sequence[Case]) -> list[str]:
     """A line for each checkpoint that is known to have been trained on scenes of the cases."""
     scenes = scenes_of(cases)
-    known = [(str(checkpoint.folder), trained_on(checkpoint, scenes)) for checkpoint in checkpoints]
+    known = [(str(checkpoint.folder), trained_on(checkpoint, cases)) for checkpoint in checkpoints]
     return [contamination(folder, names, len(scenes)) for folder, names in known if names]
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.observations import Observations
+from persist_cli.data.held_out import HELD_OUT_FROM, was_trained_on
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case
@@ -189,12 +190,39 @@ class Unseen(Revisit):
         for file in search.trajectories():
             if file.info.source.get("split") == "train":
                 raise DataError(f"{file.path}: its scene is of the training split; collect with --split test")
-            if file.info.scene in search.training_scenes:
+            if was_trained_on(file.info, search.training_scenes):
                 raise DataError(f"{file.path}: the model was trained on its scene {file.info.scene!r}")
         cases: list[Case] = []
         for folder in search.folders:
             cases += super().find(dataclasses.replace(search, folders=[folder]))
         return cases
+
+
+class Later(Revisit):
+    """The protocol of one capture: its later frames are held out, and the memory is of all that came before."""
+
+    name = "later"
+    title = "Later frames of a capture"
+    definition = (
+        "clips of the frames at the end of each capture that are held out from training (`persist import --hold-out`), "
+        "each beginning in the middle of the one before; memory of all true frames up to the first; nothing is written"
+    )
+    selections = ("all", "last", "new")
+
+    def find(self, search: ClipSearch) -> list[Case]:
+        """Find the clips of every capture in the order of its frames."""
+        frames = search.frames or search.predicted_at_once + 1
+        chosen = []
+        for number, file in enumerate(search.trajectories()):
+            first = file.info.source.get(HELD_OUT_FROM)
+            if first is None:
+                raise DataError(f"{file.path}: holds no frame out; import the capture with --hold-out 0.3")
+            if was_trained_on(file.info, search.training_scenes, first):
+                raise DataError(f"{file.path}: the model was trained on frames that are held out here")
+            chosen += [(start, number) for start in range(first, len(file) - frames + 1, max(1, frames // 2))]
+        if not chosen:
+            raise DataError(f"{search.where}: no capture has {frames} frames held out; give --frames or hold out more")
+        return self.make_cases(chosen[: search.limit], frames, search)
 
 
 class ThereAndBack(Protocol):
@@ -281,7 +309,9 @@ class Long(Protocol):
         ]
 
 
-PROTOCOLS: dict[str, Protocol] = {protocol.name: protocol for protocol in (Revisit(), ThereAndBack(), Long(), Unseen())}
+PROTOCOLS: dict[str, Protocol] = {
+    protocol.name: protocol for protocol in (Revisit(), ThereAndBack(), Long(), Unseen(), Later())
+}
 
 
 def turning_point(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, int]:

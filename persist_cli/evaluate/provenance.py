@@ -15,6 +15,7 @@ import torch
 from persist_cli import __version__
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.checkpoints import lineage
+from persist_cli.data.held_out import was_trained_on
 from persist_cli.evaluate.cases import Case
 from persist_cli.io.files import file_sha256, read_json
 from persist_cli.io.hub import cached_weight
@@ -66,7 +67,7 @@ def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str,
         "training_scenes": {
             "known": len(scenes.names),
             "complete": scenes.complete,
-            "evaluated": sorted(scenes.names & scenes_of(cases)),
+            "evaluated": trained_on(checkpoint, cases),
         }
     }
 
@@ -76,9 +77,16 @@ def scenes_of(cases: Sequence[Case]) -> frozenset[str]:
     return frozenset(case.scene for case in cases)
 
 
-def trained_on(checkpoint: Checkpoint, scenes: frozenset[str]) -> list[str]:
-    """Names of those scenes that a checkpoint is known to have been trained on, in order."""
-    return sorted(lineage.training_scenes(checkpoint).names & scenes)
+def trained_on(checkpoint: Checkpoint, cases: Sequence[Case]) -> list[str]:
+    """Names of the cases' scenes that a checkpoint is known to have been trained on, in order.
+
+    Where it was trained on the first frames of a scene only, cases of later frames do not count.
+    """
+    names = lineage.training_scenes(checkpoint).names
+    earliest: dict[tuple[str, str], Case] = {}
+    for case in sorted(cases, key=lambda case: case.start):
+        earliest.setdefault((case.data, case.trajectory), case)
+    return sorted({case.scene for case in earliest.values() if was_trained_on(case.file.info, names, case.start)})
 
 
 def recipe_sha256(folder: Path) -> str | None:

@@ -15,6 +15,8 @@ from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.observations import Observations
+from persist_cli.checkpoints.lineage import training_scenes
+from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import add_paths, load_paths
@@ -35,6 +37,9 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
     paths = plan_camera_paths(plan)
     folders = check_folders(out, len(paths))
     warn_of_short_path(plan, paths[0])
+    view = unfamiliar_view([paths[0].info], training_scenes(checkpoint))
+    if view is not None:
+        warn(f"warning: {view}")
     model = assemble_world(checkpoint, adapter, plan, paths[0].info)
     plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(model.sampling)))
     rollouts = [dataclasses.replace(rollout, kept_paths=paths_to_keep(plan, rollout)) for rollout in roll(model, paths)]

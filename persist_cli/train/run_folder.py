@@ -42,7 +42,7 @@ class RunFolder:
     def __init__(self, path: Path, trainer: Trainer, base: Checkpoint | None) -> None:
         self.path, self.trainer, self.base = path, trainer, base
         self.saved = trainer.state.step
-        self.scenes, self.recipes = TrainingScenes(trainer.scenes), dict[str, str]()
+        self.scenes, self.recipes = trainer.scenes, dict[str, str]()
         if trainer.accelerator.is_main_process:
             remove_leftovers(path)
             if base is not None:

@@ -17,8 +17,11 @@ from accelerate import Accelerator
 from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.api.backbone import Backbone, Clips
+from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.data.augment import Augmentation
+from persist_cli.data.cameras import vertical_view
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
+from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.errors import PersistError, RecipeError
@@ -90,7 +93,7 @@ class Trainer:
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
-        self.scenes = frozenset(file.info.scene for file in clips.files)
+        self.scenes = scenes_of(clips)
         self.clips: Dataset[Any] = clips
         self.encoder = self.clip_encoder(cache)
         if self.encoder is not None:
@@ -322,6 +325,13 @@ class Trainer:
                     save()
                     saved = time.monotonic()
         return None
+
+
+def scenes_of(clips: ClipDataset) -> TrainingScenes:
+    """The scenes of all clips, and the views that cameras have in random windows too."""
+    names = frozenset(trained_scene(file.info) for file in clips.files)
+    views = [vertical_view(file.info, share) for file in clips.files for share in (clips.plan.augmentation.crop, 1.0)]
+    return TrainingScenes(names, fov=(min(views), max(views)))
 
 
 def augmentation_of(data: DataSettings) -> Augmentation:

@@ -112,6 +112,15 @@ def test_the_codec_stage_measures_the_scale_of_its_latents():
     assert float(backbone.codec.encode(clips.rgb, clips.depth).detach().std()) == pytest.approx(1.0, abs=0.01)
 
 
+def test_a_codec_that_trains_its_decoder_leaves_latents_and_their_scale_as_they_are():
+    backbone, clips = micro(codec_trains="decoder"), random_clips(2)
+    scale, trained = backbone.codec.vae.config.scaling_factor, backbone.trained_parameters("codec")
+    assert all(name.startswith("codec.vae.decoder.") for name in trained)
+    assert len(trained) == len([*backbone.codec.vae.decoder.parameters()])
+    backbone.finish_stage("codec", [clips])
+    assert backbone.codec.vae.config.scaling_factor == scale
+
+
 def test_rays_as_printed_in_the_paper_change_the_model_input():
     correct, printed = (
         micro(rays=rays).conditions(random_clips(1), torch.tensor([0])).camera for rays in ("correct", "printed")

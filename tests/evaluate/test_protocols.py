@@ -112,3 +112,32 @@ def test_a_view_is_wholly_seen_by_its_own_frame_and_not_at_all_by_none(walks):
     seen = Store(walks)[0].read().observations
     assert seen_share(seen, 3, [3]) == 1.0
     assert seen_share(seen, 3, []) == 0.0
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A capture of which the frames from 12 on are held out."""
+    room = Room(32, 32)
+    info = replace(room.info, source={"held_out_from": 12})
+    write_trajectory(tmp_path / "capture.parquet", info, room.frames(slow_turn(24)))
+    return tmp_path
+
+
+def test_later_clips_are_of_held_out_frames_and_remember_all_before(capture):
+    cases = PROTOCOLS["later"].find(search(capture, 5))
+    assert [case.start for case in cases] == [12, 14, 16, 18]
+    assert all(case.context == case.start + 1 for case in cases)
+    assert len(PROTOCOLS["later"].find(search(capture, 5, ["room before frame 12"]))) == 4
+
+
+@pytest.mark.parametrize("scene", ["room", "room before frame 13"])
+def test_later_clips_are_refused_to_a_model_that_was_trained_on_them(capture, scene):
+    with pytest.raises(DataError, match="was trained on frames that are held out here"):
+        PROTOCOLS["later"].find(search(capture, 5, [scene]))
+
+
+def test_a_capture_without_held_out_frames_or_with_few_has_no_later_clips(walks, capture):
+    with pytest.raises(DataError, match=r"import the capture with --hold-out 0\.3"):
+        PROTOCOLS["later"].find(search(walks))
+    with pytest.raises(DataError, match="no capture has 20 frames held out"):
+        PROTOCOLS["later"].find(search(capture, 20))

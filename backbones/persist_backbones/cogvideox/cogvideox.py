@@ -425,7 +425,8 @@ class CogVideoX(Backbone):
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Return the parameters of VAE, transformer or adapter by name, and freeze all others."""
         self.requires_grad_(False)
-        modules: dict[Stage, nn.Module | None] = {"codec": self.codec, "1": self.transformer, "2": self.adapter}
+        codec = self.codec.vae.decoder if self.settings.codec_trains == "decoder" else self.codec
+        modules: dict[Stage, nn.Module | None] = {"codec": codec, "1": self.transformer, "2": self.adapter}
         module = modules[stage]
         if module is None:
             raise CheckpointError("stage 2 trains a memory adapter; add one first")
@@ -447,8 +448,8 @@ class CogVideoX(Backbone):
             start_as_components(self.codec, torch.cat([frames_to_batch(image) for image in images]).to(self.device))
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
-        """Measure the scale of the latents on these clips, after the codec's stage only."""
-        if stage == "codec":
+        """Measure the scale of the latents on these clips, after a codec's stage that trained its encoder."""
+        if stage == "codec" and self.settings.codec_trains == "all":
             self.codec.take_scale((batch.rgb.to(self.device), batch.depth.to(self.device)) for batch in clips)
 
     @classmethod

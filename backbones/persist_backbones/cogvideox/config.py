@@ -127,6 +127,8 @@ class CogVideoXSettings:
             is trained on; a quarter of the pixels costs a quarter of the time.
         codec_start: weights of a fresh codec: ``random``, or the principal ``components`` of the training images'
             squares of pixels, for a VAE of one block that codes every frame alone.
+        codec_trains: what the codec's stage trains: ``all`` of it, or its ``decoder``, so that latents stay as they are
+            and models that were trained on them still fit.
         transformer: changes to the preset's transformer configuration.
         vae: changes to the preset's VAE configuration.
     """
@@ -149,5 +151,6 @@ class CogVideoXSettings:
     kl_weight: NonNegativeFloat = 1e-6
     codec_window: tuple[int, PositiveInt, PositiveInt] | None = None
     codec_start: Literal["random", "components"] = "random"
+    codec_trains: Literal["all", "decoder"] = "all"
     transformer: dict[str, Any] = field(default_factory=dict)
     vae: dict[str, Any] = field(default_factory=dict)

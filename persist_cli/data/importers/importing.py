@@ -11,6 +11,7 @@ from typing import Any
 from persist_cli.api.actions import FREE, ActionVocabulary, free_motion
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.data.held_out import HELD_OUT_FROM, ONLY_BEFORE
 from persist_cli.data.images import CropResize, crop_resize, parse_size
 from persist_cli.data.store import SUFFIX, TrajectoryFile, schema, write_trajectory
 from persist_cli.errors import DataError, PluginError
@@ -31,6 +32,8 @@ class ImportPlan:
         step: metres of a step of walking actions to add, ``None`` for the usual one, or for no such actions.
         turn: degrees of a turn of walking actions to add, as ``step``.
         skip_bad: leave out frames that cannot be used.
+        hold_out: share of the frames at the end of each trajectory that are kept for tests; 0 for none.
+        part: ``train`` for the frames before those, ``test`` for all, of which those at the end are held out.
     """
 
     size: tuple[int, int] | None = None
@@ -38,11 +41,40 @@ class ImportPlan:
     step: float | None = None
     turn: float | None = None
     skip_bad: bool = False
+    hold_out: float = 0.0
+    part: str = ""
 
     @staticmethod
-    def of(size: str | None, every: int, step: float | None, turn: float | None, skip_bad: bool) -> ImportPlan:
+    def of(
+        size: str | None, every: int, step: float | None, turn: float | None, skip_bad: bool, hold_out: float = 0.0
+    ) -> ImportPlan:
         """Return the plan of the command's options; ``size`` is ``HEIGHTxWIDTH`` in pixels."""
-        return ImportPlan(parse_size(size) if size else None, every, step, turn, skip_bad)
+        return ImportPlan(parse_size(size) if size else None, every, step, turn, skip_bad, hold_out)
+
+    def parts(self, out: Path) -> list[tuple[ImportPlan, Path]]:
+        """What is written and where: all into ``out``, or with frames held out a training and a test part into it."""
+        if not self.hold_out:
+            return [(self, out)]
+        return [(replace(self, part=part), out / part) for part in ("train", "test")]
+
+    def first_held_out(self, trajectory: ForeignTrajectory) -> int:
+        """Number of the first kept frame that is held out.
+
+        Raises:
+            DataError: when nothing would be left on one of the sides.
+        """
+        length = self.length(trajectory)
+        first = length - round(length * self.hold_out)
+        if not 0 < first < length:
+            raise DataError(f"{trajectory.name}: --hold-out {self.hold_out:g} of {length} frames leaves a part empty")
+        return first
+
+    def source(self, trajectory: ForeignTrajectory) -> dict[str, Any]:
+        """What the source of the imported trajectory says of the frames that are held out."""
+        if not self.part:
+            return {}
+        key = ONLY_BEFORE if self.part == "train" else HELD_OUT_FROM
+        return {"split": self.part, key: self.first_held_out(trajectory)}
 
     def info(self, info: TrajectoryInfo) -> TrajectoryInfo:
         """The info of the imported trajectory."""
@@ -67,7 +99,8 @@ class ImportPlan:
             DataError: for a bad frame, unless bad frames are left out; and when all are.
         """
         crop = self._crop(trajectory.info) if self.size else None
-        last, gap = None, False
+        most = self.written(trajectory)
+        last, gap, kept = None, False, 0
         for frame in islice(trajectory.frames, 0, None, self.every):
             if isinstance(frame, DataError):
                 if not self.skip_bad:
@@ -75,6 +108,9 @@ class ImportPlan:
                 left_out.append(frame)
                 gap = True
                 continue
+            if kept == most:
+                break
+            kept += 1
             if last is not None:
                 yield replace(last, action=FREE if gap or self.every > 1 else last.action)
             last, gap = crop.frame(frame) if crop else frame, False
@@ -86,6 +122,10 @@ class ImportPlan:
     def length(self, trajectory: ForeignTrajectory) -> int:
         """Number of frames that are kept when none is bad."""
         return -(-trajectory.length // self.every)
+
+    def written(self, trajectory: ForeignTrajectory) -> int:
+        """Number of frames of this part when none is bad."""
+        return self.first_held_out(trajectory) if self.part == "train" else self.length(trajectory)
 
     def _vocabulary(self, own: ActionVocabulary) -> ActionVocabulary:
         """The foreign actions, or ``free`` where they lead to frames that are left out, and walking ones if wanted."""
@@ -118,7 +158,13 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
     importer = make_importer(format)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")
-    rows = [import_trajectory(importer, trajectory, plan, out) for trajectory in importer.trajectories(source)]
+    if not 0 <= plan.hold_out < 1:
+        raise DataError(f"--hold-out {plan.hold_out:g}: give a share of the frames, 0 or more and below 1, as in 0.3")
+    rows = [
+        import_trajectory(importer, trajectory, part, folder)
+        for part, folder in plan.parts(out)
+        for trajectory in importer.trajectories(source)
+    ]
     if json:
         print_json({"out": str(out), "trajectories": rows})
         return
@@ -132,23 +178,24 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         if row["causes"]:
             rest = row["left_out"] - len(row["causes"])
             say(f"left out of {row['name']}: {'; '.join(row['causes'])}{f'; and {rest} more' if rest else ''}")
-    say(f"next: persist inspect {out}")
+    say(f"next: persist inspect {plan.parts(out)[-1][1]}")
 
 
 def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
     """Write one trajectory unless it is there, and return what the table says of it."""
     path = out / f"{trajectory.name}{SUFFIX}"
     info = plan.info(trajectory.info)
+    info = replace(info, source=info.source | plan.source(trajectory))
     state, left_out = "already there", list[DataError]()
     if not _is_imported(path, info, plan, trajectory):
         frames = _checked(plan.frames(trajectory, left_out), info, importer)
-        _write(path, info, plan.length(trajectory), frames)
+        _write(path, info, plan.written(trajectory), frames)
         state = "written"
     length = TrajectoryFile(path).length
     return {
-        "name": trajectory.name,
+        "name": f"{out.name}/{trajectory.name}" if plan.part else trajectory.name,
         "frames": length,
-        "left_out": plan.length(trajectory) - length,
+        "left_out": plan.written(trajectory) - length,
         "causes": [str(cause) for cause in left_out[:MOST_CAUSES]],
         "height": info.height,
         "width": info.width,
@@ -173,7 +220,7 @@ def _is_imported(path: Path, info: TrajectoryInfo, plan: ImportPlan, trajectory:
     if not path.exists():
         return False
     file = TrajectoryFile(path)
-    most = plan.length(trajectory)
+    most = plan.written(trajectory)
     length_fits = 0 < file.length <= most if plan.skip_bad else file.length == most
     if not length_fits or schema(file.info).metadata != schema(info).metadata:
         raise DataError(f"{path}: holds another trajectory or one of other settings; remove it or take another --out")

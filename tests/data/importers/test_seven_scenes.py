@@ -207,3 +207,19 @@ def test_an_import_stores_walking_actions_beside_the_free_motion(sequence: Path,
     (file,) = Store(tmp_path / "out")
     assert file.info.vocabulary["left"].turn == 5.0
     assert file.actions() == ("free", "free", "free", None)
+
+
+def test_frames_at_the_end_can_be_held_out_of_the_training_part(tmp_path: Path) -> None:
+    run_import("7scenes", write_sequence(tmp_path / "kitchen", 10), tmp_path / "out", ImportPlan(hold_out=0.3), False)
+    train, test = (Store(tmp_path / "out" / part)[0] for part in ("train", "test"))
+    assert (len(train), len(test)) == (7, 10)
+    assert torch.equal(train.read().observations.rgb, test.read(slice(0, 7)).observations.rgb)
+    assert train.actions()[-1] is None
+    assert (train.info.source["only_before"], test.info.source["held_out_from"]) == (7, 7)
+    run_import("7scenes", tmp_path / "kitchen", tmp_path / "out", ImportPlan(hold_out=0.3), False)  # already there
+
+
+@pytest.mark.parametrize(("share", "cause"), [(1.0, "--hold-out 1: give a share"), (0.01, "leaves a part empty")])
+def test_a_share_that_leaves_nothing_to_train_or_test_is_refused(sequence: Path, share: float, cause: str) -> None:
+    with pytest.raises(DataError, match=cause):
+        run_import("7scenes", sequence, sequence.parent / "out", ImportPlan(hold_out=share), False)
