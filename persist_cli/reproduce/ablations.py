@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from persist_cli.api.checkpoint import step_folders
 from persist_cli.errors import INTERRUPTED, PersistError, hint
-from persist_cli.evaluate.report.result_file import Difference, read_results
+from persist_cli.evaluate.report.result_file import Cell, read_results
 from persist_cli.io.files import write_json, written_aside
 from persist_cli.io.hub import cached_weight
 from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_names
@@ -35,7 +35,12 @@ HOUSES: Final = 400  # collected for training when no data are named; a quarter 
 FETCHED: Final = ("dinov2-s-derived", "lpips-alex")  # weights that are brought first
 SAMPLING: Final = "--steps 4 --sampler unipc --guidance 1"  # without guidance, so that gain is the memory's alone
 BASELINE: Final = "stage1"  # the row that gain is measured against: the base without an adapter
+CONTROL: Final = "shuffled"  # the adapter with another house's memory: what more training gives without remembering
 METRICS: Final = {"psnr": "PSNR", "psnr-last": "last frame", "lpips-alex": "LPIPS"}
+
+
+Gain = tuple[float | None, float | None, float | None]  # mean, low and high
+Gains = dict[str, Gain]  # by column
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,7 @@ class Point:
         samples: number of training samples.
         steps: number of optimizer steps.
         gain: difference to the base by column, as mean, low and high of its 95 % interval.
+        remembered: difference to the same adapter with another house's memory, likewise.
         value: the figure itself by column.
         base: the base's figure by column.
         clips: number of clips.
@@ -83,7 +89,8 @@ class Point:
     description: str
     samples: int
     steps: int
-    gain: dict[str, tuple[float | None, float | None, float | None]]
+    gain: Gains
+    remembered: Gains
     value: dict[str, float | None]
     base: dict[str, float | None]
     clips: int
@@ -163,7 +170,7 @@ def train_command(plan: Plan, name: str, steps: int) -> str:
 def eval_command(plan: Plan, name: str, memory: str, samples: int, checkpoint: Path) -> str:
     """The command line that measures a checkpoint and its base on the held-out houses."""
     data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.held_out)
-    options = f"--memories {BASELINE},{memory} --controls '' --metrics psnr,lpips-alex --frames 9 --seeds 1"
+    options = f"--memories {BASELINE},{memory} --controls {CONTROL} --metrics psnr,lpips-alex --frames 9 --seeds 1"
     out = shlex.quote(str(result_folder(plan, name, samples)))
     return f"eval {shlex.quote(str(checkpoint))} {data} {options} --clips {plan.clips} {SAMPLING} --out {out}"
 
@@ -196,21 +203,28 @@ def read_point(plan: Plan, name: str, recipe: Recipe, samples: int) -> Point:
     """
     results = read_results(result_folder(plan, name, samples) / "metrics.json")
     table = results.tables[0]
-    base, row = table.rows[BASELINE].columns, table.rows[recipe.memory.name if recipe.memory else BASELINE].columns
+    memory = recipe.memory.name if recipe.memory else BASELINE
+    base, row = table.rows[BASELINE].columns, table.rows[memory].columns
     columns = [column for column in METRICS if column in row]
-    gaps = {column: row[column].difference or Difference(mean=None) for column in columns}
     scenes = {results.measured.clips[number].scene for number in table.clips}
     return Point(
         recipe=name,
         description=recipe.description,
         samples=samples,
         steps=steps_of(recipe, samples),
-        gain={column: (gap.mean, gap.low, gap.high) for column, gap in gaps.items()},
+        gain={column: _gain(row[column], BASELINE) for column in columns},
+        remembered={column: _gain(row[column], f"{memory}, {CONTROL}") for column in columns},
         value={column: row[column].mean for column in columns},
         base={column: base[column].mean for column in columns},
         clips=len(table.clips),
         houses=len(scenes),
     )
+
+
+def _gain(cell: Cell, other: str) -> Gain:
+    """A row's difference to another one."""
+    gap = cell.differences.get(other)
+    return (None, None, None) if gap is None else (gap.mean, gap.low, gap.high)
 
 
 def points_of(plan: Plan) -> Iterator[Point]:
@@ -241,12 +255,13 @@ def write_results(plan: Plan, left_out: dict[str, str]) -> None:
 
 def table_text(points: Sequence[Point], left_out: dict[str, str]) -> str:
     """The gains as a Markdown table, of each recipe after each number of samples."""
-    lines = ["| recipe | samples | " + " | ".join(f"{title} − base" for title in METRICS.values()) + " |"]
-    lines.append("|---|---|" + "---|" * len(METRICS))
+    titles = [*(f"{title} − base" for title in METRICS.values()), "PSNR − another house's memory"]
+    lines = [f"| recipe | samples | {' | '.join(titles)} |", "|---|---|" + "---|" * len(titles)]
     for point in points:
-        gains = [_gain_text(*point.gain[column]) if column in point.gain else "" for column in METRICS]
-        lines.append(f"| {point.recipe} | {point.samples:,} | {' | '.join(gains)} |")
-    lines += [f"| {name} | | not trained: {reason} |" + " |" * (len(METRICS) - 1) for name, reason in left_out.items()]
+        gains = [point.gain.get(column) for column in METRICS] + [point.remembered.get("psnr")]
+        cells = ["n/a" if gain is None else _gain_text(*gain) for gain in gains]
+        lines.append(f"| {point.recipe} | {point.samples:,} | {' | '.join(cells)} |")
+    lines += [f"| {name} | | not trained: {reason} |" + " |" * (len(titles) - 1) for name, reason in left_out.items()]
     if points:
         houses, clips = points[-1].houses, points[-1].clips
         lines += ["", f"{clips} clips of {houses} held-out houses, 95 % intervals over houses, one training seed."]
