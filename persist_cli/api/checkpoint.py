@@ -54,6 +54,7 @@ class Checkpoint:
         adapters: folders of the memory adapters by name.
         default: the name of the adapter to use when a command names none.
         sampling: the default sampling settings of its card, else of its base's; ``None`` when neither has any.
+        protocol_sampling: those for a protocol of evaluation, by its name, where they are others.
         training_scenes: the scenes that base and adapters were trained on; ``None`` for cards of earlier versions.
     """
 
@@ -67,6 +68,7 @@ class Checkpoint:
     default: str | None = None
     sampling: Sampling | None = None
     training_scenes: TrainingScenes | None = None
+    protocol_sampling: Mapping[str, Sampling] = dataclasses.field(default_factory=dict)
 
     def adapter_folder(self, adapter: str) -> Path:
         """Return the folder of an adapter.
@@ -102,11 +104,17 @@ class Checkpoint:
         within = f"{folder.relative_to(self.folder).as_posix()}/"
         check_sums(self.folder, lambda name: name.endswith(WEIGHTS) and name.startswith(within))
 
-    def sampling_with(self, overrides: SamplingOverrides) -> Sampling:
-        """Return the card's sampling settings, or else 50 steps of DDIM without guidance, with these overrides."""
+    def sampling_with(self, overrides: SamplingOverrides, protocol: str = "") -> Sampling:
+        """Return the card's sampling settings, or else 50 steps of DDIM without guidance, with these overrides.
+
+        Args:
+            overrides: settings to use instead.
+            protocol: name of a protocol of evaluation, for which the card may have settings of its own.
+        """
         from persist_cli.api.backbone import Sampling
 
-        return dataclasses.replace(self.sampling or Sampling(), **overrides.requested())
+        default = self.protocol_sampling.get(protocol) or self.sampling or Sampling()
+        return dataclasses.replace(default, **overrides.requested())
 
     def default_adapter(self) -> str | None:
         """Return the name of the card's default or only adapter, ``None`` when there is no adapter.
@@ -154,7 +162,8 @@ def find_checkpoint(path: Path) -> Checkpoint:
         fingerprint=str(card.get("fingerprint", "")),
         adapters={path.name: path for path in sorted((folder / "adapters").glob("*")) if path.is_dir()},
         default=base_card.get("default_adapter"),
-        sampling=_sampling(card, folder / CARD) or _sampling(base_card, base / CARD),
+        sampling=_card_sampling(card, folder / CARD) or _card_sampling(base_card, base / CARD),
+        protocol_sampling=_protocol_sampling(card, folder / CARD) or _protocol_sampling(base_card, base / CARD),
         training_scenes=_training_scenes(card, folder / CARD),
     )
 
@@ -363,13 +372,23 @@ def _fingerprint(folder: Path) -> str:
     return "" if card.get("base") else str(card["fingerprint"])
 
 
-def _sampling(card: dict[str, Any], path: Path) -> Sampling | None:
+def _card_sampling(card: dict[str, Any], path: Path) -> Sampling | None:
     """Return the default sampling settings of a checkpoint's card, ``None`` when it has none."""
+    return _sampling(card["sampling"], path) if card.get("sampling") else None
+
+
+def _protocol_sampling(card: dict[str, Any], path: Path) -> dict[str, Sampling]:
+    """Return the sampling settings that a checkpoint's card has for protocols of evaluation, by their names."""
+    values = card.get("protocol_sampling") or {}
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{path}: its protocol_sampling is {values}; it holds sampling settings by protocol")
+    return {str(protocol): _sampling(value, path) for protocol, value in values.items()}
+
+
+def _sampling(value: Any, path: Path) -> Sampling:
+    """Return the sampling settings that are JSON values of a card."""
     from persist_cli.api.backbone import Sampling
 
-    value = card.get("sampling")
-    if value is None or value == {}:
-        return None
     valid = isinstance(value, dict) and all(type(item) in SAMPLING_TYPES.get(key, ()) for key, item in value.items())
     numbers = [value.get(name, 1) for name in ("memory_guidance", "context_noise")] if valid else []
     if not valid or value.get("steps", 1) < 1 or not all(0 <= number < float("inf") for number in numbers):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
@@ -79,6 +80,9 @@ class InferenceOptions:
         return torch.device("cpu")
 
 
+PROTOCOLS = ("revisit", "return", "long", "unseen")  # of evaluation, for which a card may have a sampling of its own
+
+
 @dataclass(frozen=True)
 class SamplingOverrides:
     """The options of a command that say how to sample; ``None`` keeps the checkpoint's.
@@ -98,3 +102,33 @@ class SamplingOverrides:
     def requested(self) -> dict[str, Any]:
         """Return the options that are not ``None`` by name."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+
+    @classmethod
+    def by_protocol(cls, texts: Iterable[str]) -> dict[str, Self]:
+        """Return what texts such as ``return:steps=20,sampler=ddim,guidance=1`` mean, by protocol.
+
+        Raises:
+            PersistError: for an unknown protocol or setting, and for a value that is no number where one is wanted.
+        """
+        return dict(cls._of_protocol(text) for text in texts)
+
+    @classmethod
+    def _of_protocol(cls, text: str) -> tuple[str, Self]:
+        protocol, _, settings = text.partition(":")
+        if protocol not in PROTOCOLS:
+            raise PersistError(f"--sampling-for {text}: unknown protocol {protocol!r}; {hint(protocol, PROTOCOLS)}")
+        kinds: dict[str, tuple[str, Any]] = {
+            "steps": ("steps", int), "sampler": ("sampler", str), "guidance": ("memory_guidance", float),
+            "context-noise": ("context_noise", float),
+        }  # fmt: skip
+        values: dict[str, Any] = {}
+        for setting in settings.split(","):
+            name, _, value = setting.partition("=")
+            if name not in kinds:
+                raise PersistError(f"--sampling-for {text}: unknown setting {name!r}; {hint(name, kinds)}")
+            key, kind = kinds[name]
+            try:
+                values[key] = kind(value)
+            except ValueError as error:
+                raise PersistError(f"--sampling-for {text}: {name} is {value!r}, which is no number") from error
+        return protocol, cls(**values)

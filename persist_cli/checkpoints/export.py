@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import re
 import shutil
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -58,6 +59,7 @@ class ExportPlan:
     dtype: str
     default: str | None
     sampling: SamplingOverrides
+    protocol_sampling: Mapping[str, SamplingOverrides] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,8 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         "default_adapter": _default_adapter(base, adapters, plan.default),
         "sampling": _default_sampling(base, plan.sampling),
     }
+    protocols = _protocol_sampling(base, plan)
+    defaults |= {"protocol_sampling": protocols} if protocols else {}
     scenes = training_scenes(base)
     for adapter in adapters.values():
         scenes |= training_scenes(adapter.checkpoint)
@@ -169,6 +173,22 @@ def _default_sampling(base: Checkpoint, requested: SamplingOverrides) -> dict[st
     sampling = base.sampling_with(requested)
     empty_backbone(base).check_sampling(sampling)
     return asdict(sampling)
+
+
+def _protocol_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, dict[str, Any]]:
+    """The sampling of each protocol that has one of its own: that of the checkpoint's card, with the options.
+
+    Raises:
+        PersistError: when the backbone cannot sample so.
+    """
+    common = dataclasses.replace(base, sampling=base.sampling_with(plan.sampling))
+    samplings = {
+        protocol: common.sampling_with(plan.protocol_sampling.get(protocol, SamplingOverrides()), protocol)
+        for protocol in (*base.protocol_sampling, *plan.protocol_sampling)
+    }
+    for sampling in samplings.values():
+        empty_backbone(base).check_sampling(sampling)
+    return {protocol: asdict(sampling) for protocol, sampling in samplings.items()}
 
 
 def _write_checkpoint(folder: Path, base: Checkpoint, adapters: dict[str, AdapterSource], dtype: torch.dtype) -> None:

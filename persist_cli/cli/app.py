@@ -199,6 +199,9 @@ def export(
     sampler: Annotated[str | None, typer.Option(help="Sampler when none is named.")] = None,
     guidance: Annotated[float | None, typer.Option(min=0, help="Guidance over memory when none is named.")] = None,
     context_noise: Annotated[float | None, typer.Option(min=0, help="Declared noise when none is named.")] = None,
+    sampling_for: Annotated[
+        list[str] | None, typer.Option(help="Of a protocol of eval, as in return:steps=20,sampler=ddim,guidance=1.")
+    ] = None,
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -209,7 +212,8 @@ def export(
     from persist_cli.checkpoints.export import ExportPlan, run_export
 
     sampling = SamplingOverrides(steps, sampler, guidance, context_noise)
-    run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling), out, json)
+    protocols = SamplingOverrides.by_protocol(sampling_for or [])
+    run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling, protocols), out, json)
 
 
 @app.command()

@@ -81,13 +81,13 @@ def check_bases(
     return BaseProperties(next(iter(bases_by_length)), frozenset(depthless))
 
 
-def common_sampling(checkpoints: Sequence[Checkpoint], overrides: SamplingOverrides) -> Sampling:
-    """The sampling of all rows: what the command line overrides, the rest from the checkpoints' cards.
+def common_sampling(checkpoints: Sequence[Checkpoint], overrides: SamplingOverrides, protocol: str) -> Sampling:
+    """The sampling of all rows: what the command line overrides, the rest from the checkpoints' cards for a protocol.
 
     Raises:
         CheckpointError: when the cards give different ones, because rows of one table are sampled alike.
     """
-    checkpoints_by_sampling = {checkpoint.sampling_with(overrides): checkpoint for checkpoint in checkpoints}
+    checkpoints_by_sampling = {checkpoint.sampling_with(overrides, protocol): checkpoint for checkpoint in checkpoints}
     if len(checkpoints_by_sampling) > 1:
         samplings = " and ".join(
             f"{checkpoint.folder} means {sampling.steps} steps of {sampling.sampler} with guidance "

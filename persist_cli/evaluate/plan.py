@@ -127,7 +127,7 @@ def prepare(
     if plan.memories is None:
         plan = replace(plan, memories=default_memories(checkpoints))
     plan, loader = plan.without_repeats(), BackboneLoader(plan.placement)
-    sampling = common_sampling(checkpoints, plan.sampling)
+    sampling = common_sampling(checkpoints, plan.sampling, plan.protocol)
     config = RowConfig(
         plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named, plan.training_seeds
     )

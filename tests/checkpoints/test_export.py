@@ -10,9 +10,11 @@ import torch
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.inference import PROTOCOLS as PROTOCOL_NAMES
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.load import load_adapter, load_backbone
 from persist_cli.errors import CheckpointError
+from persist_cli.evaluate.protocols import PROTOCOLS
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
 from tests.support.damage import without_sums
 from tests.support.disk import file_limit
@@ -111,6 +113,30 @@ def test_the_exported_sampling_is_the_default_of_the_checkpoint(export, runs, tm
     assert exported.sampling_with(SamplingOverrides(3, "ddim")) == Sampling(3, "ddim", 1.5)
     assert exported.sampling_with(SamplingOverrides(memory_guidance=1.0)) == Sampling(7, "unipc", 1.0)
     assert (run.sampling, run.sampling_with(SamplingOverrides())) == (None, Sampling(50, "ddim", 1.0))
+
+
+def test_a_protocol_may_have_a_sampling_of_its_own_which_options_still_override(persist, export, runs, tmp_path):
+    export(tmp_path / "m", "--steps", "4", "--sampling-for", "return:steps=20,guidance=1.5")
+    card = find_checkpoint(tmp_path / "m")
+    assert card.sampling_with(SamplingOverrides(), "return") == Sampling(20, "ddim", 1.5)
+    assert card.sampling_with(SamplingOverrides(), "revisit") == Sampling(4, "ddim", 1.0)
+    assert card.sampling_with(SamplingOverrides(steps=2), "return") == Sampling(2, "ddim", 1.5)
+    assert persist("export", tmp_path / "m", "--steps", 5, "--out", tmp_path / "again").code == 0
+    assert find_checkpoint(tmp_path / "again").sampling_with(SamplingOverrides(), "return") == Sampling(20, "ddim", 1.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ("retrun:steps=2", "unknown protocol 'retrun'; did you mean 'return'?"),
+        ("return:stesp=2", "unknown setting 'stesp'; did you mean 'steps'?"),
+        ("return:steps=many", "steps is 'many', which is no number"),
+    ],
+)
+def test_a_sampling_for_a_protocol_that_cannot_be_read_is_one_line(persist, runs, tmp_path, text, cause):
+    ended = persist("export", runs / "stage1", "--sampling-for", text, "--out", tmp_path / "m")
+    assert (ended.code, cause in ended.err) == (1, True), ended.err
+    assert set(PROTOCOL_NAMES) == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from persist_cli.evaluate.report.remarks import (
     counted,
     drawn_units,
     left_out_line,
+    sampling_line,
     too_few_lines,
     without_command,
 )
@@ -95,7 +96,8 @@ def _caption(results: EvalResults, table: CompactTable) -> str:
     clips += f", {counted(view.units, 'scenes')}" * (view.unit == "scenes")
     notes = [f"({number}) {without_command(note)}" for number, note in view.notes.items()]
     deviation = f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "one sampling seed"
-    text = f"{protocol.title or protocol.name}{domain}: {clips}; {deviation}"
+    sampled = f"; {sampling_line(results)}" if sampling_line(results) else ""
+    text = f"{protocol.title or protocol.name}{domain}: {clips}; {deviation}{sampled}"
     return escape(" ".join(f"{sentence}." for sentence in [text, *notes]))
 
 

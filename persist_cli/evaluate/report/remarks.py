@@ -35,6 +35,16 @@ def seed_legend(results: EvalResults) -> str:
     return sampling if seeds > 1 else f"mean over clips, {sampling}"
 
 
+def sampling_line(results: EvalResults) -> str:
+    """How the models' clips were sampled in this protocol; empty when the results do not say."""
+    sampling = results.sampling
+    if not sampling.steps:
+        return ""
+    guidance = "" if sampling.memory_guidance in (None, 1.0) else f", guidance over memory {sampling.memory_guidance:g}"
+    noise = f", declared context noise {sampling.context_noise:g}" if sampling.context_noise else ""
+    return f"{counted(sampling.steps, 'steps')} of {sampling.sampler}{guidance}{noise}"
+
+
 def training_seed_line(results: EvalResults) -> str:
     """Say which models have fewer training seeds than a claim needs; empty when there are none, or nothing is known.
 

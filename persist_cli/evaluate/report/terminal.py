@@ -14,6 +14,7 @@ from persist_cli.evaluate.report.remarks import (
     counted,
     difference_legend,
     left_out_line,
+    sampling_line,
     too_few_lines,
     training_seed_line,
 )
@@ -83,7 +84,7 @@ def headline(results: EvalResults, table: TerminalTable) -> str:
     scenes = counted(len({(clip.data, clip.scene) for clip in measured.clips}), "scenes")
     clips = f"{counted(len(measured.clips), 'clips')} of {measured.protocol.frames} frames in {scenes}"
     seeds = f"{len(sampling.seeds)} seed{'s' * (len(sampling.seeds) != 1)}"
-    steps = f", {sampling.steps} step{'s' * (sampling.steps != 1)} of {sampling.sampler}" if sampling.steps else ""
+    steps = f", {sampling_line(results)}" if sampling_line(results) else ""
     form = "mean ± deviation over seeds" if table.deviations else "means"
     return f"{measured.protocol.title or measured.protocol.name}: {clips}, {height}×{width}, {seeds}{steps}; {form}"
 

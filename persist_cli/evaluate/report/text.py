@@ -12,6 +12,7 @@ from persist_cli.evaluate.report.remarks import (
     contamination_lines,
     figure_legend,
     left_out_line,
+    sampling_line,
     too_few_lines,
     training_seed_line,
     unknown_scenes_lines,
@@ -27,6 +28,8 @@ def table_text(results: Mapping[str, Any] | EvalResults) -> str:
     checked = results if isinstance(results, EvalResults) else check_results(results, "results")
     blocks = [f"# {_plain(checked.measured.protocol.title or checked.measured.protocol.name)}"]
     blocks += [f"**Warning:** {_plain(line)}" for line in contamination_lines(checked)]
+    sampled = sampling_line(checked)
+    blocks += [_plain(f"{checked.measured.protocol.name} was sampled with {sampled}.")] if sampled else []
     legends = dict.fromkeys(figure_legend(checked, table) for table in compact_tables(checked))
     blocks += [_plain(legend) for legend in legends]
     for name, rows, columns, cell_text in _text_tables(checked):
