@@ -177,6 +177,7 @@ class Table:
             "definition": row.definition,
             "checkpoint": row.base.name if row.uses_model else None,
             "memory": row.adapter,
+            "truth": row.truth,
         }
 
     def reads(self, results: RowResults) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ from typing import Any
 from persist_cli.api.checkpoint import reference_checkpoint
 from persist_cli.data.reference import data_folder
 from persist_cli.evaluate.aggregate import Table, row_results
-from persist_cli.evaluate.cases import cases_json
+from persist_cli.evaluate.cases import Case, cases_json
 from persist_cli.evaluate.columns import column_json, make_columns
 from persist_cli.evaluate.example_clips import make_pictures
 from persist_cli.evaluate.journal import Processes
@@ -18,6 +18,8 @@ from persist_cli.evaluate.measure import measure_rows
 from persist_cli.evaluate.plan import EvalPlan, Evaluation, contamination_warnings, prepare
 from persist_cli.evaluate.provenance import checkpoint_json, command, environment, metric_json, scenes_json
 from persist_cli.evaluate.report.page import PAGE, write_report
+from persist_cli.evaluate.report.result_file import check_results
+from persist_cli.evaluate.report.scrutiny import scrutiny_json
 from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
@@ -49,6 +51,7 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
     if not processes.main:
         return
     results = results_json(run, processes.count)
+    results["scrutiny"] = scrutiny_json(check_results(results, "results"))
     write_json(out / RESULTS, results)
     write_text(out / TABLES, table_text(results))
     if report is not None:
@@ -77,12 +80,13 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
                 "definition": run.protocol.definition,
                 "frames": run.cases[0].frames,
             },
-            "data": run.journal.data(),
+            "data": [data | {"splits": splits_of(run.cases, data["path"])} for data in run.journal.data()],
             "image_size": [info.height, info.width],
             "clips": cases_json(run.cases),
             "metrics": metric_json(run.metrics),
         },
         "sampling": {
+            "chosen": sampling_origin(run),
             "steps": run.sampling.steps,
             "sampler": run.sampling.sampler,
             "memory_guidance": run.sampling.memory_guidance,
@@ -102,6 +106,22 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
         "tables": [Table(run, name, clips).to_json(rows) for name, clips in clips_by_domain(run).items()],
         "first_row": run.rows[0].group,
     }
+
+
+def splits_of(cases: Sequence[Case], folder: str) -> dict[str, str]:
+    """The split of each trajectory of a folder that the cases use, where the data says it."""
+    infos = {case.trajectory: case.file.info for case in cases if case.data == folder}
+    return {name: str(info.source["split"]) for name, info in infos.items() if info.source.get("split")}
+
+
+def sampling_origin(run: Evaluation) -> str:
+    """Where the sampling of the models comes from."""
+    if run.plan.sampling.requested():
+        return "named on the command line"
+    checkpoint = run.checkpoints[0]
+    if run.protocol.name in checkpoint.protocol_sampling:
+        return f"the card's for the protocol {run.protocol.name}"
+    return "the card's" if checkpoint.sampling else "the tool's default"
 
 
 def clips_by_domain(run: Evaluation) -> dict[str, list[int]]:

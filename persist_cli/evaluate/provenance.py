@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from persist_cli import __version__
-from persist_cli.api.checkpoint import Checkpoint
+from persist_cli.api.checkpoint import Checkpoint, read_card
 from persist_cli.checkpoints import lineage
 from persist_cli.data.held_out import was_trained_on
 from persist_cli.evaluate.cases import Case
@@ -60,15 +60,18 @@ def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str,
     """The number of scenes that a checkpoint is known to have been trained on, as JSON values.
 
     The number may change between runs: it depends on which earlier checkpoints and data sets can still be read.
-    ``evaluated`` names those of them that the cases show.
+    ``evaluated`` names those of them that the cases show, and ``chosen_on`` says, where the card does, on which data the
+    settings were chosen.
     """
     scenes = lineage.training_scenes(checkpoint)
+    chosen_on = read_card(checkpoint.folder).get("chosen_on")
     return {
+        "chosen_on": chosen_on if isinstance(chosen_on, str) else None,
         "training_scenes": {
             "known": len(scenes.names),
             "complete": scenes.complete,
             "evaluated": trained_on(checkpoint, cases),
-        }
+        },
     }
 
 
@@ -124,6 +127,7 @@ def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:
             "better": metric.better,
             "definition": metric.definition,
             "weights": weight_hashes(metric.weights),
+            "sources": weight_sources(metric.weights),
         }
         for name, metric in metrics.items()
     }
@@ -133,3 +137,10 @@ def weight_hashes(names: Sequence[str]) -> dict[str, str]:
     """SHA-256 of the converted weights that are in the cache, by name."""
     folders = {name: cached_weight(name) for name in names}
     return {name: str(read_json(folder / "weight.json")["sha256"]) for name, folder in folders.items() if folder}
+
+
+def weight_sources(names: Sequence[str]) -> dict[str, str]:
+    """Where the weights in the cache came from, by name, as far as that is known."""
+    folders = {name: cached_weight(name) for name in names}
+    cards = {name: read_json(folder / "weight.json") for name, folder in folders.items() if folder}
+    return {name: str(card["source"]) for name, card in cards.items() if card.get("source")}

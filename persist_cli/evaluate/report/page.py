@@ -24,6 +24,7 @@ from persist_cli.evaluate.report.remarks import (
     unknown_scenes_lines,
 )
 from persist_cli.evaluate.report.result_file import FILE, EvalResults, check_results
+from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
 from persist_cli.evaluate.report.tables import CompactTable, compact_tables
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json, write_text
@@ -92,6 +93,7 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
         unknown_scenes=unknown_scenes_lines(results), known_scenes=known_scenes,
         too_few_lines=too_few_lines, left_out_line=left_out_line, seed_legend=seed_legend(results),
         drawn_units=drawn_units(results), scenes=len({(clip.data, clip.scene) for clip in results.measured.clips}),
+        answers=scrutiny(results), windows=windows_tables(results),
         sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
         facts=_environment_facts(results), lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
         **common,

@@ -88,7 +88,8 @@ def too_few(units: int, unit: str) -> str:
 
 def counted(number: int, plural: str) -> str:
     """A number with its noun, as in ``1 clip`` and ``2 clips``."""
-    return f"{number} {plural if number != 1 else plural.removesuffix('s')}"
+    singular = f"{plural.removesuffix('ies')}y" if plural.endswith("ies") else plural.removesuffix("s")
+    return f"{number} {plural if number != 1 else singular}"
 
 
 def left_out_line(left_out: dict[str, list[str]], commands: bool = True) -> str:

@@ -46,10 +46,11 @@ class ProtocolRecord(ResultModel):
 
 
 class DataSet(ResultModel):
-    """A data set with the hash of each trajectory that was used."""
+    """A data set with the hash of each trajectory that was used, and the split that each is of, where it says so."""
 
     path: str
     trajectories: dict[str, str]
+    splits: dict[str, str] = {}
 
 
 class ClipRecord(ResultModel):
@@ -67,12 +68,13 @@ class ClipRecord(ResultModel):
 
 
 class MetricRecord(ResultModel):
-    """A metric's definition with the hash of each weight it used."""
+    """A metric's definition with the hash of each weight it used, and where that came from."""
 
     title: str
     better: str | None = None
     definition: str
     weights: dict[str, str] = {}
+    sources: dict[str, str] = {}
 
 
 class Measured(ResultModel):
@@ -180,7 +182,8 @@ class ReadsRecord(ResultModel):
 class RowRecord(ResultModel):
     """A row of the table, or in ``na`` the reason why it cannot be made of these clips.
 
-    ``training_seeds`` has the seeds of the stages of each model, which stand on so many different ``bases``.
+    ``training_seeds`` has the seeds of the stages of each model, which stand on so many different ``bases``; ``truth``
+    says what of the truth it is given, and ``windows`` has means along the rollout by metric.
     """
 
     kind: Literal["model", "control", "memory control"]
@@ -189,10 +192,12 @@ class RowRecord(ResultModel):
     checkpoint: str | None = None
     memory: str | None = None
     reads: ReadsRecord | None = None
+    truth: str = ""
     training_seeds: list[list[int]] = []
     bases: int | None = None
     columns: dict[str, Cell]
     curves: dict[str, Curve] = {}
+    windows: dict[str, list[FiniteOrNone]] = {}
 
 
 class TableRecord(ResultModel):
@@ -224,11 +229,13 @@ class CheckpointRecord(ResultModel):
     recipe_sha256: str | None = None
     training_scenes: KnownScenes | None = None
     adapters: dict[str, str] = {}
+    chosen_on: str | None = None
 
 
 class SamplingRecord(ResultModel):
-    """The sampling of every row of a model."""
+    """The sampling of every row of a model, and who chose it."""
 
+    chosen: str = ""
     steps: int | None = None
     sampler: str | None = None
     memory_guidance: float | None = None

@@ -18,6 +18,7 @@ from persist_cli.evaluate.report.remarks import (
     unknown_scenes_lines,
 )
 from persist_cli.evaluate.report.result_file import EvalResults, check_results
+from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
 from persist_cli.evaluate.report.tables import CellView, ColumnView, RowView, compact_tables
 
 TextTable = tuple[str, list[RowView], list[ColumnView], Callable[[CellView], str]]  # the last writes a cell
@@ -38,7 +39,10 @@ def table_text(results: Mapping[str, Any] | EvalResults) -> str:
         blocks.append(markdown_table(name, heads, cells, _best(rows) if cell_text is _figure else ()))
     if reads := read_rows(checked):
         blocks.append(markdown_table(READS_TITLE, READS_HEADS, reads))
+    blocks += [markdown_table(*windows) for windows in windows_tables(checked)]
     blocks.append("\n".join(f"- {_plain(line)}" for line in remark_lines(checked)))
+    answers = [f"**{answer.question}** {_plain('. '.join(answer.lines))}." for answer in scrutiny(checked)]
+    blocks.append("\n\n".join(["## Before you believe it", *answers]))
     return "\n\n".join(blocks) + "\n"
 
 

@@ -58,6 +58,7 @@ class Truth(Control):
     """The clip itself, with the figures of a perfect prediction."""
 
     title = "ground truth"
+    truth = "the true frames themselves"
     definition = "the true frames themselves"
 
     def videos(self, backbone: Backbone, clips: Sequence[CaseFrames], seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -72,6 +73,7 @@ class CodecReconstruction(Control):
     """The true frames, encoded and decoded by the model's codec."""
 
     title = "codec reconstruction"
+    truth = "the true frames themselves"
     uses_model = True
     definition = "true frames encoded and decoded, clip after clip as the model predicts them: the codec's ceiling"
 
@@ -134,6 +136,7 @@ class Nearest(EarlierFramesControl):
     """The frame that was taken at the nearest earlier pose."""
 
     title = "nearest earlier frame"
+    truth = "true earlier frames and their poses"
     definition = "the true earlier frame whose pose is nearest (metres + radians) among those the memory holds by then"
 
     def renderer(self, earlier: Observations) -> ViewRenderer:
@@ -150,6 +153,7 @@ class Warp(EarlierFramesControl):
     """Earlier RGB-D frames, projected into the view."""
 
     title = "geometric warp"
+    truth = "true earlier frames with their depth and poses"
     definition = (
         "the true earlier RGB-D frames that the memory holds by then, projected into the asked view with a z-buffer, "
         "colours from the nearest pose that shows the surface, holes filled from the nearest pixel"
@@ -170,6 +174,7 @@ class NoisyWarp(Warp):
     """
 
     random = True
+    truth = "true earlier frames with their depth, and wrong poses"
 
     def __init__(self, base: Checkpoint, writes: bool, noise: NoisyPoses) -> None:
         super().__init__(f"{Warp.title}, {noise.name}", base, writes)

@@ -28,10 +28,13 @@ DRIFT_FRAMES = 32  # after which drifting poses are off by their standard deviat
 class MemoryIntervention(ABC):
     """A rule for what is written into a row's memory.
 
-    ``writes`` says whether the model's own output may follow.
+    ``writes`` says whether the model's own output may follow, ``holds`` what the memory holds before, and ``poses``
+    whether its poses are true.
     """
 
     name: ClassVar[str]
+    holds: ClassVar[str] = "true frames"
+    poses: ClassVar[str] = "true"
     writes: ClassVar[bool] = False
 
     @property
@@ -68,6 +71,7 @@ class Emptied(MemoryIntervention):
     """A memory that is always empty."""
 
     name = "emptied"
+    holds = "nothing"
     definition = "its memory is always empty"
 
     def context(self, clip: CaseFrames) -> Observations | None:
@@ -79,6 +83,7 @@ class Oracle(MemoryIntervention):
     """A memory that holds the true frames to be predicted, too."""
 
     name = "oracle"
+    holds = "true frames, those of the clip too,"
     definition = "its memory holds the true frames of the clip too"
 
     def context(self, clip: CaseFrames) -> Observations | None:
@@ -96,6 +101,7 @@ class Shuffled(MemoryIntervention):
     """
 
     name = "shuffled"
+    holds = "true frames of another scene"
     definition = "its memory is that of the next clip in another scene, moved to where this clip begins"
 
     def __init__(self, cases: Sequence[Case]) -> None:
@@ -127,6 +133,7 @@ class NoisyPoses(MemoryIntervention):
     centimetres: float = 5.0
     degrees: float = 2.0
     name = "noisy poses (white)"
+    poses = "wrong"
     writes = True
 
     @property

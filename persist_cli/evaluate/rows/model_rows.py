@@ -80,6 +80,18 @@ class ModelRow(Row):
             return f"{self.checkpoint.name} with the adapter {NO_MEMORY!r}, {NOTHING}"
         return f"{self.checkpoint.name} with the adapter {self.adapter!r}, {self.row_memory.intervention.definition}"
 
+    @property
+    def truth(self) -> str:
+        """What of the truth model and memory are given."""
+        given = "the first frame with its depth, and the true cameras"
+        factory, intervention = self.row_memory.factory, self.row_memory.intervention
+        if factory is None or self.adapter == NO_MEMORY:
+            return given
+        holds = intervention.holds
+        if self.row_memory.writes and intervention.writes:
+            holds = "its own frames"
+        return f"{given}; its memory holds {holds} at {intervention.poses} poses"
+
     def prepare(self, backbone: Backbone, placement: InferenceOptions) -> None:
         """Load the adapter into the backbone and make it ready."""
         load_adapter(backbone, self.checkpoint, self.adapter)

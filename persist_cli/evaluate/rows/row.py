@@ -39,6 +39,11 @@ class Row(ABC):
         self.name, self.base, self.group = name, base, group or name
 
     @property
+    def truth(self) -> str:
+        """What of the truth it is given, beside the given first frame and the cameras of the clip."""
+        return "nothing but the given first frame"
+
+    @property
     @abstractmethod
     def definition(self) -> str:
         """A few words that say what the row shows."""

