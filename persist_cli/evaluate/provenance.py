@@ -60,8 +60,8 @@ def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str,
     """The number of scenes that a checkpoint is known to have been trained on, as JSON values.
 
     The number may change between runs: it depends on which earlier checkpoints and data sets can still be read.
-    ``evaluated`` names those of them that the cases show, and ``chosen_on`` says, where the card does, on which data the
-    settings were chosen.
+    ``evaluated`` names those of them that the cases show. ``chosen_on`` says on which data the settings were chosen,
+    where the card does.
     """
     scenes = lineage.training_scenes(checkpoint)
     chosen_on = read_card(checkpoint.folder).get("chosen_on")
