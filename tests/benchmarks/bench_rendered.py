@@ -220,11 +220,10 @@ def main() -> None:
     parser.add_argument("--sampler", default="unipc")
     parser.add_argument("--guidance", type=float, default=1.0)
     parser.add_argument("--rows", default="", help="only these, separated by semicolons")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, help="figures of each clip, JSON, written after each of them")
     arguments = parser.parse_args()
     rows = build_rows(arguments)
     figures: dict[str, list[dict[str, float]]] = {name: [] for name in rows}
-    seconds = dict.fromkeys(rows, 0.0)
     with torch.no_grad():
         for example in examples(arguments.data, 9, arguments.each):
             if not len(example.counted):
@@ -232,10 +231,12 @@ def main() -> None:
             for name, row in rows.items():
                 began = time.process_time()
                 video = row(example)
-                seconds[name] += time.process_time() - began
-                figures[name].append(measure(example, *video))
+                seconds = time.process_time() - began
+                figures[name].append(measure(example, *video) | {"seconds": seconds})
+            if arguments.out:
+                arguments.out.write_text(json.dumps(figures))
     say(f"{len(next(iter(figures.values())))} clips")
-    columns = ["psnr", "last", "lpips-alex", "sharpness"]
+    columns = ["psnr", "last", "lpips-alex", "sharpness", "seconds"]
     means = {
         name: {key: sum(one[key] for one in ones) / len(ones) for key in columns} for name, ones in figures.items()
     }
