@@ -15,7 +15,8 @@ FORM_KEYS = {
     "projected": {"heads", "frequencies"},
     "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
     "rendered": {
-        "heads", "frequencies", "token_size", "splat_pixels", "head_width", "head_layers", "attention_tokens",
+        "heads", "frequencies", "token_size", "splat_pixels", "supersampling", "head_width", "head_layers",
+        "attention_tokens",
     },
     "frames": {"heads", "frequencies", "frame_patch"},
 }  # fmt: skip
@@ -58,7 +59,6 @@ def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Pat
         ({"every": 3}, "every is 3, but the model has 2 layers"),
         ({"form": "canvas", "every": 3}, "every is 3, but the model has 2 layers"),
         ({"form": "canvas", "splat_pixels": 4}, "splat_pixels must be odd, not 4"),
-        ({"form": "rendered", "splat_pixels": 4}, "splat_pixels must be odd, not 4"),
         ({"form": "splat"}, "unknown adapter form 'splat'; known: cross, projected, canvas, rendered, frames"),
     ],
 )

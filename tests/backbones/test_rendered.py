@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.adapters.rendered import render_views, tokens_not_shown
+from persist_backbones.adapters.rendered import RenderedSettings, render_views, tokens_not_shown
 from persist_backbones.cogvideox.diffusion import noise_level
 from persist_backbones.tensors import push_pull
 from persist_cli.api.cameras import Cameras
@@ -26,6 +26,7 @@ from tests.support.micro_model import (
 from tests.support.micro_runs import MICRO, SIZE
 
 WIDE = {"token_size": 40.0, "splat_pixels": 199}  # a token that fills every view
+POINTS = RenderedSettings(token_size=0.001, splat_pixels=1, supersampling=1)
 
 
 def own_pixels(clips):
@@ -55,15 +56,27 @@ def clean_of(backbone, clips, tokens, timestep):
 
 def test_pixels_of_a_frame_are_drawn_back_to_where_they_were():
     clips = random_clips()
-    views = render_views(own_pixels(clips), clips.cameras, 0.001, 1)
+    views = render_views(own_pixels(clips), clips.cameras, POINTS)
     assert views.covered[:, 0, 0].all()
     assert torch.equal(views.rgb[:, 0], clips.rgb[:, 0])
     assert torch.allclose(views.depth[:, 0], clips.depth[:, 0], rtol=1e-4)
 
 
+def test_an_antialiased_pixel_is_the_mean_of_what_is_drawn_in_it_and_covered_by_its_share():
+    clips = random_clips()
+    pixel = torch.tensor([[20.25, 12.25, 1.0], [20.75, 12.25, 1.0]], dtype=torch.float64)  # two quarters of a pixel
+    place = 3 * pixel @ torch.linalg.inv(clips.cameras.intrinsics[0, 0]).T
+    colors = torch.tensor([[100, 0, 0], [200, 0, 0]], dtype=torch.uint8).expand(2, 2, 3)
+    tokens = MemoryTokens(torch.zeros(2, 2, CHANNELS), place.expand(2, 2, 3), torch.ones(2, 2).bool(), colors)
+    views = render_views(tokens, clips.cameras, dataclasses.replace(POINTS, supersampling=2))
+    assert views.rgb[0, 0, 12, 20].tolist() == [150, 0, 0]
+    assert views.covered[0, 0, 0, 12, 20] == 0.5
+    assert views.covered[0, 0].sum() == 0.5
+
+
 def test_holes_are_filled_from_around_them_and_count_as_holes():
     clips = random_clips()
-    views = render_views(wall(), clips.cameras, 0.001, 1)
+    views = render_views(wall(), clips.cameras, POINTS)
     assert views.covered.sum(dim=(1, 2, 3, 4)).tolist() == [9.0, 9.0]  # a pixel in each frame
     assert (views.rgb == 200).all()
     assert torch.allclose(views.depth[0, :, 0, 0], 3.0 - torch.arange(9) * 0.25)
@@ -145,7 +158,7 @@ def test_attention_reads_tokens_that_are_hidden_or_just_out_of_sight_and_no_othe
     tokens = MemoryTokens(torch.zeros(2, 5, CHANNELS), positions, mask, torch.zeros(2, 5, 3, dtype=torch.uint8))
     one = dataclasses.replace(clips.cameras, world_from_camera=clips.cameras.world_from_camera[:, :1],
                               intrinsics=clips.cameras.intrinsics[:, :1])  # fmt: skip
-    shown = render_views(tokens, one, 0.5, 9).shown
+    shown = render_views(tokens, one, RenderedSettings(token_size=0.5)).shown
     assert shown[0].tolist() == [True, False, False, False, False]
     assert tokens_not_shown(tokens, shown, one, 4)[0].tolist() == [1, 3, -1, -1]
 

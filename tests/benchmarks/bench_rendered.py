@@ -132,9 +132,8 @@ class Model:
         """What the adapter draws."""
         self.use()
         adapter: Any = self.backbone.adapter
-        tokens, settings = MemoryTokens.stack([self.tokens(example)]), adapter.settings
-        cameras = Clips.stack([example.clip]).cameras
-        return render_views(tokens, cameras, settings.token_size, settings.splat_pixels)
+        tokens, cameras = MemoryTokens.stack([self.tokens(example)]), Clips.stack([example.clip]).cameras
+        return render_views(tokens, cameras, adapter.settings)
 
     def drawn(self, example: Example) -> tuple[Tensor, Tensor]:
         """The drawn frames."""
@@ -214,7 +213,7 @@ def main() -> None:
     parser.add_argument("--adapters", nargs="*", default=[], help="stage-2 runs of that checkpoint")
     parser.add_argument("--packaged", action="store_true", help="the checkpoint's adapter voxel, too")
     parser.add_argument("--each", type=int, default=2, help="clips of each trajectory")
-    parser.add_argument("--cell", type=float, default=0.03)
+    parser.add_argument("--cell", type=float, default=0.02)
     parser.add_argument("--settings", default="{}", help="settings of the fresh adapter, JSON")
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--sampler", default="unipc")
@@ -237,16 +236,11 @@ def main() -> None:
                 arguments.out.write_text(json.dumps(figures))
     say(f"{len(next(iter(figures.values())))} clips")
     columns = ["psnr", "last", "lpips-alex", "sharpness", "seconds"]
-    means = {
-        name: {key: sum(one[key] for one in ones) / len(ones) for key in columns} for name, ones in figures.items()
-    }
-    table = [
-        [name, *(f"{means[name][key]:.3f}" for key in columns), f"{seconds[name] / len(figures[name]):.2f}"]
-        for name in rows
-    ]
-    print_table("", ["row", *columns, "CPU s a clip"], table)
-    if arguments.out:
-        arguments.out.write_text(json.dumps(figures))
+    table = []
+    for name, clips in figures.items():
+        means = [sum(clip[column] for clip in clips) / len(clips) for column in columns]
+        table.append([name, *(f"{mean:.3f}" for mean in means)])
+    print_table("", ["row", *columns], table)
 
 
 if __name__ == "__main__":

@@ -43,7 +43,8 @@ class RenderedSettings(AttentionSettings):
 
     Args:
         token_size: edge in metres of the square that a token is drawn as, somewhat more than the edge of a cell.
-        splat_pixels: the largest edge of a drawn token in pixels, odd; 1 draws points.
+        splat_pixels: the largest edge of a drawn token in pixels; 1 draws points.
+        supersampling: number n of an antialiased drawing, in which a pixel is the mean of n × n that are drawn.
         head_width: hidden channels of the layers that correct the prediction by the rendered views.
         head_layers: number of those layers that look at neighbouring latent pixels.
         attention_tokens: tokens that ``projected`` attention reads of those that no view shows; 0 leaves attention out
@@ -52,8 +53,9 @@ class RenderedSettings(AttentionSettings):
 
     form: Literal["rendered"] = "rendered"
     token_budget: PositiveInt = 65536
-    token_size: PositiveFloat = 0.05
+    token_size: PositiveFloat = 0.04
     splat_pixels: PositiveInt = 9
+    supersampling: PositiveInt = 2
     head_width: PositiveInt = 96
     head_layers: PositiveInt = 2
     attention_tokens: NonNegativeInt = 256
@@ -65,8 +67,8 @@ class Views(NamedTuple):
     Args:
         rgb: uint8 RGB.
         depth: planar z in metres.
-        covered: whether a pixel shows what was observed, and whether it shows what was imagined: 0 or 1, and between
-            them where both kinds meet; both are 0 in holes.
+        covered: the share of a pixel that shows what was observed, and the share that shows what was imagined; both
+            are 0 in holes.
         shown: for each token whether a view shows it.
     """
 
@@ -76,14 +78,13 @@ class Views(NamedTuple):
     shown: Bool[Tensor, "batch token"]
 
 
-def render_views(tokens: MemoryTokens, cameras: Cameras, token_size: float, most: int) -> Views:
+def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSettings) -> Views:
     """Draw tokens with a z-buffer into the views of cameras, at the images' full size.
 
     Args:
         tokens: the tokens of a batch, with colours.
         cameras: axes ``batch frame``.
-        token_size: edge in metres of a token's square, facing the camera.
-        most: largest edge of a square in pixels.
+        settings: the size of a token's square, which faces the camera, and the supersampling.
 
     Raises:
         CheckpointError: when the tokens have no colours.
@@ -93,16 +94,21 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, token_size: float, most
             "the adapter form 'rendered' draws tokens in their colours, but this memory's tokens have none; use the "
             "memory voxel, map2d or snapshots, or another form"
         )
-    shape = (*cameras.world_from_camera.shape[:2], cameras.height, cameras.width)
-    splats, _ = hide_covered(rasterize(tokens.positions, tokens.mask, cameras, token_size, most), math.prod(shape))
+    finer = settings.supersampling
+    views = cameras.resized(cameras.height * finer, cameras.width * finer)
+    shape = (*cameras.world_from_camera.shape[:2], views.height, views.width)
+    drawn_pixels = rasterize(tokens.positions, tokens.mask, views, settings.token_size, settings.splat_pixels * finer)
+    splats, _ = hide_covered(drawn_pixels, math.prod(shape))
     shown = torch.zeros_like(tokens.mask).flatten().index_fill(0, splats.token, True).view_as(tokens.mask)
     observed = (tokens.origins == Origin.OBSERVED)[..., None].float()
     drawn = splat(torch.cat([tokens.colors.float(), observed], dim=-1), splats, shape)
     color, observed, covered, logs = drawn.split([3, 1, 1, 1], dim=2)
-    pictures = torch.cat([color, logs.exp()], dim=2) * covered
-    filled = push_pull(pictures.flatten(0, 1), covered.flatten(0, 1)).unflatten(0, shape[:2])
-    rgb, depth = filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3]
-    return Views(rgb, depth, torch.cat([observed, covered - observed], dim=2), shown)
+    parts = torch.cat([color, logs.exp(), observed, torch.ones_like(covered)], dim=2) * covered
+    sums = F.avg_pool2d(parts.flatten(0, 1), finer)
+    pictures, observed, covered = sums.split([4, 1, 1], dim=1)
+    filled = push_pull(pictures, covered).unflatten(0, shape[:2])
+    origins = torch.cat([observed, covered - observed], dim=1).unflatten(0, shape[:2])
+    return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown)
 
 
 def tokens_not_shown(tokens: MemoryTokens, shown: Bool[Tensor, "batch token"], cameras: Cameras, most: int) -> Tensor:
@@ -220,8 +226,6 @@ class RenderedAdapter(Adapter[PreparedRendering]):
 
     def __init__(self, channels: int, settings: RenderedSettings, video: VideoShape) -> None:
         super().__init__(channels, settings, video)
-        if settings.splat_pixels % 2 == 0:
-            raise CheckpointError(f"splat_pixels must be odd, not {settings.splat_pixels}")
         drawn = video.outputs + 2 * video.temporal
         self.patches = nn.Linear(drawn * video.token_frames * video.patch**2, video.channels, bias=False)
         zero_init(self.patches)
@@ -242,7 +246,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         if tokens.rendered is not None:
             return tokens
         settings, spatial = self.settings, self.video.spatial
-        views = render_views(tokens, cameras, settings.token_size, settings.splat_pixels)
+        views = render_views(tokens, cameras, settings)
         shares = F.avg_pool2d(views.covered.flatten(0, 1), spatial).unflatten(0, views.covered.shape[:2])
         mask = fold_frames(shares, self.video.temporal)
         latents = encode(views.rgb, views.depth) * mask.any(dim=2, keepdim=True)
@@ -254,7 +258,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
     def rendering(self) -> Mapping[str, Any]:
         """Return the settings that ``render`` depends on."""
         settings = self.settings
-        names = ("token_size", "splat_pixels", "attention_tokens")
+        names = ("token_size", "splat_pixels", "supersampling", "attention_tokens")
         return {name: getattr(settings, name) for name in names}
 
     def noisy(
