@@ -140,6 +140,11 @@ class Sampling:
     memory_guidance: float = 1.0
     context_noise: float = 0.0
 
+    @property
+    def words(self) -> str:
+        """These settings in a few words, as in ``4 steps of unipc with guidance 1.5``."""
+        return f"{self.steps} steps of {self.sampler} with guidance {self.memory_guidance:g}"
+
 
 class Backbone(nn.Module, ABC):
     """A video diffusion model over RGB-D clips; ``forward`` is the training loss of a stage.

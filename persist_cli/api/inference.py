@@ -110,25 +110,37 @@ class SamplingOverrides:
         Raises:
             PersistError: for an unknown protocol or setting, and for a value that is no number where one is wanted.
         """
-        return dict(cls._of_protocol(text) for text in texts)
+        named = dict(cls._named(text, "--sampling-for") for text in texts)
+        for protocol in named:
+            if protocol not in PROTOCOLS:
+                raise PersistError(f"--sampling-for: unknown protocol {protocol!r}; {hint(protocol, PROTOCOLS)}")
+        return named
 
     @classmethod
-    def _of_protocol(cls, text: str) -> tuple[str, Self]:
-        protocol, _, settings = text.partition(":")
-        if protocol not in PROTOCOLS:
-            raise PersistError(f"--sampling-for {text}: unknown protocol {protocol!r}; {hint(protocol, PROTOCOLS)}")
+    def by_memory(cls, texts: Iterable[str]) -> dict[str, Self]:
+        """Return what texts such as ``voxel:steps=4,guidance=1.5`` mean, by memory.
+
+        Raises:
+            PersistError: for an unknown setting, and for a value that is no number where one is wanted.
+        """
+        return dict(cls._named(text, "--sampling-of") for text in texts)
+
+    @classmethod
+    def _named(cls, text: str, option: str) -> tuple[str, Self]:
+        """Return the name before the colon, and the settings behind it."""
+        name, _, settings = text.partition(":")
         kinds: dict[str, tuple[str, Any]] = {
             "steps": ("steps", int), "sampler": ("sampler", str), "guidance": ("memory_guidance", float),
             "context-noise": ("context_noise", float),
         }  # fmt: skip
         values: dict[str, Any] = {}
         for setting in settings.split(","):
-            name, _, value = setting.partition("=")
-            if name not in kinds:
-                raise PersistError(f"--sampling-for {text}: unknown setting {name!r}; {hint(name, kinds)}")
-            key, kind = kinds[name]
+            key, _, value = setting.partition("=")
+            if key not in kinds:
+                raise PersistError(f"{option} {text}: unknown setting {key!r}; {hint(key, kinds)}")
+            field, kind = kinds[key]
             try:
-                values[key] = kind(value)
+                values[field] = kind(value)
             except ValueError as error:
-                raise PersistError(f"--sampling-for {text}: {name} is {value!r}, which is no number") from error
-        return protocol, cls(**values)
+                raise PersistError(f"{option} {text}: {key} is {value!r}, which is no number") from error
+        return name, cls(**values)

@@ -22,6 +22,7 @@ from persist_cli.cli.options import (
     JsonOption,
     MemoriesOption,
     SamplerOption,
+    SamplingOfOption,
     SaveMemoryOption,
     StepOption,
     StepsOption,
@@ -323,6 +324,7 @@ def evaluate(
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
     context_noise: ContextNoiseOption = None,
+    sampling_of: SamplingOfOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
@@ -361,7 +363,7 @@ def evaluate(
         metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), batch=batch, noise=pose_noise,
         placement=InferenceOptions.of(dtype, save_memory), resample=resample,
-        training_seeds=training_seeds,
+        training_seeds=training_seeds, sampling_of=SamplingOverrides.by_memory(sampling_of or ()),
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

@@ -39,6 +39,14 @@ GuidanceOption = Annotated[
     typer.Option("--guidance", min=0, help="Of guidance over memory; the checkpoint's, else 1: none."),
 ]
 
+SamplingOfOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="MEMORY:KEY=VALUE,...",
+        help="Other sampling for one memory's rows, as in voxel:steps=4,sampler=unipc,guidance=1.5; may be given again.",
+    ),
+]
+
 ContextNoiseOption = Annotated[
     float | None,
     typer.Option(

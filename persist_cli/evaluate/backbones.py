@@ -55,7 +55,7 @@ class BaseProperties:
 
 
 def check_bases(
-    checkpoints: Sequence[Checkpoint], data: Sequence[Path], sampling: Sampling, loader: BackboneLoader
+    checkpoints: Sequence[Checkpoint], data: Sequence[Path], samplings: Sequence[Sampling], loader: BackboneLoader
 ) -> BaseProperties:
     """Load every base once, the first one last, and check that it takes the images and can be sampled so.
 
@@ -67,7 +67,8 @@ def check_bases(
     depthless = set()
     for base in reversed(unique_bases(checkpoints)):
         backbone = loader.load(base)
-        backbone.check_sampling(sampling)
+        for sampling in samplings:
+            backbone.check_sampling(sampling)
         for info, where in files:
             check_size(info, backbone.image_size, where)
         bases_by_length[backbone.frames_per_clip] = base

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ class EvalPlan:
     controls_named: bool = True
     resample: str = "scenes"  # one of ``RESAMPLE_UNITS``
     training_seeds: bool = False
+    sampling_of: Mapping[str, SamplingOverrides] = field(default_factory=dict)  # of the rows of some memories
 
     def without_repeats(self) -> EvalPlan:
         """This plan without repeated names, because a memory named twice would be two rows of one name."""
@@ -129,8 +130,9 @@ def prepare(
     plan, loader = plan.without_repeats(), BackboneLoader(plan.placement)
     sampling = common_sampling(checkpoints, plan.sampling, plan.protocol)
     config = RowConfig(
-        plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named, plan.training_seeds
-    )
+        plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named, plan.training_seeds,
+        {memory: replace(sampling, **own.requested()) for memory, own in plan.sampling_of.items()},
+    )  # fmt: skip
     config.check()
     if plan.resample not in RESAMPLE_UNITS:
         raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
@@ -138,7 +140,7 @@ def prepare(
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
     protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
     with busy("loading the models"):
-        bases = check_bases(checkpoints, plan.data, sampling, loader)
+        bases = check_bases(checkpoints, plan.data, [sampling, *config.sampling_of.values()], loader)
     models = build_model_rows(checkpoints, config, protocol)  # unknown memories are reported before clips are sought
     search = ClipSearch(plan.data, plan.frames, plan.clips, bases.frames_per_clip - 1, training_scenes(checkpoints))
     journal = Journal(out)
@@ -193,6 +195,8 @@ def identity(
     options |= {"sampling": asdict(sampling) | plan.placement.changes()}
     for name in ("placement", "controls_named", "resample", "training_seeds"):
         del options[name]  # what is left of them changes no measured figure
+    if not plan.sampling_of:
+        del options["sampling_of"]  # as in evaluations that an earlier version began
     values = options | {
         "checkpoints": [checkpoint_json(checkpoint) for checkpoint in checkpoints],
         "metric definitions": metric_json(metrics),

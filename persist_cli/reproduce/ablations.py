@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.api.checkpoint import step_folders
-from persist_cli.errors import INTERRUPTED, PersistError, hint
+from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.report.result_file import Cell, read_results
 from persist_cli.io.files import write_json, written_aside
 from persist_cli.io.hub import cached_weight
 from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_names
-from persist_cli.reproduce.table1 import COLLECT, run_command
+from persist_cli.reproduce.commands import COLLECT, run_line
 from persist_cli.viewing.console import say
 from persist_cli.viewing.curve import Curve, draw_curves
 
@@ -272,16 +272,6 @@ def _gain_text(mean: float | None, low: float | None, high: float | None) -> str
     if mean is None:
         return "n/a"
     return f"{mean:+.3f}" if low is None or high is None else f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]"
-
-
-def run_line(line: str) -> None:
-    """Run a command of persist in a process of its own; end this one with its exit code when it fails."""
-    say(f"\n$ persist {line}")
-    code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
-    if code == INTERRUPTED:
-        say("stopped; the same command goes on here")
-    if code:
-        sys.exit(code)
 
 
 def run_ablations(plan: Plan, houses: int = HOUSES) -> None:

@@ -3,37 +3,92 @@
 ``python -m persist_cli.reproduce.table1 [OUT]`` runs them in order, each in a process of its own; with ``--reference``
 it trains nothing and measures the model that comes with the package. Every command continues where it was stopped and
 repeats nothing that is done, so this may be stopped and started at any time.
+
+Houses for training, validation and test share no scene. Cells, head and sampling are chosen for each memory by itself
+on validation houses, by ``persist_cli.reproduce.choose``, before any of the tables is measured.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import signal
-import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from persist_cli.errors import INTERRUPTED
+from persist_cli.api.backbone import Sampling
+from persist_cli.errors import PersistError
+from persist_cli.reproduce import choose
+from persist_cli.reproduce.commands import COLLECT, run_line
 from persist_cli.viewing.console import say
 
-MEMORIES = ("none", "voxel", "map2d", "snapshots")
-FORMS = ("cross", "projected")  # of the memory adapter, compared for voxel
-SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # chosen in a trial on eight held-out clips
+PACKAGED = ("none", "voxel", "map2d", "snapshots")  # memories of the model that comes with the package
+CHOSEN = (*PACKAGED, "views", "context")  # memories for which choices are made; the first is the baseline
+FIXED = ("nwm",)  # memories as their recipes are: of the paper's NWM nothing is to be chosen
+FORMS = ("cross", "projected", "canvas", "canvas-head", "rendered")  # the same map, another way to the video
+EQUAL = ("voxel", "map2d", "snapshots", "views", "context")  # memories of equal information
+WITHOUT_DEPTH = ("none", "context", "views", "voxel")  # on a model that never saw depth; voxel reads it all the same
+SEEDS = 3  # trainings of none, voxel and the best other, each on a third of the steps
+SEED_SCHEDULE = "training.steps=500 training.cooldown=200"
+
+SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # of the packaged model; chosen in a trial on eight clips
+COMMON = "--steps 4 --sampler unipc --guidance 1"  # where nothing was chosen
+INVENTING = "--steps 20 --sampler ddim --guidance 1"  # few steps blur what is invented, which raises PSNR and SRC
 METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
-COLLECT = "collect miniworld --size 64x64"
 WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of every metric that can be fetched
 
 
-def commands(out: Path) -> list[str]:
+@dataclass(frozen=True)
+class Chosen:
+    """What ``choose`` found on validation houses.
+
+    Args:
+        sampling: sampling of each memory.
+        other: the best memory but none and voxel.
+    """
+
+    sampling: Mapping[str, Sampling] = field(default_factory=dict)
+    other: str = "snapshots"
+
+    @staticmethod
+    def of(out: Path) -> Chosen:
+        """Read the choices.
+
+        Raises:
+            PersistError: when there are none yet.
+        """
+        costs = {name: cost for name, cost in choose.chosen_costs(out).items() if name not in CHOSEN[:2]}
+        return Chosen(choose.chosen_sampling(out), min(costs, key=lambda name: costs[name]))
+
+
+def commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
     """All command lines in order; weights come first, so that nothing is missing after days of training."""
-    return [fetch_command(), *collect_commands(out), *train_commands(out), *evaluate_commands(out)]
+    return [*base_commands(out), *memory_commands(out, chosen), *evaluate_commands(out, chosen)]
+
+
+def base_commands(out: Path) -> list[str]:
+    """The command lines before the choices: weights, houses, codec, and the video models with and without depth."""
+    home, data = shlex.quote(str(out)), training_data(out)
+    cached = f"{data} --cache {home}/cache"
+    return [
+        fetch_command(),
+        *collect_commands(out),
+        f"finetune houses-64-codec {data} --out {home}/codec",
+        f"finetune houses-64-stage1 {cached} --out {home}/stage1 base={home}/codec",
+        f"finetune houses-64-stage1-rgb {cached} --out {home}/stage1-rgb base={home}/codec",
+    ]
+
+
+def choice_plan(out: Path) -> choose.Plan:
+    """The choices that are made between the video model and the memories."""
+    data, validation = (tuple(out / part / policy for policy in POLICIES) for part in ("houses", "validation"))
+    return choose.Plan(out / "choices", str(out / "stage1"), data, validation, CHOSEN)
 
 
 def reference_commands(out: Path) -> list[str]:
-    """The command lines that measure the packaged model: all tables but that of the forms, of which it has one."""
-    return [fetch_command(), *collect_test_commands(out), *evaluate_commands(out, trained=False)]
+    """The command lines that measure the packaged model: all tables of its four memories."""
+    return [fetch_command(), *collect_held_out(out, "test"), *packaged_commands(out)]
 
 
 def fetch_command() -> str:
@@ -41,82 +96,145 @@ def fetch_command() -> str:
     return f"weights fetch {' '.join(WEIGHTS)}"
 
 
+POLICIES: Mapping[str, str] = {  # by policy the scenes of each split
+    "path": "0:1200", "explore": "1200:1800", "loop": "1800:2400",
+}  # fmt: skip
+HELD_OUT: Mapping[str, str] = {"path": "0:40", "explore": "40:70", "loop": "70:100"}
+
+
 def collect_commands(out: Path) -> list[str]:
     """The command lines that collect 2,400 training houses of 100 frames, and the held-out ones."""
     home = shlex.quote(str(out))
-    return [
-        f"{COLLECT} --out {home}/houses/path --scenes 0:1600 --frames 100 --policy path",
-        f"{COLLECT} --out {home}/houses/explore --scenes 1600:2400 --frames 100 --policy explore",
-        *collect_test_commands(out),
+    train = [
+        f"{COLLECT} --out {home}/houses/{policy} --scenes {scenes} --frames 100 --policy {policy}"
+        for policy, scenes in POLICIES.items()
     ]
+    return [*train, *collect_held_out(out, "validation"), *collect_held_out(out, "test")]
 
 
-def collect_test_commands(out: Path) -> list[str]:
-    """The command lines that collect 100 held-out houses of 129 frames, on paths of three kinds."""
+def collect_held_out(out: Path, split: str) -> list[str]:
+    """The command lines that collect 100 houses of 129 frames of a split, and of the test split there and back too."""
     home = shlex.quote(str(out))
-    return [
-        f"{COLLECT} --out {home}/test/path --scenes 0:50 --frames 129 --policy path --split test",
-        f"{COLLECT} --out {home}/test/explore --scenes 50:100 --frames 129 --policy explore --split test",
-        f"{COLLECT} --out {home}/there-and-back --scenes 0:100 --frames 129 --policy there-and-back --split test",
+    lines = [
+        f"{COLLECT} --out {home}/{split}/{policy} --scenes {scenes} --frames 129 --policy {policy} --split {split}"
+        for policy, scenes in HELD_OUT.items()
     ]
+    if split != "test":
+        return lines
+    back = f"--scenes 0:100 --frames 129 --policy there-and-back --split {split}"
+    return [*lines, f"{COLLECT} --out {home}/there-and-back {back}"]
 
 
-def train_commands(out: Path) -> list[str]:
-    """The command lines that train codec, stage 1 and adapters: for each memory, of other forms, and without depth."""
+def training_data(out: Path) -> str:
+    """The options of a training on all training houses that goes on where it was stopped."""
     home = shlex.quote(str(out))
-    data = f"--data {home}/houses/path --data {home}/houses/explore --resume"
-    cached = f"{data} --cache {home}/cache"
-    stage2 = f"{cached} base={home}/stage1"
+    return " ".join([*(f"--data {home}/houses/{policy}" for policy in POLICIES), "--resume"])
+
+
+def memory_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
+    """The command lines that train adapters: of each memory, of equal information, of other forms, without depth."""
+    home = shlex.quote(str(out))
+    stage2 = f"{training_data(out)} --cache {home}/cache base={home}/stage1"
+    without_depth = f"{training_data(out)} --cache {home}/cache base={home}/stage1-rgb"
+    recipes = {memory: shlex.quote(str(choose.recipe_file(out / "choices", memory))) for memory in CHOSEN}
+    seeded = [(memory, seed) for memory in (*CHOSEN[:2], chosen.other) for seed in range(SEEDS)]
     return [
-        f"finetune houses-64-codec {data} --out {home}/codec",
-        f"finetune houses-64-stage1 {cached} --out {home}/stage1 base={home}/codec",
-        *(f"finetune houses-64-stage2-{memory} {stage2} --out {home}/{memory}" for memory in MEMORIES),
-        *(f"finetune houses-64-stage2-voxel-{form} {stage2} --out {home}/voxel-{form}" for form in FORMS),
-        f"finetune houses-64-stage1-rgb {cached} --out {home}/stage1-rgb base={home}/stage1",
-        f"finetune houses-64-stage2-voxel-rgb {cached} --out {home}/voxel-rgb base={home}/stage1-rgb",
+        *(f"finetune {recipes[memory]} {stage2} --out {home}/{memory}" for memory in CHOSEN),
+        *(f"finetune houses-64-stage2-{memory} {stage2} --out {home}/{memory}" for memory in FIXED),
+        *(f"finetune houses-64-equal-{memory} {stage2} --out {home}/equal-{memory}" for memory in EQUAL),
+        *(f"finetune houses-64-forms-{form} {stage2} --out {home}/forms-{form}" for form in FORMS),
+        *(f"finetune houses-64-stage2-{name}-rgb {without_depth} --out {home}/{name}-rgb" for name in WITHOUT_DEPTH),
+        *(
+            f"finetune {recipes[memory]} {stage2} --out {home}/seeds/{memory}-{seed} training.seed={seed} "
+            f"{SEED_SCHEDULE}"
+            for memory, seed in seeded
+        ),
     ]
 
 
-def evaluate_commands(out: Path, trained: bool = True) -> list[str]:
-    """The command lines of the tables: memories and controls on revisits, returns and long rollouts; forms.
+def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
+    """The command lines of all tables of the runs in ``out``; each memory is sampled as was chosen for it."""
+    home, runs = shlex.quote(str(out)), tables(out, tuple(CHOSEN), chosen)
+    revisit = revisit_options(out)
+    equal = [f"{home}/equal-{memory}" for memory in EQUAL]
+    forms = [f"{home}/forms-{form}" for form in FORMS]
+    without_depth = [f"{home}/{name}-rgb" for name in WITHOUT_DEPTH]
+    seeded = (*CHOSEN[:2], chosen.other)
+    seeds = [f"{home}/seeds/{memory}-{seed}" for memory in seeded for seed in range(SEEDS)]
+    return [
+        *runs,
+        table(out, "equal", equal, f"{named(EQUAL, chosen)} {revisit} --controls codec --metrics {METRICS}"),
+        table(out, "forms", forms, f"{named(('voxel',), chosen)} {revisit} --controls codec --metrics {METRICS}"),
+        table(
+            out, "without-depth", without_depth,
+            f"{named(WITHOUT_DEPTH, chosen)} {revisit} --controls codec --metrics psnr,ssim,lpips-alex",
+        ),
+        table(
+            out, "seeds", seeds,
+            f"{named(seeded, chosen)} {revisit} --controls codec --metrics {METRICS} --seeds 1 --training-seeds",
+        ),
+    ]  # fmt: skip
+
+
+def packaged_commands(out: Path) -> list[str]:
+    """The command lines of the tables of the packaged model."""
+    return tables(out, PACKAGED, None)
+
+
+def tables(out: Path, memories: Sequence[str], chosen: Chosen | None) -> list[str]:
+    """The command lines of the tables of all memories: revisits, disturbed memories, returns and long rollouts.
 
     Args:
         out: folder of everything.
-        trained: measure the runs in ``out`` rather than the model that comes with the package.
+        memories: names of the memories; the first is the baseline, the second the one that is disturbed.
+        chosen: what was chosen for the runs in ``out``; ``None`` measures the packaged model.
     """
+    home, pair, returns = shlex.quote(str(out)), memories[:2], f"--data {shlex.quote(str(out))}/there-and-back"
+
+    def rows(names: Sequence[str], *fixed: str) -> list[str]:
+        return [] if chosen is None else [f"{home}/{name}" for name in (*names, *fixed)]
+
+    def sampled(names: Sequence[str]) -> str:
+        return f"--memories {','.join(names)} {SAMPLING}" if chosen is None else named(names, chosen)
+
+    def inventing(names: Sequence[str]) -> str:
+        return f"--memories {','.join(names)} {INVENTING}"
+
+    disturbed = f"--controls shuffled,emptied,oracle,noisy,drifting --metrics {METRICS}"
+    revisit = revisit_options(out)
+    return [
+        table(
+            out, "revisit", rows(memories, *FIXED), f"{sampled(memories)} {revisit} --controls copy,nearest,warp,codec"
+        ),
+        table(out, "disturbed", rows(pair), f"{sampled(pair)} {revisit} {disturbed}"),
+        table(out, "return", rows(memories), f"{inventing(memories)} {returns} --protocol return --clips 32"),
+        table(
+            out, "long", rows(pair), f"{inventing(pair)} {returns} --protocol long --clips 16 --metrics {METRICS}"
+        ),
+    ]  # fmt: skip
+
+
+def revisit_options(out: Path) -> str:
+    """The options of a table of revisits to places of the test houses."""
     home = shlex.quote(str(out))
+    data = " ".join(f"--data {home}/test/{policy}" for policy in HELD_OUT)
+    return f"{data} --protocol revisit --frames 17 --clips 200"
 
-    def table(name: str, checkpoints: Sequence[str], options: str) -> str:
-        outputs = f"--out {home}/eval-{name} --report {home}/report-{name}"
-        return " ".join(["eval", *checkpoints, options, SAMPLING, outputs])
 
-    def memory_table(name: str, memories: Sequence[str], options: str) -> str:
-        runs = [f"{home}/{memory}" for memory in memories] if trained else []
-        return table(name, runs, f"--memories {','.join(memories)} {options}")
-
-    pair, returns = MEMORIES[:2], f"--data {home}/there-and-back"
-    revisit = f"--data {home}/test/path --data {home}/test/explore --protocol revisit --frames 17 --clips 200"
-    lines = [
-        memory_table("revisit", MEMORIES, f"{revisit} --controls copy,nearest,warp,codec"),
-        memory_table("disturbed", pair, f"{revisit} --controls shuffled,emptied,oracle,noisy --metrics {METRICS}"),
-        memory_table("return", MEMORIES, f"{returns} --protocol return --clips 32 --controls warp"),
-        memory_table("long", pair, f"{returns} --protocol long --clips 16 --metrics {METRICS}"),
+def named(memories: Sequence[str], chosen: Chosen) -> str:
+    """The options of some memories, each sampled as was chosen for it."""
+    own = [
+        f"--sampling-of {memory}:steps={sampling.steps},sampler={sampling.sampler},guidance={sampling.memory_guidance:g}"
+        for memory in memories
+        if (sampling := chosen.sampling.get(memory)) is not None
     ]
-    if trained:
-        forms = [f"{home}/voxel{form}" for form in ("", *(f"-{form}" for form in FORMS), "-rgb")]
-        lines.append(table("forms", forms, f"--memories voxel {revisit} --controls codec --metrics {METRICS}"))
-    return lines
+    return " ".join([f"--memories {','.join(memories)}", COMMON, *own])
 
 
-def run_command(command: Sequence[str]) -> int:
-    """Run a command and return its exit code; after Ctrl-C the command is given the time to end."""
-    interrupts: list[int] = []
-    previous = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))  # a child does not inherit it
-    try:
-        code = subprocess.run(command, check=False).returncode
-    finally:
-        signal.signal(signal.SIGINT, previous)
-    return INTERRUPTED if interrupts else code
+def table(out: Path, name: str, checkpoints: Sequence[str], options: str) -> str:
+    """The command line of a table with its report."""
+    home = shlex.quote(str(out))
+    return " ".join(["eval", *checkpoints, options, f"--out {home}/eval-{name} --report {home}/report-{name}"])
 
 
 def main() -> None:
@@ -125,13 +243,18 @@ def main() -> None:
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/table1"), help="folder of everything")
     parser.add_argument("--reference", action="store_true", help="measure the model of the package, train none")
     options = parser.parse_args()
-    for line in reference_commands(options.out) if options.reference else commands(options.out):
-        say(f"\n$ persist {line}")
-        code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
-        if code == INTERRUPTED:
-            say("stopped; the same command goes on here")
-        if code:
-            sys.exit(code)
+    try:
+        for line in reference_commands(options.out) if options.reference else base_commands(options.out):
+            run_line(line)
+        if options.reference:
+            return
+        choose.run_choose(choice_plan(options.out))
+        chosen = Chosen.of(options.out / "choices")
+        for line in [*memory_commands(options.out, chosen), *evaluate_commands(options.out, chosen)]:
+            run_line(line)
+    except PersistError as error:
+        say(f"error: {error}")
+        sys.exit(1)
 
 
 if __name__ == "__main__":

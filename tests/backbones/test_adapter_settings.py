@@ -11,7 +11,7 @@ from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from tests.support.micro_model import CHANNELS, micro, with_adapter
 
 FORM_KEYS = {
-    "cross": {"heads", "frequencies", "positions"},
+    "cross": {"heads", "frequencies", "positions", "normalize", "key_positions", "key_camera"},
     "projected": {"heads", "frequencies"},
     "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
     "rendered": {

@@ -149,3 +149,32 @@ def test_the_baseline_is_none_where_a_checkpoint_has_it_beside_the_default_of_ea
     several = replace(model, adapters={name: model.folder for name in ("map2d", "none", "voxel")}, default="voxel")
     assert default_memories([several]) == ("none", "voxel")
     assert default_memories([replace(several, default=None), model]) == ("none", "map2d", "voxel")
+
+
+def test_one_memory_may_be_sampled_in_its_own_way(persist, walks, tmp_path):
+    model = write_model(tmp_path / "a")
+    asked = ["eval", model, "--data", walks, *ONE[2:], "--memories", "stage1,voxel", "--steps", 1]
+    assert persist(*asked, "--out", tmp_path / "same").code == 0
+    assert persist(*asked, "--sampling-of", "voxel:steps=2,guidance=1.5", "--out", tmp_path / "own").code == 0
+    same, own = (columns(tmp_path / name) for name in ("same", "own"))
+    assert own["stage1"]["psnr"]["mean"] == same["stage1"]["psnr"]["mean"]
+    assert own["voxel"]["psnr"]["mean"] != same["voxel"]["psnr"]["mean"]
+    rows = read_json(tmp_path / "own/metrics.json")["tables"][0]["rows"]
+    assert rows["voxel"]["definition"].endswith("; 2 steps of ddim with guidance 1.5")
+    assert "steps" not in rows["stage1"]["definition"]
+    assert "holds another evaluation" in refused(persist, *asked, "--out", tmp_path / "own")
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ("voxel:stpes=4", "--sampling-of voxel:stpes=4: unknown setting 'stpes'; did you mean 'steps'"),
+        ("voxel:steps=four", "--sampling-of voxel:steps=four: steps is 'four', which is no number"),
+        ("voxels:steps=4", "--sampling-of voxels: no such memory; did you mean 'voxel'"),
+        ("voxel:sampler=unipcc", "unknown sampler 'unipcc'"),
+        ("voxel:steps=0", "0 denoising steps"),
+    ],
+)
+def test_a_sampling_of_a_memory_that_cannot_be_is_refused_in_one_line(persist, walks, tmp_path, text, cause):
+    error = refused(persist, "eval", write_model(tmp_path / "a"), "--data", walks, *ONE, "--sampling-of", text)
+    assert cause in error

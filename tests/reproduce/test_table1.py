@@ -10,31 +10,45 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import typer.main
 
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.cameras import Cameras
 from persist_cli.cli.app import app
 from persist_cli.errors import INTERRUPTED
 from persist_cli.io.files import write_json
+from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics import METRICS
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
-from persist_cli.reproduce.ablations import ablation_names
+from persist_cli.reproduce.choose import recipe_file
 from persist_cli.reproduce.table1 import (
-    MEMORIES,
+    CHOSEN,
+    Chosen,
+    base_commands,
+    choice_plan,
     collect_commands,
     commands,
     evaluate_commands,
+    memory_commands,
     reference_commands,
-    train_commands,
 )
 from tests.support.predictions import setup
+from tests.support.rooms import Room
 
 OUT = Path("my runs/table1")
 
-LINES = commands(OUT)
+CHOICES = Chosen({"voxel": Sampling(10, "ddim", 2.0)}, "views")
+
+LINES = commands(OUT, CHOICES)
+
+TRAININGS = [line for line in LINES if line.startswith("finetune")]
+
+SUPERSEDED = {f"houses-64-stage2-voxel-{form}" for form in ("cross", "projected", "rendered")}  # by houses-64-forms-…
 
 WAITING = """
 import sys
-from persist_cli.reproduce.table1 import run_command
+from persist_cli.reproduce.commands import run_command
 child = "import sys, time\\ntry: print('begun', flush=True); time.sleep(60)"
 child += "\\nexcept KeyboardInterrupt: time.sleep(0.5); print('ended', flush=True)"
 sys.exit(run_command([sys.executable, "-c", child]))
@@ -56,7 +70,7 @@ def test_the_weights_of_every_metric_but_one_are_fetched_first(tmp_path: Path, m
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     for name in names:
         write_json(tmp_path / "weights" / name / "weight.json", {"name": name})
-    assert [name for name, metric in METRICS.items() if metric.obstacle(setup())] == ["dreamsim"]
+    assert [name for name, metric in METRICS.items() if metric.obstacle(setup(unseen_scenes=2))] == ["dreamsim"]
     used = {weight for metric in METRICS.values() for weight in metric.weights}
     assert used - {"dreamsim"} == set(names)
 
@@ -78,9 +92,11 @@ def test_an_interrupt_lets_the_command_end_without_a_traceback() -> None:
 
 
 def test_every_recipe_of_the_reference_model_is_trained_after_its_base() -> None:
-    lines = [shlex.split(line) for line in train_commands(OUT)]
-    trained_here = {name for name in recipe_names() if name.startswith("houses-64-")} - {*ablation_names()}
-    assert {words[1] for words in lines} == trained_here
+    lines = [shlex.split(line) for line in TRAININGS]
+    chosen = {f"houses-64-stage2-{memory}" for memory in CHOSEN}
+    families = ("houses-64-codec", "houses-64-stage", "houses-64-forms-", "houses-64-equal-")
+    wanted = {name for name in recipe_names() if name.startswith(families)} - SUPERSEDED
+    assert {words[1] for words in lines} == wanted - chosen | {str(recipe_file(OUT / "choices", one)) for one in CHOSEN}
     trained: set[str] = set()
     for words in lines:
         bases = {word.removeprefix("base=") for word in words if word.startswith("base=")}
@@ -88,32 +104,76 @@ def test_every_recipe_of_the_reference_model_is_trained_after_its_base() -> None
         trained.add(words[words.index("--out") + 1])
 
 
-def test_models_are_trained_on_the_training_houses_and_evaluated_on_the_held_out_ones() -> None:
-    def folders(line: str, option: str) -> set[str]:
-        words = shlex.split(line)
-        return {words[number + 1] for number, word in enumerate(words) if word == option}
+def folders(line: str, option: str) -> set[str]:
+    """The folders that a command line names by an option."""
+    words = shlex.split(line)
+    return {words[number + 1] for number, word in enumerate(words) if word == option}
 
-    test = {folder for line in collect_commands(OUT) if "--split test" in line for folder in folders(line, "--out")}
-    train = {folder for line in collect_commands(OUT) for folder in folders(line, "--out")} - test
-    assert all(folders(line, "--data") == train for line in train_commands(OUT))
+
+def test_models_are_trained_chosen_and_measured_on_houses_of_three_splits() -> None:
+    collected = {line: folders(line, "--out") for line in collect_commands(OUT)}
+    test = {folder for line, found in collected.items() if "--split test" in line for folder in found}
+    validation = {folder for line, found in collected.items() if "--split validation" in line for folder in found}
+    train = {folder for found in collected.values() for folder in found} - test - validation
+    plan = choice_plan(OUT)
+    assert all(folders(line, "--data") == train for line in TRAININGS)
+    assert {*map(str, plan.data)} == train
+    assert {*map(str, plan.validation)} == validation
     assert {folder for line in evaluate_commands(OUT) for folder in folders(line, "--data")} == test
 
 
-def test_the_packaged_model_is_measured_as_a_trained_one_but_for_the_table_of_forms() -> None:
-    trained = {word for line in evaluate_commands(OUT) for word in shlex.split(line) if word.startswith("--")}
+def test_each_memory_is_sampled_as_was_chosen_for_it() -> None:
+    lines = [line for line in evaluate_commands(OUT, CHOICES) if "--protocol revisit" in line]
+    assert all("--sampling-of voxel:steps=10,sampler=ddim,guidance=2 " in line for line in lines)
+    assert not [line for line in lines if "--sampling-of none" in line]
+
+
+def test_none_voxel_and_the_best_other_memory_are_trained_with_three_seeds() -> None:
+    seeded = [shlex.split(line) for line in memory_commands(OUT, CHOICES) if "/seeds/" in line]
+    names = {words[words.index("--out") + 1].rpartition("/")[2] for words in seeded}
+    assert names == {f"{memory}-{seed}" for memory in ("none", "voxel", "views") for seed in range(3)}
+    assert len({words[-3] for words in seeded}) == 3  # seeds
+    assert len({tuple(words[-2:]) for words in seeded}) == 1  # schedules
+
+
+def test_a_model_without_depth_is_trained_on_the_codec_and_its_adapters_on_it() -> None:
+    lines = {words[1]: words for words in map(shlex.split, [*base_commands(OUT), *memory_commands(OUT)])}
+    assert f"base={OUT}/codec" in lines["houses-64-stage1-rgb"]
+    assert make_recipe(read_recipe("houses-64-stage1-rgb"), "rgb").backbone.settings["depth"] is False
+    without = [name for name in lines if name.endswith("-rgb") and "stage2" in name]
+    assert without
+    assert all(f"base={OUT}/stage1-rgb" in lines[name] for name in without)
+
+
+def test_the_packaged_model_is_measured_without_any_training() -> None:
     lines = [line for line in reference_commands(OUT) if line.startswith("eval")]
-    assert {word for line in lines for word in shlex.split(line) if word.startswith("--")} == trained
+    assert len(lines) == 4
     assert not [line for line in lines if shlex.split(line)[1].startswith(str(OUT))]
     assert not [line for line in reference_commands(OUT) if line.startswith("finetune") or "/houses/" in line]
 
 
-def test_all_memories_are_trained_alike() -> None:
-    recipes = [make_recipe(read_recipe(f"houses-64-stage2-{memory}"), memory) for memory in MEMORIES]
-    adapters = [recipe.adapter | {"token_size": None} for recipe in recipes]  # what a token stands for is the memory's
-    assert len({repr(sorted(adapter.items())) for adapter in adapters}) == 1
-    assert (
-        len({recipe.adapter["token_size"] for recipe in recipes if recipe.memory and recipe.memory.name != "snapshots"})
-        == 1
-    )
-    assert len({repr(recipe.memory.encoder_settings) for recipe in recipes if recipe.memory}) == 1
-    assert len({recipe.training.steps for recipe in recipes if recipe.memory and recipe.memory.name != "none"}) == 1
+@pytest.mark.parametrize("family", ["houses-64-forms-", "houses-64-equal-", "houses-64-stage2-"])
+def test_recipes_of_one_table_are_trained_alike(family: str) -> None:
+    names = [name for name in recipe_names() if name.startswith(family)]
+    recipes = [make_recipe(read_recipe(name), name) for name in names]
+    assert len({(repr(recipe.data), repr(recipe.training)) for recipe in recipes}) == 1
+
+
+def test_forms_are_compared_on_one_memory_and_one_number_of_tokens() -> None:
+    recipes = [make_recipe(read_recipe(name), name) for name in recipe_names() if "-forms-" in name]
+    assert len({repr(recipe.memory) for recipe in recipes}) == 1
+    assert len({recipe.adapter["token_budget"] for recipe in recipes}) == 1
+    assert len({(recipe.adapter["form"], recipe.adapter.get("head_width", 0) > 0) for recipe in recipes}) == 5
+
+
+def test_memories_of_equal_information_give_as_many_colours_of_one_size() -> None:
+    camera = Cameras(torch.eye(4).double()[None], torch.diag(torch.tensor([41.7, 41.7, 1])).double()[None], 64, 64)
+    for name in (name for name in recipe_names() if "-equal-" in name):
+        recipe = make_recipe(read_recipe(name), name)
+        frames = recipe.memory.settings.get("count", 0)  # type: ignore[union-attr]
+        budget = recipe.adapter["token_budget"]
+        assert (budget * 64 * 64 if recipe.adapter["form"] == "frames" else budget) == 16384
+        assert frames in (0, 4)
+        if recipe.adapter["form"] != "frames":
+            memory = MemoryFactory.of(recipe.memory).empty(Room().info)  # type: ignore[arg-type]
+            assert memory.resolution(camera) == pytest.approx(0.06, rel=0.05)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import PLAIN, Checkpoint
@@ -62,6 +62,7 @@ class RowConfig:
         noise: centimetres and degrees of the controls ``noisy`` and ``drifting``.
         named: whether the user named the controls, so that one that cannot be made is an error.
         training_seeds: whether checkpoints whose recipes differ in their seeds alone are one row.
+        sampling_of: sampling of the rows of some memories, where it is another.
     """
 
     memories: Sequence[str]
@@ -70,6 +71,7 @@ class RowConfig:
     noise: tuple[float, float] = (5.0, 2.0)
     named: bool = True
     training_seeds: bool = False
+    sampling_of: Mapping[str, Sampling] = field(default_factory=dict)
 
     def check(self) -> None:
         """Raise ``PersistError`` when no memory is named, for an unknown control, and for negative noise."""
@@ -79,6 +81,9 @@ class RowConfig:
         for name in self.controls:
             if name not in known:
                 raise PersistError(f"unknown control {name!r}; {hint(name, known)}")
+        for name in self.sampling_of:
+            if name not in self.memories:
+                raise PersistError(f"--sampling-of {name}: no such memory; {hint(name, list(self.memories))}")
         if min(self.noise) < 0:
             raise PersistError(f"the pose noise {self.noise[0]:g} cm, {self.noise[1]:g}° must not be negative")
 
@@ -117,7 +122,9 @@ def build_model_rows(checkpoints: Sequence[Checkpoint], config: RowConfig, proto
         adapter = None if memory == PLAIN else memory
         for name, group, owner in named_owners(memory, checkpoints_with(memory, checkpoints), config.training_seeds):
             factory = MemoryFactory.of(adapter_memory(owner, memory)) if adapter else None
-            row = ModelRow(name, owner, adapter, config.sampling, RowMemory(factory, Unmodified(), protocol.writes))
+            row_memory = RowMemory(factory, Unmodified(), protocol.writes)
+            row = ModelRow(name, owner, adapter, config.sampling_of.get(memory, config.sampling), row_memory)
+            row.own_sampling = memory in config.sampling_of
             row.group = group
             rows.append(row)
             groups.append(group)
@@ -187,6 +194,7 @@ def intervention_rows(
                 row_memory = replace(row.row_memory, intervention=intervention)
                 row_name = f"{row.name}, {intervention.name}"
                 changed = ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory)
+                changed.own_sampling = row.own_sampling
                 changed.group = f"{row.group}, {intervention.name}"
                 yield name, changed
 

@@ -68,11 +68,17 @@ class ModelRow(Row):
         super().__init__(name, checkpoint)
         self.checkpoint, self.adapter, self.sampling, self.row_memory = checkpoint, adapter, sampling, row_memory
         self.agents: list[Agent] = []
+        self.own_sampling = False  # whether the other rows may be sampled in another way
         self.growth: list[list[int]] = []
         self.kind = "model" if isinstance(row_memory.intervention, Unmodified) else "memory control"
 
     @property
     def definition(self) -> str:
+        """A few words with the checkpoint, the adapter, the content of the memory, and sampling of its own."""
+        return f"{self.model}; {self.sampling.words}" if self.own_sampling else self.model
+
+    @property
+    def model(self) -> str:
         """A few words with the checkpoint, the adapter and the content of the memory."""
         if self.adapter is None:
             return f"{self.checkpoint.name} without an adapter (stage 1)"

@@ -1,0 +1,325 @@
+"""The choices of each memory, made on validation houses: settings of memory and adapter, then of sampling.
+
+``python -m persist_cli.reproduce.choose OUT --base runs/stage1 --data runs/houses --validation runs/validation`` trains
+each memory a short time with each of a few settings and measures them on houses that are neither of the training nor of
+the test split. It then measures the best of them with other steps, samplers and guidance. So no memory is compared by
+choices that were made for another. It stops and goes on like ``make table1``: what is done is not done again.
+
+``OUT/choices.json`` has what was chosen and every trial, ``choices.md`` the same as a table, and ``OUT/recipes`` has a
+recipe for each memory with what was chosen. They are written anew after each figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from persist_cli.api.backbone import Sampling
+from persist_cli.errors import PersistError, hint
+from persist_cli.evaluate.report.result_file import read_results
+from persist_cli.io.files import read_json, write_json, write_text
+from persist_cli.recipe import EXTENDS, apply_overrides, make_recipe, read_recipe
+from persist_cli.reproduce.commands import COLLECT, run_line
+from persist_cli.viewing.console import say
+
+CHOICES: Final = "choices.json"
+RECIPE: Final = "houses-64-stage2-"  # begins the names of the recipes that are varied
+
+METRICS: Final = {"psnr": "PSNR", "psnr-last": "last frame", "lpips-alex": "LPIPS"}
+CRITERION: Final = "lpips-alex"  # lower is better; by PSNR the blurriest would be chosen
+
+FINE: Final = ("memory.settings.cell=[0.03, 0.03, 0.03]", "adapter.token_size=0.05", "adapter.token_budget=65536")
+COARSE: Final = ("memory.settings.cell=[0.0625, 0.0625, 0.0625]", "adapter.token_size=0.09")
+WIDER: Final = ("adapter.head_width=192",)
+FEW: Final = ("memory.settings.count=4", "adapter.token_budget=4", "adapter.frame_patch=1")
+MANY: Final = ("memory.settings.count=16", "adapter.token_budget=16", "adapter.frame_patch=2")
+
+# for each memory what is tried, one or two things at a time; the settings are on top of its recipe
+TRIALS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
+    "none": {"64-tokens": ("adapter.learned_tokens=64",), "16-tokens": ("adapter.learned_tokens=16",)},
+    "voxel": {"3cm": FINE, "6cm": COARSE, "3cm-wider-head": FINE + WIDER, "6cm-wider-head": COARSE + WIDER},
+    "map2d": {
+        "6cm": ("memory.settings.cell=[0.0625, 0.0625]", "adapter.token_size=0.09"),
+        "12cm": ("memory.settings.cell=[0.125, 0.125]", "adapter.token_size=0.18"),
+        "6cm-wider-head": ("memory.settings.cell=[0.0625, 0.0625]", "adapter.token_size=0.09", *WIDER),
+    },
+    "snapshots": {
+        "32x32": ("memory.settings.grid=[32, 32]", "adapter.token_size=0.12"),
+        "64x64": ("memory.settings.grid=[64, 64]", "adapter.token_size=0.09", "adapter.token_budget=32768"),
+        "32x32-wider-head": ("memory.settings.grid=[32, 32]", "adapter.token_size=0.12", *WIDER),
+    },
+    "views": {"4-frames": FEW, "16-frames": MANY},
+    "context": {"4-frames": FEW, "16-frames": MANY},
+}
+
+FIRST: Final = Sampling(4, "unipc", 1.0)  # of the trials of settings
+GUIDANCES: Final = (1.0, 1.5, 2.0)  # tried first, with the other settings of FIRST
+STEPS: Final = ((4, "ddim"), (10, "unipc"), (10, "ddim"), (20, "unipc"))  # tried then, with the best guidance
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is trained and measured.
+
+    Args:
+        out: folder of everything.
+        base: the stage-1 run or checkpoint that all stand on.
+        data: folders of the training houses.
+        validation: folders of the validation houses.
+        memories: names of the memories.
+        steps: optimizer steps of each trial.
+        clips: most clips that a trial is measured on.
+    """
+
+    out: Path
+    base: str
+    data: tuple[Path, ...]
+    validation: tuple[Path, ...]
+    memories: tuple[str, ...] = tuple(TRIALS)
+    steps: int = 400
+    clips: int = 48
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One thing that was tried, with its figures.
+
+    Args:
+        name: name of the settings.
+        overrides: settings on top of the memory's recipe.
+        sampling: how clips were sampled.
+        figures: mean of each column of ``METRICS``.
+        clips: number of clips.
+        houses: number of houses that they are of.
+    """
+
+    name: str
+    overrides: tuple[str, ...]
+    sampling: Sampling
+    figures: dict[str, float | None]
+    clips: int
+    houses: int
+
+    @property
+    def cost(self) -> float:
+        """What the choice is made by; infinite where it could not be measured."""
+        value = self.figures[CRITERION]
+        return float("inf") if value is None else value
+
+    def __str__(self) -> str:
+        return f"{self.name}, {self.sampling.words}"
+
+
+def best_of(trials: Sequence[Trial]) -> Trial:
+    """The trial of the lowest cost, of equal ones the first."""
+    return min(trials, key=lambda trial: trial.cost)
+
+
+def preparations(plan: Plan) -> list[str]:
+    """The command lines that bring weights, and validation houses where the plan names none of its own."""
+    home, lines = shlex.quote(str(plan.out)), ["weights fetch lpips-alex"]
+    if plan.validation == default_validation(plan.out):
+        split = "--frames 129 --split validation"
+        lines += [
+            f"{COLLECT} --out {home}/validation/path --scenes 0:16 --policy path {split}",
+            f"{COLLECT} --out {home}/validation/explore --scenes 16:32 --policy explore {split}",
+        ]
+    return lines
+
+
+def default_validation(out: Path) -> tuple[Path, ...]:
+    """Where validation houses are collected to."""
+    return out / "validation/path", out / "validation/explore"
+
+
+def train_command(plan: Plan, memory: str, name: str) -> str:
+    """The command line that trains a memory with the settings of a trial, on from where it stopped."""
+    data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.data)
+    cooldown = plan.steps // 3
+    settings = [*TRIALS[memory][name], f"training.steps={plan.steps}", f"training.cooldown={cooldown}"]
+    changes = shlex.join([f"base={plan.base}", *settings])
+    cache = shlex.quote(str(plan.out / "cache"))
+    run = shlex.quote(str(run_folder(plan, memory, name)))
+    return f"finetune {RECIPE}{memory} {data} --out {run} --resume --cache {cache} {changes}"
+
+
+def eval_command(plan: Plan, memory: str, name: str, sampling: Sampling) -> str:
+    """The command line that measures a trial on the validation houses."""
+    data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.validation)
+    options = f"--memories {memory} --controls '' --metrics psnr,lpips-alex --frames 9 --seeds 1 --clips {plan.clips}"
+    sampled = f"--steps {sampling.steps} --sampler {sampling.sampler} --guidance {sampling.memory_guidance:g}"
+    run, out = (shlex.quote(str(folder)) for folder in (
+        run_folder(plan, memory, name), result_folder(plan, memory, name, sampling)
+    ))  # fmt: skip
+    return f"eval {run} {data} {options} {sampled} --out {out}"
+
+
+def run_folder(plan: Plan, memory: str, name: str) -> Path:
+    """The folder of a trial's training."""
+    return plan.out / "runs" / memory / name
+
+
+def result_folder(plan: Plan, memory: str, name: str, sampling: Sampling) -> Path:
+    """The folder of a trial's evaluation."""
+    sampled = f"{sampling.sampler}-{sampling.steps}-guidance-{sampling.memory_guidance:g}"
+    return plan.out / "eval" / memory / name / sampled
+
+
+def measure(plan: Plan, memory: str, name: str, sampling: Sampling) -> Trial:
+    """Train and measure a trial, unless that is done, and return its figures."""
+    folder = result_folder(plan, memory, name, sampling)
+    if not (folder / "metrics.json").is_file():
+        run_line(train_command(plan, memory, name))
+        run_line(eval_command(plan, memory, name, sampling))
+    results = read_results(folder / "metrics.json")
+    table = results.tables[0]
+    columns = table.rows[memory].columns
+    figures = {column: columns[column].mean if column in columns else None for column in METRICS}
+    scenes = {results.measured.clips[number].scene for number in table.clips}
+    return Trial(name, TRIALS[memory][name], sampling, figures, len(table.clips), len(scenes))
+
+
+def trials_of(plan: Plan, memory: str) -> Iterator[list[Trial]]:
+    """Yield the trials of a memory so far, after each one: settings first, then guidance, then steps and sampler."""
+    trials: list[Trial] = []
+    for name in TRIALS[memory]:
+        trials.append(measure(plan, memory, name, FIRST))
+        yield trials
+    for guidance in GUIDANCES[1:] if memory != "none" else ():  # of a memory that gives nothing it changes nothing
+        trials.append(measure(plan, memory, best_of(trials).name, Sampling(FIRST.steps, FIRST.sampler, guidance)))
+        yield trials
+    chosen = best_of(trials)
+    for steps, sampler in STEPS:
+        trials.append(measure(plan, memory, chosen.name, Sampling(steps, sampler, chosen.sampling.memory_guidance)))
+        yield trials
+
+
+def choice_json(memory: str, trials: Sequence[Trial]) -> dict[str, Any]:
+    """What was chosen for a memory, why, and every trial, as JSON values."""
+    best = best_of(trials)
+    others = [trial for trial in trials if trial is not best]
+    reason = f"the only one that was measured, {CRITERION} {best.cost:.4f}"
+    if others:
+        second = best_of(others)
+        reason = f"lowest {CRITERION} of {len(trials)}, {best.cost:.4f}; next is {second}: {second.cost:.4f}"
+    return {
+        "recipe": RECIPE + memory,
+        "name": best.name,
+        "overrides": list(best.overrides),
+        "sampling": asdict(best.sampling),
+        "cost": best.figures[CRITERION],
+        "reason": f"{reason} ({best.clips} clips of {best.houses} validation houses)",
+        "trials": [asdict(trial) for trial in trials],
+    }
+
+
+def write_choices(plan: Plan, choices: Mapping[str, Any]) -> None:
+    """Write what is chosen so far as JSON, as a table and as recipes."""
+    described = {"base": plan.base, "steps": plan.steps, "by": CRITERION, "split": "validation"}
+    folders = {"data": [*map(str, plan.data)], "validation": [*map(str, plan.validation)]}
+    write_json(plan.out / CHOICES, described | folders | {"memories": dict(choices)})
+    write_text(plan.out / "choices.md", table_text(choices))
+    for memory, choice in choices.items():
+        path = recipe_file(plan.out, memory)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        values = apply_overrides({EXTENDS: choice["recipe"]}, choice["overrides"])
+        write_text(
+            path, f"# chosen on validation houses: {choice['reason']}\n{yaml.safe_dump(values, sort_keys=False)}"
+        )
+
+
+def recipe_file(out: Path, memory: str) -> Path:
+    """The recipe of a memory with what was chosen for it."""
+    return out / "recipes" / f"{memory}.yaml"
+
+
+def table_text(choices: Mapping[str, Any]) -> str:
+    """Every trial as a Markdown table, those that were chosen in bold."""
+    lines = ["| memory | settings | sampling | " + " | ".join(METRICS.values()) + " |", "|---|---|---|---:|---:|---:|"]
+    for memory, choice in choices.items():
+        for trial in choice["trials"]:
+            chosen = (trial["name"], trial["sampling"]) == (choice["name"], choice["sampling"])
+            figures = [trial["figures"][column] for column in METRICS]
+            texts = ["n/a" if figure is None else f"{figure:.4g}" for figure in figures]
+            cells = [memory, trial["name"], Sampling(**trial["sampling"]).words, *texts]
+            lines.append("| " + " | ".join(f"**{cell}**" if chosen else cell for cell in cells) + " |")
+    reasons = [f"- {memory}: {choice['reason']}" for memory, choice in choices.items()]
+    return "\n".join([*lines, "", *reasons]) + "\n"
+
+
+def chosen_sampling(out: Path) -> dict[str, Sampling]:
+    """The sampling that was chosen for each memory.
+
+    Raises:
+        PersistError: when nothing was chosen yet.
+    """
+    if not (out / CHOICES).is_file():
+        raise PersistError(f"{out / CHOICES}: not there yet; `python -m persist_cli.reproduce.choose {out}` makes it")
+    memories = read_json(out / CHOICES)["memories"]
+    return {memory: Sampling(**choice["sampling"]) for memory, choice in memories.items()}
+
+
+def chosen_costs(out: Path) -> dict[str, float]:
+    """The cost of what was chosen for each memory; ``PersistError`` when nothing was chosen yet."""
+    chosen_sampling(out)
+    choices = read_json(out / CHOICES)["memories"]
+    return {memory: float("inf") if choice["cost"] is None else choice["cost"] for memory, choice in choices.items()}
+
+
+def run_choose(plan: Plan) -> None:
+    """Make the choices of every memory, one after the other."""
+    for line in preparations(plan):
+        run_line(line)
+    choices: dict[str, Any] = {}
+    for memory in plan.memories:
+        for trials in trials_of(plan, memory):
+            choices[memory] = choice_json(memory, trials)
+            write_choices(plan, choices)
+    say(f"\n{table_text(choices)}")
+
+
+def memories_of(text: str) -> tuple[str, ...]:
+    """The memories named in a list separated by commas.
+
+    Raises:
+        PersistError: when there is nothing to choose for one.
+    """
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
+    for name in names:
+        if name not in TRIALS:
+            raise PersistError(f"no choices for memory {name!r}; {hint(name, list(TRIALS))}")
+    return names
+
+
+def main() -> None:
+    """Make the choices of some memories, and end with the exit code of a command that fails."""
+    parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.choose")
+    parser.add_argument("out", type=Path, help="folder of everything")
+    parser.add_argument("--base", default="reference", help="stage-1 run or checkpoint that all stand on")
+    parser.add_argument("--data", action="append", type=Path, required=True, help="training houses; may be repeated")
+    parser.add_argument("--validation", action="append", type=Path, help="validation houses; collected by default")
+    parser.add_argument("--memories", default=",".join(TRIALS), help="separated by commas")
+    parser.add_argument("--steps", type=int, default=Plan.steps, help="optimizer steps of a trial")
+    parser.add_argument("--clips", type=int, default=Plan.clips, help="most clips of an evaluation")
+    options = parser.parse_args()
+    validation = tuple(options.validation or default_validation(options.out))
+    try:
+        memories = memories_of(options.memories)
+        for memory in memories:
+            make_recipe(read_recipe(RECIPE + memory), RECIPE + memory)
+        run_choose(
+            Plan(options.out, options.base, tuple(options.data), validation, memories, options.steps, options.clips)
+        )
+    except PersistError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

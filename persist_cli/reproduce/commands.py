@@ -1,0 +1,36 @@
+"""Commands of persist, each run in a process of its own, as a user would type them."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Final
+
+from persist_cli.errors import INTERRUPTED
+from persist_cli.viewing.console import say
+
+COLLECT: Final = "collect miniworld --size 64x64"
+
+
+def run_command(command: Sequence[str]) -> int:
+    """Run a command and return its exit code; after Ctrl-C the command is given the time to end."""
+    interrupts: list[int] = []
+    previous = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))  # a child does not inherit it
+    try:
+        code = subprocess.run(command, check=False).returncode
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    return INTERRUPTED if interrupts else code
+
+
+def run_line(line: str) -> None:
+    """Run a command of persist in a process of its own; end this one with its exit code when it fails."""
+    say(f"\n$ persist {line}")
+    code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
+    if code == INTERRUPTED:
+        say("stopped; the same command goes on here")
+    if code:
+        sys.exit(code)

@@ -1,0 +1,144 @@
+"""Choices are made for each memory by itself, by figures on validation houses, and are not made again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from persist_cli.api.backbone import Sampling
+from persist_cli.cli.app import app
+from persist_cli.errors import PersistError
+from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
+from persist_cli.reproduce import choose
+from persist_cli.reproduce.choose import (
+    FIRST,
+    RECIPE,
+    TRIALS,
+    Plan,
+    Trial,
+    best_of,
+    chosen_costs,
+    chosen_sampling,
+    default_validation,
+    eval_command,
+    memories_of,
+    preparations,
+    recipe_file,
+    result_folder,
+    run_choose,
+    train_command,
+)
+from tests.support.example_results import example_results
+
+HOUSES = (Path("runs/houses"),)
+
+
+def plan(out: Path, *memories: str) -> Plan:
+    """The plan of some memories with validation houses of its own."""
+    return Plan(out, "reference", HOUSES, default_validation(out), memories or tuple(TRIALS))
+
+
+@pytest.mark.parametrize("memory", TRIALS)
+def test_every_trial_is_a_recipe_and_commands_that_persist_takes(memory: str, tmp_path: Path) -> None:
+    asked = plan(tmp_path / "two words", memory)
+    for name, overrides in TRIALS[memory].items():
+        values = apply_overrides(read_recipe(RECIPE + memory), overrides)
+        assert make_recipe(values, name).memory.name == memory  # type: ignore[union-attr]
+        for line in (
+            *preparations(asked),
+            train_command(asked, memory, name),
+            eval_command(asked, memory, name, FIRST),
+        ):
+            command, *arguments = shlex.split(line)
+            found = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+            while hasattr(found, "commands"):
+                found = found.commands[arguments.pop(0)]
+            found.make_context(command, arguments)
+
+
+def test_only_validation_houses_are_measured(tmp_path: Path) -> None:
+    asked = plan(tmp_path)
+    collected = [line for line in preparations(asked) if line.startswith("collect")]
+    assert all("--split validation" in line for line in collected)
+    words = shlex.split(eval_command(asked, "voxel", "6cm", FIRST))
+    data = [words[place + 1] for place, word in enumerate(words) if word == "--data"]
+    assert data == [*map(str, asked.validation)]
+
+
+def test_the_lowest_cost_is_chosen_and_of_equal_ones_the_first() -> None:
+    def trial(name: str, cost: float | None) -> Trial:
+        return Trial(name, (), FIRST, {"lpips-alex": cost}, 8, 4)
+
+    assert best_of([trial("a", 0.3), trial("b", 0.2), trial("c", 0.2), trial("d", None)]).name == "b"
+
+
+@pytest.fixture
+def measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[str]]:
+    """A folder in which evaluations find the lower LPIPS the more a clip is guided, and the commands that ran."""
+    lines: list[str] = []
+
+    def run(line: str) -> None:
+        lines.append(line)
+        words = shlex.split(line)
+        if words[0] != "eval":
+            return
+        results = example_results(clips=8)
+        guidance, finer = float(words[words.index("--guidance") + 1]), "64x64" in words[1]
+        for table in results["tables"]:
+            row = json.loads(json.dumps(table["rows"]["voxel"]))
+            row["columns"]["lpips-alex"] = row["columns"]["psnr"] | {"mean": 0.5 - 0.1 * guidance - 0.05 * finer}
+            table["rows"] = {words[words.index("--memories") + 1]: row}
+        folder = Path(words[words.index("--out") + 1])
+        folder.mkdir(parents=True)
+        (folder / "metrics.json").write_text(json.dumps(results))
+
+    monkeypatch.setattr(choose, "run_line", run)
+    return tmp_path, lines
+
+
+def test_settings_are_chosen_before_sampling_and_all_is_written(measured: tuple[Path, list[str]]) -> None:
+    out, lines = measured
+    run_choose(plan(out, "snapshots"))
+    choice = json.loads((out / "choices.json").read_text())["memories"]["snapshots"]
+    assert (choice["name"], choice["sampling"]["memory_guidance"]) == ("64x64", 2.0)
+    assert chosen_sampling(out) == {"snapshots": Sampling(4, "unipc", 2.0)}
+    assert chosen_costs(out) == {"snapshots": pytest.approx(0.25)}
+    assert len(choice["trials"]) == len(TRIALS["snapshots"]) + 2 + 4
+    trained = {shlex.split(line)[shlex.split(line).index("--out") + 1] for line in lines if line.startswith("finetune")}
+    assert trained == {str(out / "runs/snapshots" / name) for name in TRIALS["snapshots"]}
+    assert "**64x64**" in (out / "choices.md").read_text()
+    assert "validation houses" in choice["reason"]
+
+
+def test_the_recipe_that_is_written_has_what_was_chosen(measured: tuple[Path, list[str]]) -> None:
+    out, _ = measured
+    run_choose(plan(out, "snapshots"))
+    recipe = make_recipe(read_recipe(str(recipe_file(out, "snapshots"))), "chosen")
+    assert recipe.memory is not None
+    assert recipe.memory.settings["grid"] == [64, 64]
+    assert recipe.memory.encoder == "patches"
+    assert recipe.adapter["token_budget"] == 32768
+
+
+def test_what_was_measured_is_not_measured_again(measured: tuple[Path, list[str]]) -> None:
+    out, lines = measured
+    run_choose(plan(out, "none"))
+    before = len(lines)
+    run_choose(plan(out, "none"))
+    assert [line for line in lines[before:] if line.startswith(("finetune", "eval"))] == []
+    assert result_folder(plan(out), "none", "64-tokens", FIRST).is_dir()
+
+
+def test_before_anything_is_chosen_an_error_says_what_chooses(tmp_path: Path) -> None:
+    with pytest.raises(PersistError, match=r"choices.json: not there yet; `python -m persist_cli.reproduce.choose"):
+        chosen_sampling(tmp_path)
+
+
+def test_a_memory_without_choices_is_an_error_that_names_the_nearest() -> None:
+    assert memories_of("voxel, none,voxel") == ("voxel", "none")
+    with pytest.raises(PersistError, match="no choices for memory 'voxels'; did you mean 'voxel'"):
+        memories_of("voxels")
