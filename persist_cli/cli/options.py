@@ -43,7 +43,7 @@ SamplingOfOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="MEMORY:KEY=VALUE,...",
-        help="Other sampling for one memory's rows, as in voxel:steps=4,sampler=unipc,guidance=1.5; may be given again.",
+        help="Other sampling of one memory's rows, as in voxel:steps=4,sampler=unipc,guidance=1; may be repeated.",
     ),
 ]
 

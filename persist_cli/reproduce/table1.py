@@ -224,7 +224,8 @@ def revisit_options(out: Path) -> str:
 def named(memories: Sequence[str], chosen: Chosen) -> str:
     """The options of some memories, each sampled as was chosen for it."""
     own = [
-        f"--sampling-of {memory}:steps={sampling.steps},sampler={sampling.sampler},guidance={sampling.memory_guidance:g}"
+        f"--sampling-of {memory}:steps={sampling.steps},sampler={sampling.sampler},"
+        f"guidance={sampling.memory_guidance:g}"
         for memory in memories
         if (sampling := chosen.sampling.get(memory)) is not None
     ]
