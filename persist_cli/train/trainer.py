@@ -153,7 +153,7 @@ class Trainer:
                 f"--cache: in stage {recipe.stage} backbone {backbone.name!r} keeps nothing of a clip; leave it out"
             )
         keeps_features = self.factory is not None and self.factory.encoder.costly
-        if not repeats and not keeps_features and (recipe.stage == "2" or not backbone.framewise):
+        if not repeats and not keeps_features and not backbone.framewise:
             raise RecipeError(
                 "--cache: with data.clips_per_trajectory=0 hardly a clip comes twice; give it, as in "
                 "data.clips_per_trajectory=32, or leave --cache out"
