@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.support.micro_runs import MICRO_SETTINGS, run_persist, stage, write_walks
+from tests.support.micro_runs import MICRO_SETTINGS, run_persist, stage, write_loops, write_walks
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ["PERSIST_REFERENCE"] = os.devnull  # tests bring their own model, unless they test the packaged one
@@ -91,6 +91,12 @@ def fresh_accelerator() -> Iterator[None]:
 def walks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of two 32×32 walks of 24 frames through the furnished room, there and back, by named actions."""
     return write_walks(tmp_path_factory.mktemp("walks"))
+
+
+@pytest.fixture(scope="session")
+def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of two 32×32 walks of 24 frames in scenes that no model was trained on; they come back another way."""
+    return write_loops(tmp_path_factory.mktemp("held-out"))
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ from persist_cli.cli.options import (
     GuidanceOption,
     JsonOption,
     MemoriesOption,
+    NewPosesOption,
     SamplerOption,
     SamplingOfOption,
     SaveMemoryOption,
@@ -333,6 +334,10 @@ def evaluate(
     training_seeds: Annotated[
         bool, typer.Option("--training-seeds", help="Checkpoints whose recipes differ in seeds alone are one row.")
     ] = False,
+    new_poses: NewPosesOption = (0.2, 10.0),
+    allow_training_scenes: Annotated[
+        bool, typer.Option("--allow-training-scenes", help="Evaluate scenes of the training, too; results say so.")
+    ] = False,
     resample: Annotated[
         str, typer.Option(help="What intervals draw: scenes (houses), or clips where all are of one place.")
     ] = "scenes",
@@ -355,6 +360,7 @@ def evaluate(
     if not data:
         raise PersistError("give --data DATA (--data sample comes with persist), or --compare A.json B.json")
     from persist_cli.evaluate.evaluate import run_eval
+    from persist_cli.evaluate.new_poses import NewPoses
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
@@ -364,6 +370,7 @@ def evaluate(
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), batch=batch, noise=pose_noise,
         placement=InferenceOptions.of(dtype, save_memory), resample=resample,
         training_seeds=training_seeds, sampling_of=SamplingOverrides.by_memory(sampling_of or ()),
+        new_poses=NewPoses(*new_poses), allow_training_scenes=allow_training_scenes,
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

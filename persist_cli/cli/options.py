@@ -74,6 +74,15 @@ ControlsOption = Annotated[
     ),
 ]
 
+NewPosesOption = Annotated[
+    tuple[float, float],
+    typer.Option(
+        "--new-poses",
+        metavar="METRES DEGREES",
+        help="A frame counts if no frame in memory is nearer than both; 0 0 counts every frame.",
+    ),
+]
+
 CompareOption = Annotated[
     tuple[Path, Path] | None,
     typer.Option("--compare", metavar="A.json B.json", help="Compare two results instead."),

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from persist_cli.evaluate.columns import Column, chosen_frames, make_columns
+from persist_cli.evaluate.columns import Column, chosen_frames, make_columns, without_known_poses
 from persist_cli.evaluate.journal import TRUTH
 from persist_cli.evaluate.metric_suite import CELLS, FEATURES, FIGURES, READS, WEIGHTS, MetricSuite
 from persist_cli.evaluate.plan import Evaluation
@@ -66,8 +66,8 @@ class RowResults:
 
     @cached_property
     def figures(self) -> Tensor:
-        """Every figure ``[model, seed, clip, frame, metric]``, read once for all tables and curves."""
-        return self.gather(FIGURES)
+        """Every figure ``[model, seed, clip, frame, metric]``, read once; NaN at frames that do not count."""
+        return without_known_poses(self.suite.frame_metrics.values(), self.run.cases, self.gather(FIGURES))
 
     def gather(self, name: str) -> Tensor:
         """A tensor of the journal for every training seed, sampling seed and clip, ``[model, seed, clip, …]``."""

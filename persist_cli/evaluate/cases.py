@@ -19,6 +19,8 @@ from persist_cli.data.clips import interactions_of
 from persist_cli.data.store import SUFFIX, TrajectoryFile
 from persist_cli.io.files import file_sha256
 
+LISTS = ("seen_before", "first_visits", "counted")  # values of a case, one for each frame
+
 
 @dataclass(frozen=True)
 class Case:
@@ -32,7 +34,9 @@ class Case:
         frames: length of the clip, the given frame included.
         context: number of frames at the trajectory's beginning that the memory is made of before the clip.
         seen_before: for each frame the share of its view that the frames in memory have seen, ``None`` if unknown.
-        first_visits: for each frame the number of the clip's earlier frame that it returns to, -1 for none.
+        first_visits: for each frame the number of the clip's earlier frame whose place it returns to, -1 for none; see
+            ``returning_frames``.
+        counted: for each frame whether its pose is new, so that it counts, see ``NewPoses``.
     """
 
     data: str
@@ -43,6 +47,7 @@ class Case:
     context: int
     seen_before: tuple[float | None, ...]
     first_visits: tuple[int, ...]
+    counted: tuple[bool, ...]
 
     @property
     def file(self) -> TrajectoryFile:
@@ -52,7 +57,7 @@ class Case:
     @staticmethod
     def from_json(values: dict[str, Any]) -> Case:
         """The case that ``dataclasses.asdict`` wrote as JSON."""
-        lists = {key: tuple(values[key]) for key in ("seen_before", "first_visits")}
+        lists = {key: tuple(values[key]) for key in LISTS}
         return Case(**(values | lists))
 
 
@@ -76,7 +81,7 @@ class CaseFrames:
 
     @property
     def first_visits(self) -> Int64[Tensor, " frame"]:
-        """For each frame the number of the earlier frame that it returns to, -1 for none."""
+        """For each frame the number of the earlier frame whose place it returns to, -1 for none."""
         return torch.tensor(self.case.first_visits, dtype=torch.int64)
 
 
@@ -91,6 +96,11 @@ def read_case(case: Case) -> CaseFrames:
         context=file.read(slice(0, case.context)).observations if case.context else None,
         info=clip.info,
     )
+
+
+def counts(cases: Sequence[Case]) -> tuple[int, int]:
+    """How many predicted frames of the cases count, and how many there are."""
+    return sum(sum(case.counted[1:]) for case in cases), sum(case.frames - 1 for case in cases)
 
 
 def hash_trajectories(cases: Sequence[Case]) -> list[dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -30,7 +30,7 @@ SUFFIXES: dict[FrameSelection, tuple[str, str, str]] = {
     "return": (
         "-return",
         " at return",
-        "at the frames only that return to an earlier pose over more than one predicted clip",
+        "at the frames only that return to an earlier place over more than one predicted clip",
     ),
     "new": ("-new", " where new", f"at frames of whose view less than {FAMILIAR:.0%} was seen before only"),
 }
@@ -101,3 +101,13 @@ def chosen_frames(cases: Sequence[Case], frames: FrameSelection, clip_frames: in
         chosen = torch.tensor(shares) < FAMILIAR
     chosen[:, 0] = False
     return chosen
+
+
+def without_known_poses(metrics: Iterable[FrameMetric], cases: Sequence[Case], figures: Tensor) -> Tensor:
+    """Figures ``[…, clip, frame, metric]`` with NaN at frames that do not count, see ``NewPoses``.
+
+    Metrics that do not compare a frame with the true one of its pose keep all of them.
+    """
+    counted = torch.tensor([case.counted for case in cases])[..., None]
+    kept = counted | ~torch.tensor([metric.compares_with_truth for metric in metrics], dtype=torch.bool)
+    return figures.where(kept, torch.nan)

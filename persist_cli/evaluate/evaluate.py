@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 from persist_cli.api.checkpoint import reference_checkpoint
 from persist_cli.data.reference import data_folder
 from persist_cli.evaluate.aggregate import Table, row_results
-from persist_cli.evaluate.cases import Case, cases_json
+from persist_cli.evaluate.cases import Case, cases_json, counts
 from persist_cli.evaluate.columns import column_json, make_columns
 from persist_cli.evaluate.example_clips import make_pictures
 from persist_cli.evaluate.journal import Processes
@@ -69,6 +70,7 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
 def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
     """The results and all that is needed to measure them again, as JSON values."""
     info = run.cases[0].file.info
+    counted, predicted = counts(run.cases)
     rows = row_results(run)
     return {
         "format": "persist-evaluation",
@@ -77,8 +79,11 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
             "protocol": {
                 "name": run.protocol.name,
                 "title": run.protocol.title,
-                "definition": run.protocol.definition,
+                "definition": f"{run.protocol.definition}; {run.plan.new_poses.definition}",
                 "frames": run.cases[0].frames,
+                "new_poses": dataclasses.asdict(run.plan.new_poses),
+                "counted_frames": counted,
+                "predicted_frames": predicted,
             },
             "data": [data | {"splits": splits_of(run.cases, data["path"])} for data in run.journal.data()],
             "image_size": [info.height, info.width],
@@ -97,6 +102,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
         | run.plan.placement.changes(),
         "statistics": {"resampled": run.plan.resample, "resamples": RESAMPLES, "least": LEAST_UNITS},
         "warnings": contamination_warnings(run.checkpoints, run.cases),
+        "training_scenes_allowed": run.plan.allow_training_scenes,
         "environment": environment(processes),
         "command": command(),
         "checkpoints": [

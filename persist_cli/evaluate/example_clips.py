@@ -9,6 +9,7 @@ from torch import Tensor
 
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.cases import read_case
+from persist_cli.evaluate.columns import without_known_poses
 from persist_cli.evaluate.journal import ExampleClip, Unit
 from persist_cli.evaluate.measure import SHEET_CLIPS, predict
 from persist_cli.evaluate.metric_suite import FIGURES, VIDEO
@@ -68,7 +69,8 @@ def row_pictures(run: Evaluation, domains: dict[str, list[int]], loader: Backbon
 
 def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
     """The first metric's mean over the predicted frames of each clip, at the first seed."""
-    return run.journal.gather(row, 0, run.batches, FIGURES)[:, 1:, 0].nanmean(dim=1)
+    figures = run.journal.gather(row, 0, run.batches, FIGURES)
+    return without_known_poses(run.suites[row].frame_metrics.values(), run.cases, figures)[:, 1:, 0].nanmean(dim=1)
 
 
 def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Metric) -> list[int]:

@@ -18,6 +18,7 @@ from persist_cli.evaluate.backbones import BackboneLoader, check_bases, common_s
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.journal import Journal, Processes, Unit
 from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_setup
+from persist_cli.evaluate.new_poses import NEW_POSES, NewPoses
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, Protocol
 from persist_cli.evaluate.provenance import checkpoint_json, metric_json, scenes_of, trained_on, training_scenes
 from persist_cli.evaluate.report.remarks import contamination
@@ -27,6 +28,8 @@ from persist_cli.evaluate.statistics import RESAMPLE_UNITS
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
 from persist_cli.viewing.console import busy, warn
+
+ALLOW = "take data of another split, or measure it all the same with --allow-training-scenes"
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,8 @@ class EvalPlan:
     resample: str = "scenes"  # one of ``RESAMPLE_UNITS``
     training_seeds: bool = False
     sampling_of: Mapping[str, SamplingOverrides] = field(default_factory=dict)  # of the rows of some memories
+    new_poses: NewPoses = NEW_POSES
+    allow_training_scenes: bool = False
 
     def without_repeats(self) -> EvalPlan:
         """This plan without repeated names, because a memory named twice would be two rows of one name."""
@@ -134,6 +139,7 @@ def prepare(
         {memory: replace(sampling, **own.requested()) for memory, own in plan.sampling_of.items()},
     )  # fmt: skip
     config.check()
+    plan.new_poses.check()
     if plan.resample not in RESAMPLE_UNITS:
         raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
     if plan.protocol not in PROTOCOLS:
@@ -142,14 +148,15 @@ def prepare(
     with busy("loading the models"):
         bases = check_bases(checkpoints, plan.data, [sampling, *config.sampling_of.values()], loader)
     models = build_model_rows(checkpoints, config, protocol)  # unknown memories are reported before clips are sought
-    search = ClipSearch(plan.data, plan.frames, plan.clips, bases.frames_per_clip - 1, training_scenes(checkpoints))
+    search = ClipSearch(
+        plan.data, plan.frames, plan.clips, bases.frames_per_clip - 1, training_scenes(checkpoints), plan.new_poses
+    )
     journal = Journal(out)
     if processes.main:
         values = identity(plan, sampling, checkpoints, metrics)
         journal.check(values)
         if journal.cases() is None:
-            warn(f"finding clips for the protocol {protocol.name!r} in {search.where}")
-            cases = protocol.find(search)
+            cases = find_cases(protocol, search, plan)
             build_control_rows(models, checkpoints, config, protocol, cases)  # controls may not suit the clips
             with busy("hashing the data"):
                 journal.begin(values, cases)
@@ -168,6 +175,18 @@ def prepare(
     return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
 
 
+def find_cases(protocol: Protocol, search: ClipSearch, plan: EvalPlan) -> list[Case]:
+    """Find the clips.
+
+    Raises:
+        DataError: when there is none, or when a model was trained on a scene of the data, unless the plan allows it.
+    """
+    if not plan.allow_training_scenes:
+        protocol.refuse_training_scenes(search, ALLOW)
+    warn(f"finding clips for the protocol {protocol.name!r} in {search.where}")
+    return protocol.find(search)
+
+
 def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], search: ClipSearch) -> None:
     """Say when there are fewer clips than asked for, and whether a checkpoint was trained on their scenes."""
     if len(cases) < search.limit:
@@ -184,7 +203,7 @@ def contamination_warnings(checkpoints: Sequence[Checkpoint], cases: Sequence[Ca
     """A line for each checkpoint that is known to have been trained on scenes of the cases."""
     scenes = scenes_of(cases)
     known = [(str(checkpoint.folder), trained_on(checkpoint, cases)) for checkpoint in checkpoints]
-    return [contamination(folder, names, len(scenes)) for folder, names in known if names]
+    return [contamination(folder, names, len(scenes), allowed=True) for folder, names in known if names]
 
 
 def identity(
@@ -193,7 +212,7 @@ def identity(
     """JSON values of all that changes a figure, but for the data: an evaluation with equal values goes on."""
     options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
     options |= {"sampling": asdict(sampling) | plan.placement.changes()}
-    for name in ("placement", "controls_named", "resample", "training_seeds"):
+    for name in ("placement", "controls_named", "resample", "training_seeds", "allow_training_scenes"):
         del options[name]  # what is left of them changes no measured figure
     if not plan.sampling_of:
         del options["sampling_of"]  # as in evaluations that an earlier version began

@@ -19,6 +19,7 @@ from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.coverage import GRID, held_frames, recalled_share, seen_share
+from persist_cli.evaluate.new_poses import NEW_POSES, RETURN_DEGREES, RETURN_METRES, NewPoses, returning_frames
 from persist_cli.viewing.console import watched
 
 FrameSelection = Literal["all", "last", "return", "new"]  # frames of a clip that a column is the mean over
@@ -33,6 +34,10 @@ RETURN_FRAMES = 49  # of a clip that returns, when half of the trajectories come
 
 LEAST_RETURN_FRAMES = 5
 
+LEAST_RETURNING = 8  # at least one in so many frames of a clip comes back by another way
+
+START_STRIDE = 4  # frames between the starts of clips that are tried
+
 LEAST_LONG_FRAMES = 112  # frames to predict, as in the paper
 
 
@@ -46,6 +51,7 @@ class ClipSearch:
         limit: greatest number of clips.
         predicted_at_once: frames that the backbone predicts at once.
         training_scenes: names of scenes that a model is known to have been trained on.
+        new_poses: which frames count.
     """
 
     folders: Sequence[Path]
@@ -53,6 +59,7 @@ class ClipSearch:
     limit: int
     predicted_at_once: int
     training_scenes: frozenset[str] = frozenset()
+    new_poses: NewPoses = NEW_POSES
 
     @property
     def where(self) -> str:
@@ -87,10 +94,25 @@ class Protocol(ABC):
             DataError: one line, when there is none.
         """
 
+    def first_scored(self, file: TrajectoryFile) -> int:
+        """The number of the first frame of a trajectory that may be predicted."""
+        return 0
+
+    def refuse_training_scenes(self, search: ClipSearch, way_out: str) -> None:
+        """Raise ``DataError`` when a model was trained on what a data set shows from its first scored frame on.
+
+        Args:
+            search: names the data sets and the training scenes.
+            way_out: what the user may do, the end of the message.
+        """
+        for file in search.trajectories():
+            if was_trained_on(file.info, search.training_scenes, self.first_scored(file)):
+                raise DataError(f"{file.path}: the model was trained on its scene {file.info.scene!r}; {way_out}")
+
     def make_case(
         self, file: TrajectoryFile, seen: Observations, where: tuple[int, int, int], search: ClipSearch
     ) -> Case:
-        """Make a case that returns to no earlier pose.
+        """Make a case that returns to no earlier place.
 
         Args:
             file: the trajectory.
@@ -99,10 +121,9 @@ class Protocol(ABC):
             search: says how many frames are predicted at once.
         """
         start, frames, context = where
-        shares = [
-            seen_share(seen, start + frame, held_frames(start, context, frame, search.predicted_at_once, self.writes))
-            for frame in range(frames)
-        ]
+        held = [held_frames(start, context, frame, search.predicted_at_once, self.writes) for frame in range(frames)]
+        shares = [seen_share(seen, start + frame, numbers) for frame, numbers in enumerate(held)]
+        poses = seen.cameras.world_from_camera
         return Case(
             data=str(file.path.parent),
             trajectory=file.name,
@@ -112,6 +133,7 @@ class Protocol(ABC):
             context=context,
             seen_before=tuple(shares),
             first_visits=(-1,) * frames,
+            counted=search.new_poses.counted(poses, start, held),
         )
 
 
@@ -122,7 +144,8 @@ class Revisit(Protocol):
     title = "Places seen before"
     definition = (
         f"at least {LEAST_RECALLED:.0%} of the clip's last view (a grid of {GRID}×{GRID} pixels) was seen by frames "
-        "before the clip and not from its first frame; memory of all true frames up to the first; nothing is written"
+        "before the clip and not from its first frame, and most of its frames count, the last among them; memory of "
+        "all true frames up to the first; nothing is written"
     )
     writes = False
     selections = ("all", "last", "new")
@@ -131,20 +154,20 @@ class Revisit(Protocol):
         """Find the clips with the most to recall, taking turns over trajectories, disjoint within each."""
         frames = search.frames or search.predicted_at_once + 1
         files = watched(search.trajectories(), "what returns", "trajectories")
-        ranked = [self.rank_starts(file, frames) for file in files]
+        ranked = [self.rank_starts(file, frames, search.new_poses) for file in files]
         turns = range(max(map(len, ranked), default=0))
         chosen = [
             (starts[turn], number) for turn in turns for number, starts in enumerate(ranked) if turn < len(starts)
         ]
         if not chosen:
             raise DataError(
-                f"{search.where}: no clip of {frames} frames returns to a place seen before; collect with "
-                "--policy there-and-back or longer trajectories, or evaluate with --protocol long"
+                f"{search.where}: no clip of {frames} frames returns to a place seen before, by poses that are new; "
+                "collect with --policy loop or longer trajectories, or evaluate with --protocol long"
             )
         return self.make_cases(chosen[: search.limit], frames, search)
 
-    def rank_starts(self, file: TrajectoryFile, frames: int) -> list[int]:
-        """Starts of disjoint clips of one trajectory that recall enough, the most first."""
+    def rank_starts(self, file: TrajectoryFile, frames: int, new_poses: NewPoses) -> list[int]:
+        """Starts of disjoint clips of one trajectory that recall enough at poses that are new, the most first."""
         if len(file) < frames + 2:
             return []
         seen = file.read().observations
@@ -154,7 +177,8 @@ class Revisit(Protocol):
                 "before; evaluate it with --protocol return or long"
             )
         first = min(frames, len(file) - frames)  # short trajectories still have something before their clip
-        starts = range(first, len(file) - frames + 1, max(1, (frames - 1) // 2))
+        every = range(first, len(file) - frames + 1, max(1, (frames - 1) // 2))
+        starts = [start for start in every if mostly_new(seen.cameras.world_from_camera, start, frames, new_poses)]
         shares = {start: recalled_share(seen, start, start + frames - 1) for start in starts}
         enough = [start for start in starts if shares[start] >= LEAST_RECALLED]
         disjoint: list[int] = []
@@ -190,8 +214,7 @@ class Unseen(Revisit):
         for file in search.trajectories():
             if file.info.source.get("split") == "train":
                 raise DataError(f"{file.path}: its scene is of the training split; collect with --split test")
-            if was_trained_on(file.info, search.training_scenes):
-                raise DataError(f"{file.path}: the model was trained on its scene {file.info.scene!r}")
+        self.refuse_training_scenes(search, "this protocol measures unseen scenes alone")
         cases: list[Case] = []
         for folder in search.folders:
             cases += super().find(dataclasses.replace(search, folders=[folder]))
@@ -208,6 +231,10 @@ class Later(Revisit):
         "each beginning in the middle of the one before; memory of all true frames up to the first; nothing is written"
     )
     selections = ("all", "last", "new")
+
+    def first_scored(self, file: TrajectoryFile) -> int:
+        """The number of the first frame that is held out."""
+        return int(file.info.source.get(HELD_OUT_FROM, 0))
 
     def find(self, search: ClipSearch) -> list[Case]:
         """Find the clips of every capture in the order of its frames."""
@@ -226,54 +253,61 @@ class Later(Revisit):
 
 
 class ThereAndBack(Protocol):
-    """The protocol of the paper's SRC: go somewhere and return by the reversed actions."""
+    """The protocol of returns: go somewhere and come back, by another way or by the reversed actions."""
 
     name = "return"
     title = "There and back"
     definition = (
-        f"there and back by the same poses (within {SAME_METRES} m and {SAME_DEGREES:g}°), after a path that leaves "
-        f"its first pose by more than {AWAY_METRES} m or {AWAY_DEGREES:g}°; the memory begins empty and is written "
-        "with the given frame and the model's own output"
+        f"a frame returns if its pose is within {RETURN_METRES:g} m and {RETURN_DEGREES:g}° of an earlier frame that "
+        "is in memory when it is predicted, over more than one predicted clip and after the camera was farther from "
+        "that one; the nearest is its first visit; the memory begins empty and is written with the given frame and the "
+        "model's own output"
     )
     writes = True
     selections = ("all", "return")
     guards = ("copy", "truth")  # a frozen video has the best SRC, the truth not quite
 
     def find(self, search: ClipSearch) -> list[Case]:
-        """Find one clip in each trajectory that turns round and comes back far enough, all of one length."""
-        poses: dict[Path, Tensor] = {}
-        turns: dict[Path, tuple[int, int]] = {}
-        for file in watched(search.trajectories(), "turning points", "trajectories"):
-            poses[file.path] = file.poses()
-            turns[file.path] = turning_point(poses[file.path])
-        lengths = sorted(length for _, length in turns.values() if length >= LEAST_RETURN_FRAMES)
-        frames = search.frames or min(RETURN_FRAMES, lengths[len(lengths) // 2] if lengths else RETURN_FRAMES)
+        """Find one clip in each trajectory that comes back, all of one length."""
+        found: dict[Path, tuple[Tensor, int, int]] = {}
+        for file in watched(search.trajectories(), "what comes back", "trajectories"):
+            found[file.path] = (file.poses(), *turning_point(file.poses()))
+        frames = search.frames or self.usual_frames(list(found.values()), search)
         cases: list[Case] = []
         for file in watched(search.trajectories(), "seen before", "trajectories"):
-            twice, length = turns[file.path]
-            if length < max(frames, LEAST_RETURN_FRAMES) or len(cases) == search.limit:
+            poses, twice, length = found[file.path]
+            if len(cases) == search.limit or len(poses) < max(frames, LEAST_RETURN_FRAMES):
                 continue
-            start = (twice - frames + 1) // 2
-            if goes_away(poses[file.path][start : start + frames]):
-                cases.append(self.make_returning_case(file, start, frames, twice, search))
+            start = (twice - frames + 1) // 2 if length >= frames else best_start(poses, frames, search)
+            if start is not None and goes_away(poses[start : start + frames]):
+                cases.append(self.make_returning_case(file, start, frames, search))
         if not cases:
-            longest = max((length for _, length in turns.values()), default=0)
             raise DataError(
-                f"{search.where}: no trajectory goes away and comes back by the same poses within {frames} "
-                f"frames (the longest there and back has {longest}); collect with --policy there-and-back, or evaluate "
-                "with --protocol revisit or long"
+                f"{search.where}: no trajectory goes away and comes back within {frames} frames; collect with --policy "
+                "loop (another way) or there-and-back (the same poses), or evaluate with --protocol revisit or long"
             )
         return cases
 
-    def make_returning_case(
-        self, file: TrajectoryFile, start: int, frames: int, twice: int, search: ClipSearch
-    ) -> Case:
-        """Make a case whose later frames return to its earlier ones; ``twice`` is that of ``turning_point``."""
+    def usual_frames(self, found: Sequence[tuple[Tensor, int, int]], search: ClipSearch) -> int:
+        """The length of a clip with which half of the trajectories that come back have one.
+
+        Args:
+            found: for each trajectory its poses, and what ``turning_point`` says of them.
+            search: says how many frames are predicted at once and which count.
+        """
+        lengths = [
+            len(poses) if best_start(poses, len(poses), search) is not None else mirrored
+            for poses, _, mirrored in found
+        ]
+        enough = sorted(length for length in lengths if length >= LEAST_RETURN_FRAMES)
+        return min(RETURN_FRAMES, enough[len(enough) // 2]) if enough else RETURN_FRAMES
+
+    def make_returning_case(self, file: TrajectoryFile, start: int, frames: int, search: ClipSearch) -> Case:
+        """Make a case whose later frames return to its earlier ones."""
         seen = file.read(slice(0, start + frames)).observations
         case = self.make_case(file, seen, (start, frames, 0), search)
-        partners = [twice - (start + number) - start for number in range(frames)]
-        visits = [earlier if 0 <= earlier < number - 1 else -1 for number, earlier in enumerate(partners)]
-        return dataclasses.replace(case, first_visits=tuple(visits))
+        poses = seen.cameras.world_from_camera[start:]
+        return dataclasses.replace(case, first_visits=returning_frames(poses, visits_before(frames, search)))
 
 
 class Long(Protocol):
@@ -329,6 +363,36 @@ def turning_point(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, int]:
         if length > best[1]:
             best = (twice, length)
     return best
+
+
+def best_start(poses: Float[Tensor, "frame 4 4"], frames: int, search: ClipSearch) -> int | None:
+    """The first frame of the clip with the most frames that return and count; ``None`` where too few do."""
+    most, best = max(1, frames // LEAST_RETURNING) - 1, None
+    for start in range(0, len(poses) - frames + 1, START_STRIDE):
+        clip = poses[start : start + frames]
+        held = held_in_clip(frames, search)
+        counted, visits = search.new_poses.counted(clip, 0, held), returning_frames(clip, visits_before(frames, search))
+        count = sum(new and earlier >= 0 for new, earlier in zip(counted, visits, strict=True))
+        if count > most:
+            most, best = count, start
+    return best
+
+
+def held_in_clip(frames: int, search: ClipSearch) -> list[list[int]]:
+    """For each frame of a clip the numbers in it of the frames in memory, which begins empty and is written."""
+    return [held_frames(0, 0, frame, search.predicted_at_once, writes=True) for frame in range(frames)]
+
+
+def visits_before(frames: int, search: ClipSearch) -> list[list[int]]:
+    """For each frame of a clip the numbers of those in memory over more than one predicted clip before it."""
+    held = enumerate(held_in_clip(frames, search))
+    return [[number for number in numbers if frame - number > search.predicted_at_once] for frame, numbers in held]
+
+
+def mostly_new(poses: Float[Tensor, "frame 4 4"], start: int, frames: int, new_poses: NewPoses) -> bool:
+    """Whether the last frame and at least half of a clip count, where memory holds every frame up to the first."""
+    counted = new_poses.counted(poses, start, [range(start + 1)] * frames)
+    return counted[-1] and sum(counted[1:]) >= (frames - 1) / 2
 
 
 def same_poses(first: Float[Tensor, "pose 4 4"], second: Float[Tensor, "pose 4 4"]) -> Bool[Tensor, " pose"]:

@@ -110,7 +110,13 @@ class Metric(ABC):
 
 
 class FrameMetric(Metric):
-    """A metric that has a figure for each frame."""
+    """A metric that has a figure for each frame.
+
+    ``compares_with_truth`` says that a frame is compared with the true one of its pose. Where the memory holds a frame
+    of almost that pose, a copy would be enough, so such frames are left out of its means.
+    """
+
+    compares_with_truth: ClassVar[bool] = True
 
     @abstractmethod
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:

@@ -31,6 +31,7 @@ class PsnrOwn(FrameMetric):
     name = "psnr-own"
     title = "PSNR to own first visit"
     better = "higher"
+    compares_with_truth = False
     definition = f"dB {VIEWS}, over the pixels that both see; an exact copy counts as 100"
 
     def obstacle(self, setup: Setup) -> str | None:
@@ -52,6 +53,7 @@ class LpipsOwn(LpipsAlex):
 
     name = "lpips-own"
     title = "LPIPS to own first visit"
+    compares_with_truth = False
     weights = (LpipsAlex.name,)
 
     @property

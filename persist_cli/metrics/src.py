@@ -49,6 +49,7 @@ class ReturnSimilarity(FrameMetric):
 
     pairing: ClassVar[str]
     pooling: ClassVar[str] = "mean of patch tokens"
+    compares_with_truth = False
 
     @abstractmethod
     def pairs(self, prediction: Prediction) -> dict[int, tuple[int, int]]:

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from persist_cli.evaluate.cases import Case
-from persist_cli.evaluate.columns import chosen_frames, make_columns
+from persist_cli.evaluate.columns import chosen_frames, make_columns, without_known_poses
 from persist_cli.evaluate.metric_suite import choose_metrics
 from persist_cli.evaluate.protocols import PROTOCOLS
 from persist_cli.metrics import METRICS
 
 
-def case(seen_before, first_visits=(-1, -1, -1, -1)):
-    return Case("data", "walk", "room", 0, 4, 0, seen_before, first_visits)
+def case(seen_before, first_visits=(-1, -1, -1, -1), counted=(False, True, True, True)):
+    return Case("data", "walk", "room", 0, 4, 0, seen_before, first_visits, counted)
 
 
 @pytest.mark.parametrize(("frames", "chosen"), [("all", [1, 2, 3]), ("last", [3]), ("return", [2]), ("new", [1, 2])])
 def test_a_column_is_the_mean_over_its_frames_and_never_over_the_given_first_frame(frames, chosen):
     cases = [case((0.0, 0.1, 0.89, 0.9), (-1, -1, 0, -1))]
     assert chosen_frames(cases, frames)[0].nonzero()[:, 0].tolist() == chosen
+
+
+def test_a_copy_of_a_remembered_frame_enters_no_mean_but_that_of_a_metric_without_the_truth():
+    figures = torch.tensor([0.0, 100.0, 20.0, 30.0])[:, None].expand(4, 2)[None]  # of both metrics
+    metrics = choose_metrics(("psnr", "src"), METRICS)
+    kept = without_known_poses(
+        [metrics["psnr"], metrics["src"]], [case((0.0,) * 4, counted=(False, False, True, True))], figures
+    )
+    assert kept[0, :, 0].nanmean() == 25.0
+    assert torch.equal(kept[0, :, 1], figures[0, :, 1])
 
 
 def test_views_without_depth_do_not_count_as_new():

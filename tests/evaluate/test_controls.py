@@ -34,8 +34,8 @@ def backbone(stage1):
 
 
 @pytest.fixture(scope="module")
-def revisits(walks):
-    return [read_case(case) for case in PROTOCOLS["revisit"].find(ClipSearch([walks], 0, 8, 8))]
+def revisits(held_out):
+    return [read_case(case) for case in PROTOCOLS["revisit"].find(ClipSearch([held_out], 0, 8, 8))]
 
 
 def test_a_view_warped_into_itself_is_itself():
@@ -80,8 +80,8 @@ def test_the_nearest_frame_at_a_pose_seen_before_is_the_true_one(backbone, revis
         assert (rgb[0] == revisits[0].observations.rgb).all(-1).float().mean() > 0.9
 
 
-def test_the_nearest_frame_is_taken_from_what_the_memory_holds_by_then(backbone, walks):
-    case = PROTOCOLS["return"].find(ClipSearch([walks], 0, 1, 8))[0]
+def test_the_nearest_frame_is_taken_from_what_the_memory_holds_by_then(backbone, held_out):
+    case = PROTOCOLS["return"].find(ClipSearch([held_out], 0, 1, 8))[0]
     clip = read_case(case)
     row = Nearest("nearest", None, writes=True)
     assert row.held(clip, 8, 8).nonzero()[:, 0].tolist() == [0]
@@ -90,12 +90,12 @@ def test_the_nearest_frame_is_taken_from_what_the_memory_holds_by_then(backbone,
     assert torch.equal(rgb[0, 8], clip.observations.rgb[0])
 
 
-def test_the_codec_gives_as_many_frames_as_the_clip_has(backbone, walks):
-    clip = read_case(PROTOCOLS["return"].find(ClipSearch([walks], 0, 1, 8))[0])
+def test_the_codec_gives_as_many_frames_as_the_clip_has(backbone, held_out):
+    clip = read_case(PROTOCOLS["return"].find(ClipSearch([held_out], 0, 1, 8))[0])
     rgb, depth = CodecReconstruction("codec", None).videos(backbone, [clip], [0])
     assert rgb.shape[1] == depth.shape[1] == len(clip.observations) == 24
     assert torch.equal(rgb[0, 0], clip.observations.rgb[0])
 
 
-def test_walks_have_the_24_frames_that_these_tests_count_on(walks):
-    assert {len(file) for file in Store(walks)} == {24}
+def test_walks_have_the_24_frames_that_these_tests_count_on(held_out):
+    assert {len(file) for file in Store(held_out)} == {24}

@@ -38,10 +38,10 @@ def run(*arguments):
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(voxel, walks, tmp_path_factory):
+def uninterrupted(voxel, held_out, tmp_path_factory):
     """The folder of an evaluation that was not interrupted."""
     out = tmp_path_factory.mktemp("eval") / "whole"
-    run("eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out, "--report", out / "report")
+    run("eval", voxel, "--data", held_out, *QUICK, "--batch", 1, "--out", out, "--report", out / "report")
     return out
 
 
@@ -75,7 +75,7 @@ def test_the_results_hold_all_that_is_needed_to_measure_again(uninterrupted, vox
         "chosen": "named on the command line", "steps": 2, "sampler": "ddim", "memory_guidance": 1.0,
         "context_noise": 0.0, "seeds": [0, 1], "batch": 1,
     }  # fmt: skip
-    assert len(values["measured"]["data"][0]["trajectories"]["walk-0"]) == 64
+    assert len(values["measured"]["data"][0]["trajectories"]["loop-0"]) == 64
     assert values["measured"]["metrics"]["psnr"]["definition"].startswith("dB")
     assert values["checkpoints"][0]["name"] == voxel.name
     assert len(values["checkpoints"][0]["recipe_sha256"]) == len(values["checkpoints"][0]["adapters"]["voxel"]) == 64
@@ -86,12 +86,12 @@ def test_eval_leaves_a_report_with_clips_of_every_row(uninterrupted):
     report = uninterrupted / "report"
     assert {"report.html", "table.md", "table.tex", "results.json"} <= {path.name for path in report.iterdir()}
     assert list((report / "clips").glob("*voxel*best*.mp4"))
-    assert list((report / "sheets").glob("*rows-walk-0*.png"))
+    assert list((report / "sheets").glob("*rows-loop-0*.png"))
 
 
-def test_a_killed_eval_goes_on_to_the_same_figures(uninterrupted, voxel, walks, tmp_path):
+def test_a_killed_eval_goes_on_to_the_same_figures(uninterrupted, voxel, held_out, tmp_path):
     out = tmp_path / "eval"
-    command = [str(part) for part in [*PERSIST, "eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out]]
+    command = [str(part) for part in [*PERSIST, "eval", voxel, "--data", held_out, *QUICK, "--batch", 1, "--out", out]]
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while running.poll() is None and len(list(out.glob("parts/row-*"))) < 3:
         time.sleep(0.02)
@@ -100,36 +100,36 @@ def test_a_killed_eval_goes_on_to_the_same_figures(uninterrupted, voxel, walks, 
     before = {path: path.stat().st_mtime_ns for path in out.glob("parts/row-*")}
     assert len(before) >= 3
     assert not (out / "metrics.json").exists()
-    run("eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", out)
+    run("eval", voxel, "--data", held_out, *QUICK, "--batch", 1, "--out", out)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert tables(out) == tables(uninterrupted)
 
 
-def test_two_processes_give_the_same_figures_as_one(uninterrupted, voxel, walks, tmp_path):
-    command = ["eval", voxel, "--data", walks, *QUICK, "--batch", 1, "--out", tmp_path / "eval"]
+def test_two_processes_give_the_same_figures_as_one(uninterrupted, voxel, held_out, tmp_path):
+    command = ["eval", voxel, "--data", held_out, *QUICK, "--batch", 1, "--out", tmp_path / "eval"]
     run_persist_in_two_processes(*map(str, command))
     assert results(tmp_path / "eval")["environment"]["processes"] == 2
     assert tables(tmp_path / "eval") == tables(uninterrupted)
 
 
-def test_figures_do_not_depend_on_the_batch_size(persist, uninterrupted, voxel, walks, tmp_path):
-    command = ["eval", voxel, "--data", walks, *QUICK, "--batch", 2, "--controls", "copy", "--out", tmp_path]
+def test_figures_do_not_depend_on_the_batch_size(persist, uninterrupted, voxel, held_out, tmp_path):
+    command = ["eval", voxel, "--data", held_out, *QUICK, "--batch", 2, "--controls", "copy", "--out", tmp_path]
     assert persist(*command).code == 0
     columns = [tables(folder)[0]["rows"]["voxel"]["columns"]["psnr"] for folder in (tmp_path, uninterrupted)]
     assert columns[0]["per_clip"] == pytest.approx(columns[1]["per_clip"], abs=0.05)
 
 
-def test_another_evaluation_in_the_folder_is_refused(persist, uninterrupted, voxel, walks):
-    ended = persist("eval", voxel, "--data", walks, *QUICK, "--batch", 2, "--out", uninterrupted)
+def test_another_evaluation_in_the_folder_is_refused(persist, uninterrupted, voxel, held_out):
+    ended = persist("eval", voxel, "--data", held_out, *QUICK, "--batch", 2, "--out", uninterrupted)
     assert ended.code == 1
     assert "holds another evaluation (batch: 1, now 2); choose another --out" in ended.err
 
 
-def test_rows_of_checkpoints_with_one_name_show_their_folders(persist, voxel, stage1, walks, tmp_path):
+def test_rows_of_checkpoints_with_one_name_show_their_folders(persist, voxel, stage1, held_out, tmp_path):
     shutil.copytree(stage1, tmp_path / "stage1")
     shutil.copytree(voxel, tmp_path / "voxel")
     options = ["--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1, "--controls", "codec"]
-    ended = persist("eval", voxel, tmp_path / "voxel", voxel, "--data", walks, *options, "--out", tmp_path / "o")
+    ended = persist("eval", voxel, tmp_path / "voxel", voxel, "--data", held_out, *options, "--out", tmp_path / "o")
     assert ended.code == 0, ended.err
     rows = tables(tmp_path / "o")[0]["rows"]
     assert len(rows) == 3
@@ -138,9 +138,9 @@ def test_rows_of_checkpoints_with_one_name_show_their_folders(persist, voxel, st
     assert one == two
 
 
-def test_a_metric_that_cannot_be_measured_gives_its_reason_and_leaves_the_others(persist, voxel, walks, tmp_path):
+def test_a_metric_that_cannot_be_measured_gives_its_reason_and_leaves_the_others(persist, voxel, held_out, tmp_path):
     options = ["--memories", "stage1", "--metrics", "psnr,fvd,src", "--seeds", 1, "--steps", 2, "--controls", "copy"]
-    ended = persist("eval", voxel, "--data", walks, *options, "--out", tmp_path)
+    ended = persist("eval", voxel, "--data", held_out, *options, "--out", tmp_path)
     assert ended.code == 0, ended.err
     columns = tables(tmp_path)[0]["rows"]["stage1"]["columns"]
     assert columns["psnr"]["mean"] > 0
@@ -148,24 +148,26 @@ def test_a_metric_that_cannot_be_measured_gives_its_reason_and_leaves_the_others
     assert "return" in columns["src"]["na"]
 
 
-def test_two_runs_are_compared_only_when_they_measured_the_same_clips(persist, uninterrupted, voxel, walks, tmp_path):
+def test_two_runs_are_compared_only_when_they_measured_the_same_clips(
+    persist, uninterrupted, voxel, held_out, tmp_path
+):
     same = persist("eval", "--compare", uninterrupted / "metrics.json", uninterrupted / "metrics.json")
     assert same.code == 0, same.err
     options = ["--memories", "stage1", "--metrics", "psnr", "--steps", 2, "--seeds", 1, "--clips", 1]
-    ended = persist("eval", voxel, "--data", walks, *options, "--controls", "copy", "--out", tmp_path)
+    ended = persist("eval", voxel, "--data", held_out, *options, "--controls", "copy", "--out", tmp_path)
     assert ended.code == 0, ended.err
     refused = persist("eval", "--compare", uninterrupted / "metrics.json", tmp_path / "metrics.json")
     assert refused.code == 1
     assert "clip" in refused.err
 
 
-def test_an_encoder_that_does_not_fit_the_checkpoint_is_one_line(persist, voxel, stage1, walks, tmp_path):
+def test_an_encoder_that_does_not_fit_the_checkpoint_is_one_line(persist, voxel, stage1, held_out, tmp_path):
     shutil.copytree(stage1, tmp_path / "runs" / "stage1")
     shutil.copytree(voxel, tmp_path / "runs" / "voxel")
     (card,) = (tmp_path / "runs" / "voxel").glob("step-*/model/adapters/voxel/memory.json")
     write_json(card, read_json(card) | {"encoder": "patches", "encoder_settings": {"channels": 5}})
     run = tmp_path / "runs" / "voxel"
-    ended = persist("eval", run, "--data", walks, "--memories", "voxel", "--steps", 1, "--out", tmp_path / "o")
+    ended = persist("eval", run, "--data", held_out, "--memories", "voxel", "--steps", 1, "--out", tmp_path / "o")
     assert ended.code == 1
     assert [line for line in ended.err.splitlines() if line.startswith("error: ")] == ended.err.splitlines()[-1:]
 
@@ -186,20 +188,20 @@ def test_an_encoder_that_does_not_fit_the_checkpoint_is_one_line(persist, voxel,
         (["--protocol", "long"], "no trajectory has 113 frames"),
     ],
 )
-def test_an_impossible_evaluation_is_one_line_and_leaves_no_folder(persist, voxel, walks, tmp_path, options, cause):
-    ended = persist("eval", voxel, "--data", walks, "--memories", "voxel", *options, "--out", tmp_path / "o")
+def test_an_impossible_evaluation_is_one_line_and_leaves_no_folder(persist, voxel, held_out, tmp_path, options, cause):
+    ended = persist("eval", voxel, "--data", held_out, "--memories", "voxel", *options, "--out", tmp_path / "o")
     assert (ended.code, cause in ended.err) == (1, True), ended.err
     assert not (tmp_path / "o").exists()
 
 
-def test_eval_without_checkpoint_or_trajectories_names_what_is_missing(persist, voxel, walks, tmp_path):
+def test_eval_without_checkpoint_or_trajectories_names_what_is_missing(persist, voxel, held_out, tmp_path):
     assert "give --data DATA" in persist("eval", voxel).err
-    assert "give a CHECKPOINT" in persist("eval", "--data", walks).err
+    assert "give a CHECKPOINT" in persist("eval", "--data", held_out).err
     assert "no trajectory" in persist("eval", voxel, "--data", tmp_path, "--memories", "voxel").err
 
 
-def test_data_without_depth_is_measured_by_metrics_and_controls_that_need_none(persist, voxel, walks, tmp_path):
-    data, command = without_depth(walks, tmp_path / "data"), ["--memories", "voxel", "--seeds", 1, "--steps", 1]
+def test_data_without_depth_is_measured_by_metrics_and_controls_that_need_none(persist, voxel, held_out, tmp_path):
+    data, command = without_depth(held_out, tmp_path / "data"), ["--memories", "voxel", "--seeds", 1, "--steps", 1]
     common = ["--protocol", "return", *command, "--metrics", "psnr,absrel", "--out", tmp_path / "o"]
     refused = persist("eval", voxel, "--data", data, *common, "--controls", "copy,warp")
     assert "the control 'warp' needs depth, which the data does not have; leave it out of --controls" in refused.err
@@ -214,10 +216,10 @@ def test_data_without_depth_is_measured_by_metrics_and_controls_that_need_none(p
 
 
 @pytest.fixture
-def one_room(walks, tmp_path):
-    """The walks, of one room alone."""
+def one_room(held_out, tmp_path):
+    """The held_out, of one room alone."""
     (tmp_path / "data").mkdir()
-    shutil.copy(next(walks.glob("*.parquet")), tmp_path / "data")
+    shutil.copy(next(held_out.glob("*.parquet")), tmp_path / "data")
     return tmp_path / "data"
 
 
@@ -237,18 +239,31 @@ def test_one_scene_leaves_the_default_control_shuffled_a_row_of_na_with_its_reas
         1,
     ]
     refused = persist(*command, "--controls", "shuffled", "--out", tmp_path / "o")
-    assert "the control 'shuffled' needs clips of two scenes, all are of 'room-" in refused.err
+    assert "the control 'shuffled' needs clips of two scenes, all are of 'held-out-" in refused.err
     assert not (tmp_path / "o").exists()
     ended = persist(*command, "--out", tmp_path / "o", "--report", tmp_path / "r")
     assert ended.code == 0, ended.err
     assert re.search(r"│ voxel, shuffled +│ +n/a \(1\) │", ended.out)
-    assert "n/a (1): needs clips of two scenes, all are of 'room-" in ended.out
+    assert "n/a (1): needs clips of two scenes, all are of 'held-out-" in ended.out
     assert "needs clips of two scenes" in (tmp_path / "r/report.html").read_text()
     assert persist(*command, "--out", tmp_path / "o").code == 0  # a finished evaluation goes on to the same
 
 
-def test_fewer_clips_than_asked_for_are_counted_aloud(persist, voxel, walks, tmp_path):
-    command = ["eval", voxel, "--data", walks, "--memories", "stage1", "--metrics", "psnr", "--seeds", 1, "--steps", 1]
+def test_fewer_clips_than_asked_for_are_counted_aloud(persist, voxel, held_out, tmp_path):
+    command = [
+        "eval",
+        voxel,
+        "--data",
+        held_out,
+        "--memories",
+        "stage1",
+        "--metrics",
+        "psnr",
+        "--seeds",
+        1,
+        "--steps",
+        1,
+    ]
     options = ["--controls", "copy", "--out", tmp_path / "o"]
     assert "2 clips found, 5 asked for" in persist(*command, *options, "--clips", 5).err
     both = persist(*command, *options[:-1], tmp_path / "p", "--clips", 2, "--json")
@@ -257,7 +272,22 @@ def test_fewer_clips_than_asked_for_are_counted_aloud(persist, voxel, walks, tmp
 
 
 def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, voxel, walks, tmp_path):
-    command = ["eval", voxel, "--data", walks, "--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1]
+    flags = ["--allow-training-scenes", "--new-poses", 0, 0]
+    command = [
+        "eval",
+        voxel,
+        *flags,
+        "--data",
+        walks,
+        "--memories",
+        "voxel",
+        "--metrics",
+        "psnr",
+        "--seeds",
+        1,
+        "--steps",
+        1,
+    ]
     ended = persist(*command, "--controls", "copy", "--out", tmp_path / "o", "--report", tmp_path / "r")
     warning = "was trained on 2 of these 2 scenes (room-0 to room-1); its figures are not of unseen scenes"
     assert warning in ended.err
@@ -268,8 +298,8 @@ def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, vox
     assert known["evaluated"] == ["room-0", "room-1"]
 
 
-def test_eval_prints_one_table_and_leaves_the_others_beside_the_results(persist, voxel, walks, tmp_path):
-    command = ["eval", voxel, "--data", walks, "--memories", "stage1,voxel", "--seeds", 2, "--steps", 1]
+def test_eval_prints_one_table_and_leaves_the_others_beside_the_results(persist, voxel, held_out, tmp_path):
+    command = ["eval", voxel, "--data", held_out, "--memories", "stage1,voxel", "--seeds", 2, "--steps", 1]
     ended = persist(*command, "--out", tmp_path)
     assert ended.out.count("┏") == 1
     assert len(ended.out.splitlines()) <= 25

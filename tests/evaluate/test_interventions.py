@@ -24,8 +24,8 @@ from persist_cli.evaluate.rows.interventions import (
 
 
 @pytest.fixture(scope="module")
-def cases(walks):
-    return PROTOCOLS["revisit"].find(ClipSearch([walks], 0, 8, 8))
+def cases(held_out):
+    return PROTOCOLS["revisit"].find(ClipSearch([held_out], 0, 8, 8))
 
 
 def test_a_shuffled_memory_holds_another_scene_moved_to_where_the_clip_begins(cases):
@@ -49,8 +49,8 @@ def test_the_oracle_holds_the_frames_of_the_clip_and_the_emptied_memory_none(cas
     assert Emptied().context(clip) is None
 
 
-def test_noisy_poses_have_errors_of_the_given_deviations(walks):
-    seen = Store(walks)[0].read().observations
+def test_noisy_poses_have_errors_of_the_given_deviations(held_out):
+    seen = Store(held_out)[0].read().observations
     many = seen[[0] * 4000]
     wrong = NoisyPoses(5.0, 2.0).disturb(many, torch.Generator().manual_seed(0))
     metres, degrees = pose_differences(many.cameras.world_from_camera, wrong.cameras.world_from_camera)
@@ -59,8 +59,8 @@ def test_noisy_poses_have_errors_of_the_given_deviations(walks):
     assert torch.equal(wrong.rgb, many.rgb)
 
 
-def test_noise_of_no_deviation_changes_no_pose(walks):
-    seen = Store(walks)[0].read().observations
+def test_noise_of_no_deviation_changes_no_pose(held_out):
+    seen = Store(held_out)[0].read().observations
     same = NoisyPoses(0.0, 0.0).disturb(seen, torch.Generator().manual_seed(0))
     assert torch.equal(same.cameras.world_from_camera, seen.cameras.world_from_camera)
 

@@ -38,18 +38,18 @@ def refused(persist, *command):
     return ended.err.strip().splitlines()[-1]
 
 
-def test_checkpoints_whose_cards_give_different_samplings_need_options_that_name_one(persist, walks, tmp_path):
+def test_checkpoints_whose_cards_give_different_samplings_need_options_that_name_one(persist, held_out, tmp_path):
     a = write_model(tmp_path / "a", 0.1, {"steps": 1, "sampler": "ddim"})
     b = write_model(tmp_path / "b", 0.2, {"steps": 2, "sampler": "unipc", "memory_guidance": 1.5})
     for pair in ((a, b), (b, a)):
-        error = refused(persist, "eval", *pair, "--data", walks, *ONE, "--out", tmp_path / "o")
+        error = refused(persist, "eval", *pair, "--data", held_out, *ONE, "--out", tmp_path / "o")
         assert "a/voxel means 1 steps of ddim with guidance 1" in error
         assert "b/voxel means 2 steps of unipc with guidance 1.5" in error
         assert error.endswith("; name --steps, --sampler, --guidance and --context-noise")
     assert not (tmp_path / "o").exists()
     named = ["--steps", 1, "--sampler", "unipc", "--guidance", 1]
-    assert persist("eval", a, b, "--data", walks, *ONE, *named, "--out", tmp_path / "o").code == 0
-    assert persist("eval", b, "--data", walks, *ONE, "--out", tmp_path / "p").code == 0
+    assert persist("eval", a, b, "--data", held_out, *ONE, *named, "--out", tmp_path / "o").code == 0
+    assert persist("eval", b, "--data", held_out, *ONE, "--out", tmp_path / "p").code == 0
     sampled = read_json(tmp_path / "p/metrics.json")["sampling"]
     assert (sampled["steps"], sampled["sampler"], sampled["memory_guidance"]) == (2, "unipc", 1.5)
 
@@ -61,16 +61,16 @@ def test_checkpoints_whose_cards_give_different_samplings_need_options_that_name
         ({"frames": 17}, "b/voxel predicts clips of 17 frames and"),
     ],
 )
-def test_a_base_that_does_not_take_the_clips_is_refused(persist, walks, tmp_path, settings, cause):
+def test_a_base_that_does_not_take_the_clips_is_refused(persist, held_out, tmp_path, settings, cause):
     a, b = write_model(tmp_path / "a"), write_model(tmp_path / "b", 0.2, **settings)
-    error = refused(persist, "eval", a, b, "--data", walks, *ONE, "--steps", 1, "--out", tmp_path / "o")
+    error = refused(persist, "eval", a, b, "--data", held_out, *ONE, "--steps", 1, "--out", tmp_path / "o")
     assert cause in error
     assert not (tmp_path / "o").exists()
 
 
-def test_only_rows_of_a_model_without_depth_lack_depth_metrics(persist, walks, tmp_path):
+def test_only_rows_of_a_model_without_depth_lack_depth_metrics(persist, held_out, tmp_path):
     a, b = write_model(tmp_path / "a"), write_model(tmp_path / "b", 0.2, depth=False)
-    command = ["eval", a, b, "--data", walks, "--memories", "voxel", "--metrics", "psnr,absrel,drift"]
+    command = ["eval", a, b, "--data", held_out, "--memories", "voxel", "--metrics", "psnr,absrel,drift"]
     options = ["--controls", "codec", "--seeds", 1, "--clips", 1, "--steps", 1]
     ended = persist(*command, *options, "--out", tmp_path / "o", "--report", tmp_path / "r")
     assert ended.code == 0, ended.err
@@ -82,8 +82,8 @@ def test_only_rows_of_a_model_without_depth_lack_depth_metrics(persist, walks, t
     assert (tmp_path / "r/report.html").is_file()
 
 
-def test_an_evaluation_does_not_go_on_with_trajectories_that_changed(persist, walks, tmp_path):
-    voxel, data = write_model(tmp_path), shutil.copytree(walks, tmp_path / "data")
+def test_an_evaluation_does_not_go_on_with_trajectories_that_changed(persist, held_out, tmp_path):
+    voxel, data = write_model(tmp_path), shutil.copytree(held_out, tmp_path / "data")
     command = ["eval", voxel, "--data", data, *ONE, "--steps", 1, "--out", tmp_path / "o"]
     assert persist(*command).code == 0
     measured = read_json(tmp_path / "o/metrics.json")["measured"]
@@ -96,9 +96,9 @@ def test_an_evaluation_does_not_go_on_with_trajectories_that_changed(persist, wa
     assert "not what it was" in refused(persist, *command)
 
 
-def test_memories_and_data_named_twice_are_measured_once(persist, walks, tmp_path):
+def test_memories_and_data_named_twice_are_measured_once(persist, held_out, tmp_path):
     voxel, named = write_model(tmp_path), ["--memories", "voxel,voxel", "--metrics", "psnr", "--controls", "copy"]
-    twice = [*named, "--data", walks, "--data", walks, "--seeds", 1, "--steps", 1]
+    twice = [*named, "--data", held_out, "--data", held_out, "--seeds", 1, "--steps", 1]
     ended = persist("eval", voxel, *twice, "--out", tmp_path / "o")
     assert ended.code == 0, ended.err
     rows = columns(tmp_path / "o")
@@ -106,8 +106,8 @@ def test_memories_and_data_named_twice_are_measured_once(persist, walks, tmp_pat
     assert len(rows["voxel"]["psnr"]["per_clip"]) == 2
 
 
-def test_a_second_report_of_a_finished_evaluation_predicts_nothing(persist, walks, tmp_path, monkeypatch):
-    command = ["eval", write_model(tmp_path), "--data", walks, *ONE, "--steps", 1, "--out", tmp_path / "o"]
+def test_a_second_report_of_a_finished_evaluation_predicts_nothing(persist, held_out, tmp_path, monkeypatch):
+    command = ["eval", write_model(tmp_path), "--data", held_out, *ONE, "--steps", 1, "--out", tmp_path / "o"]
     assert persist(*command, "--report", tmp_path / "a").code == 0
     for module in ("measure", "example_clips"):
         monkeypatch.setattr(f"persist_cli.evaluate.{module}.predict", lambda *_: pytest.fail("predicts again"))
@@ -117,16 +117,16 @@ def test_a_second_report_of_a_finished_evaluation_predicts_nothing(persist, walk
     assert len(first) == 3
 
 
-def test_unseen_refuses_the_training_scenes_of_an_exported_model(persist, stage1, voxel, walks, tmp_path):
+def test_unseen_refuses_the_training_scenes_of_an_exported_model(persist, stage1, voxel, held_out, tmp_path):
     assert persist("export", stage1, voxel, "--out", tmp_path / "model").code == 0
-    command = ["eval", tmp_path / "model", "--data", walks, "--protocol", "unseen", *ONE, "--out", tmp_path / "o"]
-    assert "the model was trained on its scene 'room-0'" in refused(persist, *command)
+    command = ["eval", tmp_path / "model", "--data", held_out, "--protocol", "unseen", *ONE, "--out", tmp_path / "o"]
+    assert "the model was trained on its scene 'held-out-0'" in refused(persist, *command)
     assert not (tmp_path / "o").exists()
 
 
-def test_another_precision_is_another_evaluation_and_slicing_the_codec_is_not(persist, walks, tmp_path):
+def test_another_precision_is_another_evaluation_and_slicing_the_codec_is_not(persist, held_out, tmp_path):
     model, out = write_model(tmp_path / "a"), tmp_path / "o"
-    run = ["eval", model, "--data", walks, *ONE, "--steps", 1, "--out", out]
+    run = ["eval", model, "--data", held_out, *ONE, "--steps", 1, "--out", out]
     assert persist(*run).code == 0
     assert persist(*run, "--save-memory", "vae-slicing").code == 0
     assert "dtype" not in read_json(out / "metrics.json")["sampling"]
@@ -136,10 +136,10 @@ def test_another_precision_is_another_evaluation_and_slicing_the_codec_is_not(pe
     assert read_json(tmp_path / "p/metrics.json")["sampling"]["dtype"] == "bfloat16"
 
 
-def test_without_names_a_baseline_and_the_memories_of_the_checkpoints_are_compared(persist, walks, tmp_path):
+def test_without_names_a_baseline_and_the_memories_of_the_checkpoints_are_compared(persist, held_out, tmp_path):
     model = write_model(tmp_path / "a")
     options = ("--metrics", "psnr", "--controls", "copy", "--seeds", 1, "--clips", 1, "--steps", 1)
-    ended = persist("eval", model, "--data", walks, *options, "--out", tmp_path / "o")
+    ended = persist("eval", model, "--data", held_out, *options, "--out", tmp_path / "o")
     assert ended.code == 0, ended.err
     assert list(columns(tmp_path / "o")) == ["stage1", "voxel", "copy of the first frame"]
 

@@ -8,31 +8,81 @@ import numpy as np
 import pytest
 import torch
 
-from persist_cli.api.geometry import pose_differences
+from persist_cli.api.geometry import near_poses, pose_differences
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.coverage import held_frames, recalled_share, seen_share
+from persist_cli.evaluate.new_poses import NEW_POSES, NewPoses, returning_frames
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, turning_point
 from tests.support.micro_runs import slow_turn, without_depth
 from tests.support.rooms import Room, look
 
+EVERY_POSE = NewPoses(0.0, 0.0)
 
-def search(folder, frames=0, scenes=()):
+
+def search(folder, frames=0, scenes=(), new_poses=NEW_POSES):
     """A search for at most eight clips, for a model that predicts eight frames at once."""
-    return ClipSearch([folder], frames, 8, 8, frozenset(scenes))
+    return ClipSearch([folder], frames, 8, 8, frozenset(scenes), new_poses)
+
+
+def world_from_camera(case):
+    """The poses of a case's trajectory and the numbers of the frames that its memory holds by each frame."""
+    held = [held_frames(case.start, case.context, frame, 8, not case.context) for frame in range(case.frames)]
+    return case.file.poses(), held
+
+
+@pytest.mark.parametrize("protocol", ["revisit", "return"])
+def test_no_frame_in_memory_is_near_the_pose_of_a_frame_that_counts(walks, held_out, protocol):
+    for folder in (walks, held_out):
+        for case in PROTOCOLS[protocol].find(search(folder)) if folder == held_out or protocol == "return" else []:
+            poses, held = world_from_camera(case)
+            for frame, numbers in enumerate(held):
+                near = near_poses(poses[case.start + frame][None], poses[numbers], 0.2, 10.0)
+                assert case.counted[frame] != bool(near.any())
+
+
+def test_a_way_back_through_the_same_poses_has_no_clip_of_new_ones(walks):
+    with pytest.raises(DataError, match=r"by poses that are new; collect with --policy loop"):
+        PROTOCOLS["revisit"].find(search(walks))
+    for case in PROTOCOLS["return"].find(search(walks)):  # it may still be measured by what needs no truth
+        assert (case.first_visits[-1], case.counted[-1]) == (0, False)
+
+
+def test_a_frame_first_visits_an_earlier_one_that_is_near_but_not_the_same(held_out):
+    cases = PROTOCOLS["return"].find(search(held_out))
+    assert len(cases) == 2
+    for case in cases:
+        poses = read_case(case).observations.cameras.world_from_camera
+        pairs = [(number, earlier) for number, earlier in enumerate(case.first_visits) if earlier >= 0]
+        assert sum(case.counted[number] for number, _ in pairs) >= 3
+        assert all(number - earlier > 8 for number, earlier in pairs)  # over more than one predicted clip
+        metres, degrees = pose_differences(*(poses[list(numbers)] for numbers in zip(*pairs, strict=True)))
+        assert metres.max() <= 1.0
+        assert degrees.max() <= 35.0
+
+
+def test_a_camera_that_never_left_does_not_return():
+    poses = torch.from_numpy(slow_turn(5))
+    assert returning_frames(poses, [range(frame) for frame in range(5)]) == (-1,) * 5
+    assert returning_frames(torch.cat([poses, torch.from_numpy(slow_turn(12))[[11, 0]]]), [range(5)] * 7)[-1] == 0
+
+
+def test_limits_of_zero_let_every_frame_count(walks):
+    (case, *_) = PROTOCOLS["revisit"].find(search(walks, new_poses=EVERY_POSE))
+    assert case.counted == (True,) * case.frames
 
 
 def test_clips_of_a_revisit_are_on_the_way_back(walks):
     seen = Store(walks)[0].read().observations
-    cases = PROTOCOLS["revisit"].find(search(walks))
+    cases = PROTOCOLS["revisit"].find(search(walks, new_poses=EVERY_POSE))
     assert len(cases) == 2
     assert all(recalled_share(seen, case.start, case.start + 8) > 0.3 for case in cases if case.trajectory == "walk-0")
     assert recalled_share(seen, 9, 9) == 0
 
 
 def test_a_revisit_remembers_every_frame_up_to_the_first_and_none_of_the_clip(walks):
-    case = PROTOCOLS["revisit"].find(search(walks))[0]
+    case = PROTOCOLS["revisit"].find(search(walks, new_poses=EVERY_POSE))[0]
     clip = read_case(case)
     assert case.context == case.start + 1
     assert torch.equal(clip.context.rgb[-1], clip.observations.rgb[0])
@@ -48,15 +98,16 @@ def test_a_path_that_never_returns_has_no_clip_to_evaluate(tmp_path):
         PROTOCOLS["return"].find(search(tmp_path))
 
 
-def test_first_visits_of_there_and_back_have_the_same_pose(walks):
+def test_the_first_visit_of_a_there_and_back_is_the_frame_of_the_same_pose_once_that_is_in_memory(walks):
     for case in PROTOCOLS["return"].find(search(walks)):
         poses = read_case(case).observations.cameras.world_from_camera
         pairs = [(number, visit) for number, visit in enumerate(case.first_visits) if visit >= 0]
-        assert len(pairs) >= 9
-        metres, degrees = pose_differences(*(poses[list(numbers)] for numbers in zip(*pairs, strict=True)))
+        same = [(number, visit) for number, visit in pairs if number + visit == case.frames - 1]
+        assert len(same) >= 5
+        metres, degrees = pose_differences(*(poses[list(numbers)] for numbers in zip(*same, strict=True)))
         assert metres.max() < 0.02
         assert degrees.max() < 2.0
-        assert pairs[-1] == (case.frames - 1, 0)
+        assert same[-1] == (case.frames - 1, 0)
         assert case.context == 0
 
 
@@ -84,10 +135,10 @@ def test_a_long_clip_needs_112_frames_to_predict(walks, tmp_path):
     assert case.seen_before[100] > 0.9  # after a full turn
 
 
-def test_unseen_refuses_scenes_that_were_trained_on(walks, tmp_path):
+def test_unseen_refuses_scenes_that_were_trained_on(walks, held_out, tmp_path):
     with pytest.raises(DataError, match="trained on its scene 'room-1'"):
         PROTOCOLS["unseen"].find(search(walks, scenes=["room-1"]))
-    assert len(PROTOCOLS["unseen"].find(search(walks))) == 2
+    assert len(PROTOCOLS["unseen"].find(search(held_out))) == 2
     info = replace(Room(32, 32).info, source={"simulator": "miniworld", "split": "train"})
     write_trajectory(tmp_path / "a.parquet", info, Room(32, 32).frames(slow_turn(24)))
     with pytest.raises(DataError, match="of the training split"):

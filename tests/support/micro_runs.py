@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from persist_cli.api.actions import walking_actions
+from persist_cli.api.actions import ActionVocabulary, walking_actions
 from persist_cli.api.observations import Frame
 from persist_cli.cli.app import main
 from persist_cli.data.store import Store, write_trajectory
@@ -43,6 +43,11 @@ MICRO_SETTINGS = [
 SHORT = ["training.steps=4", "training.batch=2", "training.workers=0", "training.warmup=2"]
 
 OUT = ("left", "left", "forward", "left", "left", "forward", "left", "left", "left", "forward", "left")
+
+BACK = (  # another way back than that of OUT: no pose is within 0.2 m and 10° of one of the way out
+    *("backward", "backward", "right", "right", "right", "right"),
+    *("right", "backward", "right", "backward", "right", "right"),
+)
 
 PERSIST = [sys.executable, "-m", "persist_cli"]
 
@@ -113,17 +118,27 @@ def equal_runs(first: Path, second: Path) -> bool:
 
 def write_walks(folder: Path, size: int = SIZE) -> Path:
     """Write two trajectories, out and back by the reversed actions, in scenes of two names."""
-    room, vocabulary = Room(size, size), walking_actions(0.2, 15.0)
-    out = list(OUT)
+    vocabulary = walking_actions(0.2, 15.0)
+    return _write_two(folder, size, vocabulary, [*OUT, "pick_up", *vocabulary.reversed(list(OUT))], ("walk", "room"))
+
+
+def write_loops(folder: Path, size: int = SIZE) -> Path:
+    """Write two trajectories, out and back by another way, in scenes of two other names."""
+    return _write_two(folder, size, walking_actions(0.25, 15.0), [*OUT, *BACK], ("loop", "held-out"))
+
+
+def _write_two(
+    folder: Path, size: int, vocabulary: ActionVocabulary, actions: Sequence[str], names: tuple[str, str]
+) -> Path:
+    """Write the walk from two starts; ``names`` are those of trajectories and scenes, before their numbers."""
+    room = Room(size, size)
     for number, start in enumerate((look((0.0, 1.3, 0.2), 0.0, 0.0), look((0.3, 1.3, -0.2), 90.0, 0.0))):
-        actions = [*out, "pick_up", *vocabulary.reversed(out)]
         poses = [start, *vocabulary.follow(torch.from_numpy(start), actions, torch.tensor(UP).double()).numpy()]
-        names = [*actions, None]
-        frames: list[Frame] = [
-            room.see(pose, name, float(i)) for i, (pose, name) in enumerate(zip(poses, names, strict=True))
-        ]
-        info = replace(room.info, scene=f"room-{number}", vocabulary=vocabulary)
-        write_trajectory(folder / f"walk-{number}.parquet", info, frames)
+        steps = enumerate(zip(poses, [*actions, None], strict=True))
+        info = replace(room.info, scene=f"{names[1]}-{number}", vocabulary=vocabulary)
+        write_trajectory(
+            folder / f"{names[0]}-{number}.parquet", info, [room.see(pose, name, float(i)) for i, (pose, name) in steps]
+        )
     return folder
 
 

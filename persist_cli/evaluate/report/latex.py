@@ -10,6 +10,7 @@ from persist_cli.evaluate.report.remarks import (
     counted,
     drawn_units,
     left_out_line,
+    new_poses_line,
     sampling_line,
     too_few_lines,
     without_command,
@@ -58,7 +59,7 @@ def latex_tables(results: EvalResults) -> str:
         if table.left_out:
             blocks.append(f"% {left_out_line(table.left_out, commands=False)}\n")
     warnings = [f"% warning: {line}\n" for line in contamination_lines(results)]
-    return HEAD + "\n".join([*warnings, *blocks])
+    return HEAD + "\n".join([*warnings, f"% {new_poses_line(results)}\n", *blocks])
 
 
 def escape(text: str) -> str:

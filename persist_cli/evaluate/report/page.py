@@ -19,6 +19,7 @@ from persist_cli.evaluate.report.remarks import (
     drawn_units,
     known_scenes,
     left_out_line,
+    new_poses_line,
     seed_legend,
     too_few_lines,
     unknown_scenes_lines,
@@ -90,6 +91,7 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
     return jinja.get_template("report.html.jinja").render(
         results=results, sections=sections, warnings=contamination_lines(results),
         reads=read_rows(results), reads_heads=READS_HEADS, reads_title=READS_TITLE,
+        new_poses_line=new_poses_line(results),
         unknown_scenes=unknown_scenes_lines(results), known_scenes=known_scenes,
         too_few_lines=too_few_lines, left_out_line=left_out_line, seed_legend=seed_legend(results),
         drawn_units=drawn_units(results), scenes=len({(clip.data, clip.scene) for clip in results.measured.clips}),

@@ -111,28 +111,45 @@ def without_command(reason: str) -> str:
     return "; ".join(part.partition(": persist ")[0] for part in reason.split("; "))
 
 
+def new_poses_line(results: EvalResults) -> str:
+    """One line that says how many predicted frames count, and which; results of earlier versions counted all."""
+    protocol = results.measured.protocol
+    if protocol.new_poses is None or not (protocol.new_poses.metres and protocol.new_poses.degrees):
+        return "every predicted frame counts, also where the memory holds a frame of the same pose"
+    limits = f"{protocol.new_poses.metres:g} m and {protocol.new_poses.degrees:g}°"
+    whole = [title for name, title in (("fvd", "FVD"),) if name in results.measured.metrics]
+    return (
+        f"{protocol.counted_frames} of {protocol.predicted_frames} predicted frames count: those to which no frame in "
+        f"memory is nearer than {limits}" + f"; {', '.join(whole)}: whole videos" * bool(whole)
+    )
+
+
 def contamination_lines(results: EvalResults) -> list[str]:
     """A warning for each checkpoint that was trained on scenes of the evaluated clips."""
     total = len({clip.scene for clip in results.measured.clips})
     return [
-        contamination(record.path or record.name, record.training_scenes.evaluated, total)
+        contamination(
+            record.path or record.name, record.training_scenes.evaluated, total, results.training_scenes_allowed
+        )
         for record in results.checkpoints
         if record.training_scenes and record.training_scenes.evaluated
     ]
 
 
-def contamination(path: str, scenes: Sequence[str], total: int) -> str:
+def contamination(path: str, scenes: Sequence[str], total: int, allowed: bool) -> str:
     """A warning that a checkpoint was trained on some of the evaluated scenes.
 
     Args:
         path: folder of the checkpoint.
         scenes: names of the scenes that it was trained on and is evaluated on.
         total: number of scenes that it is evaluated on.
+        allowed: whether ``--allow-training-scenes`` was given.
     """
     ranges = [" to ".join([entry] if isinstance(entry, str) else entry) for entry in name_ranges(scenes)]
     names = ", ".join(ranges[:MOST_SCENES]) + ", …" * (len(ranges) > MOST_SCENES)
     which = f"{len(scenes)} of these {total} scenes" if total > 1 else "the evaluated scene"
-    return f"{run_folder(Path(path))} was trained on {which} ({names}); its figures are not of unseen scenes"
+    flag = " (--allow-training-scenes)" * allowed
+    return f"{run_folder(Path(path))} was trained on {which} ({names}); its figures are not of unseen scenes{flag}"
 
 
 def unknown_scenes_lines(results: EvalResults) -> list[str]:

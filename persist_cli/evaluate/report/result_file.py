@@ -36,13 +36,26 @@ class ResultModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
+class PoseLimits(ResultModel):
+    """A pose is new if no frame in memory is nearer than both."""
+
+    metres: float
+    degrees: float
+
+
 class ProtocolRecord(ResultModel):
-    """The protocol that chose the clips and filled the memory."""
+    """The protocol that chose the clips and filled the memory.
+
+    Of the predicted frames those count whose pose is new; results of earlier versions counted all.
+    """
 
     name: str
     title: str = ""
     definition: str = ""
     frames: int
+    new_poses: PoseLimits | None = None
+    counted_frames: int | None = None
+    predicted_frames: int | None = None
 
 
 class DataSet(ResultModel):
@@ -259,6 +272,7 @@ class EvalResults(ResultModel):
     measured: Measured
     sampling: SamplingRecord
     statistics: StatisticsRecord = StatisticsRecord()
+    training_scenes_allowed: bool = False
     environment: dict[str, Any] = {}
     command: list[str] = []
     checkpoints: list[CheckpointRecord] = []

@@ -14,6 +14,7 @@ from persist_cli.evaluate.report.remarks import (
     counted,
     difference_legend,
     left_out_line,
+    new_poses_line,
     sampling_line,
     too_few_lines,
     training_seed_line,
@@ -97,6 +98,7 @@ def lines_below(results: EvalResults, table: TerminalTable) -> list[str]:
     left_out = left_out_line(all_left_out(results))
     return [
         *([difference_legend(results, any(part.has_intervals for part in tables))] if table.differences else []),
+        new_poses_line(results),
         *dict.fromkeys(line for part in tables for line in too_few_lines(part.view)),
         *(f"{mark}: {note}" for number, note in sorted(notes.items()) if (mark := f"n/a ({number})") in shown),
         *([left_out] if left_out else []),

@@ -12,6 +12,7 @@ from persist_cli.evaluate.report.remarks import (
     contamination_lines,
     figure_legend,
     left_out_line,
+    new_poses_line,
     sampling_line,
     too_few_lines,
     training_seed_line,
@@ -66,6 +67,7 @@ def remark_lines(results: EvalResults) -> list[str]:
     rows = {row.name: row.definition for view in views for row in view.rows if row.definition}
     left_out = left_out_line(all_left_out(results))
     return [
+        new_poses_line(results),
         *dict.fromkeys(line for view in views for line in too_few_lines(view)),
         *([left_out] if left_out else []),
         *(f"n/a ({number}): {note}" for number, note in sorted(notes.items())),
