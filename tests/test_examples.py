@@ -11,7 +11,7 @@ import matplotlib
 import pytest
 
 from persist_cli.plugins import find_plugin
-from tests.support.micro_runs import stage
+from tests.support.micro_runs import stage, write_loops
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOK = EXAMPLES / "walk.ipynb"
@@ -81,7 +81,7 @@ def test_a_memory_of_ones_own_works_in_every_command(installed, persist, walks, 
     run("rollout", tmp_path / "model", *way, "--out", tmp_path / "again")
     rows = ("--memories", "voxel,last", "--controls", "emptied", "--metrics", "psnr")
     few = ("--seeds", 1, "--steps", 2, "--clips", 2, "--out", tmp_path / "eval")
-    run("eval", tmp_path / "model", "--data", walks, *rows, *few)
+    run("eval", tmp_path / "model", "--data", write_loops(tmp_path / "data"), *rows, *few)
     assert '"last"' in (tmp_path / "eval/metrics.json").read_text()
 
 

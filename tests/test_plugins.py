@@ -27,7 +27,7 @@ LAST_FRAME = """
 """
 
 
-def test_a_memory_of_another_package_works_in_every_command_by_name(persist, site, walks, stage1, tmp_path):
+def test_a_memory_of_another_package_works_in_every_command_by_name(persist, site, walks, held_out, stage1, tmp_path):
     install(site, "persist-last", "persist.memories", "last = last_frame:LastFrame", LAST_FRAME)
     recipe = ("memory.name=last", f"base={stage1}")
     assert "persist-last" in persist("plugins").out
@@ -37,7 +37,9 @@ def test_a_memory_of_another_package_works_in_every_command_by_name(persist, sit
     memory = ["--memory", tmp_path / "m.safetensors"]
     assert persist("rollout", tmp_path / "run", *options, *memory, "--out", tmp_path / "rollout").code == 0
     few = ["--metrics", "psnr", "--controls", "copy", "--seeds", 1, "--clips", 1, "--steps", 1]
-    evaluated = persist("eval", tmp_path / "run", "--data", walks, "--memories", "last", *few, "--out", tmp_path / "e")
+    evaluated = persist(
+        "eval", tmp_path / "run", "--data", held_out, "--memories", "last", *few, "--out", tmp_path / "e"
+    )
     assert (evaluated.code, "last" in evaluated.out) == (0, True)
 
 

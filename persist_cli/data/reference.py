@@ -112,7 +112,7 @@ def data_folder(text: str) -> Path:
 
 
 def sample_data() -> Path:
-    """The folder of the sample data set: held-out houses, walked through there and back.
+    """The folder of the sample data set: held-out houses, walked out and back by another way.
 
     Raises:
         DataError: when this installation has none.

@@ -162,7 +162,8 @@ class Revisit(Protocol):
         if not chosen:
             raise DataError(
                 f"{search.where}: no clip of {frames} frames returns to a place seen before, by poses that are new; "
-                "collect with --policy loop or longer trajectories, or evaluate with --protocol long"
+                "collect with --policy loop or longer trajectories, give smaller limits where a camera moves little "
+                "between frames (--new-poses 0.05 3), or evaluate with --protocol long"
             )
         return self.make_cases(chosen[: search.limit], frames, search)
 

@@ -1,8 +1,9 @@
 """``make demo`` and ``make demo-train``: the main job from end to end, by the commands that a user would type.
 
-``python -m persist_cli.reproduce.demo [OUT]`` returns with the reference model through a held-out house, with and
-without a memory of the way out. It needs neither simulator nor training nor network: model and houses come with the
-package. ``python -m persist_cli.reproduce.demo --train [OUT]`` collects houses and trains small models first.
+``python -m persist_cli.reproduce.demo [OUT]`` returns with the reference model through a held-out house by another way,
+with and without a memory of the way out, and walks 64 frames from one image. It needs neither simulator nor training
+nor network: model and houses come with the package. ``python -m persist_cli.reproduce.demo --train [OUT]`` collects
+houses and trains small models first.
 
 The commands run in one process, so that torch is imported once.
 """
@@ -28,8 +29,9 @@ from persist_cli.io.files import read_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.viewing.console import say
 
-HALF: Final = 32  # frames of the way out, after the first; the way back begins at the last of them
+HALF: Final = 32  # frames after the first that the memory is made of; what follows is the way back, by another way
 ROLLOUTS: Final = ("with-memory", "without-memory")  # folders of the two rollouts
+WALK: Final = "walk"  # folder of the rollout from a single image
 CLIPS: Final = 6  # clips that the reference model is evaluated on
 TRAINING: Final = "training.checkpoint_minutes=60 training.workers=1"
 
@@ -41,7 +43,7 @@ class Demo:
     Args:
         title: printed first.
         folder: folder to write to when none is named.
-        trajectory: gives a reference like ``sample#0`` to the trajectory that goes there and back.
+        trajectory: gives a reference like ``sample#0`` to the trajectory that goes out and comes back.
         commands: gives the command lines in order; they write ``house.png``, a folder for each of ``ROLLOUTS``,
             ``eval`` and ``report``.
         closing: gives a sentence about the results, printed last.
@@ -65,18 +67,23 @@ def reference_commands(out: Path) -> list[str]:
         f"memorize sample#0:0-{HALF + 1} --memory voxel --out {memory}",
         f"rollout {back} --adapter voxel --memory {memory} --out {home}/with-memory",
         f"rollout {back} --adapter none --out {home}/without-memory",
-        f"eval --data sample --memories none,voxel --controls copy,codec --metrics {metrics} --seeds 1 "
+        f"rollout --start sample#1:0 --follow --frames {2 * HALF} --seed 0 --adapter voxel --out {home}/{WALK}",
+        f"eval --data sample --memories none,voxel --controls copy,nearest,warp,codec --metrics {metrics} --seeds 1 "
         f"--clips {CLIPS} --out {home}/eval --report {home}/report",
     ]
 
 
 def reference_closing(out: Path) -> str:
-    """One sentence with the mean PSNR of both rollouts."""
+    """Two sentences with the mean PSNR of both rollouts, and where the walk from a single image is."""
     means = []
     for name in ROLLOUTS:
-        frames = read_json(out / name / "rollout.json")["against_ground_truth"]["psnr"]
-        means.append(f"{sum(frames) / len(frames):.1f} dB {name.replace('-', ' ')}")
-    return f"On the way back ({len(frames)} frames) PSNR is {' and '.join(means)}."
+        figures = read_json(out / name / "rollout.json")
+        means.append(f"{figures['mean_against_ground_truth']['psnr']:.1f} dB {name.replace('-', ' ')}")
+    count = sum(figures["new_poses"]["counted"])
+    return (
+        f"On the way back ({count} frames, none from a pose in memory) PSNR is {' and '.join(means)}; the table above "
+        f"says what a warp of the true frames has. {out / WALK / 'compare.mp4'}: {2 * HALF} frames from one image."
+    )
 
 
 def training_commands(out: Path) -> list[str]:
@@ -86,7 +93,7 @@ def training_commands(out: Path) -> list[str]:
     stage1 = f"base={home}/stage1 training.steps=12 training.batch=8 training.warmup=4 {TRAINING}"
     return [
         f"collect miniworld --out {train} --scenes 0:24 --frames 64 --policy path",
-        f"collect miniworld --out {test} --scenes 0:4 --frames {2 * HALF + 1} --policy there-and-back --split test",
+        f"collect miniworld --out {test} --scenes 0:4 --frames {2 * HALF + 1} --policy loop --split test",
         f"inspect {test}",
         f"finetune tiny-codec --data {train} --out {home}/codec --resume training.steps=140 training.batch=4 "
         f"{TRAINING}",
@@ -104,7 +111,7 @@ def training_commands(out: Path) -> list[str]:
 
 
 REFERENCE_DEMO: Final = Demo(
-    title="persist demo: the way back through a house that the model has never seen, with and without a memory of it",
+    title="persist demo: back by another way through a house that the model has never seen, with and without a memory",
     folder="runs/demo",
     trajectory=lambda out: "sample#0",
     commands=reference_commands,

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -81,6 +82,7 @@ class Rollout:
         seconds: duration of all branches together, without loading.
         gives_depth: whether the imagined frames have depth.
         kept_paths: world_from_camera of the paths that the memory's file shall keep, by name.
+        remembered: world_from_camera of the frames that the memory was made of, as far as its file says.
     """
 
     path: CameraPath
@@ -90,6 +92,7 @@ class Rollout:
     seconds: float
     gives_depth: bool
     kept_paths: Mapping[str, Float[Tensor, "frame 4 4"]] = field(default_factory=dict)
+    remembered: Float[Tensor, "frame 4 4"] = field(default_factory=lambda: torch.zeros(0, 4, 4, dtype=torch.float64))
 
 
 def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import Checkpoint
+from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
 from persist_cli.io.files import write_json, write_text
@@ -81,7 +82,12 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
     start, seen, truth = rollout.path.start, rollout.seen, rollout.path.truth
     if truth is not None:
         against = compare(start, seen, truth, rollout.gives_depth)
-        figures = figures | {"against_ground_truth": against, "mean_against_ground_truth": means(against)}
+        counted = new_frames(rollout)
+        figures = figures | {
+            "against_ground_truth": against,
+            "new_poses": {"metres": NEAR_METRES, "degrees": NEAR_DEGREES, "counted": counted},
+            "mean_against_ground_truth": means(against, counted),
+        }
     scale = write_pictures(rollout, out)
     figures = figures | {"depth_colors": scale and scale.to_json()}
     poses = path_of(rollout)
@@ -135,15 +141,35 @@ def with_bar(video: Video, scale: DepthScale) -> Video:
     return below([video, still(scale.bar(video.shape[2]), len(video))])
 
 
-def means(figures: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """Return the mean of each figure over the frames in which it is defined."""
-    return {name: float(torch.tensor(values, dtype=torch.float64).nanmean()) for name, values in figures.items()}
+def new_frames(rollout: Rollout) -> list[bool]:
+    """Return for each imagined frame whether its pose is new: not near the start frame or one of the memory's file."""
+    known = torch.cat([rollout.remembered, rollout.path.start.cameras.world_from_camera.double()])
+    near = near_poses(rollout.seen.cameras.world_from_camera.double(), known)
+    return [not bool(frames.any()) for frames in near]
+
+
+def means(figures: Mapping[str, Sequence[float]], counted: Sequence[bool]) -> dict[str, float]:
+    """Return the mean of each figure over the frames that count and have it; a figure of no such frame is left out."""
+    known = {
+        name: torch.tensor([value for value, new in zip(values, counted, strict=True) if new], dtype=torch.float64)
+        for name, values in figures.items()
+    }
+    return {name: float(values.nanmean()) for name, values in known.items() if bool(values.isfinite().any())}
+
+
+def counted_words(figures: Mapping[str, Any]) -> str:
+    """Return which frames the means count, where these are not all: no others are near one in memory."""
+    counted = figures["new_poses"]["counted"]
+    if all(counted):
+        return ""
+    limits = f"{figures['new_poses']['metres']:g} m and {figures['new_poses']['degrees']:g}°"
+    return f" ({sum(counted)} of {len(counted)} count: those farther than {limits} from every remembered frame)"
 
 
 def summary(figures: Mapping[str, Any]) -> str:
     """Return the means against the true frames that the terminal shows, as in ``"PSNR 21.34, LPIPS-Alex 0.3127"``."""
     measured = figures["mean_against_ground_truth"]
-    return ", ".join(f"{METRICS[name].title} {measured[name]:.4g}" for name in PRINTED if name in measured)
+    return ", ".join(f"{METRICS[name].title} {measured[name]:.4g}" for name in PRINTED if name in measured) or "none"
 
 
 def compare(

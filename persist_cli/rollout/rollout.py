@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from torch import Tensor
+import torch
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
@@ -22,7 +22,7 @@ from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import add_paths, load_paths
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
 from persist_cli.rollout.open_world import assemble_world
-from persist_cli.rollout.outputs import describe, path_of, summary, write_outputs
+from persist_cli.rollout.outputs import counted_words, describe, path_of, summary, write_outputs
 from persist_cli.rollout.world_model import WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, progress, say, warn
 
@@ -42,7 +42,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
         warn(f"warning: {view}")
     model = assemble_world(checkpoint, adapter, plan, paths[0].info)
     plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(model.sampling)))
-    rollouts = [dataclasses.replace(rollout, kept_paths=paths_to_keep(plan, rollout)) for rollout in roll(model, paths)]
+    rollouts = [with_paths(plan, rollout) for rollout in roll(model, paths)]
     records = [describe(checkpoint, adapter, plan, rollout) for rollout in rollouts]
     triples = zip(rollouts, folders, records, strict=True)
     with busy("writing videos and maps"):
@@ -54,7 +54,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
         frames, actions = len(rollout.seen), rollout.path.text
         say(f"{frames} frames in {rollout.seconds:.1f} s along {actions!r}; written to {folder}")
         if rollout.path.truth is not None:
-            say(f"mean against the true frames: {summary(record)}")
+            say(f"mean against the true frames{counted_words(record)}: {summary(record)}")
 
 
 def check_folders(out: Path, branches: int) -> list[Path]:
@@ -74,11 +74,12 @@ def check_folders(out: Path, branches: int) -> list[Path]:
     return folders
 
 
-def paths_to_keep(plan: RolloutPlan, rollout: Rollout) -> dict[str, Tensor]:
-    """Return the paths of the memory's file, and that of the rollout if its frames were written."""
+def with_paths(plan: RolloutPlan, rollout: Rollout) -> Rollout:
+    """Return a rollout with the paths of the memory's file, and to be kept also its own if its frames were written."""
     paths = load_paths(plan.memory) if plan.memory else {}
+    remembered = torch.cat([rollout.remembered, *(poses.double() for poses in paths.values())])
     add_paths(paths, {"rollout": path_of(rollout)} if plan.write else {})
-    return paths
+    return dataclasses.replace(rollout, kept_paths=paths, remembered=remembered)
 
 
 def warn_of_short_path(plan: RolloutPlan, path: CameraPath) -> None:

@@ -48,7 +48,7 @@ def without_extras(tmp_path):
     return run
 
 
-def test_every_command_works_without_extras(without_extras, walks, stage1, voxel, tmp_path):
+def test_every_command_works_without_extras(without_extras, walks, held_out, stage1, voxel, tmp_path):
     few = ["--metrics", "psnr", "--controls", "copy", "--seeds", 1, "--clips", 1, "--steps", 1, "--memories", "voxel"]
     printed = without_extras(
         ["recipes"], ["recipes", "tiny-stage1"], ["plugins"], ["weights", "list"], ["inspect", walks],
@@ -56,7 +56,7 @@ def test_every_command_works_without_extras(without_extras, walks, stage1, voxel
         [*stage("stage1", walks, tmp_path / "run", f"base={stage1}", "training.steps=1")],
         ["memorize", f"{walks}#0:0-5", "--out", tmp_path / "m.safetensors"],
         ["rollout", voxel, "--start", f"{walks}#0:4", "--actions", "left", "--steps", 1, "--out", tmp_path / "rollout"],
-        ["eval", voxel, "--data", walks, *few, "--out", tmp_path / "eval", "--report", tmp_path / "report"],
+        ["eval", voxel, "--data", held_out, *few, "--out", tmp_path / "eval", "--report", tmp_path / "report"],
         ["export", stage1, voxel, "--out", tmp_path / "export"],
     )  # fmt: skip
     for text in printed:

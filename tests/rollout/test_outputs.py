@@ -16,9 +16,9 @@ from persist_cli.rollout.outputs import means, summary
 def roll(persist, voxel, walks, tmp_path):
     """Return a function that rolls out with one denoising step from frame 2 of the walk and gives the result."""
 
-    def run(*options, start=2, run=voxel):
+    def run(*options, start=2, run=voxel, data=walks):
         steps = () if "--help" in options else ("--steps", 1)
-        return persist("rollout", run, "--start", f"{walks}#0:{start}", "--out", tmp_path / "o", *steps, *options)
+        return persist("rollout", run, "--start", f"{data}#0:{start}", "--out", tmp_path / "o", *steps, *options)
 
     return run
 
@@ -32,8 +32,8 @@ def size(path):
         return video.streams.video[0].width, video.streams.video[0].height
 
 
-def test_means_against_the_truth_are_printed_and_stored_beside_the_lists(roll, tmp_path):
-    result = roll("--follow", "--frames", 4)
+def test_means_against_the_truth_are_printed_and_stored_beside_the_lists(roll, held_out, tmp_path):
+    result = roll("--follow", "--frames", 4, data=held_out)
     stored = figures(tmp_path)
     psnr = sum(stored["against_ground_truth"]["psnr"]) / 4
     assert stored["mean_against_ground_truth"]["psnr"] == pytest.approx(psnr)
@@ -41,9 +41,22 @@ def test_means_against_the_truth_are_printed_and_stored_beside_the_lists(roll, t
 
 
 def test_the_terminal_shows_lpips_where_it_was_measured_and_no_figure_that_is_not_defined_spoils_a_mean():
-    measured = means({"psnr": [20.0, 22.0], "lpips-alex": [0.25, 0.75], "absrel": [0.5, math.nan]})
+    measured = means({"psnr": [20.0, 22.0], "lpips-alex": [0.25, 0.75], "absrel": [0.5, math.nan]}, [True, True])
     assert measured["absrel"] == 0.5
     assert summary({"mean_against_ground_truth": measured}) == "PSNR 21, LPIPS-Alex 0.5"
+
+
+def test_frames_near_a_remembered_one_are_in_the_lists_but_not_in_the_means(roll, persist, walks, tmp_path):
+    memory = tmp_path / "m.safetensors"
+    assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0
+    result = roll(
+        "--follow", "--frames", 6, "--memory", memory, start=15
+    )  # the reversed actions of the memorized frames
+    stored = figures(tmp_path)
+    assert len(stored["against_ground_truth"]["psnr"]) == 6
+    assert not any(stored["new_poses"]["counted"])
+    assert "psnr" not in stored["mean_against_ground_truth"]
+    assert "(0 of 6 count: those farther than 0.2 m and 10° from every remembered frame): none" in result.out
 
 
 def test_frames_that_are_not_there_to_follow_are_said_in_one_line(roll):

@@ -101,7 +101,7 @@ def write_sequence(folder: Path, frames: int = 4, size: tuple[int, int] = (48, 6
 
     Args:
         folder: the folder to make.
-        frames: number of frames; 24 are once around.
+        frames: number of frames; 24 are once around, and the next 24 once more through the places in between.
         size: height and width in pixels.
         suffix: of the colour images.
     """
@@ -110,7 +110,8 @@ def write_sequence(folder: Path, frames: int = 4, size: tuple[int, int] = (48, 6
     matrix = room.intrinsics
     matrix[:2, 2] -= 0.5  # as 7-Scenes counts
     np.savetxt(folder / "camera-intrinsics.txt", matrix)
-    for number, frame in enumerate(room.frames(walk(24)[np.arange(frames) % 24])):
+    twice = np.concatenate([walk(48)[::2], walk(48)[1::2]])
+    for number, frame in enumerate(room.frames(twice[np.arange(frames) % 48])):
         stem = folder / f"frame-{3 * number:06d}"
         Image.fromarray(frame.rgb).save(f"{stem}.color.{suffix}")
         millimetres = np.round(frame.depth * 1000).astype(np.uint16)
