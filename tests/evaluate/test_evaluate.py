@@ -272,22 +272,8 @@ def test_fewer_clips_than_asked_for_are_counted_aloud(persist, voxel, held_out, 
 
 
 def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, voxel, walks, tmp_path):
-    flags = ["--allow-training-scenes", "--new-poses", 0, 0]
-    command = [
-        "eval",
-        voxel,
-        *flags,
-        "--data",
-        walks,
-        "--memories",
-        "voxel",
-        "--metrics",
-        "psnr",
-        "--seeds",
-        1,
-        "--steps",
-        1,
-    ]
+    command = ["eval", voxel, "--data", walks, "--allow-training-scenes", "--new-poses", 0, 0, "--memories", "voxel"]
+    command += ["--metrics", "psnr", "--seeds", 1, "--steps", 1]
     ended = persist(*command, "--controls", "copy", "--out", tmp_path / "o", "--report", tmp_path / "r")
     warning = "was trained on 2 of these 2 scenes (room-0 to room-1); its figures are not of unseen scenes"
     assert warning in ended.err
@@ -296,6 +282,30 @@ def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, vox
     assert [warning in line for line in results(tmp_path / "o")["warnings"]] == [True]
     known = results(tmp_path / "o")["checkpoints"][0]["training_scenes"]
     assert known["evaluated"] == ["room-0", "room-1"]
+
+
+def test_scenes_of_the_training_are_refused_and_the_message_says_what_to_do(persist, voxel, walks, tmp_path):
+    for protocol in ("revisit", "return", "long", "unseen"):
+        ended = persist("eval", voxel, "--data", walks, "--protocol", protocol, "--out", tmp_path / "o")
+        assert ended.code == 1
+        assert "the model was trained on its scene 'room-0'" in ended.err
+        assert ("--allow-training-scenes" in ended.err) == (protocol != "unseen")
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_results_keep_the_limits_of_new_poses_and_how_many_frames_count(persist, voxel, held_out, tmp_path):
+    command = ["eval", voxel, "--data", held_out, "--memories", "stage1", "--metrics", "psnr", "--seeds", 1]
+    command += ["--steps", 1, "--controls", "nearest", "--protocol", "return", "--out", tmp_path]
+    ended = persist(*command)
+    assert ended.code == 0, ended.err
+    protocol = results(tmp_path)["measured"]["protocol"]
+    assert protocol["new_poses"] == {"metres": 0.2, "degrees": 10.0}
+    line = f"{protocol['counted_frames']} of {protocol['predicted_frames']} predicted frames count"
+    assert line in ended.out
+    assert line in (tmp_path / "tables.md").read_text()
+    assert "nearer than 0.2 m and 10°" in protocol["definition"]
+    refused = persist(*command, "--new-poses", 0.1, 10)
+    assert "holds another evaluation (new_poses metres: 0.2, now 0.1)" in refused.err
 
 
 def test_eval_prints_one_table_and_leaves_the_others_beside_the_results(persist, voxel, held_out, tmp_path):

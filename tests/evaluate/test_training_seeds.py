@@ -77,7 +77,7 @@ def test_tables_show_the_spread_over_training_seeds_and_say_where_they_are_too_f
     assert "2 training seeds (voxel): a difference" in table_text(results_of(0, 1))
 
 
-def test_eval_makes_one_row_of_three_trainings(persist, voxel, walks, tmp_path):
+def test_eval_makes_one_row_of_three_trainings(persist, voxel, held_out, tmp_path):
     for seed in range(3):
         shutil.copytree(voxel, tmp_path / f"voxel-{seed}")
         (recipe,) = (tmp_path / f"voxel-{seed}").glob("step-*/model/recipe.yaml")
@@ -86,7 +86,7 @@ def test_eval_makes_one_row_of_three_trainings(persist, voxel, walks, tmp_path):
     shutil.copytree(voxel.parent / "stage1", tmp_path / "stage1", dirs_exist_ok=True)
     runs = [tmp_path / f"voxel-{seed}" for seed in range(3)]
     options = ["--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1, "--controls", "emptied"]
-    command = ["eval", *runs, "--data", walks, *options, "--training-seeds"]
+    command = ["eval", *runs, "--data", held_out, *options, "--training-seeds"]
     ended = persist(*command, "--out", tmp_path / "o")
     assert ended.code == 0, ended.err
     rows = read_json(tmp_path / "o/metrics.json")["tables"][0]["rows"]
