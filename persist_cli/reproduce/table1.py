@@ -113,7 +113,7 @@ def collect_commands(out: Path) -> list[str]:
 
 
 def collect_held_out(out: Path, split: str) -> list[str]:
-    """The command lines that collect 100 houses of 129 frames of a split, and of the test split there and back too."""
+    """The command lines that collect 100 houses of 129 frames of a split, and of the test split out and back by another way too."""
     home = shlex.quote(str(out))
     lines = [
         f"{COLLECT} --out {home}/{split}/{policy} --scenes {scenes} --frames 129 --policy {policy} --split {split}"
@@ -121,8 +121,8 @@ def collect_held_out(out: Path, split: str) -> list[str]:
     ]
     if split != "test":
         return lines
-    back = f"--scenes 0:100 --frames 129 --policy there-and-back --split {split}"
-    return [*lines, f"{COLLECT} --out {home}/there-and-back {back}"]
+    loop = f"--scenes 0:100 --frames 129 --policy loop --split {split}"
+    return [*lines, f"{COLLECT} --out {home}/test/loop {loop}"]
 
 
 def training_data(out: Path) -> str:
