@@ -98,7 +98,7 @@ class Protocol(ABC):
         """The number of the first frame of a trajectory that may be predicted."""
         return 0
 
-    def refuse_training_scenes(self, search: ClipSearch, way_out: str) -> None:
+    def refuse_training_scenes(self, search: ClipSearch, way_out: str = "take data of another split") -> None:
         """Raise ``DataError`` when a model was trained on what a data set shows from its first scored frame on.
 
         Args:
@@ -210,12 +210,16 @@ class Unseen(Revisit):
     )
     domains = True
 
+    def refuse_training_scenes(self, search: ClipSearch, way_out: str = "") -> None:
+        """Raise ``DataError`` when a model was trained on a scene; there is no way out but other data."""
+        super().refuse_training_scenes(search)
+
     def find(self, search: ClipSearch) -> list[Case]:
         """Find the clips of each data set, up to the limit in each."""
         for file in search.trajectories():
             if file.info.source.get("split") == "train":
                 raise DataError(f"{file.path}: its scene is of the training split; collect with --split test")
-        self.refuse_training_scenes(search, "this protocol measures unseen scenes alone")
+        self.refuse_training_scenes(search)
         cases: list[Case] = []
         for folder in search.folders:
             cases += super().find(dataclasses.replace(search, folders=[folder]))
