@@ -113,7 +113,7 @@ def collect_commands(out: Path) -> list[str]:
 
 
 def collect_held_out(out: Path, split: str) -> list[str]:
-    """The command lines that collect 100 houses of 129 frames of a split, and of the test split out and back by another way too."""
+    """The command lines that collect 100 houses of 129 frames of a split, and loops through all of the test split."""
     home = shlex.quote(str(out))
     lines = [
         f"{COLLECT} --out {home}/{split}/{policy} --scenes {scenes} --frames 129 --policy {policy} --split {split}"
@@ -122,7 +122,7 @@ def collect_held_out(out: Path, split: str) -> list[str]:
     if split != "test":
         return lines
     loop = f"--scenes 0:100 --frames 129 --policy loop --split {split}"
-    return [*lines, f"{COLLECT} --out {home}/test/loop {loop}"]
+    return [*lines, f"{COLLECT} --out {home}/loop {loop}"]
 
 
 def training_data(out: Path) -> str:
@@ -189,7 +189,7 @@ def tables(out: Path, memories: Sequence[str], chosen: Chosen | None) -> list[st
         memories: names of the memories; the first is the baseline, the second the one that is disturbed.
         chosen: what was chosen for the runs in ``out``; ``None`` measures the packaged model.
     """
-    home, pair, returns = shlex.quote(str(out)), memories[:2], f"--data {shlex.quote(str(out))}/there-and-back"
+    home, pair, returns = shlex.quote(str(out)), memories[:2], f"--data {shlex.quote(str(out))}/loop"
 
     def rows(names: Sequence[str], *fixed: str) -> list[str]:
         return [] if chosen is None else [f"{home}/{name}" for name in (*names, *fixed)]
