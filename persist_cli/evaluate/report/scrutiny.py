@@ -22,6 +22,8 @@ DIGITS = 12  # characters shown of a hash
 
 SHARP = 0.7  # of the truth's, below which a row is called blurred
 
+CELLS = {"cells": "cells in the map"}  # what has windows and is no metric
+
 GRAINY = 1.5  # grain over sharpness, above which detail is called noise
 
 
@@ -178,7 +180,8 @@ def windows_tables(results: EvalResults) -> Sequence[tuple[str, list[str], list[
             record = results.measured.metrics.get(metric)
             count = max(map(len, rows.values()))
             digits = 0 if record is None else 2
-            title = f"{where}{record.title if record else 'cells in the map'} along the rollout"
+            name = record.title if record else CELLS.get(metric, metric)
+            title = f"{where}{name} along the rollout"
             length = results.measured.protocol.frames - 1
             step = -(-length // count)
             heads = ["row", *(f"{first + 1}–{min(first + step, length)}" for first in range(0, length, step))]
