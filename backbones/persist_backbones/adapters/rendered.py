@@ -53,7 +53,7 @@ class RenderedSettings(AttentionSettings):
 
     form: Literal["rendered"] = "rendered"
     token_budget: PositiveInt = 65536
-    token_size: PositiveFloat = 0.04
+    token_size: PositiveFloat = 0.03
     splat_pixels: PositiveInt = 9
     supersampling: PositiveInt = 2
     head_width: PositiveInt = 96
