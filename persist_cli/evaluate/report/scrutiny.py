@@ -10,6 +10,7 @@ from typing import Any
 from persist_cli.evaluate.report.remarks import (
     contamination_lines,
     counted,
+    new_poses_line,
     sampling_line,
     training_seed_line,
     unknown_scenes_lines,
@@ -45,8 +46,8 @@ class Answer:
 def scrutiny(results: EvalResults) -> list[Answer]:
     """Every question with its answer, as far as the results have it."""
     answers = [
-        _data(results), _contamination(results), _trainings(results), _intervals(results), _choices(results),
-        _truth_read(results), _sharpness(results), _networks(results), _pictures(results),
+        _data(results), _frames(results), _contamination(results), _trainings(results), _intervals(results),
+        _choices(results), _truth_read(results), _sharpness(results), _networks(results), _pictures(results),
     ]  # fmt: skip
     return [answer for answer in answers if answer.lines]
 
@@ -67,6 +68,12 @@ def _data(results: EvalResults) -> Answer:
         f"sampling seeds {', '.join(map(str, seeds))}",
     ]
     return Answer("Which clips?", tuple(lines), not named or any(split == "train" for split in splits))
+
+
+def _frames(results: EvalResults) -> Answer:
+    limits = results.measured.protocol.new_poses
+    copies = limits is None or not (limits.metres and limits.degrees)
+    return Answer("Could a copy do?", (new_poses_line(results),), copies)
 
 
 def _contamination(results: EvalResults) -> Answer:

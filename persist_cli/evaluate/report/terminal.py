@@ -26,10 +26,10 @@ from persist_cli.viewing.console import BORDER, OUT, print_table, say
 NAME_WIDTH = 28  # characters of a row's name before it goes on in the next line
 
 KEY_COLUMNS = {  # by protocol: the columns that get their difference and deviation before any other is shown
-    "revisit": ("psnr", "lpips-alex", "fvd", "absrel"),
-    "unseen": ("psnr", "lpips-alex", "fvd", "absrel"),
-    "return": ("src", "src-away", "psnr-return", "lpips-alex-return"),
-    "long": ("psnr", "lpips-alex", "fvd", "absrel"),
+    "revisit": ("psnr", "sharpness", "lpips-alex", "fvd", "absrel"),
+    "unseen": ("psnr", "sharpness", "lpips-alex", "fvd", "absrel"),
+    "return": ("src", "src-patch", "psnr-return", "sharpness-return", "lpips-alex-return", "psnr-own"),
+    "long": ("psnr", "sharpness-least", "lpips-alex", "lpips-alex-growth", "fvd"),
 }
 
 FURTHER_COLUMNS = ("psnr", "ssim", "lpips-vgg", "psnr-new", "psnr-last", "drift")  # the rest follows in its order

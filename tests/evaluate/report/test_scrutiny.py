@@ -47,6 +47,17 @@ def test_splits_trainings_and_choices_that_are_known_are_told_and_no_doubt():
     assert not any(known[question].doubt for question in questions)
 
 
+def test_frames_of_poses_in_memory_are_a_doubt_unless_they_are_left_out():
+    def change(results):
+        limits = {"new_poses": {"metres": 0.2, "degrees": 10.0}, "counted_frames": 40, "predicted_frames": 48}
+        results["measured"]["protocol"] |= limits
+
+    assert answers()["Could a copy do?"].doubt
+    known = answers(change)["Could a copy do?"]
+    assert known.lines[0].startswith("40 of 48 predicted frames count")
+    assert not known.doubt
+
+
 def test_training_houses_and_intervals_over_clips_of_few_scenes_are_doubts():
     known = answers(lambda results: results["measured"]["data"][0].update(splits={"house-0": "train"}))
     assert known["Which clips?"].doubt
