@@ -28,7 +28,7 @@ NAME_WIDTH = 28  # characters of a row's name before it goes on in the next line
 KEY_COLUMNS = {  # by protocol: the columns that get their difference and deviation before any other is shown
     "revisit": ("psnr", "sharpness", "lpips-alex", "fvd", "absrel"),
     "unseen": ("psnr", "sharpness", "lpips-alex", "fvd", "absrel"),
-    "return": ("src", "src-patch", "psnr-return", "sharpness-return", "lpips-alex-return", "psnr-own"),
+    "return": ("src", "src-away", "src-patch", "psnr-return", "sharpness-return", "lpips-alex-return", "psnr-own"),
     "long": ("psnr", "sharpness-least", "lpips-alex", "lpips-alex-growth", "fvd"),
 }
 
