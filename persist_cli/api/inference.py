@@ -80,7 +80,7 @@ class InferenceOptions:
         return torch.device("cpu")
 
 
-PROTOCOLS = ("revisit", "return", "long", "unseen")  # of evaluation, for which a card may have a sampling of its own
+PROTOCOLS = ("revisit", "later", "return", "long", "unseen")  # of evaluation; a card may have a sampling for each
 
 
 @dataclass(frozen=True)

@@ -35,28 +35,69 @@ RECIPE: Final = "houses-64-stage2-"  # begins the names of the recipes that are 
 METRICS: Final = {"psnr": "PSNR", "psnr-last": "last frame", "lpips-alex": "LPIPS"}
 CRITERION: Final = "lpips-alex"  # lower is better; by PSNR the blurriest would be chosen
 
-FINE: Final = ("memory.settings.cell=[0.03, 0.03, 0.03]", "adapter.token_size=0.05", "adapter.token_budget=65536")
-COARSE: Final = ("memory.settings.cell=[0.0625, 0.0625, 0.0625]", "adapter.token_size=0.09")
-WIDER: Final = ("adapter.head_width=192",)
-FEW: Final = ("memory.settings.count=4", "adapter.token_budget=4", "adapter.frame_patch=1")
-MANY: Final = ("memory.settings.count=16", "adapter.token_budget=16", "adapter.frame_patch=2")
 
-# for each memory what is tried, one or two things at a time; the settings are on top of its recipe
-TRIALS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
-    "none": {"64-tokens": ("adapter.learned_tokens=64",), "16-tokens": ("adapter.learned_tokens=16",)},
-    "voxel": {"3cm": FINE, "6cm": COARSE, "3cm-wider-head": FINE + WIDER, "6cm-wider-head": COARSE + WIDER},
+@dataclass(frozen=True)
+class Settings:
+    """What a trial trains.
+
+    Args:
+        overrides: settings on top of the recipe.
+        form: end of the recipe's name, ``-rendered`` for that of another form of the adapter.
+    """
+
+    overrides: tuple[str, ...] = ()
+    form: str = ""
+
+    def recipe(self, memory: str) -> str:
+        """The name of the recipe for a memory."""
+        return f"{RECIPE}{memory}{self.form}"
+
+
+def cells(edge: float, axes: int, drawn: float, budget: int) -> tuple[str, ...]:
+    """The settings of a map with cells of an edge in metres, drawn somewhat larger."""
+    size = f"memory.settings.cell={[edge] * axes}"
+    return size, f"adapter.token_size={drawn}", f"adapter.token_budget={budget}"
+
+
+def images(side: int, drawn: float, budget: int) -> tuple[str, ...]:
+    """The settings of snapshots of so many rows and columns of patches."""
+    return f"memory.settings.grid={[side, side]}", f"adapter.token_size={drawn}", f"adapter.token_budget={budget}"
+
+
+def frames(count: int, patch: int) -> tuple[str, ...]:
+    """The settings of so many whole frames, cut into patches of so many latent pixels."""
+    return f"memory.settings.count={count}", f"adapter.token_budget={count}", f"adapter.frame_patch={patch}"
+
+
+RENDERED: Final = "-rendered"
+WIDER: Final = ("adapter.head_width=192",)
+
+# for each memory what is tried: form, resolution and head where it has them
+TRIALS: Final[dict[str, dict[str, Settings]]] = {
+    "none": {"canvas": Settings(), "rendered": Settings(form=RENDERED)},
+    "voxel": {
+        "canvas-6cm": Settings(cells(0.0625, 3, 0.09, 16384)),
+        "canvas-3cm": Settings(cells(0.03, 3, 0.05, 65536)),
+        "rendered-6cm": Settings(cells(0.0625, 3, 0.09, 16384), RENDERED),
+        "rendered-2cm": Settings(cells(0.02, 3, 0.03, 131072), RENDERED),
+        "rendered-2cm-wider-head": Settings(cells(0.02, 3, 0.03, 131072) + WIDER, RENDERED),
+    },
     "map2d": {
-        "6cm": ("memory.settings.cell=[0.0625, 0.0625]", "adapter.token_size=0.09"),
-        "12cm": ("memory.settings.cell=[0.125, 0.125]", "adapter.token_size=0.18"),
-        "6cm-wider-head": ("memory.settings.cell=[0.0625, 0.0625]", "adapter.token_size=0.09", *WIDER),
+        "canvas-6cm": Settings(cells(0.0625, 2, 0.09, 16384)),
+        "canvas-12cm": Settings(cells(0.125, 2, 0.18, 16384)),
+        "rendered-6cm": Settings(cells(0.0625, 2, 0.09, 16384), RENDERED),
+        "rendered-2cm": Settings(cells(0.02, 2, 0.03, 131072), RENDERED),
+        "rendered-6cm-wider-head": Settings(cells(0.0625, 2, 0.09, 16384) + WIDER, RENDERED),
     },
     "snapshots": {
-        "32x32": ("memory.settings.grid=[32, 32]", "adapter.token_size=0.12"),
-        "64x64": ("memory.settings.grid=[64, 64]", "adapter.token_size=0.09", "adapter.token_budget=32768"),
-        "32x32-wider-head": ("memory.settings.grid=[32, 32]", "adapter.token_size=0.12", *WIDER),
+        "canvas-32x32": Settings(images(32, 0.12, 16384)),
+        "canvas-64x64": Settings(images(64, 0.09, 32768)),
+        "rendered-32x32": Settings(images(32, 0.12, 16384), RENDERED),
+        "rendered-64x64": Settings(images(64, 0.06, 131072), RENDERED),
+        "rendered-64x64-wider-head": Settings(images(64, 0.06, 131072) + WIDER, RENDERED),
     },
-    "views": {"4-frames": FEW, "16-frames": MANY},
-    "context": {"4-frames": FEW, "16-frames": MANY},
+    "views": {"4-frames": Settings(frames(4, 1)), "16-frames": Settings(frames(16, 2))},
+    "context": {"4-frames": Settings(frames(4, 1)), "16-frames": Settings(frames(16, 2))},
 }
 
 FIRST: Final = Sampling(4, "unipc", 1.0)  # of the trials of settings
@@ -93,7 +134,7 @@ class Trial:
 
     Args:
         name: name of the settings.
-        overrides: settings on top of the memory's recipe.
+        settings: what was trained.
         sampling: how clips were sampled.
         figures: mean of each column of ``METRICS``.
         clips: number of clips.
@@ -101,7 +142,7 @@ class Trial:
     """
 
     name: str
-    overrides: tuple[str, ...]
+    settings: Settings
     sampling: Sampling
     figures: dict[str, float | None]
     clips: int
@@ -143,11 +184,12 @@ def train_command(plan: Plan, memory: str, name: str) -> str:
     """The command line that trains a memory with the settings of a trial, on from where it stopped."""
     data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.data)
     cooldown = plan.steps // 3
-    settings = [*TRIALS[memory][name], f"training.steps={plan.steps}", f"training.cooldown={cooldown}"]
+    trial = TRIALS[memory][name]
+    settings = [*trial.overrides, f"training.steps={plan.steps}", f"training.cooldown={cooldown}"]
     changes = shlex.join([f"base={plan.base}", *settings])
     cache = shlex.quote(str(plan.out / "cache"))
     run = shlex.quote(str(run_folder(plan, memory, name)))
-    return f"finetune {RECIPE}{memory} {data} --out {run} --resume --cache {cache} {changes}"
+    return f"finetune {trial.recipe(memory)} {data} --out {run} --resume --cache {cache} {changes}"
 
 
 def eval_command(plan: Plan, memory: str, name: str, sampling: Sampling) -> str:
@@ -210,9 +252,9 @@ def choice_json(memory: str, trials: Sequence[Trial]) -> dict[str, Any]:
         second = best_of(others)
         reason = f"lowest {CRITERION} of {len(trials)}, {best.cost:.4f}; next is {second}: {second.cost:.4f}"
     return {
-        "recipe": RECIPE + memory,
+        "recipe": best.settings.recipe(memory),
         "name": best.name,
-        "overrides": list(best.overrides),
+        "overrides": list(best.settings.overrides),
         "sampling": asdict(best.sampling),
         "cost": best.figures[CRITERION],
         "reason": f"{reason} ({best.clips} clips of {best.houses} validation houses)",
@@ -313,7 +355,8 @@ def main() -> None:
     try:
         memories = memories_of(options.memories)
         for memory in memories:
-            make_recipe(read_recipe(RECIPE + memory), RECIPE + memory)
+            for settings in TRIALS[memory].values():
+                make_recipe(read_recipe(settings.recipe(memory)), settings.recipe(memory))
         run_choose(
             Plan(options.out, options.base, tuple(options.data), validation, memories, options.steps, options.clips)
         )
