@@ -32,7 +32,7 @@ from persist_cli.viewing.console import say
 HALF: Final = 32  # frames after the first that the memory is made of; what follows is the way back, by another way
 ROLLOUTS: Final = ("with-memory", "without-memory")  # folders of the two rollouts
 WALK: Final = "walk"  # folder of the rollout from a single image
-CLIPS: Final = 6  # clips that the reference model is evaluated on
+CLIPS: Final = 4  # clips that the reference model is evaluated on
 TRAINING: Final = "training.checkpoint_minutes=60 training.workers=1"
 
 
