@@ -112,7 +112,7 @@ WEIGHTS: Final[dict[str, Weight]] = {
             size=1_710_540_580,
             sha256="a2bf730a0c7debf160f7a6b50b3aaf3703e7e88ac73de7a314903141db026dcb",
             hub=HubRepository("openai/clip-vit-large-patch14", "32bd64288804d66eefd0ccbe215aa642df71cc41"),
-            otherwise="no package index has it: copy it into a folder and name that with --from",
+            otherwise="no package with it is known: copy it into a folder and name that with --from",
         ),
         Weight(
             "lpips-alex",
