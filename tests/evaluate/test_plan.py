@@ -117,10 +117,10 @@ def test_a_second_report_of_a_finished_evaluation_predicts_nothing(persist, held
     assert len(first) == 3
 
 
-def test_unseen_refuses_the_training_scenes_of_an_exported_model(persist, stage1, voxel, held_out, tmp_path):
+def test_unseen_refuses_the_training_scenes_of_an_exported_model(persist, stage1, voxel, walks, tmp_path):
     assert persist("export", stage1, voxel, "--out", tmp_path / "model").code == 0
-    command = ["eval", tmp_path / "model", "--data", held_out, "--protocol", "unseen", *ONE, "--out", tmp_path / "o"]
-    assert "the model was trained on its scene 'held-out-0'" in refused(persist, *command)
+    command = ["eval", tmp_path / "model", "--data", walks, "--protocol", "unseen", *ONE, "--out", tmp_path / "o"]
+    assert "the model was trained on its scene 'room-0'" in refused(persist, *command)
     assert not (tmp_path / "o").exists()
 
 
