@@ -93,7 +93,7 @@ def test_a_memory_file_is_read_where_the_model_computes(name, tmp_path):
     assert len(loaded.read(room_walk(3).cameras, 16)) == 16
 
 
-@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas", "rendered"])
 def test_losses_and_gradients_of_every_stage_are_those_of_the_cpu(form):
     found, gradients = [], []
     for device in ("cpu", DEVICE):

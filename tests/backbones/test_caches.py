@@ -95,7 +95,7 @@ def test_predictions_with_and_without_memory_have_caches_of_their_own(name):
     assert equal(backbone.generate(CLIPS, Sampling(STEPS, memory_guidance=0.0)), unguided)
 
 
-@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas", "rendered"])
 @pytest.mark.parametrize("name", ["first-block", "MagCache"])
 def test_skipped_blocks_add_their_memory_once(name, form):
     backbone = with_adapter(micro(transformer={**micro().settings.transformer, "num_layers": 4}), form=form)

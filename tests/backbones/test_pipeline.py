@@ -30,7 +30,7 @@ from persist_cli.recipe import MemoryConfig
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, trained
 
 CLIPS = random_clips(2, random_tokens(2, 5))
-FORMS = pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+FORMS = pytest.mark.parametrize("form", ["cross", "projected", "canvas", "rendered"])
 FRAMEWISE = {"vae": {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4,
                      "temporal_compression_ratio": 1}}  # fmt: skip
 

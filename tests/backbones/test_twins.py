@@ -153,7 +153,7 @@ def test_a_trained_twin_survives_saving_and_diffusers_reads_its_own_parts(twins,
     assert pipe.scheduler.config.snr_shift_scale == (3.0 if name == "2b" else 1.0)
 
 
-@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas", "rendered"])
 def test_weights_are_loaded_into_memory_that_torch_allocated_wherever_they_lie_in_their_files(twins, form, tmp_path):
     model = with_adapter(load_twin(twins["5b-i2v"], SHORTER), form=form)
     for folder in ("base", "adapter"):
@@ -174,7 +174,7 @@ def test_weights_are_loaded_into_memory_that_torch_allocated_wherever_they_lie_i
         assert equal(model.generate(clips, Sampling(2)), backbone.generate(clips, Sampling(2)))
 
 
-@pytest.mark.parametrize("form", ["cross", "projected", "canvas"])
+@pytest.mark.parametrize("form", ["cross", "projected", "canvas", "rendered"])
 def test_in_version_1_5_a_memory_reaches_the_tokens_of_the_frames_that_see_it(twins, form):
     model = with_adapter(
         load_twin(twins["1.5-5b-i2v"], SHORTER), form=form, **({"head_width": 8} if form == "canvas" else {})
@@ -184,7 +184,8 @@ def test_in_version_1_5_a_memory_reaches_the_tokens_of_the_frames_that_see_it(tw
     ahead, behind = random_tokens(1, 1), random_tokens(1, 1)
     ahead.positions[:] = torch.tensor([0.0, 0.0, 5.0])
     behind.positions[:] = torch.tensor([0.0, 0.0, -1.0])
-    masks = [model.adapter.prepare(tokens, clips.cameras).mask for tokens in (ahead, behind)]
+    memories = [model.memory_condition(dataclasses.replace(clips, tokens=tokens)) for tokens in (ahead, behind)]
+    masks = [memory.memory.mask for memory in memories]
     if form != "cross":  # tokens of the padding and the first frame, and of the eight others
         visible = [mask.reshape(1, 2, -1).any(dim=-1).tolist() for mask in masks]
         assert visible == [[[True, True]], [[False, True]]]
