@@ -34,7 +34,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 
 ERROR = 0.05  # variance of rendered latents about the true ones, where those of the codec have about 1
-COVERED = 8.0  # steepness of a fresh gate in the share of a latent pixel that is covered; it is half open at a half
+SPARSE = 0.125  # share of a latent pixel at which a fresh gate is half open: holes between points are filled well
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,10 @@ class RenderedHead(CanvasHead):
     """A network that moves the prediction towards the rendered views at each latent pixel and channel.
 
     Let r be the latents of the rendered views and x the clean latents as predicted. The new ones are x + g (r − x), and
-    a correction is added to the prediction. A fresh head corrects nothing, and its gate g is open where a latent pixel
-    is covered: g = 1 / (1 + SNR · ``ERROR``) is the weight of r in the mean of two measurements of x, one by the noisy
-    latents, with errors of variance 1 / SNR, and one by the rendered views, with errors of variance ``ERROR``.
+    a correction is added to the prediction. A fresh head corrects nothing, and its gate g is open where points cover a
+    latent pixel, if only sparsely: g = 1 / (1 + SNR · ``ERROR``) is the weight of r in the mean of two measurements of
+    x, one by the noisy latents, with errors of variance 1 / SNR, and one by the rendered views, with errors of variance
+    ``ERROR``.
 
     Args:
         drawn: channels of latents and mask of the rendered views.
@@ -174,8 +175,8 @@ class RenderedHead(CanvasHead):
         color, _, depth, _ = inputs[:, :, : 2 * predicted.shape[2]].chunk(4, dim=2)
         clean = level.clean(predicted, torch.cat([color, depth], dim=2))
         snr = (level.signal / level.noise).square()
-        opened = torch.sigmoid(gate - ((-COVERED * (memory.share - 0.5)).exp() + snr * ERROR).log())
-        opened = opened * (memory.share > 0)
+        doubt = (SPARSE / memory.share.clamp_min(1e-3)).square() + snr * ERROR
+        opened = torch.sigmoid(gate - doubt.log()) * (memory.share > 0)
         moved: Tensor = level.moved(predicted, opened * (memory.latents - clean)) + correction
         return moved
 
