@@ -41,11 +41,11 @@ LANGUAGES = {"bash", "console", "python", "toml", "yaml", "json", "text", "bibte
 # what is put in the place of large numbers: an option or setting that is given again wins
 SHORTER = {
     "finetune": (
-        "training.steps=2", "training.batch=2", "training.accumulation=1", "training.workers=0", "training.warmup=1",
+        "training.steps=1", "training.batch=1", "training.accumulation=1", "training.workers=0", "training.warmup=1",
         "training.cooldown=0",
     ),
-    "rollout": ("--steps", "2"),
-    "eval": ("--clips", "2", "--seeds", "1", "--steps", "2"),
+    "rollout": ("--steps", "1"),
+    "eval": ("--clips", "1", "--seeds", "1", "--steps", "1"),
     "collect": ("--workers", "1"),
 }  # fmt: skip
 

@@ -118,7 +118,8 @@ class ShallowCopies:
         backbone = copy.deepcopy(model)
         settings = dataclasses.replace(recipe.training, compile=False)
         with fake_tensors():
-            backbone.to_empty(device="cpu")
+            # to_empty would make two fake tensors for each parameter, one of it as it is and the new one
+            backbone._apply(lambda old: torch.empty(old.shape, dtype=old.dtype, device="cpu"))  # type: ignore[no-untyped-call]
             parameters = backbone.trained_parameters(recipe.stage)
             backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
             if kind.sharded:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import torch
-from diffusers.training_utils import EMAModel
 from torch import nn
 
 from persist_cli.api.stages import MemorySavings
 from persist_cli.errors import PersistError
 from persist_cli.recipe import TrainingSettings
+
+if TYPE_CHECKING:
+    from diffusers.training_utils import EMAModel
 
 COMPILERS = ("c++", "g++", "clang++")  # what torch.compile looks for on a CPU
 
@@ -57,6 +60,8 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSetting
 
 def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> EMAModel:
     """The moving average of the parameters, on their device or on the CPU as the settings say."""
+    from diffusers.training_utils import EMAModel  # it imports most of diffusers, which takes seconds
+
     average = EMAModel(parameters, decay=settings.ema, use_ema_warmup=True)
     if settings.ema_device == "cpu":
         average.to("cpu")

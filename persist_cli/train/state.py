@@ -11,12 +11,11 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 from accelerate import PartialState
 from accelerate.utils import broadcast_object_list
-from diffusers.training_utils import EMAModel
 from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.distributed.checkpoint.api import CheckpointException
@@ -30,6 +29,9 @@ from persist_cli.errors import CheckpointError
 from persist_cli.io.files import folder_aside, read_json, read_tensors, write_json, write_tensors
 from persist_cli.io.sha256sums import check_sums, write_sums
 from persist_cli.train.distributed import is_sharded
+
+if TYPE_CHECKING:
+    from diffusers.training_utils import EMAModel
 
 STATE_FILE: Final = "training.safetensors"  # of a training that is not sharded
 

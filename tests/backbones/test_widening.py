@@ -19,7 +19,7 @@ def plain_folder(tmp_path):
     )
     transformer.save_pretrained(tmp_path / "transformer")
     blocks = {"down_block_types": ("CogVideoXDownBlock3D",) * 3, "up_block_types": ("CogVideoXUpBlock3D",) * 3}
-    AutoencoderKLCogVideoX(**MICRO["vae"], **blocks, layers_per_block=1).save_pretrained(tmp_path / "vae")
+    AutoencoderKLCogVideoX(**MICRO["vae"], **blocks).save_pretrained(tmp_path / "vae")
     CogVideoXDDIMScheduler(prediction_type="v_prediction").save_pretrained(tmp_path / "scheduler")
     return tmp_path
 

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 
 from persist_backbones.extensions.caches import enable_cache
 from persist_cli.api.backbone import Backbone, Clip, Clips, Sampling
-from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.observations import Observations
 from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone

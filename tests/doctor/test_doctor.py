@@ -25,6 +25,11 @@ from tests.support.micro_runs import MICRO_SETTINGS
 MICRO = [*MICRO_SETTINGS, "base=null"]
 SMALL = ["training.batch=8", "training.precision=bf16"]
 
+# savings in force already, so that few others are estimated
+SAVING = ["training.batch=2", "training.vae_slicing=true", "training.gradient_checkpointing=true"]
+
+SEARCHED = ["training.batch=2", "training.precision=no", "training.ema_device=cpu"]
+
 ONE_GPU = Launch(1, True)
 
 
@@ -118,7 +123,7 @@ def test_no_strategy_is_refused_by_the_training_that_it_is_for(recipe, settings,
 
 
 def test_the_smallest_change_that_is_reported_fits_when_it_is_made(persist):
-    settings = [*MICRO, *SMALL, "--gpu-memory", str(estimate().peak * 0.8 / GIB)]
+    settings = [*MICRO, *SEARCHED, "--gpu-memory", str(estimate(*SEARCHED).peak * 0.8 / GIB)]
     before = json.loads(persist("doctor", "tiny-stage1", *settings, "--json").out)
     assert not before["fits"]
     assert before["smallest"]["settings"]
@@ -151,7 +156,7 @@ def test_the_launch_command_runs_the_recipe_with_the_strategy():
 
 
 def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
-    settings = [*MICRO, *SMALL, "base=nowhere", "--gpus", "1", "--gpu-memory", "1", "--json"]
+    settings = [*MICRO, *SAVING, "base=nowhere", "--gpus", "1", "--gpu-memory", "1", "--json"]
     recipes = ("tiny-stage1", "tiny-stage2-voxel")
     stage1, stage2 = (json.loads(persist("doctor", name, *settings).out)["strategies"] for name in recipes)
     assert (stage1[-1]["name"], stage1[-1]["recipe"]) == ("stage 2 only", "tiny-stage2-voxel")
@@ -161,7 +166,7 @@ def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
 
 def test_the_launch_command_has_the_users_options_and_the_pretrained_weights_to_begin_with(persist):
     machine = ["--gpus", "2", "--gpu-memory", "80", "--fsdp"]
-    changes = [*MICRO, "training.batch=8", "lora={rank: 2}"]
+    changes = [*MICRO, *SAVING, "lora={rank: 2}"]
     words = shlex.split(persist("doctor", "tiny-stage1", *machine, *changes).out.splitlines()[-1])
     assert words[:6] == ["accelerate", "launch", "--num_processes", "2", "--use_fsdp", "--fsdp_version"]
     assert words[words.index("DATA") + 1 :] == [*changes, "backbone.settings.pretrained=DIR"]
@@ -214,7 +219,7 @@ def test_an_impossible_recipe_or_machine_is_reported_in_one_line(persist, option
 
 def test_what_is_not_installed_is_one_proposal_less_and_no_error(persist, monkeypatch):
     monkeypatch.setitem(sys.modules, "peft", None)
-    arguments = ["doctor", "tiny-stage1", *MICRO, *SMALL, "--gpu-memory", "80"]
+    arguments = ["doctor", "tiny-stage1", *MICRO, *SAVING, "--gpu-memory", "80"]
     ended, record = persist(*arguments), json.loads(persist(*arguments, "--json").out)
     cause = "lora needs the package peft: pip install 'persist-cli[lora]'"
     assert (ended.code, f"\nnot considered: LoRA ({cause})\n" in ended.out) == (0, True)

@@ -7,14 +7,13 @@ import json
 import re
 import shutil
 import signal
-import subprocess
-import time
 
 import pytest
 
 from persist_cli.cli.app import main
 from persist_cli.io.files import read_json, write_json
-from tests.support.micro_runs import PERSIST, run_persist_in_two_processes, without_depth
+from tests.support.micro_runs import without_depth
+from tests.support.processes import run_command, run_in_pair, start_persist, wait_until
 
 QUICK = ["--memories", "stage1,voxel", "--metrics", "psnr,absrel", "--seeds", 2, "--steps", 2]
 
@@ -91,12 +90,10 @@ def test_eval_leaves_a_report_with_clips_of_every_row(uninterrupted):
 
 def test_a_killed_eval_goes_on_to_the_same_figures(uninterrupted, voxel, held_out, tmp_path):
     out = tmp_path / "eval"
-    command = [str(part) for part in [*PERSIST, "eval", voxel, "--data", held_out, *QUICK, "--batch", 1, "--out", out]]
-    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while running.poll() is None and len(list(out.glob("parts/row-*"))) < 3:
-        time.sleep(0.02)
-    running.send_signal(signal.SIGKILL)
-    running.wait()
+    running = start_persist("eval", voxel, "--data", held_out, *QUICK, "--batch", 1, "--out", out)
+    wait_until(lambda: len(list(out.glob("parts/row-*"))) >= 3, running)
+    running.send(signal.SIGKILL)
+    assert running.wait() == -signal.SIGKILL
     before = {path: path.stat().st_mtime_ns for path in out.glob("parts/row-*")}
     assert len(before) >= 3
     assert not (out / "metrics.json").exists()
@@ -107,7 +104,8 @@ def test_a_killed_eval_goes_on_to_the_same_figures(uninterrupted, voxel, held_ou
 
 def test_two_processes_give_the_same_figures_as_one(uninterrupted, voxel, held_out, tmp_path):
     command = ["eval", voxel, "--data", held_out, *QUICK, "--batch", 1, "--out", tmp_path / "eval"]
-    run_persist_in_two_processes(*map(str, command))
+    codes = run_in_pair(run_command, [*map(str, command)], output=tmp_path)
+    assert codes == [0, 0], (tmp_path / "0.log").read_text()
     assert results(tmp_path / "eval")["environment"]["processes"] == 2
     assert tables(tmp_path / "eval") == tables(uninterrupted)
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import signal
 import time
 from dataclasses import replace
 
@@ -17,6 +16,7 @@ from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.memory_config import plugin_settings
 from persist_cli.memorize.memory_file import load_memory, load_paths
+from tests.support.processes import start_persist, wait_until
 from tests.support.room_views import MEMORIES, same_bits
 from tests.support.rooms import Room, walk
 
@@ -147,12 +147,10 @@ def test_killing_memorize_leaves_no_partial_file_and_it_can_run_again(data, tmp_
     expected = (tmp_path / "expected" / "room.safetensors").read_bytes()
     out = tmp_path / "killed" / "room.safetensors"
     out.parent.mkdir()
-    command = [sys.executable, "-c", "from persist_cli.cli.app import main; main()", "memorize", f"{data}#a"]
-    process = subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while process.poll() is None and not any(out.parent.iterdir()):
-        time.sleep(0.0005)
+    process = start_persist("memorize", f"{data}#a", "--out", out)
+    wait_until(lambda: any(out.parent.iterdir()), process)
     time.sleep(delay)
-    process.kill()
+    process.send(signal.SIGKILL)
     process.wait()
     assert not out.exists() or out.read_bytes() == expected
     memorize(capsys, f"{data}#a", "--out", out)

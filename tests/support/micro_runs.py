@@ -33,7 +33,7 @@ MICRO = {
         "num_layers": 2, "num_attention_heads": 2, "attention_head_dim": 32, "in_channels": 8, "out_channels": 4,
         "time_embed_dim": 32, "text_embed_dim": 8,
     },
-    "vae": {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4},
+    "vae": {"block_out_channels": [8, 8, 8], "layers_per_block": 1, "norm_num_groups": 4, "latent_channels": 4},
 }  # fmt: skip
 
 MICRO_SETTINGS = [
@@ -85,11 +85,6 @@ def two_process_launch(module: str, *arguments: str, kind: Sequence[str] = ("--m
     command = [sys.executable, "-m", "accelerate.commands.launch", *launch, "--module"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "true"}
     return {"args": [*command, module, *arguments], "env": environment}
-
-
-def run_persist_in_two_processes(*arguments: str) -> None:
-    """Run ``persist`` as two processes."""
-    subprocess.run(**two_process_launch("persist_cli", *arguments), check=True, capture_output=True)
 
 
 def run_result(run: Path) -> tuple[dict[str, torch.Tensor], str]:

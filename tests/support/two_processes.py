@@ -1,7 +1,7 @@
-"""Several commands of ``persist`` in the same two processes, because processes are slow to start.
+"""Several commands of ``persist`` in the same two processes with gloo, whose connection they share.
 
-A launcher runs ``python -m tests.support.two_processes JOBS.json``. A job is the environment and the arguments of a
-command. The main process writes the exit code and the error output of each into a file beside the jobs.
+A job is the environment and the arguments of a command. The main process writes the exit code and the error output of
+each into a file.
 """
 
 from __future__ import annotations
@@ -10,15 +10,14 @@ import contextlib
 import io
 import json
 import os
-import subprocess
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from accelerate.state import AcceleratorState
 
 from persist_cli.cli.app import main
-from tests.support.micro_runs import two_process_launch
+from tests.support.processes import run_in_pair
 
 Job = dict[str, Any]
 
@@ -30,12 +29,17 @@ def job(*arguments: str, **environment: str) -> Job:
 
 def run_in_two(folder: Path, *jobs: Job) -> list[tuple[int, str]]:
     """Run jobs in two processes with gloo; returns the exit code and the error output of each."""
-    (folder / "jobs.json").write_text(json.dumps(jobs))
-    process = subprocess.run(
-        **two_process_launch("tests.support.two_processes", str(folder / "jobs.json")), capture_output=True, text=True
-    )
-    assert process.returncode == 0, process.stderr
+    codes = run_in_pair(run_jobs, folder, jobs, output=folder)
+    assert codes == [0, 0], (folder / "0.log").read_text()
     return [(code, errors) for code, errors in json.loads((folder / "ended.json").read_text())]
+
+
+def run_jobs(folder: Path, jobs: Sequence[Job]) -> None:
+    """Run jobs one after another in this process; the main one writes how they ended into ``folder/ended.json``."""
+    os.environ["FORK_LAUNCHED"] = "1"  # so that accelerate keeps the connection of the processes for the next job
+    results = [run(job) for job in jobs]
+    if os.environ["RANK"] == "0":
+        (folder / "ended.json").write_text(json.dumps(results))
 
 
 def run(job: Job) -> tuple[int, str]:
@@ -52,11 +56,3 @@ def run(job: Job) -> tuple[int, str]:
         for name in job["environment"]:
             del os.environ[name]
     return 0, errors.getvalue()
-
-
-if __name__ == "__main__":
-    os.environ["FORK_LAUNCHED"] = "1"  # so that accelerate keeps the connection of the processes for the next job
-    path = Path(sys.argv[1])
-    results = [run(job) for job in json.loads(path.read_text())]
-    if os.environ["RANK"] == "0":
-        (path.parent / "ended.json").write_text(json.dumps(results))

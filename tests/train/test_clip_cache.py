@@ -21,16 +21,20 @@ from persist_cli.io.files import ASIDE, read_tensors
 from persist_cli.memorize import sources
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import find_plugin, make_backbone
-from persist_cli.recipe import Recipe, TrainingSettings
+from persist_cli.recipe import DataSettings, Recipe, TrainingSettings
 from persist_cli.train import clip_cache
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.tensor_cache import STALE, CacheSettings, TensorCache, cache_key
 from tests.support.disk import file_limit
-from tests.support.micro_runs import MICRO, MICRO_SETTINGS, SIZE, equal_runs, losses, run_persist_process, stage
+from tests.support.micro_runs import MICRO, MICRO_SETTINGS, SIZE, equal_runs, losses, stage
+from tests.support.processes import start_persist
 
 FEW = "data.clips_per_trajectory=3"
 
-STILL = "backbone.settings.vae={block_out_channels: [8, 8, 8], norm_num_groups: 4, latent_channels: 4, "
+STILL = (
+    "backbone.settings.vae={block_out_channels: [8, 8, 8], layers_per_block: 1, norm_num_groups: 4, "
+    "latent_channels: 4, "
+)
 
 FRAMEWISE = ["base=null", *MICRO_SETTINGS, STILL + "temporal_compression_ratio: 1}"]
 
@@ -134,9 +138,10 @@ def test_with_a_full_cache_only_the_clip_is_encoded_and_not_its_trajectory(persi
 @pytest.mark.slow
 def test_latents_are_stored_in_the_precision_of_training(walks, stage1, tmp_path):
     changes = [f"base={stage1}", FEW, "training.precision=bf16"]  # a process of its own: accelerate fixes it for one
-    run_persist_process(*stage("stage1", walks, tmp_path / "without", *changes))
+    assert start_persist(*stage("stage1", walks, tmp_path / "without", *changes)).wait() == 0
     for name in ("cold", "warm"):
-        run_persist_process(*stage("stage1", walks, tmp_path / name, *changes, "--cache", str(tmp_path / "cache")))
+        cached = stage("stage1", walks, tmp_path / name, *changes, "--cache", str(tmp_path / "cache"))
+        assert start_persist(*cached).wait() == 0
         assert equal_runs(tmp_path / "without", tmp_path / name)
     latents = [read_tensors(path)[0]["video"] for path in entries(tmp_path / "cache")]
     assert {video.dtype for video in latents} == {torch.bfloat16}
@@ -163,7 +168,8 @@ def keys_of(walks, voxel):
         memory = replace(usual, **changes) if stage == "2" else None
         backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget})
         factory = MemoryFactory.of(memory) if memory else None
-        recipe = Recipe(stage, memory=memory, training=TrainingSettings(precision=precision))
+        data = DataSettings(clips_per_trajectory=3)
+        recipe = Recipe(stage, memory=memory, data=data, training=TrainingSettings(precision=precision))
         with torch.no_grad():
             next(backbone.codec.parameters()).add_(codec)
         return CacheKeys.of(recipe, backbone, factory, "cpu").of_clip(frames)

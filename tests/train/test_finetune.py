@@ -32,6 +32,7 @@ from tests.support.micro_runs import (
     run_result,
     stage,
 )
+from tests.support.processes import start_persist, wait_until
 
 
 def test_a_run_writes_its_recipe_logs_loss_curve_and_checkpoint(codec):
@@ -124,12 +125,10 @@ def test_a_run_killed_at_a_random_moment_resumes_and_ends_like_an_uninterrupted_
 ):
     run = tmp_path / "killed"
     arguments = stage("stage1", walks, run, "--resume", f"base={codec}", *SIX)
-    child = subprocess.Popen([*PERSIST, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while not list(run.glob("step-*")) and time.monotonic() < deadline and child.poll() is None:
-        time.sleep(0.02)
+    child = start_persist(*arguments)
+    wait_until(lambda: list(run.glob("step-*")), child)
     time.sleep(random.Random(seed).random() * 0.3)
-    child.send_signal(signal.SIGKILL)
+    child.send(signal.SIGKILL)
     child.wait()
     find_checkpoint(run)
     assert persist(*arguments).code == 0
