@@ -209,8 +209,8 @@ def main() -> None:
     """Measure all rows on all clips."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, nargs="+", required=True)
-    parser.add_argument("--checkpoint", default=None, help="by default the packaged model")
-    parser.add_argument("--adapters", nargs="*", default=[], help="stage-2 runs of that checkpoint")
+    parser.add_argument("--checkpoint", type=Path, help="by default the packaged model")
+    parser.add_argument("--adapters", type=Path, nargs="*", default=[], help="stage-2 runs of that checkpoint")
     parser.add_argument("--packaged", action="store_true", help="the checkpoint's adapter voxel, too")
     parser.add_argument("--each", type=int, default=2, help="clips of each trajectory")
     parser.add_argument("--cell", type=float, default=0.02)
