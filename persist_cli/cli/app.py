@@ -13,20 +13,27 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
     DEFAULT_CONTROLS,
     ActionsOption,
+    CheckpointsArgument,
     Commands,
     CompareOption,
     ContextNoiseOption,
     ControlsOption,
     DtypeOption,
     GuidanceOption,
+    HoldOutOption,
     JsonOption,
     MemoriesOption,
     NewPosesOption,
+    ResampleOption,
     SamplerOption,
     SamplingOfOption,
     SaveMemoryOption,
+    SkipBadOption,
     StepOption,
     StepsOption,
+    StoredTurnOption,
+    TrainingScenesOption,
+    TrainingSeedsOption,
     TurnOption,
     VerifyOption,
     limit_spinning,
@@ -116,15 +123,9 @@ def import_(
     size: Annotated[str | None, typer.Option(help="Resize (after cropping to the aspect) to HxW.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Keep every n-th frame.")] = 1,
     step: Annotated[float | None, typer.Option(min=0.001, help="Store walking actions: metres of a step.")] = None,
-    turn: Annotated[
-        float | None, typer.Option(min=0.001, max=180.0, help="Store walking actions: degrees of a turn.")
-    ] = None,
-    skip_bad: Annotated[
-        bool, typer.Option("--skip-bad", help="Leave out frames whose pose or images cannot be used, and count them.")
-    ] = False,
-    hold_out: Annotated[
-        float, typer.Option(help="Share of frames at the end kept for tests: writes OUT/train and OUT/test.")
-    ] = 0.0,
+    turn: StoredTurnOption = None,
+    skip_bad: SkipBadOption = False,
+    hold_out: HoldOutOption = 0.0,
     json: JsonOption = False,
 ) -> None:
     """Import posed RGB-D of another format.
@@ -237,7 +238,7 @@ def memorize(
     data: Annotated[list[str] | None, typer.Argument(metavar="DATA[#trajectory[:frames]]")] = None,
     out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
     memory: Annotated[
-        str | None, typer.Option(help="A memory (`persist plugins`); the checkpoint's, else voxel.")
+        str | None, typer.Option(help="A memory (`persist plugins`); the checkpoint's, or voxel.")
     ] = None,
     encoder: Annotated[str | None, typer.Option(help="An encoder; `persist plugins` lists them.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="As in memory.cell=[0.25,1,0.25].")] = None,
@@ -310,9 +311,7 @@ def rollout(
 
 @app.command("eval")
 def evaluate(
-    checkpoints: Annotated[
-        list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Runs or checkpoints; else the reference.")
-    ] = None,
+    checkpoints: CheckpointsArgument = None,
     data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
     protocol: Annotated[str, typer.Option(help="revisit, return, long, unseen or later.")] = "revisit",
     memories: MemoriesOption = None,
@@ -331,32 +330,21 @@ def evaluate(
     verify: VerifyOption = False,
     batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
     pose_noise: Annotated[tuple[float, float], typer.Option(help="Of noisy and drifting: σ in cm, degrees.")] = (5, 2),
-    training_seeds: Annotated[
-        bool, typer.Option("--training-seeds", help="Checkpoints whose recipes differ in seeds alone are one row.")
-    ] = False,
+    training_seeds: TrainingSeedsOption = False,
     new_poses: NewPosesOption = (0.2, 10.0),
-    allow_training_scenes: Annotated[
-        bool, typer.Option("--allow-training-scenes", help="Evaluate scenes of the training, too; results say so.")
-    ] = False,
-    resample: Annotated[
-        str, typer.Option(help="What intervals draw: scenes (houses), or clips where all are of one place.")
-    ] = "scenes",
+    allow_training_scenes: TrainingScenesOption = False,
+    resample: ResampleOption = "scenes",
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/eval"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html, tables, curves, clips.")] = None,
     compare: CompareOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Compare checkpoints, memories and controls on equal clips of held-out scenes.
+    """Compare checkpoints, memories and controls on equal clips of held-out scenes, or two results (--compare).
 
     persist eval runs/none runs/voxel --data runs/houses-test --memories none,voxel --report runs/report
-
-    persist eval --compare runs/a/metrics.json runs/b/metrics.json
     """
     if compare is not None:
-        from persist_cli.evaluate.report.compare import run_compare
-
-        run_compare(*compare, json, report)
-        return
+        return compare_results(compare, json, report)
     if not data:
         raise PersistError("give --data DATA (--data sample comes with persist), or --compare A.json B.json")
     from persist_cli.evaluate.evaluate import run_eval
@@ -364,15 +352,21 @@ def evaluate(
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
-        data=tuple(data), protocol=protocol, memories=None if memories is None else split_names(memories),
-        controls=split_names(DEFAULT_CONTROLS if controls is None else controls), controls_named=controls is not None,
-        metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), batch=batch, noise=pose_noise,
-        placement=InferenceOptions.of(dtype, save_memory), resample=resample,
-        training_seeds=training_seeds, sampling_of=SamplingOverrides.by_memory(sampling_of or ()),
-        new_poses=NewPoses(*new_poses), allow_training_scenes=allow_training_scenes,
+        data=tuple(data), protocol=protocol, metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
+        memories=None if memories is None else split_names(memories), controls_named=controls is not None, batch=batch,
+        controls=split_names(DEFAULT_CONTROLS if controls is None else controls), noise=pose_noise, resample=resample,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), training_seeds=training_seeds,
+        sampling_of=SamplingOverrides.by_memory(sampling_of or ()), allow_training_scenes=allow_training_scenes,
+        placement=InferenceOptions.of(dtype, save_memory), new_poses=NewPoses(*new_poses),
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
+
+
+def compare_results(files: tuple[Path, Path], json: bool, report: Path | None) -> None:
+    """Compare two files of results."""
+    from persist_cli.evaluate.report.compare import run_compare
+
+    run_compare(*files, json, report)
 
 
 @app.command(context_settings={"allow_interspersed_args": True})

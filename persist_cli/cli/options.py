@@ -28,6 +28,10 @@ SPINS: Final = "3000"  # rounds of busy waiting, some microseconds; tests/benchm
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
+CheckpointsArgument = Annotated[
+    list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Runs or checkpoints; else the reference.")
+]
+
 StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
 
 SamplerOption = Annotated[
@@ -56,6 +60,20 @@ ContextNoiseOption = Annotated[
     ),
 ]
 
+StoredTurnOption = Annotated[
+    float | None,
+    typer.Option("--turn", min=0.001, max=180.0, help="Store walking actions: degrees of a turn."),
+]
+
+SkipBadOption = Annotated[
+    bool, typer.Option("--skip-bad", help="Leave out frames whose pose or images cannot be used, and count them.")
+]
+
+HoldOutOption = Annotated[
+    float,
+    typer.Option("--hold-out", help="Share of frames at the end kept for tests: writes OUT/train and OUT/test."),
+]
+
 DEFAULT_CONTROLS: Final = "copy,nearest,warp,codec,shuffled,emptied"
 
 MemoriesOption = Annotated[
@@ -81,6 +99,18 @@ NewPosesOption = Annotated[
         metavar="METRES DEGREES",
         help="A frame counts if no frame in memory is nearer than both; 0 0 counts every frame.",
     ),
+]
+
+TrainingScenesOption = Annotated[
+    bool, typer.Option("--allow-training-scenes", help="Evaluate scenes of the training, too; results say so.")
+]
+
+TrainingSeedsOption = Annotated[
+    bool, typer.Option("--training-seeds", help="Checkpoints whose recipes differ in seeds alone are one row.")
+]
+
+ResampleOption = Annotated[
+    str, typer.Option("--resample", help="What intervals draw: scenes (houses), or clips where all are of one place.")
 ]
 
 CompareOption = Annotated[

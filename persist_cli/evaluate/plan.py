@@ -139,11 +139,7 @@ def prepare(
         {memory: replace(sampling, **own.requested()) for memory, own in plan.sampling_of.items()},
     )  # fmt: skip
     config.check()
-    plan.new_poses.check()
-    if plan.resample not in RESAMPLE_UNITS:
-        raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
-    if plan.protocol not in PROTOCOLS:
-        raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
+    check_choices(plan)
     protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
     with busy("loading the models"):
         bases = check_bases(checkpoints, plan.data, [sampling, *config.sampling_of.values()], loader)
@@ -173,6 +169,15 @@ def prepare(
     clip_frames = bases.frames_per_clip - 1
     suites = [MetricSuite(metrics, make_setup(cases, gives_depth, clip_frames)) for gives_depth in depths]
     return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
+
+
+def check_choices(plan: EvalPlan) -> None:
+    """Raise ``PersistError`` for an unknown protocol or unit of resampling, or limits of new poses that cannot be."""
+    plan.new_poses.check()
+    if plan.resample not in RESAMPLE_UNITS:
+        raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
+    if plan.protocol not in PROTOCOLS:
+        raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
 
 
 def find_cases(protocol: Protocol, search: ClipSearch, plan: EvalPlan) -> list[Case]:

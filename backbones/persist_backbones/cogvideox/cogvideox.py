@@ -6,8 +6,7 @@ Start reading here: ``forward`` is the training loss, ``sample`` the sampling lo
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCondition, VideoShape
-from persist_backbones.adapters.forms import adapter_settings, load_adapter, make_adapter, save_adapter
+from persist_backbones.cogvideox.adapted import AdaptedBackbone
 from persist_backbones.cogvideox.codec import Codec, frames_to_batch, to_uint8
 from persist_backbones.cogvideox.codec_start import start_as_components
 from persist_backbones.cogvideox.config import CogVideoXSettings
@@ -56,13 +55,10 @@ from persist_backbones.cogvideox.parts import (
 )
 from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_backbones.noise_levels import add_level, draw_levels
-from persist_cli.api.backbone import Backbone, ClipLatents, Clips, Sampling
-from persist_cli.api.cameras import Cameras
+from persist_cli.api.backbone import ClipLatents, Clips, Sampling
 from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.stages import ParameterGroup, Stage
-from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
-from persist_cli.io.setting_docs import Setting
 
 
 @dataclass
@@ -100,7 +96,7 @@ class NoisedPrediction(NamedTuple):
     timesteps: Tensor
 
 
-class CogVideoX(Backbone):
+class CogVideoX(AdaptedBackbone):
     """diffusers' CogVideoX image-to-video, widened to RGB-D, cameras, interactions and memory (PEWM).
 
     Args:
@@ -115,8 +111,6 @@ class CogVideoX(Backbone):
 
     def __init__(self, settings: CogVideoXSettings) -> None:
         super().__init__(settings)
-        self.adapters = nn.ModuleDict()
-        self.adapter_name: str | None = None
         self.current_timestep: Tensor | None = None  # of the prediction, while clips are sampled
         self.set_parts(starting_parts(settings))
         self.prompt = starting_prompt(settings, self.prompt)
@@ -284,52 +278,6 @@ class CogVideoX(Backbone):
         """Scale latents of the first frame alone for the model, and add zeros for all other latent frames."""
         return self.shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
 
-    def memory_condition(
-        self, clips: Clips, generators: list[torch.Generator] | None = None, level: Tensor | None = None
-    ) -> MemoryCondition:
-        """Embed the batch's tokens with the adapter in use; without an adapter there is no memory.
-
-        Args:
-            clips: the batch; without tokens its memory is empty.
-            generators: generators that draw, for training, noise and which samples see no memory.
-            level: noise level that each sample's memory is declared to have, in sampling; ``None`` for 0.
-
-        Raises:
-            CheckpointError: when the tokens do not come from the encoder that the adapter was trained with.
-        """
-        adapter = self.adapter
-        if adapter is None:
-            return NO_MEMORY
-        tokens = clips.tokens or MemoryTokens.stack([MemoryTokens.empty(adapter.channels)] * len(clips.seeds))
-        if tokens.features.shape[-1] != adapter.channels:
-            raise CheckpointError(
-                f"the memory gives features of {tokens.features.shape[-1]} channels, adapter {self.adapter_name!r} was "
-                f"trained with {adapter.channels}; use the encoder it was trained with"
-            )
-        cameras = clips.cameras.to(self.device)
-        with torch.no_grad():
-            tokens = adapter.render(tokens.to(self.device), cameras, self.codec.encode)
-        if generators is not None and adapter.settings.noise:
-            level = draw_levels(generators, adapter.settings.noise)
-            tokens = adapter.noisy(tokens, level.to(self.device), generators)
-        memory = adapter.prepare(tokens, cameras)
-        if level is not None and adapter.settings.noise:
-            memory = dataclasses.replace(memory, level=level.to(self.device))
-        return AdapterCondition(adapter, memory if generators is None else adapter.dropped(memory, generators))
-
-    @torch.no_grad()
-    def keep_tokens(self, clips: Clips) -> MemoryTokens:
-        """Return what the adapter in use needs of the clips' tokens: the encoded views of a memory that it renders."""
-        tokens, adapter = super().keep_tokens(clips), self.adapter
-        if adapter is None:
-            return tokens
-        return adapter.render(tokens.to(self.device), clips.cameras.to(self.device), self.codec.encode)
-
-    def token_encoding(self) -> str:
-        """Return what ``keep_tokens`` depends on: the codec, and the adapter's settings of rendering."""
-        settings = None if self.adapter is None else self.adapter.rendering()
-        return "" if settings is None else json.dumps({"codec": self.encoding()} | dict(settings), sort_keys=True)
-
     def conditions(
         self,
         clips: Clips,
@@ -395,25 +343,6 @@ class CogVideoX(Backbone):
         """Whether the codec encodes every frame alone."""
         return self.codec.framewise
 
-    @property
-    def adapter(self) -> Adapter[Any] | None:
-        """The memory adapter in use, ``None`` without one."""
-        return None if self.adapter_name is None else self.adapters[self.adapter_name]  # type: ignore[return-value]
-
-    @property
-    def token_budget(self) -> int:
-        """Largest number of tokens that the adapter in use takes for a clip; 0 without an adapter."""
-        return self.adapter.settings.token_budget if self.adapter else 0
-
-    @property
-    def reads_frames(self) -> bool:
-        """Whether the adapter in use reads whole frames."""
-        return self.adapter is not None and self.adapter.reads_frames
-
-    def count_tokens(self, tokens: MemoryTokens, cameras: Cameras) -> int:
-        """Return how many tokens the adapter in use makes of one sample's memory tokens."""
-        return super().count_tokens(tokens, cameras) if self.adapter is None else self.adapter.count(tokens, cameras)
-
     def parameter_groups(self) -> list[ParameterGroup]:
         """Return the parameters of VAE, transformer, LoRA, widening and each memory adapter, in this order."""
         return group_parameters(self.named_parameters())
@@ -452,21 +381,6 @@ class CogVideoX(Backbone):
         if stage == "codec" and self.settings.codec_trains == "all":
             self.codec.take_scale((batch.rgb.to(self.device), batch.depth.to(self.device)) for batch in clips)
 
-    @classmethod
-    def adapter_settings(cls, chosen: Mapping[str, Any]) -> list[Setting]:
-        """Return the settings of the form and preset that are chosen."""
-        return adapter_settings(chosen)
-
-    def add_adapter(self, name: str, channels: int, settings: Mapping[str, Any]) -> None:
-        """Add a fresh memory adapter and use it."""
-        self._take_adapter(name, make_adapter(channels, settings, self.video_shape, f"adapter {name!r}"))
-
-    def use_adapter(self, name: str | None) -> None:
-        """Use one of the adapters, or none: plain stage 1."""
-        if name is not None and name not in self.adapters:
-            raise CheckpointError(f"no memory adapter {name!r}; there are: {', '.join(self.adapters) or 'none'}")
-        self.adapter_name = name
-
     def checkpoint_settings(self) -> dict[str, Any]:
         """Return the settings without the sources of weights and prompt, and with what the weights were trained for."""
         rotary = self.transformer.base.config.use_rotary_positional_embeddings
@@ -503,21 +417,7 @@ class CogVideoX(Backbone):
         """Return the setting ``pretrained`` with an absolute path, valid from any working directory."""
         return origin_of(self.settings.pretrained)
 
-    def save_adapter(self, folder: Path) -> None:
-        """Write the memory adapter in use."""
-        if self.adapter is None:
-            raise CheckpointError("no memory adapter is in use, so none can be saved")
-        save_adapter(self.adapter, folder)
-
-    def load_adapter(self, name: str, folder: Path) -> None:
-        """Add the adapter that ``save_adapter`` wrote, and use it."""
-        self._take_adapter(name, load_adapter(folder, self.video_shape))
-
     @property
     def video_shape(self) -> VideoShape:
         """The sizes of the model that an adapter is built for."""
         return self.transformer.video_shape(self.codec.spatial, self.codec.temporal)
-
-    def _take_adapter(self, name: str, adapter: Adapter[Any]) -> None:
-        self.adapters[name] = adapter.to(self.device)
-        self.adapter_name = name
