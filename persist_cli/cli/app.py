@@ -237,9 +237,7 @@ def relink(
 def memorize(
     data: Annotated[list[str] | None, typer.Argument(metavar="DATA[#trajectory[:frames]]")] = None,
     out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
-    memory: Annotated[
-        str | None, typer.Option(help="A memory (`persist plugins`); the checkpoint's, or voxel.")
-    ] = None,
+    memory: Annotated[str | None, typer.Option(help="Of `persist plugins`; the checkpoint's, else voxel.")] = None,
     encoder: Annotated[str | None, typer.Option(help="An encoder; `persist plugins` lists them.")] = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="As in memory.cell=[0.25,1,0.25].")] = None,
     checkpoint: Annotated[
