@@ -331,7 +331,7 @@ def scenes_of(clips: ClipDataset) -> TrainingScenes:
     """The scenes of all clips, and the views that cameras have in random windows too."""
     names = frozenset(trained_scene(file.info) for file in clips.files)
     views = [vertical_view(file.info, share) for file in clips.files for share in (clips.plan.augmentation.crop, 1.0)]
-    return TrainingScenes(names, fov=(min(views), max(views)))
+    return TrainingScenes(names, fov=(min(views), max(views)) if views else None)
 
 
 def augmentation_of(data: DataSettings) -> Augmentation:

@@ -182,8 +182,8 @@ def compare_samplers(comparison: Comparison) -> list[dict[str, Any]]:
             model.sampling = sampling
             clip_seconds, video = imagine(model, clip)
             seconds[name].append(clip_seconds)
-            frame_figures = comparison.suite.figures(video.rgb, video.depth, clip, name)[1:]
-            figures[name].append(frame_figures.mean(0).numpy())
+            prediction = comparison.suite.prediction(video.rgb, video.depth, clip, name)
+            figures[name].append(comparison.suite.figures(prediction)[1:].mean(0).numpy())
     times = Times({name: np.array(values) for name, values in seconds.items()})
     first = next(iter(samplings))
     return [

@@ -14,10 +14,10 @@ def model(tmp_path_factory):
     return fresh_model(tmp_path_factory.mktemp("model"), MICRO)
 
 
-def test_samplers_and_memories_are_compared_on_clips_that_return(model, walks, tmp_path, capsys, monkeypatch):
+def test_samplers_and_memories_are_compared_on_clips_that_return(model, held_out, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))  # without weights of LPIPS
     sizes = ["--clips", "2", "--steps", "3,1", "--guidance", "1.5"]
-    main(["--checkpoint", *map(str, model), "--data", str(walks), *sizes, "--out", str(tmp_path)])
+    main(["--checkpoint", *map(str, model), "--data", str(held_out), *sizes, "--out", str(tmp_path)])
     results = json.loads((tmp_path / "sampling.json").read_text())
     samplers, memories = results["samplers"], results["memories"]
     assert [(row["sampler"], row["steps"]) for row in samplers] == [(name, n) for name in SAMPLERS for n in (3, 1)]
@@ -34,9 +34,9 @@ def test_samplers_and_memories_are_compared_on_clips_that_return(model, walks, t
     assert "time to ddim 3" in printed
 
 
-def test_a_memory_that_no_checkpoint_has_is_an_error(model, walks):
+def test_a_memory_that_no_checkpoint_has_is_an_error(model, held_out):
     with pytest.raises(CheckpointError, match="no checkpoint has a memory adapter 'map2d'; there are: none, voxel"):
-        main(["--checkpoint", *map(str, model), "--data", str(walks), "--adapter", "map2d"])
+        main(["--checkpoint", *map(str, model), "--data", str(held_out), "--adapter", "map2d"])
 
 
 def test_a_checkpoint_without_data_is_refused(model):

@@ -151,9 +151,9 @@ def test_the_baseline_is_none_where_a_checkpoint_has_it_beside_the_default_of_ea
     assert default_memories([replace(several, default=None), model]) == ("none", "map2d", "voxel")
 
 
-def test_one_memory_may_be_sampled_in_its_own_way(persist, walks, tmp_path):
+def test_one_memory_may_be_sampled_in_its_own_way(persist, held_out, tmp_path):
     model = write_model(tmp_path / "a")
-    asked = ["eval", model, "--data", walks, *ONE[2:], "--memories", "stage1,voxel", "--steps", 1]
+    asked = ["eval", model, "--data", held_out, *ONE[2:], "--memories", "stage1,voxel", "--steps", 1]
     assert persist(*asked, "--out", tmp_path / "same").code == 0
     assert persist(*asked, "--sampling-of", "voxel:steps=2,guidance=1.5", "--out", tmp_path / "own").code == 0
     same, own = (columns(tmp_path / name) for name in ("same", "own"))

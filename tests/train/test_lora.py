@@ -143,7 +143,7 @@ def test_an_export_stands_alone_and_is_the_same_model(persist, walks, lora, tmp_
 
 def test_lora_may_change_a_pretrained_directory_of_diffusers(persist, walks, pretrained, tmp_path):
     changes = [change for change in MICRO_SETTINGS if "transformer" not in change and "vae" not in change]
-    changes += ["base=null", f"backbone.settings.pretrained={pretrained}", *LORA]
+    changes += ["base=null", f"backbone.settings.pretrained={pretrained}", "backbone.settings.prompt=null", *LORA]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
     backbone = load_backbone(find_checkpoint(tmp_path / "run"))
     before = read_tensors(pretrained / "transformer/diffusion_pytorch_model.safetensors")[0]

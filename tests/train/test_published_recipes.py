@@ -12,7 +12,7 @@ TWINS = {"cogvideox-2b": "2b", "cogvideox-5b-i2v": "5b-i2v"}
 
 SMALL = [
     f"backbone.settings.height={SIZE}", f"backbone.settings.width={SIZE}", "training.steps=2", "training.batch=2",
-    "training.accumulation=1", "training.workers=0", "training.warmup=1",
+    "training.accumulation=1", "training.workers=0", "training.warmup=1", "backbone.settings.prompt=null",
 ]  # fmt: skip
 
 BLOCKS = ["memory.encoder=patches", "adapter={width: 16, heads: 2, token_budget: 32}", "data.context_frames=4"]
