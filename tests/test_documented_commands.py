@@ -28,6 +28,7 @@ from persist_cli.plugins import make_simulator
 from tests.support.documented import Block, commands, read_blocks, run_here, shown_commands, shows
 from tests.support.micro_runs import write_walks
 from tests.support.rooms import write_sequence
+from tests.support.text_encoder import write_text_encoder
 from tests.support.twins import write_twin
 
 ROOT = Path(__file__).parents[1]
@@ -100,7 +101,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 GIVEN: dict[str, Callable[[Path], object]] = {
     "captures/kitchen": lambda path: write_sequence(path, 48, (48, 64)),  # twice around, so that clips return
     "DATA": write_walks,
-    "DIR": lambda path: write_twin("5b-i2v", path),
+    "DIR": lambda path: write_text_encoder(write_twin("5b-i2v", path)),
 }
 
 

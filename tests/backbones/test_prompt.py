@@ -1,44 +1,28 @@
 """The prompt's embedding: computed by a local T5, read from a file, or zeros, and never downloaded."""
 
-import json
 import shutil
 
 import pytest
 import torch
 from diffusers import CogVideoXPipeline
-from tokenizers import Tokenizer, models, pre_tokenizers, trainers
-from transformers import T5Config, T5EncoderModel, T5Tokenizer
+from transformers import T5EncoderModel, T5Tokenizer
 
 from persist_backbones import write_prompt
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.plugins import make_backbone
 from tests.support.micro_model import micro
+from tests.support.text_encoder import write_text_encoder
 from tests.support.twins import load_twin, write_snapshot, write_twin
 
 PROMPT = "a walk"
-SPECIAL = ["<pad>", "</s>", "<unk>"]
-
-
-def small_tokenizer() -> T5Tokenizer:
-    """A unigram tokenizer, trained on one line of text."""
-    unigram = Tokenizer(models.Unigram())
-    unigram.pre_tokenizer = pre_tokenizers.Metaspace()
-    trainer = trainers.UnigramTrainer(vocab_size=40, special_tokens=SPECIAL, unk_token="<unk>", show_progress=False)
-    unigram.train_from_iterator(["a walk through a furnished house, a walk back"] * 4, trainer)
-    vocabulary = [(piece, score) for piece, score in json.loads(unigram.to_str())["model"]["vocab"]]
-    return T5Tokenizer(vocab=vocabulary, extra_ids=0)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A twin with tokenizer and text encoder, as diffusers' pipeline saves them."""
     home = write_twin("2b", tmp_path_factory.mktemp("twin"))
-    tokenizer = small_tokenizer()
-    tokenizer.save_pretrained(home / "tokenizer")
-    torch.manual_seed(1)
-    sizes = {"d_model": 8, "d_ff": 16, "d_kv": 4, "num_heads": 2, "num_layers": 1}
-    T5EncoderModel(T5Config(**sizes, vocab_size=len(tokenizer))).save_pretrained(home / "text_encoder")
+    write_text_encoder(home)
     return home
 
 
