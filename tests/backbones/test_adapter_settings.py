@@ -32,7 +32,8 @@ def test_every_adapter_form_has_exactly_the_settings_that_it_uses(form: str, tmp
 
 
 @pytest.mark.parametrize(
-    ("form", "key"), [(form, key) for form in FORM_KEYS for key in set().union(*FORM_KEYS.values()) - FORM_KEYS[form]]
+    ("form", "key"),
+    [(form, key) for form in FORM_KEYS for key in sorted(set().union(*FORM_KEYS.values()) - FORM_KEYS[form])],
 )
 def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Path) -> None:
     backbone = with_adapter(micro(), form=form)

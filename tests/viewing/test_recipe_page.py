@@ -22,7 +22,7 @@ OF_PLUGINS = [
     if kind != "importer"
     for plugin in list_plugins(kind)
 ]
-SETTINGS_TYPES = {kind for kind in [Recipe, *OF_PLUGINS, *(form.settings_type for form in FORMS.values())]}
+SETTINGS_TYPES = [*dict.fromkeys([Recipe, *OF_PLUGINS, *(form.settings_type for form in FORMS.values())])]
 
 
 def shown(name: str) -> str:
