@@ -24,8 +24,9 @@ gain-curve: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.ablations runs/gain-curve --only paper,improved \
 		--samples 1000,2000,5000,10000,20000,50000
 
+# two processes of one thread each take about half the time of one, and each file stays in one process
 test: $(STAMP) lint
-	$(VENV)/bin/python -m pytest --durations=20 -m "not slow and not gpu"
+	$(VENV)/bin/python -m pytest -n 2 --dist loadfile --durations=20 -m "not slow and not gpu"
 
 test-slow: $(STAMP)
 	$(VENV)/bin/python -m pytest -m slow
