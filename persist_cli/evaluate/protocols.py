@@ -274,7 +274,8 @@ class ThereAndBack(Protocol):
         """Find one clip in each trajectory that comes back, all of one length."""
         found: dict[Path, tuple[Tensor, int, int]] = {}
         for file in watched(search.trajectories(), "what comes back", "trajectories"):
-            found[file.path] = (file.poses(), *turning_point(file.poses()))
+            poses = file.poses()
+            found[file.path] = (poses, *turning_point(poses))
         frames = search.frames or self.usual_frames(list(found.values()), search)
         cases: list[Case] = []
         for file in watched(search.trajectories(), "seen before", "trajectories"):
