@@ -1,4 +1,4 @@
-"""Plugins by entry point: backbones, memories, encoders, simulators and importers, those of persist itself too.
+"""Plugins by entry point, such as backbones, memories and policies, those of persist itself too.
 
 Listing plugins imports none. Loading imports one and checks that its class can be used; any failure, here or later in
 one of its methods, becomes one line that names plugin, package, version, target and cause.
@@ -20,9 +20,11 @@ from persist_cli.errors import TRACEBACK, PersistError, PluginError, hint
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone
+    from persist_cli.api.cost import Cost
     from persist_cli.api.encoder import Encoder
     from persist_cli.api.importer import Importer
     from persist_cli.api.memory import FrameOfReference, Memory
+    from persist_cli.api.policy import Policy
     from persist_cli.api.simulator import Simulator
 
 
@@ -40,6 +42,8 @@ KINDS: Final = {
     "encoder": PluginKind("persist.encoders", "persist_cli.api.encoder:Encoder", ("settings",)),
     "simulator": PluginKind("persist.simulators", "persist_cli.api.simulator:Simulator", ("settings",)),
     "importer": PluginKind("persist.importers", "persist_cli.api.importer:Importer", ()),
+    "policy": PluginKind("persist.policies", "persist_cli.api.policy:Policy", ("settings",)),
+    "cost": PluginKind("persist.costs", "persist_cli.api.cost:Cost", ("settings",)),
 }
 
 OWN: Final = ("persist_cli", "persist_backbones", "persist_memory")  # packages whose errors are bugs of ours
@@ -216,6 +220,16 @@ def make_simulator(name: str, settings: dict[str, Any]) -> Simulator:
 def make_importer(name: str) -> Importer:
     """Make the importer of a name."""
     return load_plugin("importer", name)()  # type: ignore[no-any-return]
+
+
+def make_policy(name: str, settings: dict[str, Any]) -> Policy:
+    """Make the policy of a name with plain settings."""
+    return _make("policy", name, settings)  # type: ignore[no-any-return]
+
+
+def make_cost(name: str, settings: dict[str, Any]) -> Cost:
+    """Make the cost of a name with plain settings."""
+    return _make("cost", name, settings)  # type: ignore[no-any-return]
 
 
 def make_settings(kind: str, name: str, settings: dict[str, Any]) -> Any:

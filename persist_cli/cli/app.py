@@ -40,6 +40,8 @@ from persist_cli.cli.options import (
     show_version,
     split_names,
 )
+from persist_cli.cli.planning import planning_app
+from persist_cli.cli.weights import weights_app
 from persist_cli.errors import TRACEBACK, PersistError
 
 app = typer.Typer(
@@ -50,8 +52,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-weights_app = typer.Typer(no_args_is_help=True, help="Weights of encoders and metrics: what there is, fetch, path.")
 app.add_typer(weights_app, name="weights")
+app.add_typer(planning_app)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -388,7 +390,7 @@ def doctor(
 
 @app.command()
 def plugins(json: JsonOption = False) -> None:
-    """List every backbone, memory, encoder, simulator and importer; a broken one shows its cause."""
+    """List every plugin: backbones, memories, encoders, simulators, importers, policies, costs."""
     from persist_cli.viewing.listings import show_plugins
 
     show_plugins(json)
@@ -411,39 +413,3 @@ def recipes(
         from persist_cli.viewing.recipe_page import show_recipe
 
         show_recipe(name, json)
-
-
-@weights_app.command("list")
-def weights_list(json: JsonOption = False) -> None:
-    """List every weight with its use, licence, size and sources, and whether it is here."""
-    from persist_cli.weights.fetch import show_weights
-
-    show_weights(json)
-
-
-@weights_app.command("fetch")
-def weights_fetch(
-    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Weights; `persist weights list` lists them.")],
-    source: Annotated[
-        Path | None, typer.Option("--from", help="Directory to look into first; else $PERSIST_WEIGHTS.")
-    ] = None,
-    offline: Annotated[bool, typer.Option("--offline", help="Never ask the network.")] = False,
-) -> None:
-    """Bring weights into the cache, verified and as safetensors: from a directory, the hub, or a pinned archive.
-
-    persist weights fetch lpips-alex i3d-kinetics-400
-    """
-    from persist_cli.weights.fetch import run_fetch
-
-    run_fetch(names, source, offline)
-
-
-@weights_app.command("path")
-def weights_path(name: Annotated[str, typer.Argument(help="A fetched weight.")]) -> None:
-    """Print the folder of a fetched weight, and nothing else.
-
-    ls $(persist weights path lpips-alex)
-    """
-    from persist_cli.weights.fetch import show_path
-
-    show_path(name)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import MapPoints
 from persist_cli.api.observations import Origin
 from persist_cli.io.files import written_aside
@@ -71,17 +71,6 @@ def draw_map(
     _finish_axes(axes, low, high, handles)
     with written_aside(out) as aside:
         figure.savefig(aside, dpi=150, format="png")
-
-
-def ground_axes(world_up: Sequence[float]) -> Float[Tensor, "3 3"]:
-    """Return a float64 rotation whose rows are right and up in the picture, and height; it never mirrors the map.
-
-    Right is the world axis farthest from up, projected onto the ground.
-    """
-    up = torch.nn.functional.normalize(torch.tensor(list(world_up), dtype=torch.float64), dim=0)
-    right = torch.eye(3, dtype=torch.float64)[int(up.abs().argmin())]
-    right = torch.nn.functional.normalize(right - up * (up @ right), dim=0)
-    return torch.stack([right, torch.linalg.cross(up, right), up])
 
 
 def paint(

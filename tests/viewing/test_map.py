@@ -7,8 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
+from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import MapPoints
-from persist_cli.viewing.map import draw_map, ground_axes, paint
+from persist_cli.viewing.map import draw_map, paint
 from tests.support.room_views import room_walk, written_memory
 from tests.support.rooms import UP
 
