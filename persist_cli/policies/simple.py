@@ -1,0 +1,135 @@
+"""Two policies that look for no goal, to compare others with: at random, and straight ahead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from persist_cli.api.actions import Action, ActionVocabulary
+from persist_cli.api.ground import Body, Cover
+from persist_cli.api.policy import Policy, Situation
+from persist_cli.errors import PersistError
+
+CHECKS: Final = 4  # places that are looked up within the radius of the body, to each side
+
+
+@dataclass(frozen=True)
+class RandomSettings:
+    """How often each action is drawn.
+
+    Args:
+        weights: weight of each action by its name, as in ``{forward: 2, left: 1, right: 1}``; actions that are left out
+            are never drawn. Empty: all actions that walk ahead or turn are drawn equally often, as Habitat's random
+            agent does.
+    """
+
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        wrong = [name for name, weight in self.weights.items() if not 0 <= weight < math.inf]
+        if wrong or (self.weights and not any(self.weights.values())):
+            raise ValueError(f"weights {dict(self.weights)} must be at least 0, and one of them above it")
+
+
+class RandomPolicy(Policy):
+    """Draws each action by itself; it never stops."""
+
+    settings_type = RandomSettings
+    settings: RandomSettings
+
+    def propose(
+        self, situation: Situation, horizon: int, count: int, generator: torch.Generator
+    ) -> list[tuple[str, ...]]:
+        """Return ``count`` sequences of ``horizon`` actions.
+
+        Raises:
+            DataError: when the vocabulary lacks an action that has a weight.
+            PersistError: when it has no action that moves.
+        """
+        vocabulary = situation.info.vocabulary
+        weights = self.settings.weights or {action.name: 1.0 for action in ahead_or_turning(vocabulary)}
+        names = [vocabulary[name].name for name in weights]
+        shares = torch.tensor([*weights.values()], dtype=torch.float64).expand(count, -1)
+        draws = torch.multinomial(shares, horizon, replacement=True, generator=generator)
+        return [tuple(names[number] for number in row) for row in draws.tolist()]
+
+
+class StraightPolicy(Policy):
+    """Walks ahead until the known ground is occupied, and turns there to a random side until the way is free again."""
+
+    def propose(
+        self, situation: Situation, horizon: int, count: int, generator: torch.Generator
+    ) -> list[tuple[str, ...]]:
+        """Return ``count`` sequences of ``horizon`` actions, which differ in the sides that they turn to.
+
+        Raises:
+            PersistError: when the vocabulary has no step ahead or no turn.
+        """
+        return [self._walk(situation, horizon, generator) for _ in range(count)]
+
+    def _walk(self, situation: Situation, horizon: int, generator: torch.Generator) -> tuple[str, ...]:
+        vocabulary, up = situation.info.vocabulary, torch.tensor(situation.info.world_up, dtype=torch.float64)
+        ahead, turns = gait(vocabulary)
+        pose, side = situation.seen.cameras.world_from_camera[-1].double(), None
+        names: list[str] = []
+        for _ in range(horizon):
+            moved = vocabulary.move(pose, ahead.name, up)
+            if not is_blocked(situation, pose[:3, 3], moved[:3, 3]):
+                pose, side = moved, None
+                names.append(ahead.name)
+                continue
+            side = side or turns[int(torch.randint(len(turns), (1,), generator=generator))]
+            pose = vocabulary.move(pose, side.name, up)
+            names.append(side.name)
+        return tuple(names)
+
+
+def ahead_or_turning(vocabulary: ActionVocabulary) -> list[Action]:
+    """The actions that walk ahead or turn.
+
+    Raises:
+        PersistError: when there is none.
+    """
+    chosen = [action for action in vocabulary.actions if action.forward > 0 or (action.turn and not action.forward)]
+    if not chosen:
+        raise PersistError(f"no action walks ahead or turns; a policy needs one (known: {vocabulary.listing()})")
+    return chosen
+
+
+def gait(vocabulary: ActionVocabulary) -> tuple[Action, list[Action]]:
+    """The longest step straight ahead, and the smallest turn on the spot to each side that has one.
+
+    Raises:
+        PersistError: when there is no such step or no such turn.
+    """
+    steps = [action for action in vocabulary.actions if action.forward > 0 and not action.turn]
+    turning = [action for action in vocabulary.actions if action.turn and not action.forward]
+    if not steps or not turning:
+        raise PersistError(f"a policy needs a step straight ahead and a turn; known: {vocabulary.listing()}")
+    sides = [[action for action in turning if action.turn * sign > 0] for sign in (1, -1)]
+    smallest = [min(side, key=lambda action: abs(action.turn)) for side in sides if side]
+    return max(steps, key=lambda action: action.forward), smallest
+
+
+def is_blocked(situation: Situation, start: Float[Tensor, " 3"], end: Float[Tensor, " 3"]) -> bool:
+    """Whether known ground is occupied within the default body's radius of the way between two places.
+
+    Args:
+        situation: its ground is looked up; what is unknown there counts as free.
+        start: world metres.
+        end: world metres.
+    """
+    ground, radius = situation.ground, Body().radius
+    along = torch.linspace(0, 1, 2 * CHECKS + 1, dtype=torch.float64)[1:, None]
+    offsets = torch.linspace(-radius, radius, 2 * CHECKS + 1, dtype=torch.float64)
+    across = torch.cartesian_prod(offsets, offsets)
+    across = across[across.norm(dim=1) <= radius + 1e-9]
+    first, last = ground.places(torch.stack([start, end]))
+    places = (first + (last - first) * along)[:, None] + across
+    return bool((ground.at(places) == Cover.OCCUPIED).any())
