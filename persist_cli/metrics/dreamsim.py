@@ -87,8 +87,14 @@ def distance(
     weights: Mapping[str, Tensor], rgb: UInt8[Tensor, "frame 224 224 3"], truth: UInt8[Tensor, "frame 224 224 3"]
 ) -> Float[Tensor, " frame"]:
     """Return for each frame one minus the cosine similarity of the class tokens less their means."""
-    tokens = [class_token(weights, frames).double() for frames in (rgb, truth)]
-    centred, true_centred = (token - token.mean(-1, keepdim=True) for token in tokens)
+    return token_distance(class_token(weights, rgb), class_token(weights, truth))
+
+
+def token_distance(
+    tokens: Float[Tensor, "frame channel"], true_tokens: Float[Tensor, "#frame channel"]
+) -> Float[Tensor, " frame"]:
+    """Return the same distance of class tokens; the truth may be a single frame, with which all compare."""
+    centred, true_centred = (token.double() - token.double().mean(-1, keepdim=True) for token in (tokens, true_tokens))
     return 1 - torch.cosine_similarity(centred, true_centred, dim=-1)
 
 

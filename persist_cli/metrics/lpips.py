@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -131,10 +131,18 @@ def perceptual_distance(
     truth: UInt8[Tensor, "frame height width 3"],
 ) -> Float[Tensor, " frame"]:
     """Return the sum over taps of the mean over pixels of head · (difference of unit features)² (Zhang et al., (1))."""
-    pairs = zip(features(weights, network, rgb), features(weights, network, truth), strict=True)
+    return feature_distance(weights, features(weights, network, rgb), features(weights, network, truth))
+
+
+def feature_distance(
+    weights: Mapping[str, Tensor],
+    taps: Sequence[Float[Tensor, "frame channel rows columns"]],
+    true_taps: Sequence[Float[Tensor, "#frame channel rows columns"]],
+) -> Float[Tensor, " frame"]:
+    """Return the same distance of what ``features`` gave; the truth may be a single frame, with which all compare."""
     distances = [
         functional.conv2d((generated - true).square(), weights[f"head{number}.weight"]).mean((1, 2, 3))
-        for number, (generated, true) in enumerate(pairs)
+        for number, (generated, true) in enumerate(zip(taps, true_taps, strict=True))
     ]
     return torch.stack(distances).sum(0)
 

@@ -50,7 +50,7 @@ def plugin_state(plugin: Plugin, claims: int) -> str:
         loaded = import_plugin(plugin)
     except PluginError as error:
         return error.cause
-    missing = loaded.missing() if plugin.kind == "simulator" else ""
+    missing = loaded.missing() if plugin.kind in ("simulator", "cost") else ""
     return missing or "ok"
 
 

@@ -1,0 +1,103 @@
+"""Costs on random weights, and on places that can be computed by hand."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from persist_cli.api.cost import Futures
+from persist_cli.api.ground import GroundMap
+from persist_cli.api.policy import Goal
+from persist_cli.errors import PersistError
+from persist_cli.metrics import METRICS, dreamsim
+from persist_cli.metrics.lpips import ALEX, tensor_shapes
+from persist_cli.plugins import load_plugin, make_cost
+from tests.metrics.test_src import cache_random_encoder
+from tests.support.predictions import cache_random, prediction, random_frames, still_camera
+
+GROUND = GroundMap.empty((0.0, -1.0, 0.0))
+
+
+def futures_at(*positions, size=32):
+    """Futures of one frame a candidate, of random pixels, with cameras at world positions."""
+    rgb, depth = random_frames(0, frames=len(positions), size=size)
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(positions), 1, 1, 1)
+    poses[:, 0, :3, 3] = torch.tensor(positions, dtype=torch.float64)
+    return Futures(rgb[:, None], depth[:, None], poses, torch.ones(len(positions), 1, dtype=torch.bool))
+
+
+def image_goal(rgb):
+    return Goal(rgb, None, "room")
+
+
+@pytest.fixture(params=["lpips", "dreamsim", "dino"])
+def cost(request, tmp_path, monkeypatch):
+    """A cost of images with random weights."""
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    monkeypatch.setattr(dreamsim, "WIDTH", 24)
+    cache_random(tmp_path, "lpips-alex", tensor_shapes(ALEX))
+    cache_random(tmp_path, "dreamsim", dreamsim.tensor_shapes())
+    cache_random_encoder(tmp_path / "weights" / "dinov2-s-derived")
+    return make_cost(request.param, {})
+
+
+def test_only_the_goal_image_itself_costs_nothing(cost):
+    futures = futures_at((0, 0, 0), (1, 0, 0), (2, 0, 0))
+    costs = cost.measure(futures, image_goal(futures.rgb[1, 0]), GROUND)
+    assert costs.shape == (3, 1)
+    assert float(costs[1]) == pytest.approx(0, abs=1e-9)
+    assert min(costs[0], costs[2]) > 1e-6
+
+
+def test_a_frame_costs_the_same_in_any_batch_and_for_a_new_goal(cost):
+    futures = futures_at((0, 0, 0), (1, 0, 0), (2, 0, 0))
+    one = Futures(futures.rgb[2:], futures.depth[2:], futures.world_from_camera[2:], futures.free[2:])
+    for number in (0, 1):
+        goal = image_goal(futures.rgb[number, 0])
+        alone = cost.measure(one, goal, GROUND)
+        torch.testing.assert_close(cost.measure(futures, goal, GROUND)[2:], alone, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize(("name", "metric"), [("lpips", "lpips-alex"), ("dreamsim", "dreamsim")])
+@pytest.mark.parametrize("cost", ["lpips"], indirect=True)
+def test_the_costs_named_as_metrics_are_these_metrics(cost, name, metric):
+    futures, (goal, _) = futures_at((0, 0, 0), (1, 0, 0)), random_frames(1, frames=1)
+    truth = still_camera(goal.expand(2, -1, -1, -1), futures.depth[:, 0])
+    measured = METRICS[metric].measure(prediction(futures.rgb[:, 0], futures.depth[:, 0], truth))
+    costs = make_cost(name, {}).measure(futures, image_goal(goal[0]), GROUND)
+    torch.testing.assert_close(costs[:, 0], measured, rtol=1e-6, atol=1e-9)
+
+
+def test_a_goal_image_of_another_size_or_none_is_one_line(cost):
+    futures = futures_at((0, 0, 0))
+    with pytest.raises(PersistError, match="the goal image has 48×48 pixels, frames have 32×32; resize it"):
+        cost.measure(futures, image_goal(random_frames(0, size=48)[0][0]), GROUND)
+    with pytest.raises(PersistError, match=f"cost '{cost.name}' compares images, and the goal is a place"):
+        cost.measure(futures, Goal(None, torch.zeros(3), "room"), GROUND)
+
+
+def test_costs_without_weights_say_how_they_are_fetched(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    missing = {name: load_plugin("cost", name).missing() for name in ("lpips", "dreamsim", "dino", "distance")}
+    assert missing["lpips"].endswith("persist weights fetch lpips-alex")
+    assert missing["dreamsim"].endswith("persist weights fetch dreamsim --from DIR")
+    assert missing["dino"].endswith("persist weights fetch dinov2-s-derived")
+    assert missing["distance"] == ""
+    with pytest.raises(PersistError, match=r"cost 'dino': weights .* are not here"):
+        make_cost("dino", {}).measure(futures_at((0, 0, 0)), image_goal(random_frames(0)[0][0]), GROUND)
+
+
+@pytest.mark.parametrize("cost", ["lpips"], indirect=True)
+def test_images_too_small_for_lpips_are_one_line(cost):
+    futures = futures_at((0, 0, 0), size=24)
+    with pytest.raises(PersistError, match="LPIPS takes images of at least 31 px, not 24"):
+        cost.measure(futures, image_goal(futures.rgb[0, 0]), GROUND)
+
+
+def test_the_distance_is_measured_on_the_ground_alone():
+    futures = futures_at((0, 0, 0), (3, 5, 4))  # y is down here
+    goal = Goal(None, torch.tensor([0.0, -1.0, 0.0]), "room")
+    cost = make_cost("distance", {})
+    assert cost.measure(futures, goal, GROUND).tolist() == [[0.0], [5.0]]
+    with pytest.raises(PersistError, match="cost 'distance' measures the way to a place, and the goal is an image"):
+        cost.measure(futures, replace(goal, position=None, rgb=futures.rgb[0, 0]), GROUND)
