@@ -51,7 +51,7 @@ class ImageCost(Cost):
             (height, width), (high, wide) = goal.rgb.shape[:2], futures.rgb.shape[2:4]
             raise PersistError(f"the goal image has {width}×{height} pixels, frames have {wide}×{high}; resize it")
         costs = self.compare(futures.rgb.flatten(0, 1).cpu(), self.goal_features(goal.rgb.cpu()))
-        return costs.double().cpu().unflatten(0, (candidates, frames))
+        return costs.double().cpu().reshape(candidates, frames)
 
     def goal_features(self, image: UInt8[Tensor, "height width 3"]) -> Any:
         """Return the features of a goal image, those kept if it is the last one again."""

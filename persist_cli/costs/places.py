@@ -20,7 +20,8 @@ class DistanceCost(Cost):
     def measure(self, futures: Futures, goal: Goal, ground: GroundMap) -> Float[Tensor, "candidate frame"]:
         """Return the straight distance of each frame in metres; ``PersistError`` when the goal has no place."""
         places, there = ground_places(futures, goal, ground, self.name)
-        return (places - there).norm(dim=-1)
+        metres: Tensor = (places - there).norm(dim=-1)
+        return metres
 
 
 def ground_places(
