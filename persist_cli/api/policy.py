@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, UInt8
@@ -13,6 +13,9 @@ from torch import Tensor
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.io.settings import NoSettings
+
+if TYPE_CHECKING:
+    from persist_cli.api.policy_network import PolicyNetwork
 
 GoalKind = Literal["image", "place"]
 
@@ -63,7 +66,8 @@ class Policy(ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
-    frames: ClassVar[int] = 1  # of the past that it looks at, the present one included
+    network_type: ClassVar[type[PolicyNetwork] | None] = None  # what ``persist finetune`` trains for it
+    frames: int = 1  # of the past that it looks at, the present one included; an instance may need others
     reads: ClassVar[frozenset[GoalKind]] = frozenset()  # of a goal, one of them suffices; empty: it needs none
     name: str = ""  # set by the registry
 

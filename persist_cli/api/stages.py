@@ -10,8 +10,8 @@ import torch
 from pydantic import Field
 from torch import nn
 
-Stage = Literal["codec", "1", "2"]
-STAGES: tuple[Stage, ...] = ("codec", "1", "2")
+Stage = Literal["codec", "1", "2", "policy"]  # the last trains a policy, the others a backbone
+STAGES: tuple[Stage, ...] = ("codec", "1", "2")  # of a backbone
 
 
 @dataclass(frozen=True)
