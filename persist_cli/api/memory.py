@@ -71,12 +71,14 @@ class MapPoints:
         colors: uint8 RGB, 0…255.
         spread: side in metres of the square that is drawn for each point.
         origins: the ``Origin`` of each point; without it all are observed.
+        rise: metres of height that each point stands for, half of them below it; infinite where heights are unknown.
     """
 
     positions: Float[Tensor, "point 3"]
     colors: UInt8[Tensor, "point 3"]
     spread: float = 0.05
     origins: UInt8[Tensor, " point"] = None  # type: ignore[assignment]  # set below
+    rise: float = 0.0
 
     def __post_init__(self) -> None:
         if self.origins is None:

@@ -159,7 +159,7 @@ class GridMemory(Memory):
         """Return the cells' centres, in the colours of their nearest observations."""
         centers = self._in_world(self._centers(self.grid.keys))
         colors, origins = unpack_colors(self.grid.values("colors")), self.grid.values(ORIGINS)
-        return MapPoints(centers, colors, self.lattice.across, origins)
+        return MapPoints(centers, colors, self.lattice.across, origins, self.lattice.rise(self.reference.world_up))
 
     def figures(self) -> MemoryFigures:
         """Return the number of cells, their bytes, and the corners of the smallest world-aligned box around them."""

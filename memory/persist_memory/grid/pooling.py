@@ -9,7 +9,7 @@ and never the whole upsampled image.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -82,6 +82,11 @@ class Lattice:
         if self.flat:
             extent[1] = 0.0
         return extent
+
+    def rise(self, world_up: Sequence[float]) -> float:
+        """Return the metres of height that a cell stands for; infinite where all heights fall into one cell."""
+        up = torch.tensor(list(world_up), dtype=torch.float64)
+        return math.inf if self.flat else float((self.grid_from_world @ up).abs() @ self.size)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Maps of the ground from depth and memories, and ways over them."""

@@ -1,0 +1,146 @@
+"""Maps of the ground from depth, against a room whose walls and furniture are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.ground import Body, Cover, GroundMap
+from persist_cli.api.memory import FrameOfReference, MapPoints
+from persist_cli.api.observations import Observations, Origin
+from persist_cli.navigation.ground_mapper import GroundMapper, body_of, ground_from_frames
+from persist_cli.plugins import make_encoder, make_memory
+from tests.support.rooms import UP, Room, look
+
+BODY = Body(radius=0.2, camera_height=1.25, height=1.4)
+ROOM = Room(64, 64)
+
+
+def seen(*poses: np.ndarray, origin: Origin = Origin.OBSERVED) -> Observations:
+    """What a camera sees of the room."""
+    frames = list(ROOM.frames(np.stack(poses)))
+    matrix = torch.from_numpy(ROOM.intrinsics).expand(len(frames), 3, 3)
+    cameras = Cameras(torch.from_numpy(np.stack(poses)), matrix, ROOM.height, ROOM.width)
+    rgb, depth = (torch.from_numpy(np.stack([getattr(f, name) for f in frames])) for name in ("rgb", "depth"))
+    return Observations(rgb, depth, cameras).with_origin(origin)
+
+
+def around(x: float = 0.0, z: float = 0.0, pitch: float = 0.0) -> list[np.ndarray]:
+    """Poses of a whole turn at a place."""
+    return [look((x, 1.25, z), yaw, pitch) for yaw in range(0, 360, 15)]
+
+
+def cover_at(ground: GroundMap, x: float, z: float) -> Cover:
+    """The cover of a place on the room's floor."""
+    return Cover(int(ground.at(ground.places(torch.tensor([[x, 0.0, z]], dtype=torch.float64)))[0]))
+
+
+@pytest.mark.parametrize("pitch", [0.0, -20.0])
+def test_walls_and_furniture_are_occupied_and_the_floor_between_is_free(pitch):
+    ground = ground_from_frames(seen(*around(0.0, 0.0, pitch)), UP, BODY)
+    assert [cover_at(ground, x, z) for x, z in ((2.5, 0.1), (-2.5, 0.3), (0.1, 2.0))] == [Cover.OCCUPIED] * 3
+    assert cover_at(ground, -1.3, 0.9) == cover_at(ground, 0.6, 0.5) == Cover.OCCUPIED
+    assert {cover_at(ground, x, z) for x, z in ((0.0, 0.0), (2.2, 0.0), (-2.0, 0.0), (0.0, 1.6))} == {Cover.FREE}
+
+
+def test_what_is_behind_a_wall_or_out_of_view_is_unknown():
+    ground = ground_from_frames(seen(look((0.0, 1.25, 1.0), 0.0, 0.0)), UP, BODY)  # looks along -z
+    assert cover_at(ground, 0.0, 1.8) == cover_at(ground, 0.0, -2.6) == Cover.UNKNOWN
+    assert cover_at(ground, 0.6, -0.5) == Cover.FREE
+
+
+def test_only_things_at_the_height_of_the_body_are_in_its_way():
+    over, under = replace(BODY, step_over=0.6), BODY
+    view = seen(look((0.0, 1.25, 1.0), 0.0, -20.0))  # on a box 0.5 m high
+    assert cover_at(ground_from_frames(view, UP, under), 0.0, -1.0) == Cover.OCCUPIED
+    assert cover_at(ground_from_frames(view, UP, over), 0.0, -1.0) == Cover.FREE
+
+
+def test_a_moved_world_has_the_same_map():
+    frames, offset = seen(*around()), torch.tensor([7.3, -2.0, 1.17], dtype=torch.float64)
+    poses = frames.cameras.world_from_camera.clone()
+    poses[:, :3, 3] += offset
+    moved = replace(frames, cameras=replace(frames.cameras, world_from_camera=poses))
+    ground, other = ground_from_frames(frames, UP, BODY), ground_from_frames(moved, UP, BODY)
+    assert (ground.states == other.states).float().mean() > 0.999  # of pixels on the border of two squares
+    assert torch.allclose(torch.tensor(other.origin) - torch.tensor(ground.origin), ground.places(offset).float())
+
+
+def test_a_turned_world_has_the_same_covers():
+    turn = torch.tensor([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)  # z is up
+    frames = seen(*around())
+    turned = replace(frames, cameras=replace(frames.cameras, world_from_camera=turn @ frames.cameras.world_from_camera))
+    ground, other = ground_from_frames(frames, UP, BODY), ground_from_frames(turned, (0.0, 0.0, 1.0), BODY)
+    places = torch.rand(2000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 5 - 2.5
+    covers, others = ground.at(ground.places(places)), other.at(other.places(places @ turn[:3, :3].T))
+    assert (covers == others).float().mean() > 0.98
+
+
+def test_frames_added_one_by_one_give_the_map_of_all():
+    frames, mapper = seen(*around()[:6]), GroundMapper(UP, BODY)
+    for number in range(6):
+        mapper.add(frames[number : number + 1])
+        mapper.map()
+    whole = ground_from_frames(frames, UP, BODY)
+    places = torch.rand(500, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 6 - 3
+    assert torch.equal(mapper.map().at(places), whole.at(places))
+
+
+def test_adding_to_a_copy_does_not_change_the_mapper():
+    mapper = GroundMapper(UP, BODY)
+    mapper.add(seen(look((0.0, 1.25, 0.0), 0.0, 0.0)))
+    copy, before = mapper.copy(), mapper.map().states.clone()
+    copy.add(seen(look((0.0, 1.25, 0.0), 180.0, 0.0)))
+    assert torch.equal(mapper.map().states, before)
+    assert int((copy.map().states > 0).sum()) > int((before > 0).sum())
+
+
+def test_imagined_walls_give_way_to_observed_floor_and_to_the_majority_of_imagined_frames():
+    poses, near = [look((0.0, 1.25, 0.0), 90.0, 0.0)], lambda: seen(look((0.0, 1.25, 0.0), 90.0, 0.0))
+    wrong = replace(near(), depth=torch.full_like(near().depth, 1.0)).with_origin(Origin.IMAGINED)
+    mapper = GroundMapper(UP, BODY)
+    mapper.add(wrong)
+    assert cover_at(mapper.map(), -1.0, 0.0) == Cover.OCCUPIED
+    majority, observed = mapper.copy(), mapper.copy()
+    majority.add(seen(*poses * 2, origin=Origin.IMAGINED))
+    observed.add(seen(*poses))
+    assert cover_at(majority.map(), -1.0, 0.0) == cover_at(observed.map(), -1.0, 0.0) == Cover.FREE
+
+
+def test_a_frame_without_depth_says_nothing_but_where_it_was_taken():
+    frames = seen(look((0.0, 1.25, 0.0), 0.0, 0.0)).without_depth()
+    ground = ground_from_frames(frames, UP, BODY)
+    assert cover_at(ground, 0.1, 0.0) == Cover.FREE
+    assert int((ground.states > 0).sum()) < 60
+
+
+@pytest.mark.parametrize(("kind", "knows_walls"), [("voxel", True), ("points", True), ("map2d", False)])
+def test_the_points_of_a_memory_say_what_their_heights_tell(kind, knows_walls):
+    memory = make_memory(
+        kind, {"stride": 2} if kind == "points" else {}, make_encoder("patches", {}), FrameOfReference("room", UP)
+    )
+    memory.write(seen(*around()))
+    mapper = GroundMapper(UP, BODY)
+    mapper.add_points(memory.points(), floor=0.0)
+    ground = mapper.map()
+    strip = torch.stack([torch.linspace(2.2, 2.8, 40), torch.zeros(40), torch.zeros(40)], 1).double()
+    assert bool((ground.at(ground.places(strip)) == Cover.OCCUPIED).any()) == knows_walls
+    assert (cover_at(ground, 1.9, 0.0) == Cover.FREE) == knows_walls
+
+
+def test_observed_frames_count_before_the_points_of_a_memory():
+    mapper = GroundMapper(UP, BODY)
+    mapper.add(seen(look((0.0, 1.25, 0.0), 90.0, 0.0)))
+    wall = torch.tensor([[-1.0, 0.7, 0.0]], dtype=torch.float64)
+    mapper.add_points(MapPoints(wall, torch.zeros(1, 3, dtype=torch.uint8)), floor=0.0)
+    assert cover_at(mapper.map(), -1.0, 0.0) == Cover.FREE
+
+
+def test_a_body_has_the_camera_height_that_its_data_set_tells():
+    assert body_of(ROOM.info) == Body()
+    told = body_of(replace(ROOM.info, source={"camera_height": 1.7}))
+    assert (told.camera_height, told.height) == (1.7, 1.7)
