@@ -79,7 +79,7 @@ def _paths(simulator: Simulator, random: np.random.Generator, look_around: Calla
         goal = grid.place(reachable[int(random.integers(len(reachable)))]) if reachable else simulator.agent[0]
         if looks:
             yield from _turned(look_around(_nearer_turn(simulator, grid, grid.distances(goal)) or 0))
-        steps = yield from _go_to(simulator, grid, goal)
+        steps = yield from go_to(simulator, grid, goal)
         if steps == 0:
             yield from _turned(int(random.choice([-1, 1])) * int(random.integers(1, max(2, round(90 / turn)))))
 
@@ -191,7 +191,7 @@ def _inviting_turn(simulator: Simulator, random: np.random.Generator, visits: Co
     return options[int(np.argmax(scores))]
 
 
-def _go_to(simulator: Simulator, grid: FreeGrid, goal: Ground) -> Generator[str, bool, int]:
+def go_to(simulator: Simulator, grid: FreeGrid, goal: Ground) -> Generator[str, bool, int]:
     """Turn and step along the shortest way to the goal until near it or no nearer, and return the number of steps."""
     distances = grid.distances(goal)
     step, _ = _gait(simulator)

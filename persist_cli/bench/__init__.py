@@ -1,0 +1,1 @@
+"""Benchmarks of plans and collisions against a simulator's own truth."""
