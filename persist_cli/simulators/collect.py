@@ -285,7 +285,7 @@ def collect_frames(simulator: Simulator, plan: CollectPlan, seed: int) -> Iterat
     """
     random = np.random.default_rng([plan.seed, seed])
     simulator.open_scene(seed)
-    simulator.place(_random_start(simulator, random), float(random.uniform(-math.pi, math.pi)))
+    simulator.place(random_start(simulator, random), float(random.uniform(-math.pi, math.pi)))
     return walk(simulator, POLICIES[plan.policy], random, plan.frames)
 
 
@@ -344,7 +344,7 @@ def _exit_with(parent: Any) -> None:
     os._exit(1)
 
 
-def _random_start(simulator: Simulator, random: np.random.Generator) -> tuple[float, float]:
+def random_start(simulator: Simulator, random: np.random.Generator) -> tuple[float, float]:
     """A free place from which a metre straight ahead is free in some direction: not a nook behind a thing."""
     ground = random_ground(simulator, random)
     for _ in range(START_TRIES):

@@ -1,0 +1,201 @@
+"""A true house of a simulator as an environment, with the interface and the rewards of an imagined one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from persist_cli.api.policy import Goal
+from persist_cli.api.simulator import Simulator
+from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
+from persist_cli.environments.task import Attempt, TaskSettings, View
+from persist_cli.errors import DataError, PluginError
+from persist_cli.io.settings import parse_settings
+from persist_cli.plugins import load_plugin, make_simulator
+from persist_cli.simulators.collect import CollectPlan, random_start
+from persist_cli.simulators.free_grid import Cell, FreeGrid, Ground, clear_distance
+
+NAME: Final = "persist/SimulatedHouse-v0"
+
+TRIES: Final = 100  # starts and goals that are drawn before a house counts as too small
+
+OPEN_VIEW: Final = 1.0  # metres that are free before the agent in the view at a goal
+
+
+@dataclass(frozen=True)
+class SimulatedSettings(TaskSettings):
+    """The houses of ``persist/SimulatedHouse-v0``, beside its task.
+
+    Args:
+        simulator: name of the plugin.
+        scenes: ``A:B`` or one number; each episode draws one of them.
+        split: ``train``, ``validation`` or ``test``, as in ``persist collect``.
+        size: ``HxW`` of the images in pixels.
+        settings: of the simulator's agent, such as ``step``, ``turn`` and ``fov``.
+    """
+
+    simulator: str = "miniworld"
+    scenes: str = "0:100"
+    split: str = "train"
+    size: str = "64x64"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def plan(self) -> CollectPlan:
+        """Return the plan of a collection of the same scenes, checked."""
+        scenes = f"{self.scenes}:{int(self.scenes) + 1}" if self.scenes.isdecimal() else self.scenes
+        plan = CollectPlan(self.simulator, scenes, size=self.size, split=self.split)
+        plan.check()
+        return plan
+
+
+class SimulatedScenes(Scenes):
+    """Houses of a simulator, one open for each environment.
+
+    Args:
+        settings: houses and task.
+        count: number of environments.
+
+    Raises:
+        PersistError: when the simulator is missing or does not know these settings.
+    """
+
+    def __init__(self, settings: SimulatedSettings, count: int = 1) -> None:
+        plan = settings.plan()
+        needs = load_plugin("simulator", settings.simulator).missing()
+        if needs:
+            raise PluginError(f"simulator {settings.simulator!r} {needs}")
+        height, width = plan.image_size
+        agent = {"height": height, "width": width} | settings.settings
+        self.houses = [OpenHouse(make_simulator(settings.simulator, agent), settings) for _ in range(count)]
+        self.seeds = plan.generator_seeds
+        self.houses[0].open(self.seeds[0])
+        super().__init__(self.houses[0].simulator.info, settings)
+
+    def begin(self, number: int, draws: np.random.Generator) -> Attempt:
+        """Draw a house, a start and a goal in it."""
+        house = self.houses[number]
+        house.open(self.seeds[int(draws.integers(len(self.seeds)))])
+        return house.begin(draws)
+
+    def walk(self, actions: Mapping[int, Sequence[str]]) -> dict[int, list[View]]:
+        """Let the agents act, one after another."""
+        return {number: [self.houses[number].act(name) for name in names] for number, names in actions.items()}
+
+
+class OpenHouse:
+    """A simulator with one scene open, and the metres of the way to a goal in it.
+
+    Args:
+        simulator: has no scene open yet.
+        task: rewards and observations.
+    """
+
+    def __init__(self, simulator: Simulator, task: TaskSettings) -> None:
+        self.simulator, self.task = simulator, task
+        self._seed: int | None = None
+        self._grid: FreeGrid
+        self._goal: Ground = (0.0, 0.0)
+        self._distances: dict[Cell, float] = {}
+
+    def open(self, seed: int) -> None:
+        """Open the scene of a generator's seed, unless it is open."""
+        if seed == self._seed:
+            return
+        self.simulator.open_scene(seed)
+        self._seed, self._grid = seed, FreeGrid(self.simulator)
+
+    def begin(self, draws: np.random.Generator) -> Attempt:
+        """Put the agent at a random start, with a goal that is as far away as the task says.
+
+        Raises:
+            DataError: when the scene has no two such places.
+        """
+        for _ in range(TRIES):
+            start = random_start(self.simulator, draws)
+            goal = self._draw_goal(start, draws)
+            if goal is not None:
+                break
+        else:
+            low, high = self.task.goal_distance
+            scene = self.simulator.info.scene
+            raise DataError(f"{scene}: no start and goal that are {low:g} to {high:g} m apart; set goal_distance")
+        self._goal, self._distances = goal[0], self._grid.distances(goal[0])
+        shown = self._look_from(*goal)
+        view = self._look_from(start, float(draws.uniform(-math.pi, math.pi)))
+        info = self.simulator.info
+        seen = Goal(torch.from_numpy(shown.rgb), torch.from_numpy(shown.world_from_camera[:3, 3]), info.scene)
+        return Attempt(view, seen, info.world_up, self.task)
+
+    def act(self, action: str) -> View:
+        """Do an action, and return what is seen after it."""
+        return self._view(free=self.simulator.act(action))
+
+    def _draw_goal(self, start: Ground, draws: np.random.Generator) -> tuple[Ground, float] | None:
+        """Draw a place and a heading with an open view; ``None`` when this start has none."""
+        distances = self._grid.distances(start)
+        places = [self._grid.place(cell) for cell in sorted(distances)]
+        far = [place for place in places if self.task.is_far_enough(self._metres(place, start, distances))]
+        for _ in range(TRIES if far else 0):
+            place, heading = far[int(draws.integers(len(far)))], float(draws.uniform(-math.pi, math.pi))
+            if clear_distance(self.simulator, place, heading, OPEN_VIEW, OPEN_VIEW):
+                return place, heading
+        return None
+
+    def _look_from(self, ground: Ground, heading: float) -> View:
+        self.simulator.place(ground, heading)
+        return self._view(free=True)
+
+    def _view(self, free: bool) -> View:
+        frame = self.simulator.observe()
+        left = self._metres(self.simulator.agent[0], self._goal, self._distances)
+        return View(frame.rgb, frame.depth, frame.world_from_camera, left, free)
+
+    def _metres(self, ground: Ground, goal: Ground, distances: dict[Cell, float]) -> float:
+        """Metres from a place to a goal: straight, or along the ways that ``distances`` has."""
+        if self.task.distance == "straight":
+            return math.dist(ground, goal)
+        metres = self._grid.remaining(ground, distances)
+        if math.isfinite(metres):
+            return metres
+        # a free place so narrow that no free cell lies beside it: by the nearest way of all
+        return min(length + math.dist(ground, self._grid.place(cell)) for cell, length in distances.items())
+
+
+class SimulatedHouse(HouseEnv):
+    """A true house: ``gymnasium.make("persist/SimulatedHouse-v0", scenes="0:100")``.
+
+    Args:
+        render_mode: ``rgb_array`` or ``None``.
+        settings: those of ``SimulatedSettings``.
+
+    Raises:
+        PersistError: one line with what is wrong in the settings, or missing.
+    """
+
+    def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
+        super().__init__(SimulatedScenes(parse_settings(SimulatedSettings, settings, NAME)), render_mode)
+
+
+class SimulatedHouseVector(HouseVectorEnv):
+    """Several true houses: ``gymnasium.make_vec("persist/SimulatedHouse-v0", num_envs=4, scenes="0:100")``.
+
+    Args:
+        num_envs: number of environments.
+        max_episode_steps: steps after which an episode is truncated.
+        render_mode: ``rgb_array`` or ``None``.
+        settings: those of ``SimulatedSettings``.
+
+    Raises:
+        PersistError: as ``SimulatedHouse``.
+    """
+
+    def __init__(
+        self, num_envs: int = 1, max_episode_steps: int | None = None, render_mode: str | None = None, **settings: Any
+    ) -> None:
+        scenes = SimulatedScenes(parse_settings(SimulatedSettings, settings, NAME), num_envs)
+        super().__init__(scenes, num_envs, max_episode_steps, render_mode)

@@ -1,0 +1,132 @@
+"""The true house as an environment: Gymnasium's checks, rewards by the way round walls, equal seeds, bad settings."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import persist_cli.environments  # noqa: F401  registers them
+from persist_cli.errors import PersistError
+from tests.support.miniworlds import make_world
+
+NAME = "persist/SimulatedHouse-v0"
+HOUSES = {"scenes": "0:2", "split": "test", "size": "32x32"}
+
+
+@pytest.fixture(autouse=True)
+def _rendering() -> None:
+    make_world(height=32, width=32)
+
+
+def make(**settings: object) -> gymnasium.Env:
+    return gymnasium.make(NAME, **HOUSES | settings)
+
+
+def test_the_checker_of_gymnasium_finds_nothing():
+    check_env(make().unwrapped)
+    check_env(make(chunk=2, observe_goal="place").unwrapped)
+
+
+def test_actions_are_those_that_move_in_the_order_of_the_vocabulary():
+    assert make().unwrapped.actions == ("forward", "backward", "left", "right")
+
+
+def test_equal_seeds_give_equal_episodes_and_other_seeds_others():
+    env = make()
+    first, again, other = (env.reset(seed=seed)[0] for seed in (3, 3, 4))
+    assert np.array_equal(first["rgb"], again["rgb"])
+    assert not np.array_equal(first["rgb"], other["rgb"])
+
+
+def test_the_goal_shows_what_the_agent_sees_there():
+    env = make()
+    for seed in range(3):
+        seen, info = env.reset(seed=seed)
+        attempt, house = env.unwrapped.attempt, env.unwrapped.scenes.houses[0]
+        place = attempt.goal.position.numpy()[[0, 2]]
+        views = (house._look_from(tuple(place), 2 * np.pi * turn / 720) for turn in range(720))
+        assert min(np.abs(view.rgb.astype(int) - seen["goal"]).mean() for view in views) < 2
+        assert 1.5 <= info["distance"] <= 8.0
+
+
+def test_the_way_round_a_wall_is_longer_than_the_line_through_it():
+    ways, lines = make(), make(distance="straight")
+    longer = [ways.reset(seed=seed)[1]["distance"] - lines_of(lines, ways) for seed in range(8)]
+    assert min(longer) > -1e-9
+    assert max(longer) > 0.5
+
+
+def lines_of(lines: gymnasium.Env, ways: gymnasium.Env) -> float:
+    """The straight distance to the goal of an episode whose reward goes by the way."""
+    attempt = ways.unwrapped.attempt
+    return float(np.linalg.norm(attempt.goal.position.numpy() - attempt.now.world_from_camera[:3, 3]))
+
+
+def test_a_vector_of_houses_is_equal_to_single_ones_with_its_seeds():
+    vector = gymnasium.make_vec(NAME, num_envs=2, max_episode_steps=3, **HOUSES)
+    singles = [make(max_episode_steps=3) for _ in range(2)]
+    seen = vector.reset(seed=5)[0]
+    alone = [env.reset(seed=5 + number)[0] for number, env in enumerate(singles)]
+    for step in range(5):
+        assert all(np.array_equal(seen[name][n], alone[n][name]) for name in seen for n in range(2))
+        actions = np.array([step % 4, (step + 1) % 4])
+        seen, rewards, _, truncated, infos = vector.step(actions)
+        for number, env in enumerate(singles):
+            alone[number], reward, _, over, info = env.step(actions[number])
+            assert (rewards[number], truncated[number]) == (reward, over)
+            if over:
+                assert np.array_equal(infos["final_obs"][number]["rgb"], alone[number]["rgb"])
+                assert infos["final_info"]["walked"][number] == info["walked"]
+                alone[number] = env.reset()[0]
+
+
+def test_the_shortest_way_reaches_the_goal_and_earns_its_length_and_the_bonus():
+    env = make(step_cost=0.0, collision_penalty=0.0)
+    _, info = env.reset(seed=1)
+    total, reached = 0.0, False
+    for _ in range(200):
+        _, reward, reached, _, after = env.step(greedy(env))
+        total += reward
+        if reached:
+            break
+    assert reached
+    assert total == pytest.approx(info["distance"] - after["distance"] + 2.5)
+
+
+def greedy(env: gymnasium.Env) -> int:
+    """The action of the shortest way: a step where one of the turns shows no shorter way, else a turn to the left."""
+    house = env.unwrapped.scenes.houses[0]
+    ground, heading = house.simulator.agent
+    turn, steps = np.deg2rad(house.simulator.info.vocabulary["left"].turn), 0.25 * np.arange(1, 4)
+
+    def gain(turns: int) -> float:
+        x, z = house.simulator.ahead(heading + turns * turn)
+        places = [(ground[0] + step * x, ground[1] + step * z) for step in steps]
+        if not all(house.simulator.is_free(place) for place in places):
+            return np.inf
+        return house._metres(places[-1], house._goal, house._distances)
+
+    best = min(range(-12, 12), key=lambda turns: (round(gain(turns), 3), abs(turns)))
+    return 0 if best == 0 else 2 if best > 0 else 3
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"scenes": "two"}, "scenes 'two': write A:B"),
+        ({"sucess_radius": 2.0}, "did you mean 'success_radius'"),
+        ({"simulator": "miniwrld"}, "did you mean 'miniworld'"),
+        ({"settings": {"fov": 500}}, "fov 500.0 is not between"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_one_line(wrong, words):
+    with pytest.raises(PersistError, match=words) as caught:
+        make(**wrong)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_house_too_small_for_the_wanted_way_is_named():
+    with pytest.raises(PersistError, match=r"house-1000000: no start and goal that are 90 to 99 m apart"):
+        make(scenes="0", goal_distance=[90.0, 99.0]).reset(seed=0)
