@@ -79,6 +79,11 @@ class ActionVocabulary:
         """Whether any action has a motion of its own, so that a camera can be moved by names."""
         return any(action.forward or action.turn for action in self.actions)
 
+    @property
+    def moving(self) -> tuple[Action, ...]:
+        """The actions that walk ahead or turn on the spot, which plans and policies choose from."""
+        return tuple(action for action in self.actions if action.forward > 0 or (action.turn and not action.forward))
+
     def listing(self) -> str:
         """Return all actions in one line, as in ``"forward (0.25 m ahead), left (turns 15° to the left)"``."""
         return ", ".join(f"{action.name} ({action.effect})" for action in self.actions) or "none"

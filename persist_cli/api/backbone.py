@@ -302,6 +302,22 @@ class Backbone(nn.Module, ABC):
             in metres; the first frame is that of ``first``. Other frames have depth 0 unless ``gives_depth``.
         """
 
+    def generate_frame(
+        self, first: Clips, sampling: Sampling, frames: Sequence[int]
+    ) -> tuple[UInt8[Tensor, "batch height width 3"], Float[Tensor, "batch height width"]]:
+        """Generate clips, and return a single frame of each, which planning judges.
+
+        A backbone overrides this when it can leave the other frames undecoded.
+
+        Args:
+            first: as for ``generate``.
+            sampling: as for ``generate``.
+            frames: for each clip the number of the frame, 0 is the given one.
+        """
+        rgb, depth = self.generate(first, sampling)
+        rows = torch.arange(len(frames))
+        return rgb[rows, list(frames)], depth[rows, list(frames)]
+
     @abstractmethod
     def reconstruct(self, clips: Clips) -> tuple[Tensor, Tensor]:
         """Return the clips encoded and decoded, in the form of ``generate``'s result: the limit of its quality."""

@@ -96,7 +96,7 @@ def ahead_or_turning(vocabulary: ActionVocabulary) -> list[Action]:
     Raises:
         PersistError: when there is none.
     """
-    chosen = [action for action in vocabulary.actions if action.forward > 0 or (action.turn and not action.forward)]
+    chosen = list(vocabulary.moving)
     if not chosen:
         raise PersistError(f"no action walks ahead or turns; a policy needs one (known: {vocabulary.listing()})")
     return chosen

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from persist_cli.api.cost import Futures
-from persist_cli.api.ground import GroundMap
+from persist_cli.api.ground import Cover, GroundMap, ground_axes
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
 from persist_cli.metrics import METRICS, dreamsim
@@ -101,3 +101,37 @@ def test_the_distance_is_measured_on_the_ground_alone():
     assert cost.measure(futures, goal, GROUND).tolist() == [[0.0], [5.0]]
     with pytest.raises(PersistError, match="cost 'distance' measures the way to a place, and the goal is an image"):
         cost.measure(futures, replace(goal, position=None, rgb=futures.rgb[0, 0]), GROUND)
+
+
+def room_with_wall():
+    """Ground of 4 m × 4 m in squares of 0.1 m, with a wall at x = 2 m that leaves the last metre open; y is up."""
+    states = torch.full((40, 40), int(Cover.FREE), dtype=torch.uint8)
+    states[:30, 20] = int(Cover.OCCUPIED)
+    return GroundMap(states, (0.0, 0.0), 0.1, ground_axes((0.0, 0.0, 1.0)))
+
+
+def test_the_geodesic_cost_leads_round_a_wall_and_counts_unknown_ground_more():
+    ground = room_with_wall()
+    goal = Goal(None, torch.tensor([3.0, 0.55, 1.2]), "room")
+    futures = futures_at((1.0, 0.55, 1.2), (3.0, 1.55, 0.0))
+    behind, beside = (
+        make_cost("geodesic", {"radius": 0.1, "unknown": 20.0}).measure(futures, goal, ground)[:, 0].tolist()
+    )
+    assert beside == pytest.approx(1.0, abs=0.1)
+    assert behind > 2 * (2.45**2 + 1) ** 0.5  # up to the wall's end and down again, where straight it is 2 m
+    unseen = GroundMap(torch.zeros_like(ground.states), ground.origin, ground.spacing, ground.axes)
+    over_unknown = make_cost("geodesic", {"unknown": 3.0}).measure(futures, goal, unseen)
+    assert over_unknown[:, 0].tolist() == pytest.approx([6.0, 3.0], abs=0.3)
+
+
+def test_the_geodesic_cost_knows_places_off_the_map_and_ways_that_are_shut():
+    ground = room_with_wall()
+    cost = make_cost("geodesic", {"unknown": 2.0})
+    off = cost.measure(futures_at((7.0, 2.0, 0.0)), Goal(None, torch.tensor([3.5, 2.0, 0.0]), "room"), ground)
+    assert float(off) == pytest.approx(0.5 + 2 * 3.0, abs=0.3)
+    shut = ground.states.clone()
+    shut[20:30, 20:30] = int(Cover.OCCUPIED)
+    shut[22:28, 22:28] = int(Cover.FREE)
+    walls = GroundMap(shut, ground.origin, ground.spacing, ground.axes)
+    inside = cost.measure(futures_at((2.5, 2.5, 0.0)), Goal(None, torch.tensor([0.5, 0.5, 0.0]), "room"), walls)
+    assert float(inside) == float("inf")

@@ -6,7 +6,7 @@ Start reading here: ``forward`` is the training loss, ``sample`` the sampling lo
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -241,10 +241,23 @@ class CogVideoX(AdaptedBackbone):
 
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
         """Generate clips from each sample's own noise; the first frame is that of ``first``."""
-        denoised = self.on_denoised
-        latents = self.sample(first, sampling, None if denoised is None else lambda _: denoised())
-        colors, depth = self.decode(latents, first)
+        colors, depth = self.decode(self.sample_noticed(first, sampling), first)
         return to_uint8(colors), depth
+
+    @torch.no_grad()
+    def generate_frame(self, first: Clips, sampling: Sampling, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Generate clips and return a frame of each; a codec that codes every frame alone decodes no others."""
+        if not self.framewise or 0 in frames:
+            return super().generate_frame(first, sampling, frames)
+        latents = self.shape.drop_padding(self.sample_noticed(first, sampling))
+        chosen = latents[torch.arange(len(frames)), list(frames)][:, None]
+        colors, depth = self.codec.decode_images(chosen, self.settings.depth)
+        return to_uint8(colors)[:, 0], depth[:, 0]
+
+    def sample_noticed(self, first: Clips, sampling: Sampling) -> Float[Tensor, "batch frame channel height width"]:
+        """Denoise latents and call ``on_denoised``, if it is set, after each step."""
+        denoised = self.on_denoised
+        return self.sample(first, sampling, None if denoised is None else lambda _: denoised())
 
     @torch.no_grad()
     def decode(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -76,6 +76,13 @@ class ExtendedCogVideoX(CogVideoX):
         if self.offloaded is not None:
             self.offloaded.maybe_free_model_hooks()
         return clips
+
+    def generate_frame(self, first: Clips, sampling: Sampling, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Generate clips and return a frame of each; offloaded weights are on the CPU again afterwards."""
+        chosen = super().generate_frame(first, sampling, frames)
+        if self.offloaded is not None:
+            self.offloaded.maybe_free_model_hooks()
+        return chosen
 
     def prepare_inference(self, options: InferenceOptions) -> None:
         """Get ready to sample; offloaded weights are on the CPU between clips."""
