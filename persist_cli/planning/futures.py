@@ -1,0 +1,247 @@
+"""What candidates would see: imagined by a world model, or seen in the simulator itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.cost import Futures
+from persist_cli.api.ground import Body, Cover, GroundMap
+from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.api.simulator import Simulator
+from persist_cli.data.clips import interactions_of
+from persist_cli.errors import DataError
+from persist_cli.navigation.ways import way_is_free
+from persist_cli.rollout.world_model import WorldModel
+
+Over = Literal["last", "best"]  # which frame of a candidate is judged: its last, or the one of least cost
+Actions = Sequence[str]
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Where a candidate leads.
+
+    Args:
+        poses: world_from_camera after each action, metres.
+        free: whether the way of each action was free; else the agent stayed where it was.
+    """
+
+    poses: Float[Tensor, "action 4 4"]
+    free: Bool[Tensor, " action"]
+
+
+@dataclass(frozen=True)
+class Imagined:
+    """What candidates would see, and where they lead.
+
+    Args:
+        futures: frames to judge: the last one of each candidate, or all, where shorter candidates repeat their last.
+        walks: of each candidate, all of its actions.
+    """
+
+    futures: Futures
+    walks: list[Walk]
+
+
+class FutureModel(Protocol):
+    """A model under which candidates are judged."""
+
+    def imagine(self, candidates: Sequence[Actions], over: Over, sees: bool = True) -> Imagined:
+        """Return what an agent would see that did the actions of each candidate from its present state.
+
+        The state does not change. Candidates may have different lengths; an empty one sees the present frame.
+
+        Args:
+            candidates: names of actions.
+            over: ``last`` for the last frame of each, ``best`` for all.
+            sees: whether images are needed; else they may be left out, with height and width 0.
+        """
+        ...
+
+
+class WorldFutures:
+    """The futures that a world model imagines.
+
+    The candidates are imagined as one batch, which encodes the present frame once and reads the memory once. Only what
+    ``over`` asks for is decoded. Frames are written into a copy of the memory as long as a further clip reads it.
+
+    Args:
+        model: its first agent stands at the present frame.
+        ground: what is known to be free; a move over ground known to be occupied does not move.
+        body: of the agent; ``None`` for an agent that goes through walls.
+    """
+
+    def __init__(self, model: WorldModel, ground: GroundMap, body: Body | None = None) -> None:
+        self.model, self.ground, self.body = model, ground, body
+
+    def imagine(self, candidates: Sequence[Actions], over: Over, sees: bool = True) -> Imagined:
+        """Return what the candidates would see; see ``FutureModel``."""
+        agent = self.model.agents[0]
+        walks = walk_all(agent.now.cameras, agent.info, candidates, self.ground, self.body)
+        poses, free = padded(walks, agent.now.cameras.world_from_camera[0], over)
+        count, frames = poses.shape[:2]
+        if not sees:
+            return Imagined(without_images(poses, free), walks)
+        rgb = agent.now.rgb.expand(count, -1, -1, -1)[:, None].repeat(1, frames, 1, 1, 1)
+        depth = agent.now.depth.expand(count, -1, -1)[:, None].repeat(1, frames, 1, 1)
+        length = self.model.backbone.frames_per_clip - 1
+        clips = [-(-len(names) // length) for names in candidates]
+        for together in sorted(set(clips) - {0}):
+            numbers = [number for number, count in enumerate(clips) if count == together]
+            seen = self._see([walks[number] for number in numbers], [candidates[number] for number in numbers], over)
+            for number, (images, depths) in zip(numbers, seen, strict=True):
+                rgb[number, : len(images)], rgb[number, len(images) :] = images, images[-1]
+                depth[number, : len(images)], depth[number, len(images) :] = depths, depths[-1]
+        return Imagined(Futures(rgb, depth, poses, free), walks)
+
+    def _see(self, walks: Sequence[Walk], candidates: Sequence[Actions], over: Over) -> list[tuple[Tensor, Tensor]]:
+        """Return RGB and depth of the frames to judge, of candidates that take equally many clips."""
+        branches = self.model.branches(len(walks))
+        length, agents = branches.backbone.frames_per_clip - 1, branches.agents
+        paths = [cameras_at(agent.now.cameras, walk.poses) for agent, walk in zip(agents, walks, strict=True)]
+        interactions = [interactions_of(names, agents[0].info.vocabulary) for names in candidates]
+        lead = (max(map(len, candidates)) - 1) // length * length
+        before, rest = [path[:lead] for path in paths], [path[lead:] for path in paths]
+        clips = list(branches.imagine(before, [acts[:lead] for acts in interactions])) if lead else []
+        for agent in agents:
+            agent.write = False  # nothing reads what the last clip would write
+        if over == "last":
+            inputs = branches.recall(range(len(rest)), rest, [acts[lead:] for acts in interactions])
+            rgb, depth = branches.backbone.generate_frame(inputs, branches.sampling, [len(path) for path in rest])
+            return list(zip(rgb.cpu()[:, None], depth.cpu()[:, None], strict=True))
+        clips += branches.imagine(rest, [acts[lead:] for acts in interactions])
+        videos = zip(*clips, strict=True)
+        return [
+            (torch.cat([seen.rgb for seen in video]), torch.cat([seen.depth for seen in video])) for video in videos
+        ]
+
+
+class SimulatorFutures:
+    """What would truly be seen: the agent walks each candidate in the simulator, and goes back.
+
+    Args:
+        simulator: has an open scene with the agent in it.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+
+    def imagine(self, candidates: Sequence[Actions], over: Over, sees: bool = True) -> Imagined:
+        """Return what the candidates would see; see ``FutureModel``.
+
+        Raises:
+            DataError: for an action that changes the scene, since going back does not undo it.
+        """
+        ground, heading = self.simulator.agent
+        try:
+            walked = []
+            for names in candidates:
+                self.simulator.place(ground, heading)
+                walked.append(self._walk(names, over))
+        finally:
+            self.simulator.place(ground, heading)
+        walks = [walk for walk, _ in walked]
+        poses, free = padded(walks, self._pose(), over)
+        if not sees:
+            return Imagined(without_images(poses, free), walks)
+        videos = [[*frames, *[frames[-1]] * (poses.shape[1] - len(frames))] for _, frames in walked]
+        rgb = torch.from_numpy(np.stack([[frame.rgb for frame in video] for video in videos]))
+        depth = torch.from_numpy(np.stack([[frame.depth for frame in video] for video in videos])).float()
+        return Imagined(Futures(rgb, depth, poses, free), walks)
+
+    def _walk(self, names: Actions, over: Over) -> tuple[Walk, list[Frame]]:
+        """Do the actions; return the walk, and the frames to judge."""
+        free, poses, frames = [], [], []
+        for name in names:
+            if self.simulator.info.vocabulary[name].interaction:
+                raise DataError(f"action {name!r} changes the scene, which the simulator as a model cannot undo")
+            free.append(self.simulator.act(name))
+            frames.append(self.simulator.observe())
+            poses.append(torch.from_numpy(frames[-1].world_from_camera))
+        frames = frames or [self.simulator.observe()]
+        walk = Walk(
+            torch.stack(poses) if poses else torch.zeros(0, 4, 4, dtype=torch.float64), torch.tensor(free).bool()
+        )
+        return walk, frames[-1:] if over == "last" else frames
+
+    def _pose(self) -> Tensor:
+        return torch.from_numpy(self.simulator.observe().world_from_camera)
+
+
+def walk_all(
+    camera: Cameras, info: TrajectoryInfo, candidates: Sequence[Actions], ground: GroundMap, body: Body | None
+) -> list[Walk]:
+    """Return where candidates lead from one camera; a move over occupied ground stays where it is.
+
+    This is the cheap check: the map as it is now, and unknown ground counts as free.
+
+    Args:
+        camera: with a frame axis of one.
+        info: up axis and vocabulary.
+        candidates: names of actions; ``DataError`` for one that the vocabulary lacks.
+        ground: what is known to be free.
+        body: of the agent; ``None`` to go through walls.
+    """
+    world_up = torch.tensor(info.world_up, dtype=torch.float64)
+    poses = [[camera.world_from_camera[0].double()] for _ in candidates]
+    free: list[list[bool]] = [[] for _ in candidates]
+    for step in range(max(map(len, candidates), default=0)):
+        moving = [number for number, names in enumerate(candidates) if len(names) > step]
+        ends = [info.vocabulary.move(poses[number][-1], candidates[number][step], world_up) for number in moving]
+        starts = torch.stack([poses[number][-1] for number in moving])
+        allowed = ways_are_free(starts, torch.stack(ends), ground, body)
+        for number, end, way in zip(moving, ends, allowed, strict=True):
+            poses[number].append(end if way else poses[number][-1])
+            free[number].append(way)
+    return [
+        Walk(torch.stack(path)[1:], torch.tensor(ways, dtype=torch.bool))
+        for path, ways in zip(poses, free, strict=True)
+    ]
+
+
+def ways_are_free(
+    starts: Float[Tensor, "way 4 4"], ends: Float[Tensor, "way 4 4"], ground: GroundMap, body: Body | None
+) -> list[bool]:
+    """Return for each move whether its way is not known to be occupied; a move on the spot always is free."""
+    if body is None:
+        return [True] * len(starts)
+    first, last = (ground.places(poses[:, :3, 3]) for poses in (starts, ends))
+    blocked = way_is_free(ground, first, last, body.radius) == Cover.OCCUPIED
+    moves = (last - first).norm(dim=-1) > 1e-6
+    return [not stopped for stopped in (blocked & moves).tolist()]
+
+
+def cameras_at(camera: Cameras, poses: Float[Tensor, "frame 4 4"]) -> Cameras:
+    """Return cameras like this one, which has a frame axis of one, at other poses."""
+    return Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
+
+
+def padded(
+    walks: Sequence[Walk], start: Float[Tensor, "4 4"], over: Over
+) -> tuple[Float[Tensor, "candidate frame 4 4"], Bool[Tensor, "candidate frame"]]:
+    """Return poses and free ways of the frames to judge; shorter walks repeat their last, empty ones the start."""
+    length = 1 if over == "last" else max(1, *(len(walk.poses) for walk in walks))
+    poses, free = [], []
+    for walk in walks:
+        path = walk.poses if len(walk.poses) else start.double()[None]
+        ways = walk.free if len(walk.free) else torch.ones(1, dtype=torch.bool)
+        number = torch.arange(length).clamp_max(len(path) - 1) if over == "best" else torch.tensor([len(path) - 1])
+        poses.append(path[number])
+        free.append(ways[number])
+    return torch.stack(poses), torch.stack(free)
+
+
+def without_images(poses: Float[Tensor, "candidate frame 4 4"], free: Bool[Tensor, "candidate frame"]) -> Futures:
+    """Return futures of which only the poses are known."""
+    count, frames = poses.shape[:2]
+    return Futures(
+        torch.zeros(count, frames, 0, 0, 3, dtype=torch.uint8), torch.zeros(count, frames, 0, 0), poses, free
+    )

@@ -1,0 +1,253 @@
+"""The methods of planning: rank the proposals of a policy, or search over actions by the cross-entropy method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+import torch
+from jaxtyping import Float
+from pydantic import PositiveInt
+from torch import Tensor
+
+from persist_cli.api.actions import ActionVocabulary
+from persist_cli.api.policy import Policy, Situation
+from persist_cli.errors import PersistError
+from persist_cli.planning.judge import Candidate, Judge
+
+OnRound = Callable[[int, float], None]  # is told the number of a round and the least cost so far
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a planner found.
+
+    Args:
+        candidates: all that were judged, the first to be judged first.
+        rounds: number of rounds begun.
+        frames: imagined frames.
+        seconds: of judging.
+        exhausted: whether the budget ended it.
+    """
+
+    candidates: list[Candidate]
+    rounds: int
+    frames: int
+    seconds: float
+    exhausted: bool
+
+    @property
+    def best(self) -> Candidate:
+        """The candidate of least cost; of equal ones the first."""
+        return min(self.candidates, key=lambda candidate: candidate.cost)
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """The chosen actions; empty means: stay here."""
+        return self.best.chosen
+
+
+class Planner(Protocol):
+    """A method of planning."""
+
+    def plan(self, situation: Situation, judge: Judge, generator: torch.Generator, on_round: OnRound) -> Plan:
+        """Return a plan from a situation.
+
+        Args:
+            situation: what the agent knows; its goal is the judge's.
+            judge: judges candidates within its budget.
+            generator: source of all that is random.
+            on_round: is called after each round.
+        """
+        ...
+
+    def executed(self, count: int) -> None:
+        """Let the planner know that so many of the chosen actions were done, before it plans again."""
+        ...
+
+
+def nothing(number: int, cost: float) -> None:
+    """Take no notice of a round."""
+
+
+@dataclass(frozen=True)
+class RankSettings:
+    """How many proposals are ranked.
+
+    Args:
+        horizon: most actions of a proposal.
+        candidates: proposals of a round.
+        rounds: rounds, each of new proposals.
+    """
+
+    horizon: PositiveInt = 8
+    candidates: PositiveInt = 16
+    rounds: PositiveInt = 1
+
+
+class Rank:
+    """Imagines the proposals of a policy and takes the one of least cost (PEWM, section 4.3).
+
+    Args:
+        policy: proposes.
+        settings: how many.
+
+    Raises:
+        PersistError: when the policy does not look as far ahead as the horizon.
+    """
+
+    settings_type = RankSettings
+
+    def __init__(self, policy: Policy, settings: RankSettings) -> None:
+        if policy.longest is not None and settings.horizon > policy.longest:
+            raise PersistError(
+                f"policy {policy.name!r} looks at most {policy.longest} actions ahead, not {settings.horizon}; give "
+                f"--horizon {policy.longest}"
+            )
+        self.policy, self.settings = policy, settings
+
+    def plan(self, situation: Situation, judge: Judge, generator: torch.Generator, on_round: OnRound = nothing) -> Plan:
+        """Return the judged proposals; see ``Planner``."""
+        horizon, count, number = self.settings.horizon, self.settings.candidates, 0
+        while number < self.settings.rounds and not judge.exhausted:
+            number += 1
+            proposals = self.policy.propose(situation, horizon, count, generator)
+            judge.judge(proposals, number)
+            on_round(number, least(judge))
+        return finished(judge, number)
+
+    def executed(self, count: int) -> None:
+        """Do nothing: each plan begins anew."""
+
+
+@dataclass(frozen=True)
+class CemSettings:
+    """The cross-entropy method over discrete actions (PEWM, section 4.3), with options of iCEM (Pinneri et al. 2020).
+
+    Args:
+        horizon: actions of a candidate.
+        candidates: candidates of a round.
+        rounds: most rounds.
+        elites: share of the candidates, the best, that the distributions follow.
+        smoothing: share of the old distributions in the new ones.
+        kept: share of the elites that the next round judges again beside its own, as in iCEM; 0 for none.
+        shift: share of the last plan's distributions, shifted by what was executed, in those that the next plan begins
+            with, and whether its best candidate is among the first; 0 begins uniform each time.
+        actions: names of the actions to choose from; by default those that walk ahead or turn.
+    """
+
+    horizon: PositiveInt = 8
+    candidates: PositiveInt = 60
+    rounds: PositiveInt = 12
+    elites: float = 0.3
+    smoothing: float = 0.2
+    kept: float = 0.0
+    shift: float = 0.0
+    actions: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, value, low in (
+            ("elites", self.elites, 1e-9), ("smoothing", self.smoothing, 0.0), ("kept", self.kept, 0.0),
+            ("shift", self.shift, 0.0),
+        ):  # fmt: skip
+            if not low <= value <= 1:
+                place = "above 0 and at most at 1" if low else "between 0 and 1"
+                raise ValueError(f"{name} {value:g} is a share; it must lie {place}")
+
+
+@dataclass
+class Cem:
+    """Searches over sequences of actions: draws, judges, and follows the best in the next round.
+
+    A plan is not the last round's mean but the best candidate of all.
+
+    Args:
+        settings: of the method.
+    """
+
+    settings: CemSettings
+    settings_type = CemSettings
+    _last: tuple[Float[Tensor, "action name"], tuple[str, ...]] | None = field(default=None, init=False)
+
+    def plan(self, situation: Situation, judge: Judge, generator: torch.Generator, on_round: OnRound = nothing) -> Plan:
+        """Return all judged candidates; see ``Planner``.
+
+        Raises:
+            DataError: for an action that the vocabulary lacks.
+        """
+        settings, names = self.settings, action_names(situation.info.vocabulary, self.settings.actions)
+        probabilities, kept, number = *self._begin(names), 0
+        while number < settings.rounds and not judge.exhausted:
+            number += 1
+            drawn = draw(probabilities, names, settings.candidates - len(kept), generator)
+            candidates = judge.judge([*kept, *drawn], number)
+            on_round(number, least(judge))
+            # every draw counts, the repeated too, as the distributions say how often they come
+            costs = {candidate.actions: candidate.cost for candidate in candidates}
+            ranked = sorted((actions for actions in [*kept, *drawn] if actions in costs), key=lambda one: costs[one])
+            elites = ranked[: max(1, round(settings.elites * len(ranked)))]
+            share = settings.smoothing
+            probabilities = share * probabilities + (1 - share) * frequencies(elites, names)
+            kept = list(dict.fromkeys(elites))[: round(settings.kept * len(elites))]
+        plan = finished(judge, number)
+        self._last = probabilities, plan.best.actions
+        return plan
+
+    def executed(self, count: int) -> None:
+        """Shift the distributions that the next plan begins with by the actions that were done."""
+        if self._last is not None:
+            probabilities, best = self._last
+            uniform = torch.full_like(probabilities, 1 / probabilities.shape[1])
+            shifted = torch.cat([probabilities[count:], uniform[:count]])[: len(probabilities)]
+            self._last = shifted, (best + best[-1:] * count)[count : count + len(best)]
+
+    def _begin(self, names: Sequence[str]) -> tuple[Float[Tensor, "action name"], list[tuple[str, ...]]]:
+        """Return the distributions of the first round, and candidates to judge beside those that are drawn."""
+        uniform = torch.full((self.settings.horizon, len(names)), 1 / len(names), dtype=torch.float64)
+        if not self.settings.shift or self._last is None or self._last[0].shape != uniform.shape:
+            return uniform, []
+        probabilities, best = self._last
+        return self.settings.shift * probabilities + (1 - self.settings.shift) * uniform, [best]
+
+
+METHODS: Final = ("rank", "cem")
+
+
+def action_names(vocabulary: ActionVocabulary, chosen: Sequence[str]) -> list[str]:
+    """Return the chosen actions, or those that walk ahead or turn.
+
+    Raises:
+        DataError: for an action that the vocabulary lacks.
+        PersistError: when none is chosen and none walks or turns.
+    """
+    names = [vocabulary[name].name for name in dict.fromkeys(chosen)] or [action.name for action in vocabulary.moving]
+    if not names:
+        raise PersistError(f"no action walks ahead or turns, so that nothing can be planned: {vocabulary.listing()}")
+    return names
+
+
+def draw(
+    probabilities: Float[Tensor, "action name"], names: Sequence[str], count: int, generator: torch.Generator
+) -> list[tuple[str, ...]]:
+    """Return ``count`` sequences, each action drawn from its own distribution."""
+    if count < 1:
+        return []
+    numbers = torch.multinomial(probabilities, count, replacement=True, generator=generator).T
+    return [tuple(names[number] for number in row) for row in numbers.tolist()]
+
+
+def frequencies(sequences: Sequence[Sequence[str]], names: Sequence[str]) -> Float[Tensor, "action name"]:
+    """Return how often each action has each name, as shares."""
+    numbers = torch.tensor([[names.index(name) for name in sequence] for sequence in sequences])
+    return torch.nn.functional.one_hot(numbers, len(names)).double().mean(0)
+
+
+def least(judge: Judge) -> float:
+    """Return the least cost so far."""
+    return min(candidate.cost for candidate in judge.judged.values())
+
+
+def finished(judge: Judge, rounds: int) -> Plan:
+    """Return the plan of all that was judged."""
+    return Plan(list(judge.judged.values()), rounds, judge.frames, judge.seconds, judge.exhausted)

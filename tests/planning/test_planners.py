@@ -1,0 +1,181 @@
+"""Planners on the poses that candidates lead to, where the best plan is known."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from persist_cli.api.cost import Cost
+from persist_cli.api.ground import GroundMap
+from persist_cli.api.policy import Goal, Situation
+from persist_cli.errors import DataError, PersistError, RecipeError
+from persist_cli.io.settings import parse_settings
+from persist_cli.planning.futures import WorldFutures
+from persist_cli.planning.judge import Budget, Judge, check_goal
+from persist_cli.planning.planners import Cem, CemSettings, Rank, RankSettings, draw, frequencies
+from persist_cli.plugins import make_cost, make_policy
+
+AHEAD = ("forward",) * 4
+
+
+@pytest.fixture
+def situation(model):
+    """An agent whose goal is the place where four steps ahead lead."""
+    agent = model.agents[0]
+    place = agent.cameras_after(AHEAD).centers[-1]
+    return Situation(agent.now, agent.info, Goal(None, place, agent.info.scene), GroundMap.empty(agent.info.world_up))
+
+
+@pytest.fixture
+def judge(model, situation):
+    """Return a function that makes a judge of the straight distance to that place."""
+
+    def make(**changes):
+        futures = WorldFutures(model, situation.ground)
+        return Judge(futures, make_cost("distance", {}), situation.goal, situation.ground, **changes)
+
+    return make
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_a_judge_measures_the_last_frame_or_the_best(judge):
+    too_far = [*AHEAD, "forward", "forward"]
+    last, best = judge().judge([too_far], 1)[0], judge(over="best").judge([too_far], 1)[0]
+    assert (last.cost, last.best, last.chosen) == (pytest.approx(0.4), 6, tuple(too_far))
+    assert (best.cost, best.best, best.chosen) == (pytest.approx(0.0, abs=1e-6), 4, AHEAD)
+    stay = judge(over="best").judge([[], ["left"]], 1)[0]
+    assert (stay.best, stay.chosen, stay.cost) == (0, (), pytest.approx(0.8))
+
+
+def test_what_was_judged_is_not_imagined_again(judge):
+    one = judge()
+    first = one.judge([["left"], ["right"], ["left"]], 1)
+    assert [candidate.actions for candidate in first] == [("left",), ("right",)]
+    assert one.frames == 2
+    assert one.judge([["left"]], 2)[0].round == 1
+    assert one.frames == 2
+
+
+def test_costs_do_not_depend_on_the_batch(judge):
+    sequences = dict.fromkeys(draw(torch.full((4, 3), 1 / 3), ["forward", "left", "right"], 9, seeded()))
+    alone = [judge(batch=1).judge([names], 1)[0].cost for names in sequences]
+    assert [candidate.cost for candidate in judge(batch=9).judge([*sequences], 1)] == pytest.approx(alone)
+
+
+def test_the_cross_entropy_method_finds_the_way_and_a_seed_gives_the_same_plan(judge, situation):
+    settings = CemSettings(horizon=4, candidates=30, rounds=6)
+    rounds = []
+    plan = Cem(settings).plan(situation, judge(), seeded(), lambda number, cost: rounds.append((number, cost)))
+    assert plan.actions == AHEAD
+    assert plan.best.cost == pytest.approx(0.0, abs=1e-6)
+    assert [number for number, _ in rounds] == [1, 2, 3, 4, 5, 6]
+    assert [cost for _, cost in rounds] == sorted((cost for _, cost in rounds), reverse=True)
+    again = Cem(settings).plan(situation, judge(), seeded())
+    assert [one.actions for one in again.candidates] == [one.actions for one in plan.candidates]
+
+
+def test_later_rounds_draw_what_the_elites_did(judge, situation):
+    plan = Cem(CemSettings(horizon=4, candidates=60, rounds=5, smoothing=0.1)).plan(situation, judge(), seeded())
+    means = [
+        sum(one.cost for one in plan.candidates if one.round == number)
+        / sum(one.round == number for one in plan.candidates)
+        for number in (1, 2)
+    ]
+    assert means[1] < means[0]
+    assert plan.frames < 5 * 60 * 4  # as the distributions narrow, sequences come again
+
+
+def test_frequencies_are_shares_of_each_place():
+    shares = frequencies([("a", "b"), ("a", "a"), ("b", "a"), ("a", "a")], ["a", "b"])
+    assert shares.tolist() == [[0.75, 0.25], [0.75, 0.25]]
+
+
+def test_a_shifted_plan_goes_on_where_the_last_one_was_left(judge, situation):
+    planner = Cem(CemSettings(horizon=4, candidates=30, rounds=4, shift=1.0, kept=0.5))
+    planner.plan(situation, judge(), seeded())
+    before, best = planner._last
+    planner.executed(1)
+    probabilities, kept = planner._begin(["forward", "left", "right"])
+    assert torch.equal(probabilities[:3], before[1:])
+    assert probabilities[3].tolist() == pytest.approx([1 / 3] * 3)
+    assert kept == [(*best[1:], best[-1])]
+    following = judge()
+    planner.plan(situation, following, seeded(1))
+    assert next(iter(following.judged)) == kept[0]
+
+
+def test_ranking_takes_the_proposal_of_least_cost(judge, situation):
+    plan = Rank(make_policy("random", {}), RankSettings(4, 40)).plan(situation, judge(), seeded())
+    assert len({candidate.actions for candidate in plan.candidates}) == len(plan.candidates) <= 40
+    assert plan.best.cost == min(candidate.cost for candidate in plan.candidates) < 0.5
+    more = Rank(make_policy("random", {}), RankSettings(4, 40, rounds=3)).plan(situation, judge(), seeded())
+    assert len(more.candidates) > len(plan.candidates)
+    assert more.rounds == 3
+
+
+def test_a_budget_of_frames_is_kept_to_the_frame(judge, situation):
+    plan = Cem(CemSettings(horizon=4, candidates=30, rounds=6)).plan(situation, judge(budget=Budget(50)), seeded())
+    assert plan.exhausted
+    assert plan.frames == 48
+    with pytest.raises(PersistError, match="a budget of 3 frames does not suffice for one candidate of 4 actions"):
+        Cem(CemSettings(horizon=4)).plan(situation, judge(budget=Budget(3)), seeded())
+
+
+def test_a_budget_of_seconds_ends_a_plan_after_its_first_batch_at_least(judge, situation):
+    one = judge(budget=Budget(seconds=1e-9), batch=5)
+    plan = Rank(make_policy("random", {}), RankSettings(4, 40)).plan(situation, one, seeded())
+    assert (len(plan.candidates), plan.exhausted) == (5, True)
+
+
+@pytest.mark.parametrize(("budget", "cause"), [({"frames": 0}, "0 frames"), ({"seconds": 0.0}, "0 seconds")])
+def test_a_budget_of_nothing_is_refused(budget, cause):
+    with pytest.raises(PersistError, match=f"a budget of {cause} imagines nothing"):
+        Budget(**budget)
+
+
+def test_an_action_that_the_vocabulary_lacks_is_refused(judge, situation):
+    with pytest.raises(DataError, match="unknown action 'leftt'; did you mean 'left'"):
+        Cem(CemSettings(actions=("leftt",))).plan(situation, judge(), seeded())
+
+
+def test_shares_that_are_none_are_refused():
+    with pytest.raises(RecipeError, match=r"elites 0 is a share; it must lie above 0 and at most at 1"):
+        parse_settings(CemSettings, {"elites": 0}, "cem")
+    with pytest.raises(RecipeError, match=r"smoothing 1\.5 is a share; it must lie between 0 and 1"):
+        parse_settings(CemSettings, {"smoothing": 1.5}, "cem")
+
+
+class Undefined(Cost):
+    """A cost that is not defined."""
+
+    reads, sees, name = "place", False, "undefined"
+
+    def measure(self, futures, goal, ground):
+        return torch.full(futures.free.shape, torch.nan)
+
+
+def test_a_cost_that_is_nan_is_one_line(judge):
+    broken = dataclasses.replace(judge(), cost=Undefined(None))
+    with pytest.raises(PersistError, match=r"cost 'undefined' of 'left\*2 forward' is NaN \(1 of 1 candidates\)"):
+        broken.judge([["left", "left", "forward"]], 1)
+
+
+def test_costs_and_policies_that_need_another_goal_are_refused(situation):
+    with pytest.raises(PersistError, match="cost 'lpips' needs the image of the goal, which has none"):
+        check_goal(situation.goal, make_cost("lpips", {}))
+    image = Goal(torch.zeros(32, 32, 3, dtype=torch.uint8), None, "room")
+    with pytest.raises(PersistError, match="cost 'distance' needs the place of the goal, which has none"):
+        check_goal(image, make_cost("distance", {}))
+
+
+def test_a_policy_that_does_not_look_so_far_is_refused():
+    class Near(type(make_policy("random", {}))):
+        longest = 5
+
+    policy = Near(make_policy("random", {}).settings)
+    policy.name = "near"
+    with pytest.raises(PersistError, match="policy 'near' looks at most 5 actions ahead, not 8; give --horizon 5"):
+        Rank(policy, RankSettings(horizon=8))
