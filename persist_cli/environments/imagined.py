@@ -1,0 +1,224 @@
+"""A house that the world model imagines, as an environment: nothing but its memory and a start frame is true."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from persist_cli.api.checkpoint import REFERENCE, find_checkpoint
+from persist_cli.api.ground import GroundMap
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
+from persist_cli.environments.goals import Goals, KnownGround, PosedFrames, find_goals
+from persist_cli.environments.task import Attempt, TaskSettings, View
+from persist_cli.errors import CheckpointError, DataError
+from persist_cli.io.settings import parse_settings
+from persist_cli.navigation.ground_mapper import GroundMapper, body_of
+from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
+from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.world_model import Agent, WorldModel
+
+NAME: Final = "persist/ImaginedHouse-v0"
+
+TRIES: Final = 100  # starts that are drawn before it is said that no goal is far enough
+
+SEEDS: Final = 2**31  # of an agent's noise
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginedSettings(TaskSettings):
+    """The house of ``persist/ImaginedHouse-v0``, beside its task.
+
+    Args:
+        start: frame of a data set, as in ``runs/houses#0:32``; of several, as in ``runs/houses#0:0-33``, one is drawn.
+        goal: frames of a data set, as for the start; ``[x, y, z]`` in world metres; or ``random``: free known ground.
+        checkpoint: a run, an export or ``reference``, the model that comes with the package.
+        adapter: name of a memory adapter, by default the checkpoint's own; ``stage1`` for none.
+        memory: a file of ``persist memorize``, or frames of a data set to make one of; ``None`` for an empty memory.
+        write: whether what is imagined is written into the memory, for the rest of the episode.
+        sampling: steps, sampler and guidance in place of the checkpoint's own.
+        step: metres of an action, in place of the data set's own.
+        turn: degrees of an action.
+    """
+
+    start: str
+    goal: str | tuple[float, float, float]
+    checkpoint: str = REFERENCE
+    adapter: str | None = None
+    memory: str | None = None
+    write: bool = True
+    sampling: SamplingOverrides = field(default_factory=SamplingOverrides)
+    step: float | None = None
+    turn: float | None = None
+
+    @property
+    def memory_file(self) -> Path | None:
+        """The file of the memory, ``None`` where frames are named or nothing is."""
+        path = Path(self.memory or "")
+        return path if path.suffix == ".safetensors" or path.is_file() else None
+
+    @property
+    def given_frames(self) -> PosedFrames | None:
+        """The frames that the memory is made of, ``None`` where there are none."""
+        return PosedFrames(self.memory) if self.memory is not None and self.memory_file is None else None
+
+
+class ImaginedScenes(Scenes):
+    """One house, imagined for several agents in one batch; each episode begins with the memory as it was given.
+
+    Args:
+        settings: house and task.
+        count: number of environments.
+
+    Raises:
+        PersistError: one line when something is missing or damaged, or does not go together.
+    """
+
+    def __init__(self, settings: ImaginedSettings, count: int = 1) -> None:
+        self.starts, self.given = PosedFrames(settings.start), settings.given_frames
+        if self.given is not None:
+            self.given.check_scene(self.starts.info.scene)
+        world, info = open_house(settings, self.starts)
+        super().__init__(info, settings)
+        self.world, self.first = world, world.agents[0]
+        if self.given is not None:
+            memorize_frames(world, self.given)
+        body = body_of(info)
+        self.known = KnownGround(self._map(settings), body.radius, settings)
+        free = Goals(self.known.free_places(self.starts.positions), info.scene)
+        self.goals = find_goals(settings.goal, free, settings.observe_goal)
+        self._agents = [self.first] * count
+        self._goals = [0] * count
+
+    def begin(self, number: int, draws: np.random.Generator) -> Attempt:
+        """Draw a start, a goal and the seed of the noise."""
+        start, goal = self._draw(draws)
+        frame = self.starts[start]
+        first = self.first
+        agent = Agent(first.memory, int(draws.integers(SEEDS)), first.write, shared=True)
+        WorldModel(self.world.backbone, [agent], self.world.sampling).reset([frame], [self.info])
+        self._agents[number], self._goals[number] = agent, goal
+        (view,) = self._views(number, frame, [True])
+        return Attempt(view, self.goals.goal(goal), self.info.world_up, self.task)
+
+    def walk(self, actions: Mapping[int, Sequence[str]]) -> dict[int, list[View]]:
+        """Let the agents act; what all of them see is imagined in one batch."""
+        world = WorldModel(self.world.backbone, [self._agents[number] for number in actions], self.world.sampling)
+        steps = imagined_steps(world, list(actions.values()))
+        return {number: self._views(number, *step) for number, step in zip(actions, steps, strict=True)}
+
+    def _draw(self, draws: np.random.Generator) -> tuple[int, int]:
+        """Draw a start, and a goal that is as far from it as the task says."""
+        for _ in range(TRIES):
+            start = int(draws.integers(len(self.starts)))
+            metres = self.known.metres(self.goals.positions, self.starts.positions[start])
+            if len(metres) == 1 and len(self.starts) == 1:
+                far = (metres > self.task.success_radius).nonzero()[:, 0]
+            else:
+                low, high = self.task.goal_distance
+                far = ((metres >= low) & (metres <= high)).nonzero()[:, 0]
+            if len(far):
+                return start, int(far[int(draws.integers(len(far)))])
+        raise DataError(self._too_near())
+
+    def _too_near(self) -> str:
+        low, high = self.task.goal_distance
+        if len(self.goals.positions) == 1 and len(self.starts) == 1:
+            return f"{self.starts.text}: its goal is within the success_radius of {self.task.success_radius:g} m"
+        return f"{self.starts.text}: none of its goals is {low:g} to {high:g} m away; set goal_distance"
+
+    def _views(self, number: int, seen: Observations, free: Sequence[bool]) -> list[View]:
+        """What an agent saw, with the metres to its goal."""
+        poses = seen.cameras.world_from_camera.cpu()
+        left = self.known.metres(poses[:, :3, 3], self.goals.positions[self._goals[number]])
+        rows = zip(seen.rgb.cpu(), seen.depth.cpu(), poses, left.tolist(), free, strict=True)
+        return [View(rgb.numpy(), depth.numpy(), pose.double().numpy(), m, was) for rgb, depth, pose, m, was in rows]
+
+    def _map(self, settings: ImaginedSettings) -> GroundMap:
+        """What is known of the ground: from the memory or the frames that it was made of, and the start frames."""
+        body = body_of(self.info)
+        mapper = GroundMapper(self.info.world_up, body)
+        for frames in filter(None, [self.given, self.starts]):
+            for source in frames.sources:
+                for piece in source.pieces():
+                    mapper.add(piece)
+        if settings.memory_file is not None and self.first.memory is not None:
+            height = self.starts.positions @ torch.tensor(self.info.world_up, dtype=torch.float64)
+            mapper.add_points(self.first.memory.points(), float(height.mean()) - body.camera_height)
+        return mapper.map()
+
+
+def open_house(settings: ImaginedSettings, starts: PosedFrames) -> tuple[WorldModel, TrajectoryInfo]:
+    """Return a world model with one agent, which has not begun, and the start's info with the actions to take."""
+    checkpoint = find_checkpoint(Path(settings.checkpoint))
+    adapter = checkpoint.chosen_adapter(settings.adapter)
+    plan = RolloutPlan(
+        settings.start, (), False, 0, settings.memory_file, settings.adapter, settings.write, 0,
+        settings.sampling, InferenceOptions(), settings.step, settings.turn,
+    )  # fmt: skip
+    info = replace(starts.info, vocabulary=walking_vocabulary(starts.file, plan))
+    if adapter is None and settings.memory is not None:
+        raise CheckpointError(f"{checkpoint.folder}: without a memory adapter it cannot read {settings.memory}")
+    return assemble_world(checkpoint, adapter, plan, info), info
+
+
+def memorize_frames(world: WorldModel, frames: PosedFrames) -> None:
+    """Write given frames into the memory of the world's agent."""
+    for source in frames.sources:
+        for piece in source.pieces():
+            world.agents[0].memorize(piece, world.backbone.device)
+
+
+def imagined_steps(world: WorldModel, actions: Sequence[Sequence[str]]) -> list[tuple[Observations, list[bool]]]:
+    """Return what each agent sees after each of its actions, and whether the way of each was free."""
+    return [(seen, [True] * len(seen)) for seen in world.step(actions)]
+
+
+class ImaginedHouse(HouseEnv):
+    """An imagined house: ``gymnasium.make("persist/ImaginedHouse-v0", start="sample#0:32", goal="sample#0:0")``.
+
+    Args:
+        render_mode: ``rgb_array`` or ``None``.
+        settings: those of ``ImaginedSettings``.
+
+    Raises:
+        PersistError: one line with what is wrong in the settings, or missing.
+    """
+
+    def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
+        super().__init__(ImaginedScenes(imagined_settings(settings)), render_mode)
+
+
+class ImaginedHouseVector(HouseVectorEnv):
+    """Several agents in one imagined house, whose frames are imagined in one batch.
+
+    For example ``gymnasium.make_vec("persist/ImaginedHouse-v0", num_envs=8, start="sample#0:32", goal="sample#0:0")``.
+
+    Args:
+        num_envs: number of environments.
+        max_episode_steps: steps after which an episode is truncated.
+        render_mode: ``rgb_array`` or ``None``.
+        settings: those of ``ImaginedSettings``.
+
+    Raises:
+        PersistError: as ``ImaginedHouse``.
+    """
+
+    def __init__(
+        self, num_envs: int = 1, max_episode_steps: int | None = None, render_mode: str | None = None, **settings: Any
+    ) -> None:
+        scenes = ImaginedScenes(imagined_settings(settings), num_envs)
+        super().__init__(scenes, num_envs, max_episode_steps, render_mode)
+
+
+def imagined_settings(settings: Mapping[str, Any]) -> ImaginedSettings:
+    """Return the settings of plain values, where paths may stand for their text."""
+    texts = {name: os.fspath(value) if isinstance(value, os.PathLike) else value for name, value in settings.items()}
+    return parse_settings(ImaginedSettings, texts, NAME)
