@@ -132,22 +132,24 @@ def world(walks):
 @pytest.mark.parametrize("name", MAPS)
 def test_a_rollout_sees_what_it_sees_on_the_cpu_and_maps_it_where_it_computes(name, world):
     here, there = world(name, "cpu"), world(name, DEVICE)
-    mine, others = (model.step([["left"] * 12])[0] for model in (here, there))
+    mine, others = (model.step([["left"] * 12])[0].seen for model in (here, there))
     assert everywhere(there.agents[0].memory.tensors().values())
     assert (mine.rgb.int() - others.rgb.int()).abs().float().mean() < 1
     assert torch.allclose(mine.depth, others.depth, rtol=0.05, atol=0.05)
 
 
 def test_a_rollout_in_bfloat16_sees_nearly_the_same(world):
-    mine, others = (world("voxel", DEVICE, kind).step([["left"] * 8])[0] for kind in (torch.float32, torch.bfloat16))
+    mine, others = (
+        world("voxel", DEVICE, kind).step([["left"] * 8])[0].seen for kind in (torch.float32, torch.bfloat16)
+    )
     assert (mine.rgb.int() - others.rgb.int()).abs().float().mean() < 8
 
 
 def test_branches_see_what_rollouts_alone_see(world):
     ways = [["left"] * 8, ["forward"] * 8]
-    together = world("voxel", DEVICE).branches(2).step(ways)
+    together = [result.seen for result in world("voxel", DEVICE).branches(2).step(ways)]
     for seen, way in zip(together, ways, strict=True):
-        alone = world("voxel", DEVICE).step([way])[0]
+        alone = world("voxel", DEVICE).step([way])[0].seen
         assert (seen.rgb.int() - alone.rgb.int()).abs().float().mean() < 0.5
 
 

@@ -178,7 +178,7 @@ def memorize_frames(world: WorldModel, frames: PosedFrames) -> None:
 
 def imagined_steps(world: WorldModel, actions: Sequence[Sequence[str]]) -> list[tuple[Observations, list[bool]]]:
     """Return what each agent sees after each of its actions, and whether the way of each was free."""
-    return [(seen, [True] * len(seen)) for seen in world.step(actions)]
+    return [(result.seen, result.free.tolist()) for result in world.step(actions)]
 
 
 class ImaginedHouse(HouseEnv):

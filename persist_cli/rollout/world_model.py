@@ -1,31 +1,55 @@
 """The world model, which imagines clip by clip what agents will see when they act, and remembers it.
 
-``WorldModel.imagine`` is the one loop of the tool: recall, denoise, observe, memorize. Rollouts and evaluations use it;
-a single agent is a batch of one.
+One loop is all of the tool: recall, denoise, observe, memorize. ``WorldModel.imagine`` goes along given cameras, as
+evaluations do; ``WorldModel.act`` goes where actions lead, and an agent with a body stops at what is in its way. A
+single agent is a batch of one.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.backbone import Backbone, Clip, Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.ground import Body
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Origin, TrajectoryInfo
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
+from persist_cli.rollout.surroundings import Surroundings, Walk, plan_walks
 
 
 def unchanged(seen: Observations) -> Observations:
     """Return the frames unchanged."""
     return seen
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What an agent sees after each of its actions, and which of them it could take.
+
+    Args:
+        seen: a frame after each action. A blocked action changes nothing, so its frame is the one before it once more.
+        free: whether the way of each action was free.
+    """
+
+    seen: Observations
+    free: Bool[Tensor, " action"]
+
+    @staticmethod
+    def concatenate(parts: Sequence[StepResult]) -> StepResult:
+        """Join results of one agent, one after the other."""
+        return StepResult(
+            Observations.concatenate([part.seen for part in parts]), torch.cat([part.free for part in parts])
+        )
 
 
 @dataclass
@@ -38,6 +62,7 @@ class Agent:
         write: whether observed and imagined frames are written into the memory.
         disturb: changes frames before they are written, as an evaluation with noisy poses does.
         shared: whether other agents read this memory too, so that it is copied before it is written.
+        body: what of it can be blocked; ``None`` for a camera that goes through walls.
     """
 
     memory: Memory | None
@@ -45,14 +70,40 @@ class Agent:
     write: bool = True
     disturb: Callable[[Observations], Observations] = unchanged
     shared: bool = False
+    body: Body | None = None
     reads: list[tuple[int, int]] = field(default_factory=list, init=False)  # tokens and bytes, of each clip
     now: Observations = field(init=False)
     info: TrajectoryInfo = field(init=False)
     clips: int = field(default=0, init=False)
+    surroundings: Surroundings | None = field(default=None, init=False)  # ``None`` without a body
+
+    def begin(self, observation: Observations, info: TrajectoryInfo) -> None:
+        """Stand at an observed frame; its info has the frame's scene, up axis and vocabulary."""
+        self.now, self.info, self.clips = observation, info, 0
+        self.surroundings = None
+        if self.body is not None:
+            self.surroundings = Surroundings(self.body, observation, info, self.memory)
+
+    def branch(self, memory: Memory | None) -> Agent:
+        """Return an agent in this one's state, with a memory that it shares with others."""
+        branch = Agent(memory, self.seed, self.write, self.disturb, memory is not None, self.body)
+        branch.now, branch.info, branch.clips = self.now, self.info, self.clips
+        branch.surroundings = self.surroundings and self.surroundings.copy()
+        return branch
+
+    def walk(self) -> Walk:
+        """Return a walk without an action yet, from the present frame."""
+        return Walk(self.info, self.now.cameras, self.surroundings if self.body is not None else None)
 
     def cameras_after(self, actions: Sequence[str]) -> Cameras:
         """Return the cameras after each of the actions, starting at the present frame."""
         return cameras_along(self.now.cameras, self.info, actions)
+
+    def notice(self, seen: Observations) -> Observations:
+        """Let imagined frames count for what is in the way of later actions, and return them."""
+        if self.surroundings is not None:
+            self.surroundings.see(seen)
+        return seen
 
     def observe(self, seen: Observations) -> None:
         """Make the last of the frames the present one, and count their clip."""
@@ -82,11 +133,26 @@ class WorldModel:
     def reset(self, observations: Sequence[Observations], infos: Sequence[TrajectoryInfo]) -> None:
         """Let each agent begin at one observed frame; its info has the frame's scene, up axis and vocabulary."""
         for agent, observation, info in zip(self.agents, observations, infos, strict=True):
-            agent.now, agent.info, agent.clips = observation, info, 0
+            agent.begin(observation, info)
             agent.memorize(observation, self.backbone.device)
 
-    def step(self, actions: Sequence[Sequence[str]]) -> list[Observations]:
-        """Return for each agent the frames that it sees after each of its actions.
+    def step(self, actions: Sequence[Sequence[str]], check_again: bool = True) -> list[StepResult]:
+        """Return for each agent what it sees after each of its actions; arguments and errors as of ``act``."""
+        return [StepResult.concatenate(parts) for parts in zip(*self.act(actions, check_again), strict=True)]
+
+    def act(self, actions: Sequence[Sequence[str]], check_again: bool = True) -> Iterator[list[StepResult]]:
+        """Yield for each imagined clip what every agent sees after some of its next actions, until none is left.
+
+        A step is blocked where the ground on its way is known to be occupied: by what the agent observed, by what its
+        memory held at the start, or by what it imagined since. Unknown ground counts as free. A blocked action does not
+        move the agent. Agents without a body are never blocked.
+
+        Args:
+            actions: for each agent at least one name of its vocabulary.
+            check_again: whether each clip's own depth is looked at too. An agent then stops at a wall that only this
+                clip shows, what was imagined behind the wall is dropped, and the rest of its actions gets another clip.
+                It costs some milliseconds a frame and now and then a clip; planners that compare many short futures
+                leave it out.
 
         Raises:
             PersistError: when there is not one list of actions for each agent, or a list is empty.
@@ -96,10 +162,41 @@ class WorldModel:
                 f"{len(self.agents)} branches were given {len(actions)} lists of {[*map(len, actions)]} "
                 "actions; each needs one of at least one action"
             )
-        pairs = list(zip(self.agents, actions, strict=True))
-        cameras = [agent.cameras_after(names) for agent, names in pairs]
-        clips = list(self.imagine(cameras, [interactions_of(names, agent.info.vocabulary) for agent, names in pairs]))
-        return [Observations.concatenate(parts) for parts in zip(*clips, strict=True)]
+        left = [tuple(names) for names in actions]
+        while any(left):
+            walks = [agent.walk() for agent in self.agents]
+            plan_walks(walks, left, self.backbone.frames_per_clip - 1)
+            results = self.follow(walks, check_again)
+            left = [names[len(walk.names) :] for names, walk in zip(left, walks, strict=True)]
+            yield results
+
+    def follow(self, walks: Sequence[Walk], check_again: bool) -> list[StepResult]:
+        """Imagine a clip of each walk that moves, cut where it proves blocked, and return what every agent sees."""
+        moving = [number for number, walk in enumerate(walks) if walk.poses]
+        interactions = [interactions_of(walks[n].moves, walks[n].info.vocabulary) for n in moving]
+        clips = self.predict(moving, [walks[n].cameras for n in moving], interactions) if moving else []
+        imagined = dict(zip(moving, clips, strict=True))
+        results = []
+        for number, (agent, walk) in enumerate(zip(self.agents, walks, strict=True)):
+            now, seen = agent.now, imagined.get(number, agent.now[:0])
+            if number in imagined:
+                seen = self.stopped(walk, seen) if check_again else agent.notice(seen)
+                self.take(agent, seen)
+            results.append(StepResult(walk.frames(now, seen), walk.verdicts))
+        return results
+
+    def stopped(self, walk: Walk, seen: Observations) -> Observations:
+        """Return the frames of a clip up to the first action that they show to be blocked, and cut the walk there.
+
+        What is returned counts for later actions.
+        """
+        if walk.surroundings is None:
+            return seen
+        stop = walk.surroundings.first_blocked(seen)
+        if stop is None:
+            return seen
+        walk.cut(stop)
+        return seen[:stop]
 
     def branches(self, count: int) -> WorldModel:
         """Return a world model with ``count`` agents in the state of the first agent, with the same sampling noise.
@@ -114,13 +211,14 @@ class WorldModel:
             raise PersistError(f"{count} branches of a rollout; it must be at least 1")
         agent = self.agents[0]
         memory = None if agent.memory is None else agent.memory.copy()
-        agents = [Agent(memory, agent.seed, agent.write, agent.disturb, memory is not None) for _ in range(count)]
-        for branch in agents:
-            branch.now, branch.info, branch.clips = agent.now, agent.info, agent.clips
-        return WorldModel(self.backbone, agents, self.sampling)
+        branches = copy.copy(self)  # of this one's class
+        branches.agents = [agent.branch(memory) for _ in range(count)]
+        return branches
 
     def imagine(self, cameras: Sequence[Cameras], interactions: Sequence[Interactions]) -> Iterator[list[Observations]]:
-        """Yield for each clip the frames of every agent, which are none for an agent at the end of its path.
+        """Yield for each clip the frames of every agent along its cameras, none for an agent at the end of its path.
+
+        Nothing is in the way of a camera, with or without a body.
 
         As long as all agents have one present frame and one memory, as those of ``branches`` do at first, the frame is
         encoded once and the memory is read once.
@@ -134,16 +232,27 @@ class WorldModel:
             clip = slice(first, first + length)
             moving = [number for number, path in enumerate(cameras) if len(path) > first]
             ways = [cameras[number][clip] for number in moving]
-            clips = self.recall(moving, ways, [interactions[number][clip] for number in moving])
-            rgb, depth = self.denoise(clips)
+            seen = self.predict(moving, ways, [interactions[number][clip] for number in moving])
             frames = [agent.now[:0] for agent in self.agents]
-            for row, (number, way) in enumerate(zip(moving, ways, strict=True)):
-                new = slice(1, len(way) + 1)
-                seen = Observations(rgb[row, new], depth[row, new], way).with_origin(Origin.IMAGINED)
-                self.agents[number].observe(seen)
-                self.agents[number].memorize(seen, self.backbone.device)
-                frames[number] = seen
+            for number, part in zip(moving, seen, strict=True):
+                self.take(self.agents[number], self.agents[number].notice(part))
+                frames[number] = part
             yield frames
+
+    def predict(
+        self, moving: Sequence[int], ways: Sequence[Cameras], interactions: Sequence[Interactions]
+    ) -> list[Observations]:
+        """Return what some agents would see along their next cameras; arguments as of ``recall``."""
+        rgb, depth = self.denoise(self.recall(moving, ways, interactions))
+        return [
+            Observations(rgb[row, 1 : len(way) + 1], depth[row, 1 : len(way) + 1], way).with_origin(Origin.IMAGINED)
+            for row, way in enumerate(ways)
+        ]
+
+    def take(self, agent: Agent, seen: Observations) -> None:
+        """Let an agent go on from the last of the frames that it imagined, and remember them."""
+        agent.observe(seen)
+        agent.memorize(seen, self.backbone.device)
 
     def recall(self, moving: Sequence[int], ways: Sequence[Cameras], interactions: Sequence[Interactions]) -> Clips:
         """Return the clips that the backbone shall predict: present frames, cameras to come and memory tokens.

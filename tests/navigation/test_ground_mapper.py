@@ -8,25 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from persist_cli.api.cameras import Cameras
 from persist_cli.api.ground import Body, Cover, GroundMap
 from persist_cli.api.memory import FrameOfReference, MapPoints
 from persist_cli.api.observations import Observations, Origin
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of, ground_from_frames
 from persist_cli.plugins import make_encoder, make_memory
-from tests.support.rooms import UP, Room, look
-
-BODY = Body(radius=0.2, camera_height=1.25, height=1.4)
-ROOM = Room(64, 64)
+from tests.support.room_worlds import BODY, ROOM, room_views
+from tests.support.rooms import UP, look
 
 
 def seen(*poses: np.ndarray, origin: Origin = Origin.OBSERVED) -> Observations:
     """What a camera sees of the room."""
-    frames = list(ROOM.frames(np.stack(poses)))
-    matrix = torch.from_numpy(ROOM.intrinsics).expand(len(frames), 3, 3)
-    cameras = Cameras(torch.from_numpy(np.stack(poses)), matrix, ROOM.height, ROOM.width)
-    rgb, depth = (torch.from_numpy(np.stack([getattr(f, name) for f in frames])) for name in ("rgb", "depth"))
-    return Observations(rgb, depth, cameras).with_origin(origin)
+    return room_views(*poses).with_origin(origin)
 
 
 def around(x: float = 0.0, z: float = 0.0, pitch: float = 0.0) -> list[np.ndarray]:

@@ -46,7 +46,7 @@ def test_each_candidate_sees_what_a_rollout_of_its_actions_does(model):
     last = WorldFutures(model, unknown_ground(model)).imagine(CANDIDATES, "last")
     every = WorldFutures(model, unknown_ground(model)).imagine(CANDIDATES, "best")
     for number, names in enumerate(CANDIDATES):
-        frames = model.branches(1).step([names])[0].rgb if names else model.agents[0].now.rgb
+        frames = model.branches(1).step([names])[0].seen.rgb if names else model.agents[0].now.rgb
         assert alike(every.futures.rgb[number, : len(frames)], frames)
         assert alike(every.futures.rgb[number, -1], frames[-1])  # shorter ones repeat their last
         assert alike(last.futures.rgb[number, 0], frames[-1])

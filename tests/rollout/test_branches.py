@@ -59,8 +59,8 @@ def record_sizes(monkeypatch, owner, name):
 
 
 def test_a_branch_imagines_what_a_single_rollout_does(start):
-    branched = start(seed=5).branches(3).step(ACTIONS)
-    single = [start(seed=5).step([names])[0] for names in ACTIONS]
+    branched = [result.seen for result in start(seed=5).branches(3).step(ACTIONS)]
+    single = [start(seed=5).step([names])[0].seen for names in ACTIONS]
     assert all(alike(first, second) for first, second in zip(branched, single, strict=True))
     assert not alike(branched[0], branched[1])
 
@@ -114,19 +114,19 @@ def test_branches_that_do_not_write_share_one_memory(start):
 
 def test_branches_may_have_different_numbers_of_actions(start):
     actions = [["left"] * 3, ["right"] * 12]
-    videos = start().branches(2).step(actions)
+    videos = [result.seen for result in start().branches(2).step(actions)]
     assert [len(video) for video in videos] == [3, 12]
-    assert all(alike(video, start().step([names])[0]) for video, names in zip(videos, actions, strict=True))
+    assert all(alike(video, start().step([names])[0].seen) for video, names in zip(videos, actions, strict=True))
 
 
 def test_branching_again_does_not_change_the_first_world_model(start):
     model = start()
     branch = model.branches(1)
     branch.step([["left"] * 8])
-    continued = branch.branches(2).step([["left"] * 8, ["forward"] * 8])[0]
-    expected = start().step([["left"] * 16])[0]
+    continued = branch.branches(2).step([["left"] * 8, ["forward"] * 8])[0].seen
+    expected = start().step([["left"] * 16])[0].seen
     assert alike(continued, expected[8:])
-    assert alike(model.step([["left"] * 8])[0], expected[:8])
+    assert alike(model.step([["left"] * 8])[0].seen, expected[:8])
 
 
 def test_branches_that_cannot_work_are_refused(start):

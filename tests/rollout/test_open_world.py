@@ -20,7 +20,7 @@ def test_a_world_that_is_opened_imagines_what_rollout_does(persist, voxel, walks
     start, options = f"{walks}#0:2", ("--memory", memory, "--steps", 2, "--actions", "left*4 forward*6")
     assert persist("rollout", voxel, "--start", start, "--out", out, *options).code == 0
     world = open_world(start, voxel, memory=memory, sampling=FAST)
-    (seen,) = world.step([["left"] * 4 + ["forward"] * 6])
+    seen = world.step([["left"] * 4 + ["forward"] * 6])[0].seen
     assert read_video(out / "rgb.mp4", SIZE, SIZE).shape == (1 + len(seen.rgb), SIZE, SIZE, 3)
     world.agents[0].memory.save(tmp_path / "after.safetensors")
     written, remembered = load_memory(out / "memory.safetensors"), load_memory(tmp_path / "after.safetensors")
@@ -30,7 +30,7 @@ def test_a_world_that_is_opened_imagines_what_rollout_does(persist, voxel, walks
 def test_a_world_without_an_adapter_has_no_memory(voxel, walks):
     world = open_world(f"{walks}#0:2", voxel, adapter="stage1", sampling=FAST)
     assert world.agents[0].memory is None
-    assert len(world.step([["left"]])[0]) == 1
+    assert len(world.step([["left"]])[0].seen) == 1
 
 
 def test_a_world_is_not_opened_with_the_memory_of_another_scene(persist, voxel, walks, tmp_path):

@@ -135,7 +135,7 @@ def test_the_world_model_writes_imagined_frames_into_the_memory(walks):
     model = WorldModel(backbone, [Agent(memory)], Sampling(1))
     model.reset([trajectory.observations], [trajectory.info])
     cells = memory.figures().cells
-    seen = model.step([["left"] * 12])[0]
+    seen = model.step([["left"] * 12])[0].seen
     assert len(seen) == 12
     assert memory.figures().cells > cells
     assert (memory.figures().observed, seen.origins.unique().tolist()) == (cells, [Origin.IMAGINED])
