@@ -19,7 +19,7 @@ from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.observations import Observations
 from persist_cli.api.stages import Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.errors import PersistError
+from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.setting_docs import Setting
 from persist_cli.io.settings import NoSettings
 
@@ -158,6 +158,7 @@ class Backbone(nn.Module, ABC):
     settings_type: ClassVar[type] = NoSettings
     sharded_blocks: ClassVar[tuple[str, ...]] = ()  # class names of blocks that a sharded model gathers one by one
     never_sharded: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
+    built_by: ClassVar[tuple[str, ...]] = ()  # settings that say how it is built, which a base has its own of
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:
@@ -402,6 +403,14 @@ class Backbone(nn.Module, ABC):
         Raises:
             CheckpointError: when a file is missing or corrupt, or a tensor has another shape.
         """
+
+    def load_codec(self, folder: Path) -> None:
+        """Load the codec alone of what ``save_base`` wrote; all else stays fresh.
+
+        Raises:
+            CheckpointError: as ``load_base`` does, and when this backbone cannot.
+        """
+        raise CheckpointError(f"{folder}: backbone {self.name!r} takes no codec alone; leave its own settings out")
 
     @abstractmethod
     def load_adapter(self, name: str, folder: Path) -> None:

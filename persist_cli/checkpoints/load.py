@@ -7,7 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.checkpoints.lineage import RECIPE
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
@@ -41,7 +44,7 @@ def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = Non
     from persist_cli.plugins import make_backbone
 
     with without_weights():
-        return make_backbone(checkpoint.backbone, checkpoint.settings | (settings or {}))
+        return make_backbone(checkpoint.backbone, merge_settings(checkpoint.settings, settings or {}))
 
 
 def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:
@@ -113,16 +116,59 @@ def named_adapter(text: str) -> tuple[Checkpoint, str]:
 def start_backbone(config: BackboneConfig, base: Checkpoint | None) -> Backbone:
     """The backbone that a training begins with: a fresh one, or that of the base with the config's settings on top.
 
-    Raises:
-        RecipeError: when the base is of another backbone than the config.
-    """
-    if base is None:
-        from persist_cli.plugins import make_backbone
+    Of a base that is a codec trained from nothing, the config may change the video model: that is then a fresh one.
 
+    Raises:
+        RecipeError: when the base is of another backbone than the config, or was built by other settings.
+    """
+    from persist_cli.plugins import load_plugin, make_backbone
+
+    if base is None:
         return make_backbone(config.name, config.settings)
     if base.backbone != config.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
-    return load_backbone(base, config.settings)
+    built_by = load_plugin("backbone", config.name).built_by
+    changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by if key in config.settings})
+    if not changed:
+        return load_backbone(base, config.settings)
+    if not is_own_codec(base):
+        raise RecipeError(
+            f"backbone.settings.{changed[0]}: base {base.folder} is a model that was built with another; leave it out"
+        )
+    base.check_weights(None)
+    backbone = make_backbone(config.name, merge_settings(base.settings, config.settings))
+    backbone.load_codec(base.base_folder)
+    return backbone
+
+
+def merge_settings(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with others on top, of which mappings replace single entries."""
+    merged = dict(settings)
+    for key, value in changes.items():
+        own = settings.get(key)
+        merged[key] = merge_settings(own, value) if isinstance(own, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def changed_settings(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> list[str]:
+    """Names of the settings that ``changes`` gives another value, those inside of mappings as ``mapping.name``."""
+    changed: list[str] = []
+    for key, value in changes.items():
+        own = settings.get(key)
+        if isinstance(own, dict) and isinstance(value, dict):
+            changed += [f"{key}.{name}" for name in changed_settings(own, value)]
+        elif value != own:
+            changed.append(key)
+    return changed
+
+
+def is_own_codec(base: Checkpoint) -> bool:
+    """Whether a base is a codec that was trained from nothing, so that its video model has random weights."""
+    recipe = base.base_folder / RECIPE
+    if not recipe.is_file():
+        return False
+    values = yaml.safe_load(recipe.read_text())
+    return values["stage"] == "codec" and not values["base"] and not values["backbone"]["settings"].get("pretrained")
 
 
 def starts_from_random_codec(recipe: Recipe, backbone: Backbone) -> bool:

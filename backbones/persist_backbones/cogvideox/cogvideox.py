@@ -45,6 +45,7 @@ from persist_backbones.cogvideox.model import NO_MEMORY, Conditions, widen
 from persist_backbones.cogvideox.parameter_groups import group_parameters, truncate_layers
 from persist_backbones.cogvideox.parts import (
     DiffusersParts,
+    load_part,
     load_parts,
     load_world,
     merge_lora,
@@ -106,6 +107,7 @@ class CogVideoX(AdaptedBackbone):
     settings_type = CogVideoXSettings
     sharded_blocks = ("CogVideoXBlock", "MemoryBlock", "CanvasBlock")
     never_sharded = ("codec",)
+    built_by = ("transformer", "prediction", "vae")
     settings: CogVideoXSettings
     prompt: Tensor
 
@@ -425,6 +427,12 @@ class CogVideoX(AdaptedBackbone):
         if base is not None:
             merge_lora(self.transformer.base, folder, check=not isinstance(base, Path))  # lora_base verifies a folder
         self.prompt = load_world(self.transformer, folder)
+
+    def load_codec(self, folder: Path) -> None:
+        """Load the VAE of what ``save_base`` wrote; the transformer stays fresh."""
+        own = DiffusersParts(self.transformer.base, self.codec.vae, self.scheduler)
+        self.set_parts(dataclasses.replace(own, vae=load_part(folder, "vae")))
+        self.prompt = starting_prompt(self.settings, self.prompt)
 
     def origin(self) -> dict[str, Any]:
         """Return the setting ``pretrained`` with an absolute path, valid from any working directory."""

@@ -116,7 +116,7 @@ def load_parts(folder: Path) -> DiffusersParts:
     Raises:
         CheckpointError: one line when a part is missing, corrupt or does not fit its configuration.
     """
-    return DiffusersParts(*(_load_part(folder, name) for name in SUBFOLDERS))
+    return DiffusersParts(*(load_part(folder, name) for name in SUBFOLDERS))
 
 
 def on_meta_device() -> bool:
@@ -304,7 +304,8 @@ def check_name(name: str) -> None:
         raise CheckpointError(f"{name}: no such directory, and not the name of a repository on the hub (owner/model)")
 
 
-def _load_part(folder: Path, name: str) -> Any:
+def load_part(folder: Path, name: str) -> Any:
+    """Load one part of a diffusers directory, a key of ``SUBFOLDERS``; errors as of ``load_parts``."""
     if not (folder / name).is_dir():
         raise CheckpointError(
             f"{folder}: no {name}/ folder; a diffusers CogVideoX directory has {', '.join(SUBFOLDERS)}"
