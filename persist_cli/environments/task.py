@@ -88,12 +88,12 @@ class View:
 
 
 def moving_actions(info: TrajectoryInfo) -> tuple[str, ...]:
-    """Return the actions that move the agent, in the order of its vocabulary: action 0 of an environment is the first.
+    """Return the actions that walk ahead or turn, in the order of the vocabulary: action 0 is the first of them.
 
     Raises:
         DataError: when there are none, as in a capture.
     """
-    names = tuple(action.name for action in info.vocabulary.actions if action.forward or action.turn)
+    names = tuple(action.name for action in info.vocabulary.moving)
     if not names:
         raise DataError(f"{info.scene}: no action moves the camera ({info.vocabulary.listing()})")
     return names

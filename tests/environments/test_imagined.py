@@ -41,7 +41,7 @@ def test_a_step_shows_what_the_world_model_imagines(settings, persist, voxel, wa
     env.reset(seed=0)
     seed = env.unwrapped.scenes._agents[0].seed
     world = open_world(f"{walks}#0:6", voxel, memory=memory, sampling=SamplingOverrides(steps=1), seed=seed)
-    for action, name in ((2, "left"), (0, "forward"), (3, "right")):
+    for action, name in ((1, "left"), (0, "forward"), (2, "right")):
         seen = env.step(action)[0]
         ((expected, _),) = imagined_steps(world, [[name]])
         assert np.array_equal(seen["rgb"], expected.rgb[0].numpy())
@@ -54,26 +54,26 @@ def test_a_memory_file_is_the_same_as_the_frames_that_it_was_made_of(settings, p
     frames, file = make(settings), make(settings, memory=memory)
     frames.reset(seed=1)
     file.reset(seed=1)
-    assert np.array_equal(frames.step(2)[0]["rgb"], file.step(2)[0]["rgb"])
+    assert np.array_equal(frames.step(1)[0]["rgb"], file.step(1)[0]["rgb"])
 
 
 def test_each_episode_begins_with_the_memory_as_it_was_given(settings):
     env = make(settings)
-    first = env.reset(seed=3)[0], env.step(2)[0]
+    first = env.reset(seed=3)[0], env.step(1)[0]
     given = env.unwrapped.scenes.first.memory.figures()
-    for action in (0, 2, 2):
+    for action in (0, 1, 1):
         env.step(action)
     assert env.unwrapped.scenes._agents[0].memory.figures() != given
-    again = env.reset(seed=3)[0], env.step(2)[0]
+    again = env.reset(seed=3)[0], env.step(1)[0]
     assert env.unwrapped.scenes.first.memory.figures() == given
     assert all(np.array_equal(one["rgb"], two["rgb"]) for one, two in zip(first, again, strict=True))
 
 
 def test_a_chunk_of_actions_is_seen_as_one_clip(settings):
     env = make(settings, chunk=3, success_radius=0.01, goal_distance=[0.02, 5.0])
-    assert env.action_space == gymnasium.spaces.MultiDiscrete([4, 4, 4])
+    assert env.action_space == gymnasium.spaces.MultiDiscrete([3, 3, 3])
     env.reset(seed=0)
-    env.step(np.array([2, 2, 0]))
+    env.step(np.array([1, 1, 0]))
     assert env.unwrapped.scenes._agents[0].clips == 1
 
 
@@ -86,7 +86,7 @@ def test_a_vector_is_equal_to_single_environments_with_its_seeds(settings):
     alone = [env.reset(seed=5 + number)[0] for number, env in enumerate(singles)]
     for step in range(4):
         assert all(is_alike(seen, number, alone[number]) for number in range(2))
-        actions = np.array([2 + step % 2, 3 - step % 2])
+        actions = np.array([1 + step % 2, 2 - step % 2])
         seen, rewards, _, truncated, infos = vector.step(actions)
         for number, env in enumerate(singles):
             alone[number], reward, _, over, info = env.step(actions[number])

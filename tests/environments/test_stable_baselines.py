@@ -1,0 +1,82 @@
+"""stable-baselines3's PPO learns in all environments as they are."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+import persist_cli.environments  # noqa: F401  registers them
+from persist_cli.errors import PersistError
+from tests.support.micro_runs import write_walks
+from tests.support.miniworlds import make_world
+
+pytest.importorskip("stable_baselines3", reason="it is in the extra dev")
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.vec_env import VecMonitor
+
+from persist_cli.environments.stable_baselines import BatchedVecEnv
+
+TRUE = {"id": "persist/SimulatedHouse-v0", "scenes": "0:2", "split": "test"}
+
+
+@pytest.fixture(scope="module")
+def imagined(tmp_path_factory) -> dict[str, object]:
+    """An imagined house of the packaged model's image size, which a network for images needs."""
+    walks = write_walks(tmp_path_factory.mktemp("walks"), size=64)
+    return {
+        "id": "persist/ImaginedHouse-v0", "start": f"{walks}#0:6", "goal": f"{walks}#0:0-9", "adapter": "stage1",
+        "sampling": {"steps": 1}, "success_radius": 0.1, "goal_distance": [0.15, 5.0],
+    }  # fmt: skip
+
+
+def learned(environment: object, steps: int = 8) -> PPO:
+    """PPO after some steps."""
+    model = PPO("MultiInputPolicy", environment, n_steps=4, batch_size=4, n_epochs=1, seed=0, device="cpu")
+    return model.learn(steps)
+
+
+def test_ppo_learns_in_a_true_house():
+    make_world()
+    check_env(gymnasium.make(**TRUE))
+    assert learned(gymnasium.make(**TRUE)).num_timesteps == 8
+
+
+def test_ppo_learns_in_an_imagined_house(imagined, monkeypatch):
+    monkeypatch.delenv("PERSIST_REFERENCE", raising=False)
+    assert learned(gymnasium.make(**imagined)).num_timesteps == 8
+
+
+def test_ppo_learns_from_chunks_of_actions():
+    make_world()
+    assert learned(gymnasium.make(**TRUE, chunk=3)).num_timesteps == 8
+
+
+def test_ppo_learns_in_a_batch_of_environments_and_counts_its_episodes():
+    make_world()
+    envs = gymnasium.make_vec(num_envs=2, max_episode_steps=3, **TRUE)
+    model = learned(VecMonitor(BatchedVecEnv(envs)), 16)
+    assert model.num_timesteps == 16
+    assert {episode["l"] for episode in model.ep_info_buffer} <= {1, 2, 3}
+    assert len(model.ep_success_buffer) >= 4
+
+
+def test_an_ended_episode_brings_its_last_observation_and_says_whether_it_was_truncated():
+    make_world()
+    envs = BatchedVecEnv(gymnasium.make_vec(num_envs=2, max_episode_steps=2, **TRUE))
+    envs.seed(0)
+    first = envs.reset()
+    envs.step(np.array([1, 1]))
+    seen, _, done, infos = envs.step(np.array([1, 1]))
+    assert done.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [not info["is_success"] for info in infos]
+    assert not np.array_equal(infos[0]["terminal_observation"]["rgb"], seen["rgb"][0])
+    envs.seed(0)
+    assert np.array_equal(envs.reset()["rgb"], first["rgb"])
+
+
+def test_environments_that_begin_anew_a_step_later_are_refused():
+    make_world()
+    with pytest.raises(PersistError, match="NEXT_STEP"):
+        BatchedVecEnv(gymnasium.make_vec(num_envs=1, vectorization_mode="sync", **TRUE))
