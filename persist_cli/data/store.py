@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.actions import ActionVocabulary
@@ -29,6 +29,7 @@ SUFFIX = ".parquet"
 FORMAT = "persist-trajectory"
 VERSION = 1
 METADATA_KEY = b"persist"
+OF_A_FRAME = ("rgb.bytes", "depth.bytes", "world_from_camera", "action")  # columns that ``read`` needs
 FRAMES_PER_GROUP = 8  # a clip of a few frames reads little more than itself
 IMAGE = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])  # the form of Hugging Face datasets
 COLUMNS = pa.schema(
@@ -134,6 +135,14 @@ class TrajectoryFile:
         observations = Observations(_stacked(rgb), _stacked(depth), self._cameras(poses))
         return Trajectory(self.name, observations, tuple(row["action"] for row in rows), info, numbers[0])
 
+    def rgb(self, frames: Sequence[int]) -> UInt8[Tensor, "frame height width 3"]:
+        """The images of some frames, 0…255, without reading their depth; errors as those of ``read``."""
+        numbers = self.frame_numbers(frames)
+        rows = self._rows(numbers, ("rgb.bytes",))
+        return _stacked(
+            [self._image(row["rgb"], decode_rgb, number) for number, row in zip(numbers, rows, strict=True)]
+        )
+
     def poses(self) -> Float[Tensor, "frame 4 4"]:
         """World from camera of every frame, float64, without reading an image."""
         column = self._column("world_from_camera")
@@ -189,13 +198,12 @@ class TrajectoryFile:
         intrinsics = torch.from_numpy(self.info.intrinsics).expand(len(poses), 3, 3).clone()
         return Cameras(poses, intrinsics, self.info.height, self.info.width)
 
-    def _rows(self, numbers: list[int]) -> list[dict[str, Any]]:
+    def _rows(self, numbers: list[int], columns: Sequence[str] = OF_A_FRAME) -> list[dict[str, Any]]:
         starts = self._group_starts
         group_of = {number: bisect.bisect_right(starts, number) - 1 for number in numbers}
         groups = sorted(set(group_of.values()))
-        columns = ["rgb.bytes", "depth.bytes", "world_from_camera", "action"]
         with _parquet_errors(self.path), self._open() as file:
-            table = file.read_row_groups(groups, columns=columns, use_threads=False)
+            table = file.read_row_groups(groups, columns=[*columns], use_threads=False)
         first_row: dict[int, int] = {}  # of each row group in the table
         for group in groups:
             first_row[group] = sum(self._metadata.row_group(earlier).num_rows for earlier in first_row)
