@@ -16,7 +16,7 @@ from importlib.metadata import EntryPoint, entry_points
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from persist_cli.errors import TRACEBACK, PersistError, PluginError, hint
+from persist_cli.errors import TRACEBACK, PersistError, PluginError, RecipeError, hint
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from persist_cli.api.importer import Importer
     from persist_cli.api.memory import FrameOfReference, Memory
     from persist_cli.api.policy import Policy
+    from persist_cli.api.policy_network import PolicyNetwork
     from persist_cli.api.simulator import Simulator
 
 
@@ -225,6 +226,18 @@ def make_importer(name: str) -> Importer:
 def make_policy(name: str, settings: dict[str, Any]) -> Policy:
     """Make the policy of a name with plain settings."""
     return _make("policy", name, settings)  # type: ignore[no-any-return]
+
+
+def network_type(policy: str) -> type[PolicyNetwork]:
+    """The class of the network that is trained for the policy of a name.
+
+    Raises:
+        RecipeError: when that policy is not trained.
+    """
+    loaded: type[PolicyNetwork] | None = load_plugin("policy", policy).network_type
+    if loaded is None:
+        raise RecipeError(f"policy {policy!r} has no network to train; 'nomad' has one")
+    return loaded
 
 
 def make_cost(name: str, settings: dict[str, Any]) -> Cost:

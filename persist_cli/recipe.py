@@ -23,9 +23,14 @@ from persist_cli.io.settings import parse_settings
 EXTENDS: Final = "extends"
 
 # the key that chooses a variant: settings of one variant mean nothing to another
-CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "adapter": "form"}
+CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "policy": "name", "adapter": "form"}
 SETTINGS: Final = ("adapter", "settings", "encoder_settings")  # keys that may be left empty
-SETTINGS_OF: Final = {"backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings"}
+SETTINGS_OF: Final = {
+    "backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings",
+    "policy.name": "settings",
+}  # fmt: skip
+
+OF_A_BACKBONE: Final = ("gradient_checkpointing", "compile", "frozen_precision", "vae_slicing")  # settings of training
 
 CHANGEABLE: Final = "a run may be resumed with another value"
 
@@ -56,6 +61,8 @@ class TrainingSettings:
         learning_rate: learning rate of the optimizer after the warm-up.
         warmup: steps over which the learning rate rises linearly.
         cooldown: steps at the end over which the learning rate falls linearly to zero.
+        schedule: of the learning rate after the warm-up: ``constant`` up to the cooldown, or ``cosine``, which falls to
+            zero over all steps.
         weight_decay: weight decay of the optimizer.
         clip: largest norm of all gradients together.
         ema: decay of the moving average of the weights, which is what is saved; 0 saves the last weights.
@@ -84,6 +91,7 @@ class TrainingSettings:
     learning_rate: PositiveNumber = 1e-4
     warmup: Count = 50
     cooldown: Changeable[Count] = 0
+    schedule: Literal["constant", "cosine"] = "constant"
     weight_decay: Amount = 1e-4
     clip: PositiveNumber = 1.0
     ema: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
@@ -135,6 +143,19 @@ class MemoryConfig:
     settings: Settings = field(default_factory=dict)
     encoder: str = "patches"
     encoder_settings: Settings = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """The choice of the policy to train.
+
+    Args:
+        name: name of a policy plugin that is trained; ``persist plugins`` lists policies.
+        settings: settings of its network.
+    """
+
+    name: str = "nomad"
+    settings: Settings = field(default_factory=dict)
 
 
 def _as_list(value: Any) -> Any:
@@ -197,16 +218,17 @@ class Recipe:
     """A training run.
 
     Args:
-        stage: what is trained: ``codec`` (the VAE), ``1`` (the video model) or ``2`` (a memory adapter, all else
-            frozen).
+        stage: what is trained: ``codec`` (the VAE), ``1`` (the video model), ``2`` (a memory adapter, all else
+            frozen) or ``policy`` (an agent that acts in the model, by itself).
         description: one line for ``persist recipes``.
         base: run or checkpoint to start from, ``None`` for none.
-        backbone: the video model.
+        backbone: the video model; not for policies.
         memory: the memory that the adapter reads, stage 2 only.
         adapter: settings of the memory adapter, stage 2 only.
         adapter_from: run or checkpoint whose adapter is trained on, as ``reference`` or ``reference#voxel``, instead of
             a new one; memory and settings are those of that adapter.
         lora: train a change of low rank instead of all weights of the base, stage 1 only.
+        policy: the policy, stage policy only.
         data: the clips.
         training: steps, batch, optimizer and what else decides how long and how it is trained.
     """
@@ -219,6 +241,7 @@ class Recipe:
     adapter: Settings = field(default_factory=dict)
     adapter_from: str | None = None
     lora: Lora | None = None
+    policy: PolicyConfig | None = None
     data: DataSettings = field(default_factory=DataSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
@@ -397,9 +420,24 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("data.own_writes is for stages 1 and 2; leave it out")
     if training.frozen_precision == "bf16" and training.precision == "no":
         problems.append("training.frozen_precision bf16 needs training.precision bf16")
+    problems += _of_a_policy(recipe)
     if training.batch % training.accumulation:
         problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
     return problems
+
+
+def _of_a_policy(recipe: Recipe) -> list[str]:
+    """Describe what a recipe of a policy has that means nothing to it, or lacks."""
+    if (recipe.stage == "policy") != (recipe.policy is not None):
+        return ["stage policy needs policy, as in policy: {name: nomad}; the other stages do not take it"]
+    if recipe.policy is None:
+        return []
+    own, none = to_plain(recipe), DataSettings(recipe.data.path, mirror=recipe.data.mirror)
+    data = [f"data.{key}" for key, value in _copy(dataclasses.asdict(none)).items() if own["data"][key] != value]
+    savings = [f"training.{key}" for key in OF_A_BACKBONE if own["training"][key] != getattr(TrainingSettings, key)]
+    backbone = ["backbone"] if recipe.backbone != BackboneConfig() else []
+    wrong = [*backbone, *data, *savings]
+    return [f"stage policy takes no {', '.join(wrong)}; leave them out"] if wrong else []
 
 
 def to_plain(recipe: Recipe) -> dict[str, Any]:

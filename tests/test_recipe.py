@@ -16,7 +16,7 @@ from persist_cli.recipe import (
     recipe_names,
     to_yaml,
 )
-from persist_cli.train.trainer import learning_rate
+from persist_cli.train.training_loop import learning_rate
 
 
 @pytest.mark.parametrize("name", recipe_names())

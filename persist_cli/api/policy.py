@@ -66,7 +66,7 @@ class Policy(ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
-    network_type: ClassVar[type[PolicyNetwork] | None] = None  # what ``persist finetune`` trains for it
+    network_type: ClassVar[type[PolicyNetwork] | None] = None  # trained by finetune; ``checkpoint`` is then a setting
     frames: int = 1  # of the past that it looks at, the present one included; an instance may need others
     reads: ClassVar[frozenset[GoalKind]] = frozenset()  # of a goal, one of them suffices; empty: it needs none
     name: str = ""  # set by the registry

@@ -5,21 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from persist_cli.api.meta_device import without_weights
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.doctor.machine import gib
 from persist_cli.doctor.meta_model import MetaModel, build_meta_model
+from persist_cli.policies.trained import make_network
+from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe
 from persist_cli.viewing.console import print_json, print_table
 
 
 def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:
     """Print every part's parameters, how many are new and how many each stage trains; nothing is read or written."""
-    meta_model = build_meta_model(recipe, overrides)
-    record = dry_run(meta_model)
+    values = make_recipe(apply_overrides(read_recipe(recipe), overrides), recipe) if _is_policy(recipe) else None
+    record = dry_run(build_meta_model(recipe, overrides)) if values is None else policy_dry_run(values)
     if json:
         print_json({"recipe": recipe} | record)
         return
-    stages = ["codec" if stage == "codec" else f"stage {stage}" for stage in record["total"]["trained"]]
-    title = f"{recipe}: stage {meta_model.recipe.stage} of {meta_model.backbone.name}"
+    stages = [f"stage {stage}" if stage.isdigit() else stage for stage in record["total"]["trained"]]
+    title = f"{recipe}: stage {record['stage']} of {record.get('backbone') or record['policy']}"
     columns = ["part", "parameters", "GiB", "new", *(f"{stage} trains" for stage in stages)]
     print_table(title, columns, [_row(part) for part in [*record["parts"], record["total"]]])
 
@@ -28,20 +31,36 @@ def dry_run(meta_model: MetaModel) -> dict[str, Any]:
     """The parts of the model as JSON values, with the name and shape of every parameter; sizes are those of weights."""
     stages: tuple[Stage, ...] = ("codec", "1") if meta_model.recipe.memory is None else ("codec", "1", "2")
     groups = meta_model.backbone.parameter_groups()
-    trained = {stage: set(meta_model.backbone.trained_parameters(stage)) for stage in stages}
-    parts = [_part(group, trained) for group in groups]
-    total = {
-        "name": "total",
-        **{key: sum(part[key] for part in parts) for key in ("parameters", "bytes", "new")},
-        "trained": {stage: sum(part["trained"][stage] for part in parts) for stage in stages},
-    }
     return {
         "stage": meta_model.recipe.stage,
         "backbone": meta_model.backbone.name,
         "base": str(meta_model.base.folder) if meta_model.base else None,
-        "parts": parts,
-        "total": total,
+        **_parts(groups, {stage: set(meta_model.backbone.trained_parameters(stage)) for stage in stages}),
     }
+
+
+def policy_dry_run(recipe: Recipe) -> dict[str, Any]:
+    """The parts of a policy's network as JSON values, as those of ``dry_run``."""
+    assert recipe.policy is not None
+    with without_weights():
+        network = make_network(recipe.policy.name, recipe.policy.settings)
+    trained: dict[Stage, set[str]] = {"policy": set(network.trained_parameters())}
+    named = {"stage": recipe.stage, "policy": recipe.policy.name, "base": recipe.base}
+    return named | _parts(network.parameter_groups(), trained)
+
+
+def _is_policy(recipe: str) -> bool:
+    return str(read_recipe(recipe).get("stage")) == "policy"
+
+
+def _parts(groups: Sequence[ParameterGroup], trained: dict[Stage, set[str]]) -> dict[str, Any]:
+    parts = [_part(group, trained) for group in groups]
+    total = {
+        "name": "total",
+        **{key: sum(part[key] for part in parts) for key in ("parameters", "bytes", "new")},
+        "trained": {stage: sum(part["trained"][stage] for part in parts) for stage in trained},
+    }
+    return {"parts": parts, "total": total}
 
 
 def _part(group: ParameterGroup, trained: dict[Stage, set[str]]) -> dict[str, Any]:

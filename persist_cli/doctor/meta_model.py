@@ -18,6 +18,7 @@ from persist_cli.checkpoints.load import (
     starts_from_random_codec,
     with_adapter,
 )
+from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import warn
@@ -70,6 +71,8 @@ def build_meta_model(name: str, overrides: Sequence[str]) -> MetaModel:
         PersistError: when the recipe is wrong or its parts do not go together.
     """
     recipe = make_recipe(with_adapter(apply_overrides(read_recipe(name), overrides)), name)
+    if recipe.policy is not None:
+        raise RecipeError(f"{name}: trains a policy, which fits anywhere; count its parameters with finetune --dry-run")
     place = checkpoint_folder(Path(recipe.base)) if recipe.base else None
     base = find_checkpoint(place) if place and place.exists() else None
     if recipe.base and base is None and recipe.adapter_from:

@@ -20,12 +20,14 @@ from accelerate.utils import InitProcessGroupKwargs, broadcast_object_list, set_
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, base_pointer, find_checkpoint, read_card, step_folders
+from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.checkpoints.load import add_adapter, start_backbone, starts_from_random_codec, with_adapter
 from persist_cli.checkpoints.relink import run_base, weights_at
 from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.policies.trained import find_policy, make_network
 from persist_cli.recipe import (
     Recipe,
     apply_overrides,
@@ -43,10 +45,12 @@ from persist_cli.train.distributed import (
     use_zero_on_cpus,
     zero_plugin,
 )
+from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.run_folder import RunFolder
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
-from persist_cli.train.trainer import StopSignal, Trainer
+from persist_cli.train.trainer import Trainer
+from persist_cli.train.training_loop import StopSignal
 from persist_cli.viewing.console import busy, say, warn
 
 LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, as while it writes a large model
@@ -114,7 +118,7 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     before = to_plain(make_recipe(values, str(path)))  # settings that the run's version did not have get their defaults
     changeable = changeable_on_resume()
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]
-    pointer = base_pointer(read_card(steps[-1] / "model"))
+    pointer = base_pointer(read_card(steps[-1] / "model")) if recipe.policy is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
         changed.remove("base")
     if changed:
@@ -134,9 +138,10 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
         The signal that ended the run before its last step, ``None`` when it reached that.
     """
     accelerator = make_accelerator(recipe, run)
-    with held_base(recipe.base, run) as base:
+    with held_base(recipe.base if recipe.policy is None else None, run) as base:
         with busy("loading model and data"):
-            folder, trainer = prepare_run(recipe, run, base, accelerator, plan)
+            trainer = prepare_trainer(recipe, run, base, accelerator, plan)
+            folder = prepare_run(trainer, run, base, plan)
         ended_by = trainer.train(folder.log, folder.save, stop)
         with busy("saving the checkpoint"):
             kept = folder.finish()
@@ -182,20 +187,44 @@ def held_base(base: str | None, run: Path) -> Iterator[Checkpoint | None]:
             unmark_in_use(held, run)
 
 
-def prepare_run(
+def prepare_trainer(
     recipe: Recipe, run: Path, base: Checkpoint | None, accelerator: Accelerator, plan: FinetunePlan
-) -> tuple[RunFolder, Trainer]:
-    """The run's folder and its trainer, in the state of the folder's newest checkpoint where there is one."""
+) -> Trainer | PolicyTrainer:
+    """The trainer of a recipe, which begins at its base or with fresh weights."""
+    if recipe.policy is not None:
+        return PolicyTrainer(recipe, prepare_policy(recipe, run, plan), accelerator)
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
         warn(f"{run}: {RANDOM_CODEC}")
-    trainer = Trainer(recipe, backbone, factory, accelerator, plan.cache)
+    return Trainer(recipe, backbone, factory, accelerator, plan.cache)
+
+
+def prepare_run(trainer: Trainer | PolicyTrainer, run: Path, base: Checkpoint | None, plan: FinetunePlan) -> RunFolder:
+    """The run's folder, with its trainer in the state of the folder's newest checkpoint where there is one."""
     trainer.times.enabled = plan.profile
     load_state(run, trainer.state)
-    if accelerator.log_with:
-        accelerator.init_trackers("persist")
-    return RunFolder(run, trainer, base), trainer
+    if trainer.accelerator.log_with:
+        trainer.accelerator.init_trackers("persist")
+    return RunFolder(run, trainer, base)
+
+
+def prepare_policy(recipe: Recipe, run: Path, plan: FinetunePlan) -> PolicyNetwork:
+    """The network to train: fresh, or that of the policy that ``base`` names, which a resumed run does not read again.
+
+    Raises:
+        PersistError: when the base is not there or is another policy, or a cache is asked for.
+    """
+    assert recipe.policy is not None
+    if plan.cache is not None:
+        raise RecipeError("--cache keeps what is made of clips; a policy has none, leave it out")
+    network = make_network(recipe.policy.name, recipe.policy.settings)
+    if recipe.base is not None and not step_folders(run):
+        base = find_policy(Path(recipe.base))
+        if base.policy != recipe.policy.name:
+            raise RecipeError(f"base {recipe.base} is of policy {base.policy!r}, not {recipe.policy.name!r}")
+        network.load(base.folder)
+    return network
 
 
 def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
@@ -260,6 +289,8 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
         recipe: the recipe.
         run: the run's folder.
     """
+    if recipe.policy is not None:
+        return f"persist bench plan --policy {run}"
     if recipe.memory is not None:
         return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN},{recipe.memory.name}"
     stage = re.fullmatch(r"(.+)-(?:codec|stage1)(.*)", name)

@@ -9,6 +9,7 @@ from safetensors import SafetensorError
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, step_folders
+from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
 from persist_cli.checkpoints.load import named_adapter
 from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept_checkpoints, remove_superseded
@@ -16,8 +17,10 @@ from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
 from persist_cli.io.sha256sums import rewrite_files
+from persist_cli.policies.trained import save_policy
 from persist_cli.recipe import Recipe, to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
+from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.state import save_state
 from persist_cli.train.trainer import Trainer
 
@@ -39,7 +42,7 @@ class RunFolder:
             the runs behind it may be removed later.
     """
 
-    def __init__(self, path: Path, trainer: Trainer, base: Checkpoint | None) -> None:
+    def __init__(self, path: Path, trainer: Trainer | PolicyTrainer, base: Checkpoint | None) -> None:
         self.path, self.trainer, self.base = path, trainer, base
         self.saved = trainer.state.step
         self.scenes, self.recipes = trainer.scenes, dict[str, str]()
@@ -87,22 +90,33 @@ class RunFolder:
         return kept_checkpoints(self.path, newest)
 
     def _save(self) -> None:
-        state, encoder = self.trainer.state, self.trainer.encoder
-        main = self.trainer.accelerator.is_main_process
+        state, main = self.trainer.state, self.trainer.accelerator.is_main_process
         if main:
-            self.speed.add(state.step, encoder.figures() if encoder else {})
+            self.speed.add(state.step, self.trainer.figures())
         save_state(self.path, state, self._save_model)
         if main:
             remove_superseded(self.path, self.trainer.recipe.training.keep_checkpoints)
             self.log.draw(self.path / "loss.png")
 
     def _save_model(self, folder: Path, home: Path) -> None:
-        with self.trainer.model_to_save() as backbone:
-            if self.trainer.accelerator.is_main_process:
-                self._write_model(backbone, folder, home)
+        trainer, main = self.trainer, self.trainer.accelerator.is_main_process
+        if isinstance(trainer, PolicyTrainer):
+            with trainer.model_to_save() as network:
+                if main:
+                    self._write_policy(network, folder)
+            return
+        with trainer.model_to_save() as backbone:
+            if main:
+                self._write_model(trainer, backbone, folder, home)
 
-    def _write_model(self, backbone: Backbone, folder: Path, home: Path) -> None:
-        trainer, recipe = self.trainer, self.trainer.recipe
+    def _write_policy(self, network: PolicyNetwork, folder: Path) -> None:
+        recipe = self.trainer.recipe
+        folder.mkdir()
+        write_text(folder / RECIPE, to_yaml(recipe))
+        save_policy(network, recipe.policy.name if recipe.policy else "", folder, self.scenes)
+
+    def _write_model(self, trainer: Trainer, backbone: Backbone, folder: Path, home: Path) -> None:
+        recipe = trainer.recipe
         folder.mkdir()
         backbone.finish_stage(recipe.stage, trainer.first_batches(CODEC_BATCHES))
         write_text(folder / RECIPE, to_yaml(recipe))

@@ -1,71 +1,36 @@
-"""The training loop: batch, loss, backward, clip, step, average, log."""
+"""The training of a backbone: its clips, their latents and memory tokens."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
-import signal
-import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
-from types import FrameType
+from collections.abc import Iterator
 from typing import Any, Final
 
 import torch
 from accelerate import Accelerator
-from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.data.augment import Augmentation
 from persist_cli.data.cameras import vertical_view
-from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
+from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.writing_noise import WritingNoise
-from persist_cli.errors import PersistError, RecipeError
+from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
-from persist_cli.recipe import DataSettings, Recipe, TrainingSettings
+from persist_cli.recipe import DataSettings, Recipe
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
-from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
-from persist_cli.train.log import StepLog, StepTimes
-from persist_cli.train.optimizer import make_average, make_optimizer, requested_savings, update_average
+from persist_cli.train.distributed import Sharding, uses_zero
+from persist_cli.train.optimizer import requested_savings
 from persist_cli.train.own_writes import OwnWrites
-from persist_cli.train.state import TrainingState
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.train.training_loop import TrainingLoop
 
 START_BATCHES: Final = 16  # from which fresh weights are set at the beginning of a stage
 
 
-@dataclass
-class StopSignal:
-    """Within the block, SIGINT and SIGTERM are noted here, so that a run can stop at the end of its step."""
-
-    signal: int | None = None
-    previous_handlers: dict[int, Any] = field(default_factory=dict)
-
-    def __enter__(self) -> StopSignal:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self.previous_handlers[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self.previous_handlers.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, _frame: FrameType | None) -> None:
-        self.signal = number
-
-
-def outlive_signals(_worker: int) -> None:
-    """Let a process that reads data go on when all processes get a signal: the run ends it, after its checkpoint."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-
-
-class Trainer:
+class Trainer(TrainingLoop[Backbone]):
     """Trains one stage of a backbone.
 
     Args:
@@ -87,34 +52,31 @@ class Trainer:
         accelerator: Accelerator,
         cache: CacheSettings | None = None,
     ) -> None:
-        self.recipe, self.backbone, self.accelerator = recipe, backbone, accelerator
-        self.factory = factory
-        self.times = StepTimes(accelerator.device, recipe.training.batch, enabled=False)
+        super().__init__(recipe, accelerator)
+        self.backbone, self.factory = backbone, factory
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
         self.scenes = scenes_of(clips)
-        self.clips: Dataset[Any] = clips
+        self.dataset = clips
         self.encoder = self.clip_encoder(cache)
         if self.encoder is not None:
-            self.clips = CachedClips(clips, self.encoder.cache)
+            self.dataset = CachedClips(clips, self.encoder.cache)
         self.own_writes: OwnWrites | None = None
         if recipe.data.own_writes and self.encoder is not None:
             check_own_writes(accelerator)
             self.own_writes = OwnWrites(self.encoder, WritingNoise.of(recipe.data))
         if recipe.base is None:
             backbone.begin_stage(recipe.stage, self.first_batches(START_BATCHES))
-        optimizer = make_optimizer(parameters.values(), settings)
-        self.sharding = Sharding(backbone, recipe, accelerator) if accelerator.is_fsdp2 else None
-        self.model, self.optimizer = accelerator.prepare(backbone, optimizer)
-        if self.sharding is not None:
-            parameters = self.sharding.parameters()
-        average = make_average(parameters.values(), settings) if settings.ema else None
-        moments: Any = optimizer.state
-        self.zero = uses_zero(accelerator)
-        if self.zero:
-            moments = ZeroState(self.optimizer.optimizer, [*parameters.values()])
-        self.state = TrainingState(parameters, moments, average)
+        self.prepare(backbone, parameters)
+
+    def make_sharding(self) -> Sharding | None:
+        """What prepares the backbone for FSDP2, ``None`` where nothing is sharded."""
+        return Sharding(self.backbone, self.recipe, self.accelerator) if self.accelerator.is_fsdp2 else None
+
+    def figures(self) -> dict[str, Any]:
+        """What the cache did."""
+        return self.encoder.figures() if self.encoder else {}
 
     def all_clips(self) -> ClipDataset:
         """All clips of the recipe's data sets."""
@@ -171,33 +133,10 @@ class Trainer:
         """So many batches of the first samples, of which something is measured before or after training."""
         size = self.recipe.training.batch
         for number in range(count):
-            yield self.to_batch([self.clips[number * size + row] for row in range(size)])
-
-    def loader(self) -> Iterator[Clips]:
-        """Batches of this process from the state's step to the last."""
-        settings = self.recipe.training
-        batches = DistributedBatches(
-            self.state.step, settings.steps, settings.batch, settings.accumulation,
-            self.accelerator.process_index, self.accelerator.num_processes,
-        )  # fmt: skip
-        loader: DataLoader[Any] = DataLoader(
-            self.clips,
-            batch_sampler=batches,
-            num_workers=settings.workers,
-            collate_fn=list,
-            worker_init_fn=outlive_signals,
-            generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
-        )
-        remaining = iter(loader)
-        while True:
-            with self.times.part("data"):
-                samples = next(remaining, None)
-            if samples is None:
-                return
-            yield self.to_batch(samples)
+            yield self.to_batch([self.dataset[number * size + row] for row in range(size)])
 
     def to_batch(self, samples: list[Any]) -> Clips:
-        """Make a batch of samples of ``clips``, with memory tokens in stage 2 and latents where clips come again."""
+        """Make a batch of samples of ``dataset``, with memory tokens in stage 2 and latents where clips come again."""
         if self.encoder is None:
             with self.times.part("memory"):
                 clips = [with_memory(sample, self.factory, self.backbone.token_budget) for sample in samples]
@@ -216,115 +155,6 @@ class Trainer:
             return clips
         with self.times.part("encode"), torch.no_grad(), self.accelerator.autocast():
             return dataclasses.replace(clips, latents=self.backbone.encode(clips))
-
-    def steps(self) -> Iterator[dict[str, float]]:
-        """Train to the last step; yields the logged values of each optimizer step."""
-        batches = self.loader()
-        while self.state.step < self.recipe.training.steps:
-            with self.times.step():
-                values = self.step(batches)
-            self.state.step += 1
-            yield values
-
-    def step(self, batches: Iterator[Clips]) -> dict[str, float]:
-        """Take an optimizer step; returns its losses, which are means over micro-batches and processes.
-
-        Raises:
-            PersistError: when the loss is not finite; the parameters are then unchanged.
-        """
-        settings, accelerator, times = self.recipe.training, self.accelerator, self.times
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(settings, self.state.step)
-        totals: dict[str, torch.Tensor] = {}
-        for number in range(1, settings.accumulation + 1):
-            clips = self.encoded(next(batches))
-            with self.synchronized(last=number == settings.accumulation):
-                with times.part("forward"), accelerator.autocast():  # accelerate leaves it out when it shards
-                    losses = self.model(clips, self.recipe.stage)
-                with times.part("backward"):  # DeepSpeed divides the loss itself
-                    accelerator.backward(losses["loss"] / (1 if self.zero else settings.accumulation))
-            for name, loss in losses.items():
-                totals[name] = totals.get(name, 0) + loss.detach() / settings.accumulation
-            del clips, losses  # nothing of a batch stays on the device while the optimizer works
-        means = {name: float(accelerator.reduce(total, "mean")) for name, total in totals.items()}
-        if not math.isfinite(means["loss"]):
-            raise PersistError(
-                f"the loss is {means['loss']} at step {self.state.step}; lower training.learning_rate or train with "
-                "training.precision=no"
-            )
-        with times.part("optimizer"):
-            accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
-            self.optimizer.step()
-            self.optimizer.zero_grad(set_to_none=True)
-            if self.state.average is not None:
-                update_average(self.state.average, self.state.parameters.values())
-        return means
-
-    def synchronized(self, last: bool) -> AbstractContextManager[None]:
-        """Within the block of the last micro-batch, processes add up their gradients.
-
-        Before that each keeps its own, which FSDP2 cannot: unsharded gradients might not fit.
-        """
-        if self.zero:
-            self.accelerator.gradient_state._set_sync_gradients(last)  # DeepSpeed then takes a step after the last
-        if last or self.zero or self.sharding is not None:
-            return nullcontext()
-        unsynchronized: AbstractContextManager[None] = self.accelerator.no_sync(self.model)
-        return unsynchronized
-
-    @contextmanager
-    def model_to_save(self) -> Iterator[Backbone]:
-        """Within the block the main process has the whole backbone, with averaged weights where these are kept.
-
-        All processes must enter.
-        """
-        main = self.accelerator.is_main_process
-        if self.sharding is not None:
-            with self.sharding.gathered(self.state.averages(), main) as backbone:
-                yield backbone
-        elif not main:
-            yield self.backbone
-        else:
-            parameters = self.state.parameters.values()
-            with unflattened(parameters) if self.zero else nullcontext(), self.state.averaged():
-                yield self.backbone
-
-    def agreed(self, due: bool, signal: int | None) -> tuple[bool, int | None]:
-        """Whether a checkpoint is due for any process, and the signal that any got: they save and stop together."""
-        if self.accelerator.num_processes == 1:
-            return due, signal
-        flags = torch.tensor([[int(due), signal or 0]], device=self.accelerator.device)
-        any_due, any_signal = self.accelerator.gather(flags).amax(0).tolist()
-        return bool(any_due), any_signal or None
-
-    def train(self, log: StepLog, save: Callable[[], None], stop: StopSignal) -> int | None:
-        """Train to the last step or to a signal.
-
-        Args:
-            log: gets the values of each step.
-            save: writes a checkpoint; called as often as the recipe says.
-            stop: the signal that asked this process to stop, once there is one.
-
-        Returns:
-            The signal that ended the training, ``None`` when none did.
-        """
-        settings = self.recipe.training
-        saved = time.monotonic()
-        with progress() as bar:
-            task = add_task(bar, "training", settings.steps, "steps", done=self.state.step)
-            for values in self.steps():
-                bar.update(task, advance=1, note=f"loss {values['loss']:.4f}")
-                if self.accelerator.is_main_process:
-                    log.add(self.state.step, values | {"learning_rate": learning_rate(settings, self.state.step - 1)})
-                self.accelerator.log(values, step=self.state.step)
-                late = time.monotonic() - saved > 60 * settings.checkpoint_minutes
-                due, signal = self.agreed(late, stop.signal)
-                if signal is not None:
-                    return signal
-                if due or self.state.step % settings.checkpoint_every == 0:
-                    save()
-                    saved = time.monotonic()
-        return None
 
 
 def scenes_of(clips: ClipDataset) -> TrainingScenes:
@@ -345,10 +175,3 @@ def check_own_writes(accelerator: Accelerator) -> None:
         raise RecipeError(
             "data.own_writes needs the whole model in each process; launch with --multi_gpu, or set it to 0"
         )
-
-
-def learning_rate(settings: TrainingSettings, step: int) -> float:
-    """The learning rate of a step: it rises linearly, stays, and at the end falls linearly to zero."""
-    rising = (step + 1) / max(1, settings.warmup)
-    falling = (settings.steps - step) / (settings.cooldown + 1)
-    return settings.learning_rate * min(1.0, rising, falling)

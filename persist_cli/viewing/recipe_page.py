@@ -12,13 +12,17 @@ import yaml
 
 from persist_cli.io.setting_docs import Setting, settings_of
 from persist_cli.io.settings import parse_settings
-from persist_cli.plugins import load_plugin
-from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_comment, to_plain
+from persist_cli.plugins import load_plugin, network_type
+from persist_cli.recipe import OF_A_BACKBONE, Recipe, make_recipe, read_recipe, recipe_comment, to_plain
 from persist_cli.viewing.console import busy, print_json, say
 
 WIDTH: Final = 80  # columns of a comment
 
-STAGE_OF: Final = {"memory": "2", "adapter": "2", "lora": "1"}  # the only stage that has the setting
+STAGE_OF: Final = {"memory": "2", "adapter": "2", "lora": "1", "policy": "policy"}  # the only one that has the setting
+
+NOT_OF_A_POLICY: Final = {"backbone", "adapter_from"}  # settings of the stages of a backbone
+
+OF_A_POLICY: Final = {"path", "mirror"}  # all that a policy's recipe says about its data
 
 OF_THE_BASE: Final = "what is not set here is as in the checkpoint that base names, not as shown"
 
@@ -69,6 +73,8 @@ def recipe_entries(recipe: Recipe) -> list[Entry]:
     """
     values, of_plugins = to_plain(recipe), _plugin_settings(recipe)
     settings = [setting for setting in settings_of(Recipe) if STAGE_OF.get(setting.name, recipe.stage) == recipe.stage]
+    if recipe.policy is not None:
+        settings = [*map(_of_a_policy, (setting for setting in settings if setting.name not in NOT_OF_A_POLICY))]
     return [_entry(setting, values[setting.name], setting.name, of_plugins) for setting in settings]
 
 
@@ -87,6 +93,10 @@ def recipe_yaml(name: str, recipe: Recipe, entries: Iterable[Entry]) -> str:
 
 def _plugin_settings(recipe: Recipe) -> dict[str, list[Setting]]:
     """The settings that plugins have, by the dotted key under which a recipe gives them."""
+    if recipe.policy is not None:
+        network = network_type(recipe.policy.name).settings_type
+        parse_settings(network, recipe.policy.settings, f"the network of policy {recipe.policy.name!r}")
+        return {"policy.settings": settings_of(network)}
     config = recipe.backbone
     backbone = load_plugin("backbone", config.name)
     parse_settings(backbone.settings_type, config.settings, f"backbone {config.name!r}")
@@ -99,6 +109,13 @@ def _plugin_settings(recipe: Recipe) -> dict[str, list[Setting]]:
         settings["memory.encoder_settings"] = settings_of(encoder.settings_type)
         settings["adapter"] = backbone.adapter_settings(recipe.adapter)
     return settings
+
+
+def _of_a_policy(setting: Setting) -> Setting:
+    """The setting without those inside that mean nothing to a policy."""
+    absent = {"data": {inner.name for inner in setting.inside} - OF_A_POLICY, "training": {*OF_A_BACKBONE}}
+    hidden = absent.get(setting.name, set())
+    return replace(setting, inside=tuple(inner for inner in setting.inside if inner.name not in hidden))
 
 
 def _entry(setting: Setting, value: Any, key: str, of_plugins: Mapping[str, list[Setting]]) -> Entry:

@@ -44,7 +44,7 @@ class FixedBatchTrainer(Trainer):
 
     def samples(self) -> list[Any]:
         """Read the first samples from the store."""
-        return [self.clips[number] for number in range(BATCH)]
+        return [self.dataset[number] for number in range(BATCH)]
 
     def loader(self) -> Iterator[Clips]:
         """The same batch without end."""

@@ -1,0 +1,95 @@
+"""The policy plugin ``nomad``: waypoints sampled by NoMaD's network, followed by the actions of the vocabulary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from persist_cli.api.policy import Policy, Situation
+from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.policies.nomad.network import NomadNetwork
+from persist_cli.policies.nomad.tracking import follow_waypoints
+from persist_cli.policies.simple import gait
+from persist_cli.policies.trained import find_policy, packaged_policy
+
+STOP = 2.0  # spacings
+
+
+@dataclass(frozen=True)
+class NomadSettings:
+    """How a trained network acts.
+
+    Args:
+        checkpoint: run or folder of a trained policy; ``None`` for the one that comes with the package.
+        steps: denoising steps, at most the network's noise levels; ``None`` for all.
+        masked: whether the goal's image is not looked at, so that it explores.
+        stop: predicted spacings of frames to the goal up to which it stops; 0 never stops.
+    """
+
+    checkpoint: str | None = None
+    steps: Annotated[int, Field(ge=1)] | None = None
+    masked: bool = False
+    stop: Annotated[float, Field(ge=0, allow_inf_nan=False)] = STOP
+
+
+class NomadPolicy(Policy):
+    """Samples ways towards an image, or anywhere where there is none; the first is one sample like the others.
+
+    Raises:
+        PersistError: when the trained policy is not there, is of another architecture, or has fewer noise levels.
+    """
+
+    settings_type = NomadSettings
+    network_type = NomadNetwork
+    settings: NomadSettings
+
+    def __init__(self, settings: NomadSettings) -> None:
+        super().__init__(settings)
+        trained = packaged_policy() if settings.checkpoint is None else find_policy(Path(settings.checkpoint))
+        network = trained.load()
+        if not isinstance(network, NomadNetwork):
+            raise CheckpointError(f"{trained.folder}: is of policy {trained.policy!r}, not 'nomad'")
+        levels = network.settings.noise_levels
+        if settings.steps is not None and settings.steps > levels:
+            raise RecipeError(f"policy 'nomad': steps {settings.steps}; {trained.folder} has {levels} noise levels")
+        self.network = network.to("cuda" if torch.cuda.is_available() else "cpu")
+        self.steps = settings.steps or levels
+        self.frames = network.settings.context * network.settings.spacing + 1
+
+    @property
+    def longest(self) -> int | None:
+        """The frames that its waypoints look ahead."""
+        return self.network.settings.waypoints * self.network.settings.spacing
+
+    @torch.no_grad()
+    def propose(
+        self, situation: Situation, horizon: int, count: int, generator: torch.Generator
+    ) -> list[tuple[str, ...]]:
+        """Return ``count`` ways to sampled waypoints; empty ones where the goal is as near as ``stop``.
+
+        Raises:
+            PersistError: when the vocabulary has no step ahead or no turn.
+        """
+        ahead, turns = gait(situation.info.vocabulary)
+        masked = self.settings.masked or situation.goal.rgb is None
+        condition = self._condition(situation, masked)
+        if not masked and float(self.network.distance(condition)) <= self.settings.stop:
+            return [()] * count
+        sampled = self.network.sample(condition, count, self.steps, generator).tolist()
+        return [follow_waypoints([(x, y) for x, y in way], ahead, turns, horizon) for way in sampled]
+
+    def _condition(self, situation: Situation, masked: bool) -> Tensor:
+        """What waypoints and distance follow from; a short past begins with its first frame again and again."""
+        own, device = self.network.settings, next(self.network.parameters()).device
+        last = len(situation.seen) - 1
+        frames = [max(0, last - back * own.spacing) for back in range(own.context, -1, -1)]
+        seen = situation.seen.rgb[frames]
+        goal = seen[-1] if situation.goal.rgb is None else situation.goal.rgb
+        hidden = torch.tensor([masked], device=device)
+        condition: Tensor = self.network.condition(seen[None].to(device), goal[None].to(device), hidden)[0]
+        return condition

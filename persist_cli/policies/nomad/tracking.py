@@ -1,0 +1,48 @@
+"""Waypoints followed by the actions of a vocabulary: turn towards the next one, and walk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from persist_cli.api.actions import Action
+
+
+def follow_waypoints(
+    waypoints: Sequence[tuple[float, float]], ahead: Action, turns: Sequence[Action], horizon: int
+) -> tuple[str, ...]:
+    """Return at least one and at most ``horizon`` actions that lead along waypoints.
+
+    The agent looks at the first waypoint that is at least a step away, turns until it is within half a turn of its
+    heading, and walks. It ends within half a step of the last one.
+
+    Args:
+        waypoints: metres ahead and to the left of where the agent is now.
+        ahead: a step straight ahead.
+        turns: a turn to each side, or to one side alone.
+        horizon: largest number of actions, at least 1.
+    """
+    x = y = heading = 0.0
+    target, names = 0, list[str]()
+    while len(names) < horizon:
+        distances = [math.dist((x, y), waypoint) for waypoint in waypoints]
+        while target < len(waypoints) - 1 and distances[target] < ahead.forward:
+            target += 1
+        if target == len(waypoints) - 1 and distances[target] <= ahead.forward / 2 and names:
+            break
+        angle = math.degrees(math.atan2(waypoints[target][1] - y, waypoints[target][0] - x)) - heading
+        turn = _turn_towards(angle, turns)
+        if turn is None:
+            x += ahead.forward * math.cos(math.radians(heading))
+            y += ahead.forward * math.sin(math.radians(heading))
+        else:
+            heading += turn.turn
+        names.append((turn or ahead).name)
+    return tuple(names)
+
+
+def _turn_towards(angle: float, turns: Sequence[Action]) -> Action | None:
+    """The turn by which an angle in degrees takes the fewest turns; ``None`` where it is within half of one."""
+    nearest = min(turns, key=lambda turn: (angle if turn.turn > 0 else -angle) % 360 / abs(turn.turn))
+    left = (angle + 180) % 360 - 180
+    return None if abs(left) <= abs(nearest.turn) / 2 + 1e-6 else nearest

@@ -1,0 +1,34 @@
+"""A policy by its plugin's name, or by the folder of a trained one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from persist_cli.api.policy import Policy
+from persist_cli.errors import PluginError, hint
+from persist_cli.plugins import list_plugins, make_policy
+from persist_cli.policies.trained import find_policy
+
+
+def open_policy(text: str, settings: Mapping[str, Any] | None = None) -> Policy:
+    """Return the policy that ``random``, ``nomad`` or ``runs/policy`` means.
+
+    A name comes before a folder of the same name, which ``./NAME`` means.
+
+    Args:
+        text: the name of a policy plugin, or the run or folder of a trained policy.
+        settings: plain settings of the plugin.
+
+    Raises:
+        PersistError: when there is no such policy, or it cannot be used with these settings.
+    """
+    settings = dict(settings or {})
+    if any(plugin.name == text for plugin in list_plugins("policy")):
+        return make_policy(text, settings)
+    if Path(text).exists() or len(Path(text).parts) > 1:
+        trained = find_policy(Path(text))
+        return make_policy(trained.policy, {**settings, "checkpoint": str(trained.folder)})
+    names = sorted({plugin.name for plugin in list_plugins("policy")})
+    raise PluginError(f"unknown policy {text!r}; {hint(text, names, 'installed')}; or give the folder of a trained one")

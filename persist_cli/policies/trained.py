@@ -1,0 +1,121 @@
+"""Trained policies on disk: a folder with a card, ``policy.json``, and the weights of the policy's network.
+
+A run's folder stands for its newest checkpoint, and the packaged policy for itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from persist_cli.api.checkpoint import TrainingScenes, run_folder, step_folders
+from persist_cli.api.policy_network import PolicyNetwork
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import bundled_folder, file_sha256, read_json, write_json
+from persist_cli.io.settings import parse_settings
+from persist_cli.io.sha256sums import check_sums, write_sums
+from persist_cli.plugins import network_type
+
+CARD: Final = "policy.json"
+FORMAT: Final = "persist-policy"
+VERSION: Final = 1
+PACKAGED: Final = "policy"  # the folder of the policy that comes with the package
+TRAIN: Final = "persist finetune houses-64-policy --data DATA --out runs/policy"
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A trained policy on disk; its weights are not loaded yet.
+
+    Args:
+        folder: the folder of ``policy.json``.
+        name: the name of the run or folder, which tables show.
+        policy: the name of its plugin.
+        settings: the plain settings of its network.
+        fingerprint: a hash of its weights.
+        training_scenes: the scenes that it was trained on; ``None`` where that is not known.
+    """
+
+    folder: Path
+    name: str
+    policy: str
+    settings: dict[str, Any]
+    fingerprint: str
+    training_scenes: TrainingScenes | None
+
+    def load(self) -> PolicyNetwork:
+        """Return the network with its weights, ready to act.
+
+        Raises:
+            CheckpointError: when a file is missing or damaged, or does not fit.
+        """
+        check_sums(self.folder)
+        network = make_network(self.policy, self.settings)
+        network.load(self.folder)
+        return network.eval()
+
+
+def make_network(policy: str, settings: dict[str, Any]) -> PolicyNetwork:
+    """Make the network of a policy plugin with fresh weights.
+
+    Raises:
+        RecipeError: when the policy is none that is trained, or a setting is wrong.
+    """
+    kind = network_type(policy)
+    return kind(parse_settings(kind.settings_type, settings, f"the network of policy {policy!r}"))
+
+
+def save_policy(network: PolicyNetwork, policy: str, folder: Path, scenes: TrainingScenes | None) -> None:
+    """Write a network's weights, a card and ``SHA256SUMS`` into an existing folder, which may hold other files.
+
+    Args:
+        network: the network.
+        policy: the name of its plugin.
+        folder: the folder.
+        scenes: the scenes that it was trained on, where they are known.
+    """
+    network.save(folder)
+    hashes = "".join(file_sha256(path) for path in sorted(folder.glob("*.safetensors")))
+    fingerprint = hashlib.sha256(hashes.encode()).hexdigest()
+    card: dict[str, Any] = {"format": FORMAT, "version": VERSION, "policy": policy, "fingerprint": fingerprint}
+    lineage = {} if scenes is None else {"training_scenes": scenes.to_json()}
+    write_json(folder / CARD, card | {"settings": asdict(network.settings)} | lineage)
+    write_sums(folder)
+
+
+def find_policy(path: Path) -> TrainedPolicy:
+    """Return the trained policy in a folder, or the newest one of a run.
+
+    Raises:
+        CheckpointError: when there is none, or its card is damaged.
+    """
+    steps = step_folders(path)
+    places = (path, path / "model", *([steps[-1] / "model"] if steps else []))
+    folder = next((place for place in places if (place / CARD).is_file()), None)
+    if folder is None:
+        raise CheckpointError(f"{path}: no trained policy there (no {CARD}); train one: {TRAIN}")
+    card = read_json(folder / CARD)
+    if not isinstance(card, dict) or card.get("format") != FORMAT or card.get("version") != VERSION:
+        raise CheckpointError(f"{folder / CARD}: not the card of a trained policy of version {VERSION}")
+    scenes = card.get("training_scenes")
+    try:
+        return TrainedPolicy(
+            folder, run_folder(folder).name, str(card["policy"]), dict(card["settings"]), str(card["fingerprint"]),
+            None if scenes is None else TrainingScenes.from_json(scenes),
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{folder / CARD}: the card is damaged ({error})") from error
+
+
+def packaged_policy() -> TrainedPolicy:
+    """Return the trained policy that comes with the package.
+
+    Raises:
+        CheckpointError: when this installation has none.
+    """
+    folder = bundled_folder(PACKAGED)
+    if not (folder / CARD).is_file():
+        raise CheckpointError(f"no trained policy comes with this installation; train one and give its folder: {TRAIN}")
+    return find_policy(folder)

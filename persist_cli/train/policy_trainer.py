@@ -1,0 +1,51 @@
+"""The training of a policy's network on samples of trajectories."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from accelerate import Accelerator
+
+from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.api.policy_network import PolicyNetwork, PolicySamples
+from persist_cli.data.held_out import trained_scene
+from persist_cli.data.policy_samples import PolicySampleDataset
+from persist_cli.data.reference import data_folder
+from persist_cli.errors import PersistError
+from persist_cli.recipe import Recipe
+from persist_cli.train.distributed import uses_zero
+from persist_cli.train.training_loop import TrainingLoop
+
+
+class PolicyTrainer(TrainingLoop[PolicyNetwork]):
+    """Trains the network of a policy.
+
+    Args:
+        recipe: the run's recipe.
+        network: the network.
+        accelerator: accelerate for this process, which may be one of many.
+
+    Raises:
+        PersistError: when there are no samples, or the network is to be sharded.
+    """
+
+    def __init__(self, recipe: Recipe, network: PolicyNetwork, accelerator: Accelerator) -> None:
+        super().__init__(recipe, accelerator)
+        folders = [data_folder(path) for path in recipe.data.path]
+        samples = PolicySampleDataset(folders, network.sample_form, recipe.training.seed, recipe.data.mirror)
+        self.dataset = samples
+        self.scenes = TrainingScenes(frozenset(trained_scene(file.info) for file in samples.files))
+        self.prepare(network, network.trained_parameters())
+
+    def make_sharding(self) -> None:
+        """None: a policy is small.
+
+        Raises:
+            PersistError: when the launcher asks for sharding.
+        """
+        if self.accelerator.is_fsdp2 or uses_zero(self.accelerator):
+            raise PersistError("a policy's network is small and not sharded; launch with --multi_gpu")
+
+    def to_batch(self, samples: list[Any]) -> PolicySamples:
+        """Make a batch of samples on the device."""
+        return PolicySamples.stack(samples).to(self.accelerator.device)

@@ -1,0 +1,257 @@
+"""The training loop, which is one for all that is trained: batch, loss, backward, clip, step, average, log."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any, Generic, TypeVar, cast
+
+import torch
+from accelerate import Accelerator
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+
+from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.data.clips import DistributedBatches
+from persist_cli.errors import PersistError
+from persist_cli.recipe import Recipe, TrainingSettings
+from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
+from persist_cli.train.log import StepLog, StepTimes
+from persist_cli.train.optimizer import make_average, make_optimizer, update_average
+from persist_cli.train.state import TrainingState
+from persist_cli.viewing.console import add_task, progress
+
+Model = TypeVar("Model", bound=nn.Module)
+
+
+@dataclass
+class StopSignal:
+    """Within the block, SIGINT and SIGTERM are noted here, so that a run can stop at the end of its step."""
+
+    signal: int | None = None
+    previous_handlers: dict[int, Any] = field(default_factory=dict)
+
+    def __enter__(self) -> StopSignal:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self.previous_handlers[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self.previous_handlers.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self.signal = number
+
+
+def outlive_signals(_worker: int) -> None:
+    """Let a process that reads data go on when all processes get a signal: the run ends it, after its checkpoint."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
+class TrainingLoop(ABC, Generic[Model]):
+    """Trains a model; subclasses say what its samples are.
+
+    They set ``scenes`` and ``dataset``, and call ``prepare`` at the end of their ``__init__``.
+
+    Args:
+        recipe: the run's recipe.
+        accelerator: accelerate for this process, which may be one of many.
+    """
+
+    scenes: TrainingScenes  # that are trained on
+    dataset: Dataset[Any]
+    state: TrainingState
+
+    def __init__(self, recipe: Recipe, accelerator: Accelerator) -> None:
+        self.recipe, self.accelerator = recipe, accelerator
+        self.times = StepTimes(accelerator.device, recipe.training.batch, enabled=False)
+        self.sharding: Sharding | None = None
+
+    def prepare(self, model: Model, parameters: dict[str, nn.Parameter]) -> None:
+        """Make optimizer, average and state, and let accelerate prepare the model.
+
+        Args:
+            model: its ``forward`` takes a batch of ``to_batch`` and the stage, and returns the losses.
+            parameters: those that are trained, by name.
+        """
+        self.whole, settings = model, self.recipe.training
+        optimizer = make_optimizer(parameters.values(), settings)
+        self.sharding = self.make_sharding()
+        self.model, self.optimizer = self.accelerator.prepare(model, optimizer)
+        if self.sharding is not None:
+            parameters = self.sharding.parameters()
+        average = make_average(parameters.values(), settings) if settings.ema else None
+        moments: Any = optimizer.state
+        self.zero = uses_zero(self.accelerator)
+        if self.zero:
+            moments = ZeroState(self.optimizer.optimizer, [*parameters.values()])
+        self.state = TrainingState(parameters, moments, average)
+
+    @abstractmethod
+    def make_sharding(self) -> Sharding | None:
+        """What prepares the model for FSDP2, ``None`` where nothing is sharded.
+
+        Raises:
+            PersistError: where it is to be sharded and cannot.
+        """
+
+    @abstractmethod
+    def to_batch(self, samples: list[Any]) -> Any:
+        """Make a batch of samples of ``dataset`` on the device."""
+
+    def figures(self) -> dict[str, Any]:
+        """Figures for ``speed.jsonl`` beside the speed."""
+        return {}
+
+    def encoded(self, batch: Any) -> Any:
+        """The batch as the model takes it; a subclass may measure a part of the work here."""
+        return batch
+
+    def loader(self) -> Iterator[Any]:
+        """Batches of this process from the state's step to the last."""
+        settings = self.recipe.training
+        batches = DistributedBatches(
+            self.state.step, settings.steps, settings.batch, settings.accumulation,
+            self.accelerator.process_index, self.accelerator.num_processes,
+        )  # fmt: skip
+        loader: DataLoader[Any] = DataLoader(
+            self.dataset,
+            batch_sampler=batches,
+            num_workers=settings.workers,
+            collate_fn=list,
+            worker_init_fn=outlive_signals,
+            generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
+        )
+        remaining = iter(loader)
+        while True:
+            with self.times.part("data"):
+                samples = next(remaining, None)
+            if samples is None:
+                return
+            yield self.to_batch(samples)
+
+    def steps(self) -> Iterator[dict[str, float]]:
+        """Train to the last step; yields the logged values of each optimizer step."""
+        batches = self.loader()
+        while self.state.step < self.recipe.training.steps:
+            with self.times.step():
+                values = self.step(batches)
+            self.state.step += 1
+            yield values
+
+    def step(self, batches: Iterator[Any]) -> dict[str, float]:
+        """Take an optimizer step; returns its losses, which are means over micro-batches and processes.
+
+        Raises:
+            PersistError: when the loss is not finite; the parameters are then unchanged.
+        """
+        settings, accelerator, times = self.recipe.training, self.accelerator, self.times
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(settings, self.state.step)
+        totals: dict[str, torch.Tensor] = {}
+        for number in range(1, settings.accumulation + 1):
+            batch = self.encoded(next(batches))
+            with self.synchronized(last=number == settings.accumulation):
+                with times.part("forward"), accelerator.autocast():  # accelerate leaves it out when it shards
+                    losses = self.model(batch, self.recipe.stage)
+                with times.part("backward"):  # DeepSpeed divides the loss itself
+                    accelerator.backward(losses["loss"] / (1 if self.zero else settings.accumulation))
+            for name, loss in losses.items():
+                totals[name] = totals.get(name, 0) + loss.detach() / settings.accumulation
+            del batch, losses  # nothing of a batch stays on the device while the optimizer works
+        means = {name: float(accelerator.reduce(total, "mean")) for name, total in totals.items()}
+        if not math.isfinite(means["loss"]):
+            raise PersistError(
+                f"the loss is {means['loss']} at step {self.state.step}; lower training.learning_rate or train with "
+                "training.precision=no"
+            )
+        with times.part("optimizer"):
+            accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
+            if self.state.average is not None:
+                update_average(self.state.average, self.state.parameters.values())
+        return means
+
+    def synchronized(self, last: bool) -> AbstractContextManager[None]:
+        """Within the block of the last micro-batch, processes add up their gradients.
+
+        Before that each keeps its own, which FSDP2 cannot: unsharded gradients might not fit.
+        """
+        if self.zero:
+            self.accelerator.gradient_state._set_sync_gradients(last)  # DeepSpeed then takes a step after the last
+        if last or self.zero or self.sharding is not None:
+            return nullcontext()
+        unsynchronized: AbstractContextManager[None] = self.accelerator.no_sync(self.model)
+        return unsynchronized
+
+    @contextmanager
+    def model_to_save(self) -> Iterator[Model]:
+        """Within the block the main process has the whole model, with averaged weights where these are kept.
+
+        All processes must enter.
+        """
+        main = self.accelerator.is_main_process
+        if self.sharding is not None:
+            with self.sharding.gathered(self.state.averages(), main) as gathered:
+                yield cast("Model", gathered)
+        elif not main:
+            yield self.whole
+        else:
+            parameters = self.state.parameters.values()
+            with unflattened(parameters) if self.zero else nullcontext(), self.state.averaged():
+                yield self.whole
+
+    def agreed(self, due: bool, signal: int | None) -> tuple[bool, int | None]:
+        """Whether a checkpoint is due for any process, and the signal that any got: they save and stop together."""
+        if self.accelerator.num_processes == 1:
+            return due, signal
+        flags = torch.tensor([[int(due), signal or 0]], device=self.accelerator.device)
+        any_due, any_signal = self.accelerator.gather(flags).amax(0).tolist()
+        return bool(any_due), any_signal or None
+
+    def train(self, log: StepLog, save: Callable[[], None], stop: StopSignal) -> int | None:
+        """Train to the last step or to a signal.
+
+        Args:
+            log: gets the values of each step.
+            save: writes a checkpoint; called as often as the recipe says.
+            stop: the signal that asked this process to stop, once there is one.
+
+        Returns:
+            The signal that ended the training, ``None`` when none did.
+        """
+        settings = self.recipe.training
+        saved = time.monotonic()
+        with progress() as bar:
+            task = add_task(bar, "training", settings.steps, "steps", done=self.state.step)
+            for values in self.steps():
+                bar.update(task, advance=1, note=f"loss {values['loss']:.4f}")
+                if self.accelerator.is_main_process:
+                    log.add(self.state.step, values | {"learning_rate": learning_rate(settings, self.state.step - 1)})
+                self.accelerator.log(values, step=self.state.step)
+                late = time.monotonic() - saved > 60 * settings.checkpoint_minutes
+                due, signal = self.agreed(late, stop.signal)
+                if signal is not None:
+                    return signal
+                if due or self.state.step % settings.checkpoint_every == 0:
+                    save()
+                    saved = time.monotonic()
+        return None
+
+
+def learning_rate(settings: TrainingSettings, step: int) -> float:
+    """The learning rate of a step: it rises linearly, stays or follows a cosine, and falls linearly in the end."""
+    rising = (step + 1) / max(1, settings.warmup)
+    falling = (settings.steps - step) / (settings.cooldown + 1)
+    after = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
+    cosine = (1 + math.cos(math.pi * min(1.0, max(0.0, after)))) / 2 if settings.schedule == "cosine" else 1.0
+    return settings.learning_rate * min(1.0, rising, falling, cosine)
