@@ -1,0 +1,92 @@
+"""Samples of trajectories for learned policies."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from persist_cli.api.actions import rotation_about
+from persist_cli.api.policy_network import SampleForm
+from persist_cli.data.policy_samples import PolicySampleDataset, ground_places, local_places
+from persist_cli.data.store import Store
+from persist_cli.errors import DataError
+from tests.support.rooms import UP, Room, look
+
+FORM = SampleForm(context=2, waypoints=4, spacing=2, farthest=6, nearest=2, negatives=0.3)
+
+
+def write_straight(folder: Path, yaw: float = 0.0, name: str = "straight", frames: int = 24) -> Path:
+    """Write a walk of 5 cm a frame along its heading."""
+    ahead = look((0.0, 0.0, 0.0), yaw, 0.0)[:3, 2]
+    poses = [look(tuple(np.array([0.0, 1.3, 0.5]) + 0.05 * frame * ahead), yaw, 0.0) for frame in range(frames)]
+    return Room(8, 8).write(folder / f"{name}.parquet", np.stack(poses)).parent
+
+
+def test_a_straight_walk_has_straight_waypoints(tmp_path):
+    samples = PolicySampleDataset([write_straight(tmp_path, yaw=35.0)], FORM, 0)
+    expected = torch.arange(1, 5)[:, None] * torch.tensor([0.1, 0.0])
+    assert all(torch.allclose(samples[number].waypoints, expected, atol=1e-6) for number in range(20))
+
+
+def test_waypoints_to_the_left_are_positive():
+    poses = torch.from_numpy(np.stack([look((0.0, 1.3, 0.0), 0.0, -20.0), look((-1.0, 1.3, -2.0), 50.0, 0.0)]))
+    places, headings = ground_places(poses, UP)
+    assert torch.allclose(local_places(places[1:], places[0], headings[0]), torch.tensor([[2.0, 1.0]]).double())
+
+
+def test_a_moved_and_turned_world_changes_nothing():
+    poses = torch.from_numpy(np.stack([look((0.1 * n, 1.3, 0.2 * n), 20.0 * n, -5.0) for n in range(5)]))
+    move = torch.eye(4, dtype=torch.float64)
+    move[:3, :3], move[:3, 3] = rotation_about(torch.tensor(UP), 2.3), torch.tensor([3.0, 0.0, -4.0])
+    ways = []
+    for path in (poses, move @ poses):
+        places, headings = ground_places(path, UP)
+        ways.append(local_places(places, places[1], headings[1]))
+    assert torch.allclose(*ways, atol=1e-9)
+
+
+def test_a_sample_depends_on_the_seed_and_its_number_only(walks):
+    one, other = PolicySampleDataset([walks], FORM, 0), PolicySampleDataset([walks], FORM, 0)
+    other[3]
+    assert one.choose(7) == other.choose(7)
+    assert torch.equal(one[7].seen, other[7].seen)
+    assert PolicySampleDataset([walks], FORM, 1).choose(7) != one.choose(7)
+
+
+def test_goals_are_later_frames_of_the_walk_or_frames_of_another_that_are_far(walks):
+    samples = PolicySampleDataset([walks], FORM, 0)
+    seen = set()
+    for number in range(60):
+        choice, sample = samples.choose(number), samples[number]
+        own = choice.goal_file == choice.file
+        assert sample.distance == ((choice.goal - choice.present) / 2 if own else 6)
+        assert sample.leads_to_goal == (own and 2 < sample.distance < 6)
+        assert torch.equal(sample.goal, Store(walks)[choice.goal_file].read([choice.goal]).observations.rgb[0])
+        seen.add((own, sample.distance))
+    assert seen == {(True, distance) for distance in (1, 2, 3, 4, 5, 6)} | {(False, 6)}
+
+
+def test_frames_before_the_first_are_the_first_again(walks):
+    samples = PolicySampleDataset([walks], FORM, 0)
+    choice = dataclasses.replace(samples.choose(0), present=2, goal_file=0, file=0, goal=6, mirrored=False)
+    rgb = Store(walks)[0].read([0, 0, 2]).observations.rgb
+    assert torch.equal(samples.read(choice).seen, rgb)
+
+
+def test_a_mirrored_sample_has_left_and_right_exchanged(walks):
+    plain, mirrored = PolicySampleDataset([walks], FORM, 0), PolicySampleDataset([walks], FORM, 0, mirror=1.0)
+    one, other = plain[4], mirrored[4]
+    assert torch.equal(one.seen.flip(2), other.seen)
+    assert torch.equal(one.goal.flip(1), other.goal)
+    assert torch.equal(one.waypoints * torch.tensor([1.0, -1.0]), other.waypoints)
+
+
+def test_data_that_policies_cannot_learn_from_is_refused_in_one_line(walks, tmp_path):
+    with pytest.raises(DataError, match="30 waypoints need 61 frames, the longest trajectory has 24"):
+        PolicySampleDataset([walks], dataclasses.replace(FORM, waypoints=30), 0)
+    with pytest.raises(DataError, match=r"straight.parquet: images are 8x8, those of .* are 32x32"):
+        PolicySampleDataset([walks, write_straight(tmp_path)], FORM, 0)

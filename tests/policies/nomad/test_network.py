@@ -1,0 +1,151 @@
+"""NoMaD's network: its sizes, what it depends on, and what it learns."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import nn
+
+from persist_cli.api.meta_device import without_weights
+from persist_cli.api.policy_network import PolicySamples
+from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.io.settings import parse_settings
+from persist_cli.policies.nomad.network import NomadNetwork, NomadNetworkSettings
+from tests.support.micro_policies import micro_network, random_samples
+
+NO = torch.zeros(4, dtype=torch.bool)
+
+
+def test_the_published_sizes_have_the_published_number_of_parameters():
+    with without_weights():
+        network = NomadNetwork(NomadNetworkSettings())
+    sizes = {group.name: sum(map(torch.numel, group.parameters.values())) for group in network.parameter_groups()}
+    assert sizes["seen_encoder"] == 5_288_548 - 1000 * 1281  # EfficientNet-B0 without its classifier
+    assert sizes["goal_encoder"] == sizes["seen_encoder"] + 3 * 32 * 9  # three more channels of the image
+    assert sum(sizes.values()) == sum(map(torch.numel, network.parameters()))
+
+
+def test_a_masked_goal_changes_nothing_when_its_image_changes():
+    network, samples = micro_network(), random_samples()
+    masked = torch.tensor([True, False, True, False])
+    first = network.condition(samples.seen, samples.goal, masked)
+    second = network.condition(samples.seen, samples.goal.flip(0), masked)
+    assert torch.equal(first[masked], second[masked])
+    assert not torch.isclose(first[~masked], second[~masked]).all(1).any()
+
+
+def test_the_condition_is_the_mean_over_the_tokens_that_are_not_masked():
+    network, samples = micro_network(), random_samples()
+    given: list[torch.Tensor] = []
+
+    class Kept(nn.Module):
+        def forward(self, tokens, src_key_padding_mask):
+            given.append(tokens)
+            return tokens
+
+    network.transformer = Kept()
+    masked = torch.tensor([True, False, False, False])
+    condition = network.condition(samples.seen, samples.goal, masked)
+    assert torch.allclose(condition[1:], given[0][1:].mean(1), atol=1e-6)
+    without_goal = torch.cat([given[0][:1, :-1], torch.zeros_like(given[0][:1, -1:])], dim=1)
+    assert torch.allclose(condition[:1], without_goal.mean(1) * 3 / 2, atol=1e-6)  # (context + 2) / (context + 1)
+
+
+def test_motions_are_scaled_as_published():
+    published = NomadNetworkSettings(metres=0.25)
+    network = micro_network(least=published.least, most=published.most, metres=0.25)
+    straight = torch.arange(1, 5)[None, :, None] * torch.tensor([0.25, 0.0])
+    motions = network.normalised(straight)
+    assert torch.allclose(motions, torch.tensor([3.5 / 7.5 * 2 - 1, 0.0]).expand(1, 4, 2), atol=1e-6)
+    assert torch.allclose(network.waypoints(motions), straight, atol=1e-6)
+
+
+def test_the_loss_weighs_the_distance_by_one_in_ten_thousand():
+    losses = micro_network()(random_samples(), "policy")
+    assert torch.isclose(losses["loss"], 1e-4 * losses["distance_error"] + (1 - 1e-4) * losses["noise_error"])
+
+
+def test_waypoints_that_do_not_lead_to_the_goal_or_stand_still_are_not_learned():
+    network, samples = micro_network(still=0.5), random_samples()
+    moved = samples.waypoints.clone()
+    moved[0] = 0.3
+    elsewhere = dataclasses.replace(samples, leads_to_goal=torch.tensor([False, True, True, True]))
+    changed = dataclasses.replace(elsewhere, waypoints=moved)
+    assert torch.equal(network(elsewhere, "policy")["noise_error"], network(changed, "policy")["noise_error"])
+    still = dataclasses.replace(samples, waypoints=moved)  # 0.42 m
+    assert torch.equal(network(elsewhere, "policy")["noise_error"], network(still, "policy")["noise_error"])
+
+
+def test_the_distance_of_a_masked_goal_is_not_learned():
+    assert micro_network(masked=1.0)(random_samples(), "policy")["distance_error"] == 0
+
+
+def test_what_is_random_about_a_sample_follows_from_its_seed_whatever_the_batch():
+    network, samples = micro_network(masked=0.0), random_samples()
+    half = dataclasses.replace(
+        samples.to("cpu"), seen=samples.seen[2:], goal=samples.goal[2:], waypoints=samples.waypoints[2:],
+        distance=samples.distance[2:], leads_to_goal=samples.leads_to_goal[2:], seeds=samples.seeds[2:],
+    )  # fmt: skip
+    whole, part = network._draw(samples.seeds), network._draw(half.seeds)
+    assert all(torch.equal(one[2:], other) for one, other in zip(whole, part, strict=True))
+    assert torch.isfinite(network(half, "policy")["loss"])
+
+
+def test_a_network_that_overfits_one_sample_gives_its_waypoints():
+    network, samples = micro_network(masked=0.0), random_samples(1)
+    curve = torch.tensor([[[0.3, 0.1], [0.5, 0.3], [0.6, 0.6], [0.6, 0.9]]])
+    optimizer, losses = torch.optim.AdamW(network.parameters(), 3e-3), list[float]()
+    for step in range(80):
+        loss = network(repeated(dataclasses.replace(samples, waypoints=curve), 32, step), "policy")["loss"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert sum(losses[-5:]) < 0.2 * sum(losses[:5])
+    condition = network.condition(samples.seen, samples.goal, NO[:1])[0].detach()
+    ways = network.sample(condition, 8, 10, torch.Generator().manual_seed(0))
+    assert (ways - curve).norm(dim=-1).mean() < 0.2
+
+
+def repeated(sample: PolicySamples, count: int, step: int) -> PolicySamples:
+    """A batch of one sample so often, each with noise of its own."""
+    parts = (sample.seen, sample.goal, sample.waypoints, sample.distance, sample.leads_to_goal)
+    seen, goal, waypoints, distance, leads = (part.expand(count, *part.shape[1:]) for part in parts)
+    return PolicySamples(seen, goal, waypoints, distance, leads, range(step * count, (step + 1) * count))
+
+
+def test_saved_weights_give_the_same_samples_to_the_bit(tmp_path):
+    network, samples = micro_network(), random_samples()
+    network.save(tmp_path)
+    torch.manual_seed(9)
+    other = NomadNetwork(network.settings).eval()
+    other.load(tmp_path)
+    ways = []
+    for one in (network, other):
+        condition = one.condition(samples.seen, samples.goal, NO)[0].detach()
+        ways.append(one.sample(condition, 3, 10, torch.Generator().manual_seed(0)))
+    assert torch.equal(*ways)
+
+
+def test_weights_of_another_size_are_refused(tmp_path):
+    micro_network().save(tmp_path)
+    with pytest.raises(CheckpointError, match="does not fit this model"):
+        micro_network(tokens=32).load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"waypoints": 7}, "waypoints 7 cannot be halved"),
+        ({"channels": [12]}, r"channels \[12\] must be multiples of 8"),
+        ({"tokens": 24}, "tokens 24 must be a multiple of 16"),
+        ({"least": [5.0, 1.0]}, "must be below most"),
+        ({"nearest": 8}, "nearest 8 must be below farthest 8"),
+        ({"waypoint": 8}, "did you mean 'waypoints'"),
+    ],
+)
+def test_sizes_that_do_not_go_together_are_refused_in_one_line(settings, message):
+    with pytest.raises(RecipeError, match=message):
+        parse_settings(NomadNetworkSettings, {"channels": [8, 16], "farthest": 8} | settings, "the network")

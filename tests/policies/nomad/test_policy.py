@@ -1,0 +1,107 @@
+"""The policy plugin ``nomad``: what it proposes, and how a trained policy is opened."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import pytest
+import torch
+
+from persist_cli.api.ground import GroundMap
+from persist_cli.api.policy import Goal, Situation
+from persist_cli.data.store import Store
+from persist_cli.errors import CheckpointError, PluginError, RecipeError
+from persist_cli.policies.open_policy import open_policy
+from persist_cli.policies.trained import find_policy, save_policy
+from tests.support.rooms import UP
+
+
+@pytest.fixture
+def situation(walks) -> Situation:
+    """An agent in the middle of a walk that shall reach what it sees at its end."""
+    walk = Store(walks)[0].read()
+    goal = Goal(walk.observations.rgb[-1], None, walk.info.scene)
+    return Situation(walk.observations[9:12], walk.info, goal, GroundMap.empty(UP))
+
+
+def draw(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def with_goal(situation: Situation, rgb: torch.Tensor | None) -> Situation:
+    return dataclasses.replace(situation, goal=dataclasses.replace(situation.goal, rgb=rgb))
+
+
+def test_it_proposes_ways_of_the_vocabulary_that_follow_from_the_seed(policy_run, situation):
+    policy = open_policy(str(policy_run), {"stop": 0})
+    assert (policy.name, policy.frames, policy.longest) == ("nomad", 3, 8)
+    ways = policy.propose(situation, 6, 12, draw())
+    assert len(ways) == 12
+    assert all(1 <= len(way) <= 6 for way in ways)
+    assert len(set(ways)) > 1
+    assert {name for way in ways for name in way} <= {"forward", "left", "right"}
+    assert ways == policy.propose(situation, 6, 12, draw())
+    assert ways != policy.propose(situation, 6, 12, draw(1))
+
+
+def test_without_an_image_it_goes_where_a_masked_goal_leads_whatever_the_goal(policy_run, situation):
+    masked = open_policy(str(policy_run), {"masked": True}).propose(situation, 8, 6, draw())
+    assert open_policy(str(policy_run)).propose(with_goal(situation, None), 8, 6, draw()) == masked
+    other = with_goal(situation, 255 - situation.seen.rgb[0])
+    assert open_policy(str(policy_run), {"masked": True}).propose(other, 8, 6, draw()) == masked
+
+
+def test_it_stops_where_the_predicted_distance_says_so_but_not_where_it_explores(policy_run, situation):
+    policy = open_policy(str(policy_run), {"stop": 1e6})
+    assert policy.propose(situation, 8, 3, draw()) == [()] * 3
+    assert all(policy.propose(with_goal(situation, None), 8, 3, draw()))
+
+
+def test_a_short_past_and_images_of_another_size_will_do(policy_run, situation):
+    policy = open_policy(str(policy_run), {"stop": 0})
+    first = dataclasses.replace(situation, seen=situation.seen[:1])
+    repeated = dataclasses.replace(situation, seen=situation.seen[[0, 0, 0]])
+    assert policy.propose(first, 4, 4, draw()) == policy.propose(repeated, 4, 4, draw())
+    assert situation.goal.rgb is not None
+    assert policy.propose(with_goal(situation, situation.goal.rgb.repeat(2, 2, 1)), 4, 1, draw())
+
+
+def test_fewer_denoising_steps_are_possible_and_more_are_refused(policy_run, situation):
+    assert open_policy(str(policy_run), {"steps": 2, "stop": 0}).propose(situation, 8, 2, draw())
+    with pytest.raises(RecipeError, match=r"steps 11; .* has 10 noise levels"):
+        open_policy(str(policy_run), {"steps": 11})
+
+
+def test_a_policy_opens_by_name_run_checkpoint_or_model_folder(policy_run):
+    assert open_policy("random").name == "random"
+    places = (policy_run, policy_run / "step-00000004", policy_run / "step-00000004/model")
+    assert len({find_policy(place).fingerprint for place in places}) == 1
+    assert find_policy(policy_run).training_scenes.names == {"room-0", "room-1"}
+
+
+def test_a_policy_that_is_not_there_is_refused_in_one_line_that_says_what_to_do(tmp_path, policy_run, stage1):
+    with pytest.raises(PluginError, match="unknown policy 'randm'; did you mean 'random'"):
+        open_policy("randm")
+    for place in (tmp_path, stage1, tmp_path / "missing"):
+        with pytest.raises(CheckpointError, match=f"{place}: no trained policy there .*persist finetune houses-64"):
+            open_policy(str(place))
+    with pytest.raises(CheckpointError, match="no trained policy comes with this installation"):
+        open_policy("nomad")
+
+
+def test_a_damaged_policy_is_refused(tmp_path, policy_run):
+    shutil.copytree(policy_run / "step-00000004/model", tmp_path / "policy")
+    weights = tmp_path / "policy/model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-7] + b"damaged")
+    with pytest.raises(CheckpointError, match=r"model\.safetensors"):
+        open_policy(str(tmp_path / "policy"))
+
+
+def test_the_packaged_policy_acts_where_none_is_named(tmp_path, policy_run, situation, monkeypatch):
+    monkeypatch.setenv("PERSIST_REFERENCE", str(tmp_path))
+    (tmp_path / "policy").mkdir()
+    trained = find_policy(policy_run)
+    save_policy(trained.load(), "nomad", tmp_path / "policy", trained.training_scenes)
+    ways = open_policy("nomad", {"stop": 0}).propose(situation, 8, 4, draw())
+    assert ways == open_policy(str(policy_run), {"stop": 0}).propose(situation, 8, 4, draw())
