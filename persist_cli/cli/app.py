@@ -280,6 +280,7 @@ def rollout(
     frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
     memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
+    body: Annotated[bool, typer.Option(help="Stop at what is in the way of --actions, or go through walls.")] = True,
     write: Annotated[bool, typer.Option(help="Write what is generated into the memory beside what it holds.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
     steps: StepsOption = None,
@@ -294,7 +295,7 @@ def rollout(
     """Roll out a world model from a start frame along actions, clip by clip.
 
     Several --actions are branches of one start, imagined together, each with its own memory: OUT/0, OUT/1, …
-    The agent has no body: it goes through walls.
+    An agent stops at walls and things that it sees, remembers or has imagined; --no-body lets it go through them.
 
     persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
     """
@@ -304,7 +305,7 @@ def rollout(
     plan = RolloutPlan(
         start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
         write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
-        placement=InferenceOptions.of(dtype, save_memory), step=step, turn=turn,
+        placement=InferenceOptions.of(dtype, save_memory), step=step, turn=turn, body=body,
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 

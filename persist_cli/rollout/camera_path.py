@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from persist_cli.api.actions import ActionVocabulary, format_actions
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
@@ -27,7 +28,8 @@ from persist_cli.rollout.world_model import cameras_along
 class RolloutPlan:
     """The options of ``persist rollout``; see its help.
 
-    ``step`` metres and ``turn`` degrees are those of the walking actions; ``None`` for the trajectory's own.
+    ``step`` metres and ``turn`` degrees are those of the walking actions; ``None`` for the trajectory's own. ``body``
+    says whether the agent collides; along a trajectory's own poses nothing is in its way.
     """
 
     start: str
@@ -42,6 +44,7 @@ class RolloutPlan:
     placement: InferenceOptions
     step: float | None = None
     turn: float | None = None
+    body: bool = True
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class CameraPath:
 
     Args:
         start: the observed first frame.
-        cameras: cameras of the frames to imagine.
+        cameras: cameras of the frames to imagine, where nothing is in the way.
         interactions: interaction before each of these frames, ``None`` for none.
         actions: the action that leads to each of these frames.
         truth: true frames of these cameras when the path follows a trajectory, else ``None``.
@@ -83,6 +86,8 @@ class Rollout:
         gives_depth: whether the imagined frames have depth.
         kept_paths: world_from_camera of the paths that the memory's file shall keep, by name.
         remembered: world_from_camera of the frames that the memory was made of, as far as its file says.
+        free: whether the way of each action was free.
+        body: what could be blocked; ``None`` for a camera that goes through walls.
     """
 
     path: CameraPath
@@ -93,6 +98,13 @@ class Rollout:
     gives_depth: bool
     kept_paths: Mapping[str, Float[Tensor, "frame 4 4"]] = field(default_factory=dict)
     remembered: Float[Tensor, "frame 4 4"] = field(default_factory=lambda: torch.zeros(0, 4, 4, dtype=torch.float64))
+    free: Bool[Tensor, " action"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
+    body: Body | None = None
+
+    @property
+    def blocked(self) -> list[int]:
+        """The numbers of the actions that were blocked, counted from 1 as in the sheet."""
+        return [number for number, free in enumerate(self.free.tolist(), 1) if not free]
 
 
 def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:

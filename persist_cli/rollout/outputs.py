@@ -56,6 +56,8 @@ def write_poses(path: Path, timestamps: Sequence[float], poses: Float[Tensor, "f
 # files of some rollouts
 SOMETIMES = ("compare.mp4", "depth.mp4", "map-before.png", "map-after.png", "memory.safetensors")
 
+MOST_BLOCKED = 6  # blocked actions that the terminal names
+
 PRINTED = ("psnr", "lpips-alex", "lpips-vgg")  # figures that the terminal shows
 
 
@@ -72,6 +74,8 @@ def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rol
         "frames": len(rollout.seen),
         "seconds": rollout.seconds,
         "memory": memory,
+        "body": None if rollout.body is None else dataclasses.asdict(rollout.body),
+        "blocked": rollout.blocked,
     } | branches
 
 
@@ -113,6 +117,7 @@ def write_pictures(rollout: Rollout, out: Path) -> DepthScale | None:
     if truth is not None:
         write_video(out / "compare.mp4", comparison(rows, colored, scale))
     actions = [f"{number} {action}" for number, action in enumerate(("start", *rollout.path.actions))]
+    actions = [f"{text}, blocked" if n in rollout.blocked else text for n, text in enumerate(actions)]
     write_sheet(out / "sheet.png", rows + colored, actions, bar=None if scale is None else scale.bar)
     return scale
 
@@ -166,6 +171,13 @@ def counted_words(figures: Mapping[str, Any]) -> str:
     return f" ({sum(counted)} of {len(counted)} count: those farther than {limits} from every remembered frame)"
 
 
+def blocked_words(rollout: Rollout) -> str:
+    """Return which actions were blocked, as in ``"3 of 9 actions (7 forward, 8 forward, 9 forward)"``."""
+    blocked = [f"{number} {rollout.path.actions[number - 1]}" for number in rollout.blocked]
+    shown = blocked[:MOST_BLOCKED] + ["…"] * (len(blocked) > MOST_BLOCKED)
+    return f"{len(blocked)} of {len(rollout.path.actions)} actions ({', '.join(shown)})"
+
+
 def summary(figures: Mapping[str, Any]) -> str:
     """Return the means against the true frames that the terminal shows, as in ``"PSNR 21.34, LPIPS-Alex 0.3127"``."""
     measured = figures["mean_against_ground_truth"]
@@ -204,9 +216,12 @@ def path_of(rollout: Rollout) -> torch.Tensor:
 
 def write_maps(rollout: Rollout, out: Path) -> None:
     """Write the memory, and maps of it before and after the rollout when it has points to draw."""
+    stops = rollout.seen.cameras.world_from_camera[[number - 1 for number in rollout.blocked]]
     memories: dict[str, Memory | None] = {"map-before": rollout.before, "map-after": rollout.memory}
     for name, memory in memories.items():
         if memory is not None and len(memory.points().positions):
-            draw_map(memory.points(), memory.reference.world_up, {"rollout": path_of(rollout)}, out / f"{name}.png")
+            draw_map(
+                memory.points(), memory.reference.world_up, {"rollout": path_of(rollout)}, out / f"{name}.png", stops
+            )
     if rollout.memory is not None:
         rollout.memory.save(out / "memory.safetensors", rollout.kept_paths)

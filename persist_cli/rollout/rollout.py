@@ -14,7 +14,6 @@ import torch
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
-from persist_cli.api.observations import Observations
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError
@@ -22,8 +21,8 @@ from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import add_paths, load_paths
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
 from persist_cli.rollout.open_world import assemble_world
-from persist_cli.rollout.outputs import counted_words, describe, path_of, summary, write_outputs
-from persist_cli.rollout.world_model import WorldModel
+from persist_cli.rollout.outputs import blocked_words, counted_words, describe, path_of, summary, write_outputs
+from persist_cli.rollout.world_model import StepResult, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, progress, say, warn
 
 
@@ -53,6 +52,8 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
     for rollout, folder, record in zip(rollouts, folders, figures, strict=True):
         frames, actions = len(rollout.seen), rollout.path.text
         say(f"{frames} frames in {rollout.seconds:.1f} s along {actions!r}; written to {folder}")
+        if rollout.blocked:
+            say(f"blocked, so that the agent stayed where it was: {blocked_words(rollout)}")
         if rollout.path.truth is not None:
             say(f"mean against the true frames{counted_words(record)}: {summary(record)}")
 
@@ -105,19 +106,29 @@ def roll(model: WorldModel, paths: Sequence[CameraPath]) -> list[Rollout]:
     before, began = None if memory is None else memory.copy(), time.monotonic()
     model.reset([paths[0].start], [paths[0].info])
     branches = model.branches(len(paths)) if len(paths) > 1 else model
-    cameras, clips = [path.cameras for path in paths], []
-    steps, total = model.sampling.steps, sum(map(len, cameras))
-    clip_count = -(-max(map(len, cameras)) // (model.backbone.frames_per_clip - 1))
+    left, clips = [len(path.actions) for path in paths], []
+    steps, total, length = model.sampling.steps, sum(left), model.backbone.frames_per_clip - 1
     with progress() as bar:
-        task = add_task(bar, "rollout", clip_count * steps, "denoising steps", f"0 of {total} frames")
+        task = add_task(bar, "rollout", -(-max(left) // length) * steps, "denoising steps", f"0 of {total} frames")
         with on_denoised(model.backbone, partial(bar.advance, task)):
-            for frames in branches.imagine(cameras, [path.interactions for path in paths]):
-                clips.append(frames)
-                done = sum(len(seen) for clip in clips for seen in clip)
-                bar.update(task, completed=len(clips) * steps, note=f"{done} of {total} frames")
+            for results in clips_along(branches, paths):
+                clips.append(results)
+                left = [count - len(result.seen) for count, result in zip(left, results, strict=True)]
+                expected = len(clips) + -(-max(left) // length)  # more than at first where an agent was stopped
+                note = f"{total - sum(left)} of {total} frames"
+                bar.update(task, completed=len(clips) * steps, total=expected * steps, note=note)
     seconds, depth = time.monotonic() - began, model.backbone.gives_depth
-    videos = [Observations.concatenate(parts) for parts in zip(*clips, strict=True)]
+    results = [StepResult.concatenate(parts) for parts in zip(*clips, strict=True)]
     return [
-        Rollout(path, video, before, agent.memory, seconds, depth)
-        for path, video, agent in zip(paths, videos, branches.agents, strict=True)
+        Rollout(path, result.seen, before, agent.memory, seconds, depth, free=result.free, body=agent.body)
+        for path, result, agent in zip(paths, results, branches.agents, strict=True)
     ]
+
+
+def clips_along(model: WorldModel, paths: Sequence[CameraPath]) -> Iterator[list[StepResult]]:
+    """Imagine each clip of some paths: where their actions lead, or along the poses of a trajectory."""
+    if all(path.truth is None for path in paths):
+        yield from model.act([path.actions for path in paths])
+        return
+    for frames in model.imagine([path.cameras for path in paths], [path.interactions for path in paths]):
+        yield [StepResult(seen, torch.ones(len(seen), dtype=torch.bool)) for seen in frames]

@@ -33,6 +33,7 @@ def draw_map(
     world_up: Sequence[float],
     paths: Mapping[str, Float[Tensor, "frame 4 4"]] | Sequence[Float[Tensor, "frame 4 4"]],
     out: Path,
+    stops: Float[Tensor, "stop 4 4"] | None = None,
 ) -> None:
     """Write a PNG of the map from above, true to scale, without the points higher than the cameras.
 
@@ -42,6 +43,7 @@ def draw_map(
         world_up: unit vector that points up in the world.
         paths: world_from_camera of each path, by the name that the legend shows, or in order without names.
         out: path of the PNG file.
+        stops: world_from_camera of where a camera was stopped by something in its way, drawn as crosses.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -65,6 +67,8 @@ def draw_map(
         headings = (lines[name][:, :3, 2] @ ground[:2].T).numpy()
         end = headings[-1] / max(float(np.linalg.norm(headings[-1])), 1e-9) * ARROW * max(width, height)
         _draw_path(axes, place[:, :2], end, PATH_COLORS[number % len(PATH_COLORS)], name)
+    if stops is not None and len(stops):
+        _draw_stops(axes, (stops[:, :3, 3].detach().cpu().double() @ ground.T).numpy())
     handles = axes.get_legend_handles_labels()[0] if isinstance(paths, Mapping) else []
     if _imagined(points).any():
         handles.append(Patch(facecolor="#b8b8b8", edgecolor="white", hatch="////", label="imagined"))
@@ -161,6 +165,12 @@ def _draw_path(axes: Any, place: Array, look: Array, color: str, name: str) -> N
     box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "boxstyle": "round,pad=0.15"}
     for text, at, offset in (("start", place[0], (8, 8)), ("end", place[-1], (8, -14))):
         axes.annotate(text, at, offset, textcoords="offset points", color=color, fontsize=8, bbox=box, zorder=7)
+
+
+def _draw_stops(axes: Any, place: Array) -> None:
+    """Draw a cross where something was in the way."""
+    axes.scatter(*place[:, :2].T, s=130, color="white", marker="X", zorder=6)
+    axes.scatter(*place[:, :2].T, s=70, color="black", marker="X", zorder=6, label="blocked")
 
 
 def _finish_axes(axes: Any, low: Array, high: Array, legend: list[Any]) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from persist_cli.api.ground import Cover
 from persist_cli.api.memory import FrameOfReference
+from persist_cli.data.store import write_trajectory
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.world_model import Agent
-from tests.support.room_worlds import BODY, RoomWorld, room_info, room_views, room_world
+from tests.support.room_worlds import BODY, ROOM, RoomWorld, room_info, room_views, room_world
 from tests.support.rooms import UP, look
 
 FACING = look((1.7, 1.25, 0.0), 0.0, 0.0)  # along -z, 2 m from the wall
@@ -110,6 +113,27 @@ def test_an_agent_that_is_wholly_blocked_imagines_nothing():
     [result] = world.step([["forward"] * 5])
     assert (result.free.any().item(), world.agents[0].clips) == (False, 0)
     assert torch.equal(result.seen.rgb[4], world.agents[0].now.rgb[0])
+
+
+def test_a_rollout_says_in_file_terminal_and_map_which_actions_were_blocked(persist, voxel, tmp_path):
+    data = tmp_path / "data"
+    frames = [ROOM.see(look((1.7, 1.25, -1.7), 0.0, 0.0), action) for action in ("stay", None)]  # 0.3 m from a wall
+    views = [replace(frame, rgb=frame.rgb[16:48, 16:48], depth=frame.depth[16:48, 16:48]) for frame in frames]
+    matrix = ROOM.intrinsics - np.array([[0, 0, 16], [0, 0, 16], [0, 0, 0]])
+    write_trajectory(data / "wall.parquet", replace(room_info(), intrinsics=matrix, height=32, width=32), views)
+
+    def roll(out, *options):
+        options = ("--start", f"{data}#0:0", "--out", tmp_path / out, "--steps", 1, *options)
+        result = persist("rollout", voxel, "--actions", "forward*2 left", *options)
+        assert result.code == 0, result.err
+        return result.out, json.loads((tmp_path / out / "rollout.json").read_text())
+
+    printed, record = roll("body")
+    assert "2 of 3 actions (1 forward, 2 forward)" in printed
+    assert (record["blocked"], record["frames"], record["body"]["radius"]) == ([1, 2], 3, 0.2)
+    printed, record = roll("none", "--no-body")
+    assert ("blocked" in printed, record["blocked"], record["body"]) == (False, [], None)
+    assert (tmp_path / "body/map-after.png").read_bytes() != (tmp_path / "none/map-after.png").read_bytes()
 
 
 @pytest.mark.parametrize("check_again", [True, False])

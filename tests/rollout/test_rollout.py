@@ -174,9 +174,9 @@ def test_memory_options_that_cannot_work_are_refused_in_one_line(persist, walks,
 def test_each_denoising_step_of_a_rollout_counts_in_its_progress(persist, voxel, walks, tmp_path, monkeypatch):
     monkeypatch.setattr("persist_cli.viewing.console.FIRST_LINE", 0.0)
     monkeypatch.setattr("persist_cli.viewing.console.LINE_EVERY", 0.0)
-    ended = roll(persist, voxel, walks, tmp_path, "--actions", "forward*12")  # two clips, each of two steps
+    options = ("--actions", "forward*12", "--no-body")  # two clips, each of two steps
+    ended = roll(persist, voxel, walks, tmp_path, *options)
     lines = [line for line in ended.err.splitlines() if line.startswith("rollout: ")]
-    assert [line.split(" denoising")[0] for line in lines] == [
-        "rollout: 1 of 4", "rollout: 2 of 4", "rollout: 2 of 4", "rollout: 3 of 4", "rollout: 4",
-    ]  # fmt: skip
+    counts = dict.fromkeys(line.split(" denoising")[0] for line in lines)  # a slow machine writes some of them twice
+    assert [*counts] == ["rollout: 1 of 4", "rollout: 2 of 4", "rollout: 3 of 4", "rollout: 4"]
     assert lines[-1].endswith("12 of 12 frames")
