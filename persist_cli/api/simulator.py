@@ -69,6 +69,17 @@ class Simulator(ABC):
     def act(self, action: str) -> bool:
         """Do an action; return false and change nothing if the scene forbids it. An unknown one is a ``DataError``."""
 
+    def stance(self, world_from_camera: np.ndarray[Any, Any]) -> tuple[tuple[float, float], float] | None:
+        """Return ground position and heading with which ``place`` gives the camera about this pose.
+
+        Args:
+            world_from_camera: ``[4, 4]``, metres.
+
+        Returns:
+            ``None`` where this simulator does not know; what ``observe`` then shows is to be compared.
+        """
+        return None
+
     @property
     @abstractmethod
     def agent(self) -> tuple[tuple[float, float], float]:

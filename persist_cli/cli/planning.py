@@ -7,7 +7,20 @@ from typing import Annotated
 
 import typer
 
-from persist_cli.cli.options import JsonOption
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.cli.options import (
+    ContextNoiseOption,
+    DtypeOption,
+    GuidanceOption,
+    JsonOption,
+    SamplerOption,
+    SaveMemoryOption,
+    StepOption,
+    StepsOption,
+    TurnOption,
+    VerifyOption,
+    split_names,
+)
 from persist_cli.errors import PersistError
 
 planning_app = typer.Typer()
@@ -25,6 +38,61 @@ def whole_numbers(option: str, text: str) -> tuple[int, ...]:
         return tuple(int(part) for part in text.split(","))
     except ValueError as error:
         raise PersistError(f"{option} {text!r}: write whole numbers separated by commas, as in 8,16") from error
+
+
+@planning_app.command()
+def plan(
+    start: Annotated[str, typer.Option(help="Where to start: DATA#trajectory:frame.")],
+    goal: Annotated[str, typer.Option(help="An image, a frame DATA#trajectory:frame, or a place x,y on the map.")],
+    out: Annotated[Path, typer.Option(help="Folder for plan.json, sheet.png, map.png and plan.mp4.")],
+    checkpoint: Annotated[
+        Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
+    ] = None,
+    memory: Annotated[Path | None, typer.Option(help="Memory file of the place.")] = None,
+    adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
+    method: Annotated[
+        str, typer.Option(help="rank: a policy proposes; cem: the best of a round lead the next.")
+    ] = "cem",
+    policy: Annotated[str | None, typer.Option(help="Of rank: a policy of `persist plugins`; random.")] = None,
+    cost: Annotated[str | None, typer.Option(help="Of `persist plugins`; lpips, or geodesic to a place.")] = None,
+    over: Annotated[str, typer.Option(help="Which frame counts: last, or the best of the clip.")] = "last",
+    horizon: Annotated[int | None, typer.Option(min=1, help="Actions of a candidate; 8.")] = None,
+    candidates: Annotated[int | None, typer.Option(min=1, help="Of a round; 60 of cem, 16 of rank.")] = None,
+    rounds: Annotated[int | None, typer.Option(min=1, help="Most rounds; 12 of cem, 1 of rank.")] = None,
+    actions: Annotated[str, typer.Option(help="Of cem, with commas; those that walk ahead or turn.")] = "",
+    frames: Annotated[int | None, typer.Option(help="Budget: most imagined frames.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Budget: most seconds.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="As in method.elites=0.1, policy.KEY=VALUE or cost.KEY=VALUE.")
+    ] = None,
+    batch: Annotated[int, typer.Option(min=1, help="Candidates imagined together.")] = 20,
+    body: Annotated[bool, typer.Option(help="Walls that are known stop the agent.")] = True,
+    step: StepOption = None,
+    turn: TurnOption = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of candidates and sampling noise.")] = 0,
+    steps: StepsOption = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
+    context_noise: ContextNoiseOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
+    verify: VerifyOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Plan inside the model: imagine candidates from a start, and choose the one that comes nearest to a goal.
+
+    persist plan --start sample#0:32 --goal sample#0:40 --steps 1 --guidance 1 --out runs/plan
+    """
+    from persist_cli.planning.plan import PlanOptions, run_plan
+
+    options = PlanOptions(
+        start=start, goal=goal, memory=memory, adapter=adapter, method=method, policy=policy, cost=cost, over=over,
+        horizon=horizon, candidates=candidates, rounds=rounds, actions=split_names(actions), frames=frames,
+        seconds=seconds, batch=batch, body=body, seed=seed, settings=tuple(settings or ()), step=step, turn=turn,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
+        placement=InferenceOptions.of(dtype, save_memory),
+    )  # fmt: skip
+    run_plan(checkpoint, options, out, json)
 
 
 @bench_app.command("episodes")

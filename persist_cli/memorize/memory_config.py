@@ -82,18 +82,23 @@ def _memory_names(checkpoint: Checkpoint) -> dict[str, str]:
     return {name: adapter_memory(checkpoint, name).name for name in checkpoint.adapters}
 
 
-def plugin_settings(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+def plugin_settings(texts: Sequence[str], kinds: Sequence[str] = ("memory", "encoder")) -> dict[str, dict[str, Any]]:
     """Return the settings of ``memory`` and ``encoder`` in texts such as ``memory.cell=[0.25,1,0.25]``.
+
+    Args:
+        texts: as written on the command line.
+        kinds: words that a text may begin with.
 
     Raises:
         RecipeError: when a text does not have this form.
     """
-    settings: dict[str, dict[str, Any]] = {"memory": {}, "encoder": {}}
+    settings: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
+    forms = " or ".join(f"{kind}.KEY=VALUE" for kind in kinds)
     for text in texts:
         key, equals, value = text.partition("=")
         kind, dot, name = key.strip().partition(".")
         if not (equals and dot and name) or kind not in settings:
-            raise RecipeError(f"cannot read setting {text!r}; write memory.KEY=VALUE or encoder.KEY=VALUE")
+            raise RecipeError(f"cannot read setting {text!r}; write {forms}")
         try:
             settings[kind][name] = yaml.safe_load(value)
         except yaml.YAMLError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -74,6 +74,7 @@ class Judge:
         over: ``last`` judges the last frame of each candidate, ``best`` the one that costs least.
         budget: the most that may be spent; at least one batch is judged.
         batch: candidates imagined together.
+        on_batch: is told how many frames each batch imagined.
     """
 
     model: FutureModel
@@ -83,6 +84,7 @@ class Judge:
     over: Over = "last"
     budget: Budget = field(default_factory=Budget)
     batch: int = 20
+    on_batch: Callable[[int], object] | None = None
     judged: dict[tuple[str, ...], Candidate] = field(default_factory=dict, init=False)
     frames: int = field(default=0, init=False)  # imagined so far
     seconds: float = field(default=0.0, init=False)  # spent so far
@@ -138,6 +140,8 @@ class Judge:
         frames, seconds = sum(map(len, candidates)), time.monotonic() - begun
         self.frames, self.seconds = self.frames + frames, self.seconds + seconds
         self._rate = seconds / max(frames, 1)
+        if self.on_batch is not None:
+            self.on_batch(frames)
 
     def check(self, costs: Float[Tensor, "candidate frame"], candidates: Sequence[Sequence[str]]) -> None:
         """Raise ``PersistError`` when a cost is NaN, naming the first such candidate."""

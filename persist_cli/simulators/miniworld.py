@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -148,6 +149,11 @@ class MiniWorld(Simulator):
         self._stale = self._stale or self._carried is not None
         self._ground, self._turned = ground, turned
         return True
+
+    def stance(self, world_from_camera: np.ndarray[Any, Any]) -> tuple[Ground, float]:
+        """Ground position and heading of the agent whose camera has a pose."""
+        x, _, z = (float(value) for value in world_from_camera[:3, 3])
+        return (x, z), math.atan2(-float(world_from_camera[2, 2]), float(world_from_camera[0, 2]))
 
     @property
     def agent(self) -> tuple[tuple[float, float], float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from persist_cli.io.files import written_aside
 
 PATH_COLORS = ("#d81b60", "#1e88e5", "#ffb300", "#004d40", "#8e24aa")
 UNSEEN = (0.94, 0.94, 0.95, 1.0)
+COST_COLORS = "viridis"  # of matplotlib: cheap is dark
 MARGIN = 0.5  # metres around what is drawn
+AROUND = 2.0  # metres around candidates
 ABOVE_CAMERA = 0.1  # metres over the cameras at which the ceiling is cut away
 DOTS_ACROSS = 5  # dots along the side of the square that stands for a point
 MOST_DOTS = 900  # dots along the longer side of the picture
@@ -45,8 +48,6 @@ def draw_map(
         out: path of the PNG file.
         stops: world_from_camera of where a camera was stopped by something in its way, drawn as crosses.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     ground = ground_axes(world_up)
@@ -55,7 +56,86 @@ def draw_map(
     places = {name: (path[:, :3, 3] @ ground.T).numpy() for name, path in lines.items()}
     image, extent = paint(points, ground, _ceiling(places))
     low, high = _limits(extent, places)
-    width, height = high - low
+    figure, axes = _begin_figure(image, extent, high - low)
+    for number, (name, place) in enumerate(places.items()):
+        look = _arrow(lines[name], ground, max(high - low))
+        _draw_path(axes, place[:, :2], look, PATH_COLORS[number % len(PATH_COLORS)], name)
+    if stops is not None and len(stops):
+        _draw_stops(axes, (stops[:, :3, 3].detach().cpu().double() @ ground.T).numpy())
+    handles = axes.get_legend_handles_labels()[0] if isinstance(paths, Mapping) else []
+    if _imagined(points).any():
+        handles.append(Patch(facecolor="#b8b8b8", edgecolor="white", hatch="////", label="imagined"))
+    _finish_axes(axes, low, high, handles)
+    _save(figure, out)
+
+
+@dataclass(frozen=True)
+class DrawnCandidate:
+    """A candidate of a plan on a map.
+
+    Args:
+        path: world_from_camera of the start and after each action.
+        cost: less is nearer to the goal; where it is not finite, the path is grey.
+    """
+
+    path: Float[Tensor, "frame 4 4"]
+    cost: float
+
+
+def draw_candidates(
+    points: MapPoints,
+    world_up: Sequence[float],
+    candidates: Sequence[DrawnCandidate],
+    goal: Float[Tensor, " 3"] | None,
+    out: Path,
+) -> None:
+    """Write a PNG of the map around candidates, coloured by cost, the first one on top, and the goal's place.
+
+    Args:
+        points: points of a memory; without any the picture shows the paths alone.
+        world_up: unit vector that points up in the world.
+        candidates: the chosen one first.
+        goal: its position in the world, metres; ``None`` where it is not known.
+        out: path of the PNG file.
+    """
+    ground = ground_axes(world_up)
+    paths = [candidate.path.detach().cpu().double() for candidate in candidates]
+    places = {str(number): (path[:, :3, 3] @ ground.T).numpy() for number, path in enumerate(paths)}
+    image, extent = paint(points, ground, _ceiling(places))
+    target = {} if goal is None else {"goal": (goal.cpu().double()[None] @ ground.T).numpy()}
+    low, high = _limits(None, places | target, AROUND)
+    figure, axes = _begin_figure(image, extent, high - low)
+    ends = [_arrow(path, ground, max(high - low)) for path in paths]
+    _draw_costs(figure, axes, [place[:, :2] for place in places.values()], [one.cost for one in candidates])
+    _draw_path(axes, places["0"][:, :2], ends[0], PATH_COLORS[0], "chosen")
+    for place in target.values():
+        axes.scatter(*place[0, :2], s=260, marker="*", color="#ffb300", edgecolor="black", zorder=9, label="goal")
+    _finish_axes(axes, low, high, axes.get_legend_handles_labels()[0])
+    _save(figure, out)
+
+
+def _draw_costs(figure: Any, axes: Any, places: Sequence[Array], costs: Sequence[float]) -> None:
+    """Draw lines in colours of their costs, the dearest first, with the bar of the colours."""
+    from matplotlib import colormaps
+    from matplotlib.collections import LineCollection
+
+    order = sorted(range(len(costs)), key=lambda number: -costs[number] if np.isfinite(costs[number]) else -np.inf)
+    values = np.ma.masked_invalid([costs[number] for number in order])
+    colors = colormaps[COST_COLORS].with_extremes(bad="#9e9e9e")
+    lines = LineCollection([places[number] for number in order], cmap=colors, linewidths=1.4, zorder=2.5)
+    lines.set_array(values)
+    axes.add_collection(lines)
+    ends = np.stack([places[number][-1] for number in order])
+    axes.scatter(*ends.T, s=14, c=values, cmap=lines.cmap, norm=lines.norm, zorder=2.6)
+    figure.colorbar(lines, ax=axes, label="cost", shrink=0.8)
+
+
+def _begin_figure(image: Array | None, extent: tuple[float, float, float, float] | None, size: Array) -> Any:
+    """Return a figure and its axes with the picture of a map, for so many metres across and up."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width, height = size
     scale = LONG_SIDE / max(width, height)
     figure = Figure(figsize=(max(3.2, width * scale + 1.0), max(2.6, height * scale + 0.8)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -63,16 +143,17 @@ def draw_map(
     axes.set_facecolor(UNSEEN)
     if image is not None:
         axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
-    for number, (name, place) in enumerate(places.items()):
-        headings = (lines[name][:, :3, 2] @ ground[:2].T).numpy()
-        end = headings[-1] / max(float(np.linalg.norm(headings[-1])), 1e-9) * ARROW * max(width, height)
-        _draw_path(axes, place[:, :2], end, PATH_COLORS[number % len(PATH_COLORS)], name)
-    if stops is not None and len(stops):
-        _draw_stops(axes, (stops[:, :3, 3].detach().cpu().double() @ ground.T).numpy())
-    handles = axes.get_legend_handles_labels()[0] if isinstance(paths, Mapping) else []
-    if _imagined(points).any():
-        handles.append(Patch(facecolor="#b8b8b8", edgecolor="white", hatch="////", label="imagined"))
-    _finish_axes(axes, low, high, handles)
+    return figure, axes
+
+
+def _arrow(path: Float[Tensor, "frame 4 4"], ground: Float[Tensor, "3 3"], side: float) -> Array:
+    """Return an arrow along the last view of a path, for a picture of ``side`` metres."""
+    heading: Array = (path[-1, :3, 2] @ ground[:2].T).numpy()
+    arrow: Array = heading / max(float(np.linalg.norm(heading)), 1e-9) * ARROW * side
+    return arrow
+
+
+def _save(figure: Any, out: Path) -> None:
     with written_aside(out) as aside:
         figure.savefig(aside, dpi=150, format="png")
 
@@ -146,12 +227,14 @@ def _ceiling(places: Mapping[str, Array]) -> float | None:
     return float(np.median(np.concatenate([place[:, 2] for place in places.values()]))) + ABOVE_CAMERA
 
 
-def _limits(extent: tuple[float, float, float, float] | None, places: Mapping[str, Array]) -> tuple[Array, Array]:
+def _limits(
+    extent: tuple[float, float, float, float] | None, places: Mapping[str, Array], margin: float = MARGIN
+) -> tuple[Array, Array]:
     corners = [place[:, :2] for place in places.values()]
     if extent is not None:
         corners.append(np.array([[extent[0], extent[2]], [extent[1], extent[3]]]))
     everything = np.concatenate(corners) if corners else np.zeros((1, 2))
-    return everything.min(0) - MARGIN, everything.max(0) + MARGIN
+    return everything.min(0) - margin, everything.max(0) + margin
 
 
 def _draw_path(axes: Any, place: Array, look: Array, color: str, name: str) -> None:

@@ -1,0 +1,129 @@
+"""``persist plan`` on micro models: what it leaves, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from persist_cli.viewing.video import read_video
+from tests.support.micro_runs import SIZE
+
+SMALL = ("--steps", 1, "--candidates", 6, "--rounds", 2, "--horizon", 3)
+
+
+@pytest.fixture
+def plan(persist, voxel, walks, tmp_path):
+    """Return a function that plans from a frame of a walk and returns what the command printed."""
+
+    def run(*options, start=f"{walks}#0:2", goal=f"{walks}#0:5", out=tmp_path / "plan"):
+        return persist("plan", voxel, "--start", start, "--goal", goal, "--out", out, *SMALL, *options)
+
+    return run
+
+
+@pytest.fixture
+def memory(persist, voxel, walks, tmp_path):
+    """A memory of the walk's scene that the model reads."""
+    path = tmp_path / "walk.safetensors"
+    assert persist("memorize", f"{walks}#0:0-8", "--checkpoint", voxel, "--out", path).code == 0
+    return path
+
+
+def test_a_plan_leaves_its_candidates_a_sheet_a_map_and_a_video(plan, memory, tmp_path):
+    result = plan("--cost", "distance", "--memory", memory)
+    assert result.code == 0, result.err
+    record = json.loads((tmp_path / "plan/plan.json").read_text())
+    costs = [candidate["cost"] for candidate in record["candidates"]]
+    assert costs == sorted(costs)
+    assert record["candidates"][0]["actions"] == record["text"]
+    assert len(record["actions"]) == 3
+    assert [one["round"] for one in record["rounds"]] == [1, 2]
+    assert record["rounds"][1]["least_cost"] == record["least_cost"] == costs[0]
+    assert np.shape(record["candidates"][0]["final_pose"]) == (4, 4)
+    assert len(read_video(tmp_path / "plan/plan.mp4", 64, 192)) == 4
+    assert Image.open(tmp_path / "plan/sheet.png").size[1] > 5 * 96
+    assert Image.open(tmp_path / "plan/map.png").size[0] > 300
+    assert "chosen: " in result.out
+    assert "what is really there is left out: the data is no simulator's" in result.out
+
+
+def test_a_seed_gives_the_same_plan_with_or_without_a_table(plan, tmp_path):
+    first, second = (plan("--cost", "distance", "--json", out=tmp_path / name) for name in ("a", "b"))
+    one, two = (json.loads(result.out) for result in (first, second))
+    assert one["candidates"] == two["candidates"]
+
+
+def test_a_ranked_policy_towards_a_place_on_the_map(plan, tmp_path):
+    result = plan("--method", "rank", "--policy", "straight", "--set", "cost.unknown=1.5", goal="1.0,-0.5")
+    assert result.code == 0, result.err
+    record = json.loads((tmp_path / "plan/plan.json").read_text())
+    assert record["cost"] == {"name": "geodesic", "settings": {"unknown": 1.5, "radius": 0.2}, "over": "last"}
+    assert record["policy"]["name"] == "straight"
+    assert record["goal"]["kinds"] == ["place"]
+
+
+def test_an_image_of_another_size_is_resized_and_said_so(plan, tmp_path, monkeypatch):
+    from persist_cli.metrics.lpips import ALEX, tensor_shapes
+    from tests.support.predictions import cache_random
+
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
+    cache_random(tmp_path / "cache", "lpips-alex", tensor_shapes(ALEX))
+    Image.new("RGB", (100, 80), "red").save(tmp_path / "goal.png")
+    result = plan(goal=tmp_path / "goal.png")
+    assert result.code == 0, result.err
+    assert f"resized from 100×80 to {SIZE}×{SIZE} pixels" in result.err
+    assert json.loads((tmp_path / "plan/plan.json").read_text())["cost"]["name"] == "lpips"
+
+
+PLACE = ("--cost", "distance")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--method", "cen"), "unknown --method 'cen'; did you mean 'cem'?"),
+        (("--cost", "lpipss"), "unknown cost 'lpipss'; did you mean 'lpips'?"),
+        (("--method", "rank", "--policy", "rando"), "unknown policy 'rando'; did you mean 'random'?"),
+        (("--over", "lst"), "unknown --over 'lst'; did you mean 'last'?"),
+        ((*PLACE, "--frames", 0), "a budget of 0 frames imagines nothing"),
+        ((*PLACE, "--frames", 2), "a budget of 2 frames does not suffice for one candidate of 3 actions"),
+        ((*PLACE, "--seconds", 0), "a budget of 0 seconds imagines nothing"),
+        ((*PLACE, "--actions", "forward,jump"), "unknown action 'jump'"),
+        ((*PLACE, "--policy", "random"), "--policy random: --method cem needs none; give --method rank"),
+        ((*PLACE, "--set", "method.elites=2"), "elites 2 is a share"),
+        ((*PLACE, "--set", "elites=2"), "write method.KEY=VALUE or policy.KEY=VALUE or cost.KEY=VALUE"),
+        ((*PLACE, "--method", "rank", "--actions", "left"), "--actions are those that --method cem chooses from"),
+    ],
+)
+def test_options_that_cannot_be_used_are_one_line_and_leave_nothing(plan, tmp_path, options, message):
+    result = plan(*options)
+    assert (result.code, result.out) == (1, "")
+    assert message in result.err
+    assert len(result.err.splitlines()) == 1
+    assert not (tmp_path / "plan").exists()
+
+
+@pytest.mark.parametrize(
+    ("goal", "options", "message"),
+    [
+        ("{walks}#1:5", PLACE, "is of scene 'room-1', start and memory are of 'room-0'"),
+        ("missing.png", (), "--goal missing.png: no such image; give an image file, a frame DATA#trajectory:frame"),
+        ("{tmp}/text.png", (), "not a whole image"),
+        ("1.0,2.0", ("--cost", "lpips"), "cost 'lpips' needs the image of the goal, which has none; give an image"),
+        ("{tmp}/goal.png", PLACE, "cost 'distance' needs the place of the goal, which has none; give a place"),
+    ],
+)
+def test_goals_that_cannot_be_used_are_one_line_and_leave_nothing(plan, walks, tmp_path, goal, options, message):
+    (tmp_path / "text.png").write_text("no image")
+    Image.new("RGB", (SIZE, SIZE)).save(tmp_path / "goal.png")
+    result = plan(*options, goal=goal.format(walks=walks, tmp=tmp_path))
+    assert (result.code, result.out) == (1, "")
+    assert message in result.err
+    assert not (tmp_path / "plan").exists()
+
+
+def test_a_memory_of_another_scene_is_one_line(plan, memory, walks):
+    result = plan(*PLACE, "--memory", memory, start=f"{walks}#1:2", goal=f"{walks}#1:5")
+    assert result.code == 1
+    assert "its reference is 'room-0', wanted here is 'room-1'" in result.err
