@@ -53,7 +53,9 @@ def plan(
     method: Annotated[
         str, typer.Option(help="rank: a policy proposes; cem: the best of a round lead the next.")
     ] = "cem",
-    policy: Annotated[str | None, typer.Option(help="Of rank: a policy of `persist plugins`; random.")] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="Of rank: of `persist plugins`, or a trained one's folder; random.")
+    ] = None,
     cost: Annotated[str | None, typer.Option(help="Of `persist plugins`; lpips, or geodesic to a place.")] = None,
     over: Annotated[str, typer.Option(help="Which frame counts: last, or the best of the clip.")] = "last",
     horizon: Annotated[int | None, typer.Option(min=1, help="Actions of a candidate; 8.")] = None,

@@ -30,7 +30,8 @@ from persist_cli.planning.goal import read_goal
 from persist_cli.planning.judge import Budget, Judge, check_goal
 from persist_cli.planning.outputs import Planned, write_plan
 from persist_cli.planning.planners import Cem, CemSettings, OnRound, Plan, Rank, RankSettings, action_names
-from persist_cli.plugins import make_cost, make_policy
+from persist_cli.plugins import make_cost
+from persist_cli.policies.open_policy import open_policy
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.surroundings import Surroundings
@@ -155,7 +156,7 @@ def plan_parts(options: PlanOptions) -> PlanParts:
 def chosen_policy(options: PlanOptions, settings: dict[str, Any]) -> Policy | None:
     """Return the policy of a method that ranks one's proposals, ``None`` for another method."""
     if options.method == "rank":
-        return make_policy(options.policy or "random", settings)
+        return open_policy(options.policy or "random", settings)
     if options.policy is not None or settings:
         raise PersistError(f"--policy {options.policy}: --method {options.method} needs none; give --method rank")
     return None
