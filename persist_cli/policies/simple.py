@@ -5,18 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from persist_cli.api.actions import Action, ActionVocabulary
 from persist_cli.api.ground import Body, Cover
 from persist_cli.api.policy import Policy, Situation
 from persist_cli.errors import PersistError
-
-CHECKS: Final = 4  # places that are looked up within the radius of the body, to each side
+from persist_cli.navigation.ways import way_is_free
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,11 @@ class RandomPolicy(Policy):
             PersistError: when it has no action that moves.
         """
         vocabulary = situation.info.vocabulary
-        weights = self.settings.weights or {action.name: 1.0 for action in ahead_or_turning(vocabulary)}
+        weights = self.settings.weights or {action.name: 1.0 for action in vocabulary.moving}
+        if not weights:
+            raise PersistError(
+                f"no action walks ahead or turns; policy 'random' needs one (known: {vocabulary.listing()})"
+            )
         names = [vocabulary[name].name for name in weights]
         shares = torch.tensor([*weights.values()], dtype=torch.float64).expand(count, -1)
         draws = torch.multinomial(shares, horizon, replacement=True, generator=generator)
@@ -80,7 +80,8 @@ class StraightPolicy(Policy):
         names: list[str] = []
         for _ in range(horizon):
             moved = vocabulary.move(pose, ahead.name, up)
-            if not is_blocked(situation, pose[:3, 3], moved[:3, 3]):
+            start, end = situation.ground.places(torch.stack([pose[:3, 3], moved[:3, 3]]))[:, None]
+            if int(way_is_free(situation.ground, start, end, Body().radius)) != Cover.OCCUPIED:
                 pose, side = moved, None
                 names.append(ahead.name)
                 continue
@@ -88,18 +89,6 @@ class StraightPolicy(Policy):
             pose = vocabulary.move(pose, side.name, up)
             names.append(side.name)
         return tuple(names)
-
-
-def ahead_or_turning(vocabulary: ActionVocabulary) -> list[Action]:
-    """The actions that walk ahead or turn.
-
-    Raises:
-        PersistError: when there is none.
-    """
-    chosen = list(vocabulary.moving)
-    if not chosen:
-        raise PersistError(f"no action walks ahead or turns; a policy needs one (known: {vocabulary.listing()})")
-    return chosen
 
 
 def gait(vocabulary: ActionVocabulary) -> tuple[Action, list[Action]]:
@@ -115,21 +104,3 @@ def gait(vocabulary: ActionVocabulary) -> tuple[Action, list[Action]]:
     sides = [[action for action in turning if action.turn * sign > 0] for sign in (1, -1)]
     smallest = [min(side, key=lambda action: abs(action.turn)) for side in sides if side]
     return max(steps, key=lambda action: action.forward), smallest
-
-
-def is_blocked(situation: Situation, start: Float[Tensor, " 3"], end: Float[Tensor, " 3"]) -> bool:
-    """Whether known ground is occupied within the default body's radius of the way between two places.
-
-    Args:
-        situation: its ground is looked up; what is unknown there counts as free.
-        start: world metres.
-        end: world metres.
-    """
-    ground, radius = situation.ground, Body().radius
-    along = torch.linspace(0, 1, 2 * CHECKS + 1, dtype=torch.float64)[1:, None]
-    offsets = torch.linspace(-radius, radius, 2 * CHECKS + 1, dtype=torch.float64)
-    across = torch.cartesian_prod(offsets, offsets)
-    across = across[across.norm(dim=1) <= radius + 1e-9]
-    first, last = ground.places(torch.stack([start, end]))
-    places = (first + (last - first) * along)[:, None] + across
-    return bool((ground.at(places) == Cover.OCCUPIED).any())

@@ -75,10 +75,9 @@ def test_straight_turns_before_a_wall_until_the_way_is_free():
     assert {way[:2] for way in ways} == {("forward", "forward")}  # the third step would end in the wall
     assert {way[2] for way in ways} == {"left", "right"}
     for way in ways:
-        turns = [name for name in way if name != "forward"]
-        assert len(turns) in (5, 6)
+        turns = way[2 : way.index("forward", 2)]
+        assert len(turns) in (4, 5, 6)  # to within 30 degrees of along the wall
         assert len(set(turns)) == 1
-        assert way[-1] == "forward"
 
 
 def test_a_moved_world_origin_does_not_change_where_straight_turns():
