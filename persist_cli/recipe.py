@@ -21,19 +21,13 @@ from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
 
 EXTENDS: Final = "extends"
-
 # the key that chooses a variant: settings of one variant mean nothing to another
 CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "policy": "name", "adapter": "form"}
 SETTINGS: Final = ("adapter", "settings", "encoder_settings")  # keys that may be left empty
-SETTINGS_OF: Final = {
-    "backbone.name": "settings", "memory.name": "settings", "memory.encoder": "encoder_settings",
-    "policy.name": "settings",
-}  # fmt: skip
-
+NAMES: Final = ("backbone.name", "memory.name", "policy.name")
+SETTINGS_OF: Final = {"memory.encoder": "encoder_settings"} | dict.fromkeys(NAMES, "settings")
 OF_A_BACKBONE: Final = ("gradient_checkpointing", "compile", "frozen_precision", "vae_slicing")  # settings of training
-
 CHANGEABLE: Final = "a run may be resumed with another value"
-
 Value = TypeVar("Value")
 Changeable = Annotated[Value, CHANGEABLE]
 
@@ -150,7 +144,7 @@ class PolicyConfig:
     """The choice of the policy to train.
 
     Args:
-        name: name of a policy plugin that is trained; ``persist plugins`` lists policies.
+        name: name of a policy plugin that is trained.
         settings: settings of its network.
     """
 
@@ -401,8 +395,7 @@ def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
 
 def _contradictions(recipe: Recipe) -> list[str]:
     """Describe each group of settings that are valid alone but not together."""
-    training = recipe.training
-    problems = []
+    training, problems = recipe.training, _of_a_policy(recipe)
     if training.cooldown > training.steps:
         problems.append(
             f"training.cooldown {training.cooldown} is more than training.steps {training.steps}; set both, as in "
@@ -420,24 +413,20 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("data.own_writes is for stages 1 and 2; leave it out")
     if training.frozen_precision == "bf16" and training.precision == "no":
         problems.append("training.frozen_precision bf16 needs training.precision bf16")
-    problems += _of_a_policy(recipe)
     if training.batch % training.accumulation:
         problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
     return problems
 
 
 def _of_a_policy(recipe: Recipe) -> list[str]:
-    """Describe what a recipe of a policy has that means nothing to it, or lacks."""
+    """Describe what a recipe of a policy lacks, or has that means nothing to it."""
     if (recipe.stage == "policy") != (recipe.policy is not None):
         return ["stage policy needs policy, as in policy: {name: nomad}; the other stages do not take it"]
-    if recipe.policy is None:
-        return []
-    own, none = to_plain(recipe), DataSettings(recipe.data.path, mirror=recipe.data.mirror)
-    data = [f"data.{key}" for key, value in _copy(dataclasses.asdict(none)).items() if own["data"][key] != value]
-    savings = [f"training.{key}" for key in OF_A_BACKBONE if own["training"][key] != getattr(TrainingSettings, key)]
-    backbone = ["backbone"] if recipe.backbone != BackboneConfig() else []
-    wrong = [*backbone, *data, *savings]
-    return [f"stage policy takes no {', '.join(wrong)}; leave them out"] if wrong else []
+    data, allowed = recipe.data, DataSettings(recipe.data.path, mirror=recipe.data.mirror)
+    wrong = ["backbone"] if recipe.backbone != BackboneConfig() else []
+    wrong += [f"data.{key}" for key, value in vars(allowed).items() if getattr(data, key) != value]
+    wrong += [f"training.{key}" for key in OF_A_BACKBONE if getattr(recipe.training, key) not in (False, "no")]
+    return [f"stage policy takes no {', '.join(wrong)}; leave them out"] if wrong and recipe.policy else []
 
 
 def to_plain(recipe: Recipe) -> dict[str, Any]:

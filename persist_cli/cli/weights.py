@@ -9,7 +9,9 @@ import typer
 
 from persist_cli.cli.options import JsonOption
 
-weights_app = typer.Typer(no_args_is_help=True, help="Weights of encoders and metrics: what there is, fetch, path.")
+weights_app = typer.Typer(
+    no_args_is_help=True, help="Weights of encoders, metrics, policies: what there is, fetch, path."
+)
 
 
 @weights_app.command("list")
@@ -27,6 +29,7 @@ def weights_fetch(
         Path | None, typer.Option("--from", help="Directory to look into first; else $PERSIST_WEIGHTS.")
     ] = None,
     offline: Annotated[bool, typer.Option("--offline", help="Never ask the network.")] = False,
+    sha256: Annotated[str | None, typer.Option(help="Of a file whose hash is not known here, as nomad's.")] = None,
 ) -> None:
     """Bring weights into the cache, verified and as safetensors: from a directory, the hub, or a pinned archive.
 
@@ -34,7 +37,7 @@ def weights_fetch(
     """
     from persist_cli.weights.fetch import run_fetch
 
-    run_fetch(names, source, offline)
+    run_fetch(names, source, offline, sha256)
 
 
 @weights_app.command("path")

@@ -77,12 +77,24 @@ def save_policy(network: PolicyNetwork, policy: str, folder: Path, scenes: Train
         scenes: the scenes that it was trained on, where they are known.
     """
     network.save(folder)
+    write_policy_card(folder, policy, asdict(network.settings), scenes)
+    write_sums(folder)
+
+
+def write_policy_card(folder: Path, policy: str, settings: dict[str, Any], scenes: TrainingScenes | None) -> None:
+    """Write the card that makes a folder with a network's weights a trained policy.
+
+    Args:
+        folder: the folder.
+        policy: the name of the policy's plugin.
+        settings: plain settings of its network.
+        scenes: the scenes that it was trained on, where they are known.
+    """
     hashes = "".join(file_sha256(path) for path in sorted(folder.glob("*.safetensors")))
     fingerprint = hashlib.sha256(hashes.encode()).hexdigest()
     card: dict[str, Any] = {"format": FORMAT, "version": VERSION, "policy": policy, "fingerprint": fingerprint}
     lineage = {} if scenes is None else {"training_scenes": scenes.to_json()}
-    write_json(folder / CARD, card | {"settings": asdict(network.settings)} | lineage)
-    write_sums(folder)
+    write_json(folder / CARD, card | {"settings": settings} | lineage)
 
 
 def find_policy(path: Path) -> TrainedPolicy:

@@ -22,7 +22,7 @@ from persist_cli import __version__
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import file_sha256, read_tensors, write_json, write_tensors, written_aside
 from persist_cli.weights.catalog import Archive, Weight
-from persist_cli.weights.conversion import CONFIGS, CONVERSIONS
+from persist_cli.weights.conversion import CARDS, CONFIGS, CONVERSIONS
 from persist_cli.weights.weight_sources import WeightFile
 
 MODEL: Final = "model.safetensors"
@@ -61,6 +61,8 @@ def fill_folder(weight: Weight, file: WeightFile, folder: Path) -> str:
         provenance = _copy_converted(weight, file, folder)
     if weight.name in CONFIGS:
         write_json(folder / "config.json", CONFIGS[weight.name])
+    if weight.name in CARDS:
+        CARDS[weight.name](folder)
     card = {
         "name": weight.name,
         "title": weight.title,

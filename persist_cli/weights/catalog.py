@@ -47,6 +47,7 @@ class Weight:
         digest: ``tensors_digest`` of the converted tensors; ``None`` when it is not converted.
         archive: pinned archive that holds it.
         hub: repository of the hub that holds it.
+        original: name of the original file, where no archive holds it; its SHA-256 is then the user's to give.
         otherwise: what to do when no source has it.
     """
 
@@ -59,6 +60,7 @@ class Weight:
     digest: str | None = None
     archive: Archive | None = None
     hub: HubRepository | None = None
+    original: str | None = None
     otherwise: str = "copy it into a folder and name that with --from"
 
     def sources(self) -> list[str]:
@@ -151,6 +153,15 @@ WEIGHTS: Final[dict[str, Weight]] = {
             "MIT",
             otherwise="neither hub nor package index has it as safetensors: merge the released checkpoint into a "
             "folder as dreamsim/model.safetensors and name that with --from",
+        ),
+        Weight(
+            "nomad",
+            "NoMaD",
+            "policy nomad",
+            "MIT",
+            original="nomad.pth",
+            otherwise="download nomad.pth as github.com/robodhruv/visualnav-transformer says, and name its folder with "
+            "--from and its hash with --sha256",
         ),
         Weight(
             "efficientnet-lite0",

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from persist_cli.errors import CheckpointError
 from persist_cli.metrics.lpips import ALEX, VGG
+from persist_cli.weights.nomad import our_names, write_nomad_card
 from persist_cli.weights.onnx import linear_weights, read_onnx_weights
 from persist_cli.weights.unpickling import read_pickled_arrays
 
@@ -127,6 +128,11 @@ def convert_state_dict(path: Path) -> Tensors:
     return {str(name): value.contiguous() for name, value in state.items()}
 
 
+def convert_nomad(path: Path) -> Tensors:
+    """The tensors of NoMaD's published file under the names of our network."""
+    return our_names(convert_state_dict(path), path)
+
+
 def check_names(path: Path, names: Iterable[str], expected: Iterable[str]) -> None:
     """Raise ``CheckpointError`` with the number of names that are missing or unknown, and one of each."""
     missing, unknown = sorted(set(expected) - set(names)), sorted(set(names) - set(expected))
@@ -154,6 +160,9 @@ CONVERSIONS: Final[dict[str, Callable[[Path], Tensors]]] = {
     "lpips-vgg": convert_lpips_vgg,
     "i3d-kinetics-400": convert_i3d,
     "efficientnet-lite0": convert_state_dict,
+    "nomad": convert_nomad,
 }
 
 CONFIGS: Final[dict[str, dict[str, object]]] = {"dinov2-s-derived": DINO_CONFIG}
+
+CARDS: Final[dict[str, Callable[[Path], None]]] = {"nomad": write_nomad_card}  # of policies, beside their weights

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import file_sha256, folder_aside, read_json
@@ -15,10 +18,11 @@ from persist_cli.weights.cache import fill_folder
 from persist_cli.weights.catalog import WEIGHTS, Weight, find_weight
 from persist_cli.weights.weight_sources import DOWNLOADS, find_source, from_directory
 
+SHA256: Final = re.compile("[0-9a-fA-F]{64}")
 COLUMNS = ("name", "for", "licence", "MB", "from", "here")
 
 
-def run_fetch(names: Sequence[str], directory: Path | None, offline: bool) -> None:
+def run_fetch(names: Sequence[str], directory: Path | None, offline: bool, sha256: str | None = None) -> None:
     """Bring weights into the cache, silently those that are there; one that fails does not stop the others.
 
     An interrupted fetch leaves every weight that was done, every archive that was downloaded whole, and the parts of
@@ -28,11 +32,14 @@ def run_fetch(names: Sequence[str], directory: Path | None, offline: bool) -> No
         names: names of weights.
         directory: directory to look into first; else that of the environment variable ``PERSIST_WEIGHTS``.
         offline: never use the network.
+        sha256: SHA-256 of the original file of the one weight that is named, whose hash persist does not know.
 
     Raises:
         PersistError: one line that says for each missing weight which sources failed and why, and what to do.
     """
     weights = [find_weight(name) for name in dict.fromkeys(names)]
+    if sha256 is not None:
+        weights = [with_hash(weights, sha256)]
     directory = from_directory(directory)
     if directory is not None and not directory.is_dir():
         raise PersistError(f"{directory}: no such directory of weights")
@@ -47,6 +54,20 @@ def run_fetch(names: Sequence[str], directory: Path | None, offline: bool) -> No
     shutil.rmtree(weights_home() / DOWNLOADS, ignore_errors=True)
 
 
+def with_hash(weights: Sequence[Weight], sha256: str) -> Weight:
+    """The only one of the weights with the SHA-256 that the user gives for its original file.
+
+    Raises:
+        PersistError: when it is no SHA-256, several weights are named, or persist knows the hash itself.
+    """
+    if not SHA256.fullmatch(sha256):
+        raise PersistError(f"--sha256 {sha256}: a SHA-256 has 64 digits of 0-9 and a-f, as sha256sum prints it")
+    if len(weights) != 1 or not weights[0].original:
+        unknown = ", ".join(weight.name for weight in WEIGHTS.values() if weight.original)
+        raise PersistError(f"--sha256 is for one weight whose hash is not known here ({unknown}); name that alone")
+    return dataclasses.replace(weights[0], sha256=sha256.lower())
+
+
 def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
     """Bring one weight into the cache, whole or not at all, and print on one line where it came from.
 
@@ -54,6 +75,11 @@ def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
     """
     if is_whole(weight.name):
         return
+    if weight.original and weight.sha256 is None:
+        raise PersistError(
+            f"weights {weight.name}: refused without a hash; that of {weight.original} is not known here, so give "
+            "the one that you trust: --sha256 HASH"
+        )
     home = weights_home()
     try:
         home.mkdir(parents=True, exist_ok=True)

@@ -94,6 +94,8 @@ def find_in_directory(weight: Weight, directory: Path) -> WeightFile | None:
     if weight.archive:
         places.append((directory / weight.archive.file, "archive"))
         places.append((directory / Path(weight.archive.member).name, "original"))
+    if weight.original:
+        places.append((directory / weight.original, "original"))
     if _is_folder_of(weight, directory):
         places.append((directory / "model.safetensors", "converted"))
     for path, form in places:
