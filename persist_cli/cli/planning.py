@@ -120,3 +120,37 @@ def bench_episodes(
 
     search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed)
     run_episodes(CollectPlan(simulator, scenes, size=size, split=split), search, out, json)
+
+
+@bench_app.command("collisions")
+def bench_collisions(
+    checkpoint: Annotated[Path | None, typer.Argument(help="A run or checkpoint; else the reference model.")] = None,
+    out: Annotated[Path, typer.Option(help="JSON file of the result.")] = Path("collisions.json"),
+    simulator: Annotated[str, typer.Option(help="A simulator; `persist plugins` lists them.")] = "miniworld",
+    scenes: Annotated[str, typer.Option(help="Scene seeds A:B, B not included.")] = "0:12",
+    split: Annotated[str, typer.Option(help="train, validation or test: they share no scene.")] = "test",
+    walks: Annotated[int, typer.Option(min=1, help="Random walks in each scene.")] = 4,
+    actions: Annotated[int, typer.Option(min=1, help="Actions of each walk that the simulator allows.")] = 24,
+    memories: Annotated[str | None, typer.Option(help="Of the checkpoint, with commas; else default and none.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the walks.")] = 0,
+    steps: StepsOption = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
+    context_noise: ContextNoiseOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Compare what an agent takes for blocked with the simulator's collisions: by true and by imagined frames.
+
+    persist bench collisions --scenes 0:12 --memories voxel,none --out runs/collisions.json
+    """
+    from persist_cli.bench.collisions import CollisionPlan, run_collisions
+    from persist_cli.simulators.collect import CollectPlan
+
+    plan = CollisionPlan(
+        CollectPlan(simulator, scenes, split=split, seed=seed), walks, actions,
+        None if memories is None else split_names(memories), SamplingOverrides(steps, sampler, guidance, context_noise),
+        InferenceOptions.of(dtype, save_memory),
+    )  # fmt: skip
+    run_collisions(checkpoint, plan, out, json)
