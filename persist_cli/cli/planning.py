@@ -139,6 +139,7 @@ def bench_collisions(
     context_noise: ContextNoiseOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
+    verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
     """Compare what an agent takes for blocked with the simulator's collisions: by true and by imagined frames.
