@@ -25,6 +25,7 @@ from persist_cli.environments.task import (
     moving_actions,
     observation_space,
 )
+from persist_cli.errors import DataError
 
 RENDER_MODES = ["rgb_array"]
 
@@ -182,8 +183,16 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
 
 
 def named(action: Any, names: Sequence[str]) -> list[str]:
-    """Return the names of the actions of one step: of a number, or of a chunk of numbers."""
-    return [names[int(number)] for number in np.atleast_1d(action)]
+    """Return the names of the actions of one step: of a number, or of a chunk of numbers.
+
+    Raises:
+        DataError: for a number that no action has.
+    """
+    numbers = [int(number) for number in np.atleast_1d(action)]
+    for number in numbers:
+        if not 0 <= number < len(names):
+            raise DataError(f"action {number}: they are 0 to {len(names) - 1} ({', '.join(names)})")
+    return [names[number] for number in numbers]
 
 
 def environment_seeds(seed: int | Sequence[int | None] | None, count: int) -> Sequence[int | None]:

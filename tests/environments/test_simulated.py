@@ -33,6 +33,14 @@ def test_actions_are_those_that_move_in_the_order_of_the_vocabulary():
     assert make().unwrapped.actions == ("forward", "left", "right")
 
 
+def test_an_action_that_there_is_not_is_named():
+    env = make().unwrapped
+    env.reset(seed=0)
+    for wrong in (3, -1):
+        with pytest.raises(PersistError, match=rf"action {wrong}: they are 0 to 2 \(forward, left, right\)"):
+            env.step(wrong)
+
+
 def test_equal_seeds_give_equal_episodes_and_other_seeds_others():
     env = make()
     first, again, other = (env.reset(seed=seed)[0] for seed in (3, 3, 4))
