@@ -97,7 +97,6 @@ class ImaginedScenes(Scenes):
         if self.given is not None:
             memorize_frames(world, self.given)
         self.known = KnownGround(self._map(settings), body_of(info).radius, settings)
-        self.body = body_of(info) if settings.collide else None
         free = Goals(self.known.free_places(self.starts.positions), info.scene)
         self.goals = find_goals(settings.goal, free, settings.observe_goal)
         self._agents = [self.first] * count
@@ -108,7 +107,7 @@ class ImaginedScenes(Scenes):
         start, goal = self._draw(draws)
         frame = self.starts[start]
         first = self.first
-        agent = Agent(first.memory, int(draws.integers(SEEDS)), first.write, shared=True, body=self.body)
+        agent = Agent(first.memory, int(draws.integers(SEEDS)), first.write, shared=True, body=first.body)
         self._world([agent]).reset([frame], [self.info])
         self._agents[number], self._goals[number] = agent, goal
         (view,) = self._views(number, frame, [True])
@@ -192,6 +191,7 @@ def open_house(settings: ImaginedSettings, starts: PosedFrames) -> tuple[WorldMo
     plan = RolloutPlan(
         settings.start, (), False, 0, settings.memory_file, settings.adapter, settings.write, 0,
         settings.sampling, InferenceOptions(), settings.step, settings.turn,
+        body=settings.collide,
     )  # fmt: skip
     info = replace(starts.info, vocabulary=walking_vocabulary(starts.file, plan))
     if adapter is None and settings.memory is not None:

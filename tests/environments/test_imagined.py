@@ -69,9 +69,8 @@ def test_each_episode_begins_with_the_memory_as_it_was_given(settings):
     assert all(np.array_equal(one["rgb"], two["rgb"]) for one, two in zip(first, again, strict=True))
 
 
-def test_an_agent_that_walks_straight_on_stops_at_the_wall_and_pays_for_it(settings):
-    bare = settings | {"adapter": "stage1", "memory": None}
-    env, ghost = make(bare).unwrapped, make(bare, collide=False).unwrapped
+def test_an_agent_that_walks_straight_on_stops_at_the_wall_and_pays_for_it(packaged):
+    env, ghost = (gymnasium.make(**packaged, collide=collide).unwrapped for collide in (True, False))
     for one in (env, ghost):
         one.scenes.world = RoomWorld([])  # imagines the room as it is
         one.reset(seed=0)

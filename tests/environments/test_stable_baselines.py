@@ -8,7 +8,6 @@ import pytest
 
 import persist_cli.environments  # noqa: F401  registers them
 from persist_cli.errors import PersistError
-from tests.support.micro_runs import write_walks
 from tests.support.miniworlds import make_world
 
 pytest.importorskip("stable_baselines3", reason="it is in the extra dev")
@@ -19,16 +18,6 @@ from stable_baselines3.common.vec_env import VecMonitor
 from persist_cli.environments.stable_baselines import BatchedVecEnv
 
 TRUE = {"id": "persist/SimulatedHouse-v0", "scenes": "0:2", "split": "test"}
-
-
-@pytest.fixture(scope="module")
-def imagined(tmp_path_factory) -> dict[str, object]:
-    """An imagined house of the packaged model's image size, which a network for images needs."""
-    walks = write_walks(tmp_path_factory.mktemp("walks"), size=64)
-    return {
-        "id": "persist/ImaginedHouse-v0", "start": f"{walks}#0:6", "goal": f"{walks}#0:0-9", "adapter": "stage1",
-        "sampling": {"steps": 1}, "success_radius": 0.1, "goal_distance": [0.15, 5.0],
-    }  # fmt: skip
 
 
 def learned(environment: object, steps: int = 8) -> PPO:
@@ -43,9 +32,8 @@ def test_ppo_learns_in_a_true_house():
     assert learned(gymnasium.make(**TRUE)).num_timesteps == 8
 
 
-def test_ppo_learns_in_an_imagined_house(imagined, monkeypatch):
-    monkeypatch.delenv("PERSIST_REFERENCE", raising=False)
-    assert learned(gymnasium.make(**imagined)).num_timesteps == 8
+def test_ppo_learns_in_an_imagined_house(packaged):
+    assert learned(gymnasium.make(**packaged)).num_timesteps == 8
 
 
 def test_ppo_learns_from_chunks_of_actions():
