@@ -23,6 +23,7 @@ from persist_cli.rollout.world_model import WorldModel
 
 Over = Literal["last", "best"]  # which frame of a candidate is judged: its last, or the one of least cost
 Actions = Sequence[str]
+Pose = Float[Tensor, "4 4"]
 
 
 @dataclass(frozen=True)
@@ -141,15 +142,16 @@ class SimulatorFutures:
             DataError: for an action that changes the scene, since going back does not undo it.
         """
         ground, heading = self.simulator.agent
+        start = torch.from_numpy(self.simulator.observe().world_from_camera).double()
         try:
             walked = []
             for names in candidates:
                 self.simulator.place(ground, heading)
-                walked.append(self._walk(names, over))
+                walked.append(self._walk(start, names, over if sees else None))
         finally:
             self.simulator.place(ground, heading)
         walks = [walk for walk, _ in walked]
-        poses, free = padded(walks, self._pose(), over)
+        poses, free = padded(walks, start, over)
         if not sees:
             return Imagined(without_images(poses, free), walks)
         videos = [[*frames, *[frames[-1]] * (poses.shape[1] - len(frames))] for _, frames in walked]
@@ -157,23 +159,20 @@ class SimulatorFutures:
         depth = torch.from_numpy(np.stack([[frame.depth for frame in video] for video in videos])).float()
         return Imagined(Futures(rgb, depth, poses, free), walks)
 
-    def _walk(self, names: Actions, over: Over) -> tuple[Walk, list[Frame]]:
-        """Do the actions; return the walk, and the frames to judge."""
-        free, poses, frames = [], [], []
-        for name in names:
-            if self.simulator.info.vocabulary[name].interaction:
+    def _walk(self, start: Pose, names: Actions, over: Over | None) -> tuple[Walk, list[Frame]]:
+        """Do the actions from a pose; return the walk, and the frames to judge: none for ``None``."""
+        info, free, poses, frames = self.simulator.info, [], [start], []
+        world_up = torch.tensor(info.world_up, dtype=torch.float64)
+        for number, name in enumerate(names, 1):
+            if info.vocabulary[name].interaction:
                 raise DataError(f"action {name!r} changes the scene, which the simulator as a model cannot undo")
             free.append(self.simulator.act(name))
+            poses.append(info.vocabulary.move(poses[-1], name, world_up) if free[-1] else poses[-1])
+            if over == "best" or (over == "last" and number == len(names)):
+                frames.append(self.simulator.observe())
+        if over is not None and not frames:
             frames.append(self.simulator.observe())
-            poses.append(torch.from_numpy(frames[-1].world_from_camera))
-        frames = frames or [self.simulator.observe()]
-        walk = Walk(
-            torch.stack(poses) if poses else torch.zeros(0, 4, 4, dtype=torch.float64), torch.tensor(free).bool()
-        )
-        return walk, frames[-1:] if over == "last" else frames
-
-    def _pose(self) -> Tensor:
-        return torch.from_numpy(self.simulator.observe().world_from_camera)
+        return Walk(torch.stack(poses)[1:], torch.tensor(free, dtype=torch.bool)), frames
 
 
 def walk_all(

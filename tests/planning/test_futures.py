@@ -106,5 +106,8 @@ def test_the_simulator_shows_what_is_there_and_the_agent_stands_where_it_stood()
         put_somewhere(world)
         assert [world.act(name) for name in names] == imagined.free[number, : len(names)].tolist()
         assert (world.observe().rgb == imagined.rgb[number, -1].numpy()).all()
+        torch.testing.assert_close(
+            imagined.world_from_camera[number, -1], torch.from_numpy(world.observe().world_from_camera)
+        )
     with pytest.raises(DataError, match="action 'drop' changes the scene"):
         SimulatorFutures(world).imagine([["drop"]], "last")
