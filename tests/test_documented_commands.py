@@ -24,9 +24,11 @@ import yaml
 
 from persist_cli.cli.app import app
 from persist_cli.errors import PluginError
+from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.plugins import make_simulator
 from tests.support.documented import Block, commands, read_blocks, run_here, shown_commands, shows
 from tests.support.micro_runs import write_walks
+from tests.support.predictions import cache_random
 from tests.support.rooms import write_sequence
 from tests.support.text_encoder import write_text_encoder
 from tests.support.twins import write_twin
@@ -46,6 +48,7 @@ SHORTER = {
         "training.cooldown=0",
     ),
     "rollout": ("--steps", "1"),
+    "plan": ("--candidates", "5", "--rounds", "1"),
     "eval": ("--clips", "1", "--seeds", "1", "--steps", "1"),
     "collect": ("--workers", "1"),
 }  # fmt: skip
@@ -102,6 +105,7 @@ GIVEN: dict[str, Callable[[Path], object]] = {
     "captures/kitchen": lambda path: write_sequence(path, 48, (48, 64)),  # twice around, so that clips return
     "DATA": write_walks,
     "DIR": lambda path: write_text_encoder(write_twin("5b-i2v", path)),
+    "weights fetch lpips-alex\n": lambda path: cache_random(path.parent / "cache", "lpips-alex", tensor_shapes(ALEX)),
 }
 
 
