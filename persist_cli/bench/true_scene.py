@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -94,8 +95,10 @@ class TrueScene:
 
     @property
     def info(self) -> TrajectoryInfo:
-        """Camera, up axis and vocabulary of the scene."""
-        return self.simulator.info
+        """Camera, up axis and vocabulary of the scene; its source tells the agent's body, where the simulator does."""
+        told = {name: getattr(self.simulator.settings, name, None) for name in ("camera_height", "radius")}
+        info = self.simulator.info
+        return replace(info, source=info.source | {name: value for name, value in told.items() if value is not None})
 
     @property
     def goal(self) -> Goal:
@@ -114,6 +117,16 @@ class TrueScene:
     def look(self) -> Observations:
         """Return the present frame."""
         return look(self.simulator)
+
+    def look_and_measure(self) -> tuple[Observations, float]:
+        """Return the present frame, and the geodesic metres to the goal."""
+        return self.look(), self.distance
+
+    def act_and_measure(self, actions: Sequence[str]) -> Iterator[tuple[Observations, float]]:
+        """Act from where the agent is, and yield after each action what ``look_and_measure`` returns."""
+        for action in actions:
+            self.simulator.act(action)
+            yield self.look_and_measure()
 
     def follow(self, actions: Sequence[str]) -> tuple[Observations, list[bool]]:
         """Act from where the agent is, and return the frames before, between and after, and what was allowed."""

@@ -1,0 +1,216 @@
+"""The agent of a row: what it knows of the scene, and how it decides."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+
+from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.cost import Cost
+from persist_cli.api.ground import Body
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.api.policy import Goal, Policy, Situation
+from persist_cli.api.simulator import Simulator
+from persist_cli.bench.rows import PlanningRow
+from persist_cli.bench.true_scene import TrueScene
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.navigation.ground_mapper import GroundMapper, body_of
+from persist_cli.planning.futures import FutureModel, SimulatorFutures, WorldFutures
+from persist_cli.planning.judge import Budget, Judge
+from persist_cli.planning.planners import Cem, CemSettings, Planner, Rank, RankSettings
+from persist_cli.rollout.world_model import Agent, WorldModel
+
+MOST_SEEDS = 2**31  # seeds of the sampling noise are below it
+
+DECISIONS = 100_000  # more than an episode has, so that no two decisions of all episodes share a seed
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """How all rows that imagine plan.
+
+    Args:
+        horizon: most actions that a decision looks ahead.
+        over: which frame of a candidate is judged.
+        rounds: most rounds of ``cem``.
+        budget: the most that a decision may imagine.
+        batch: candidates imagined together.
+        body: whether imagined moves over ground known to be occupied do not move.
+    """
+
+    horizon: int = 8
+    over: Literal["last", "best"] = "last"
+    rounds: int = 3
+    budget: Budget = field(default_factory=Budget)
+    batch: int = 20
+    body: bool = True
+
+
+@dataclass(frozen=True)
+class RowParts:
+    """What a row is made of, loaded once for all episodes.
+
+    Args:
+        policy: proposes; ``None`` for ``cem``.
+        cost: judges; ``None`` without imagination.
+        backbone: of the world model, with the row's adapter; ``None`` without one.
+        factory: makes the memories that the adapter reads; ``None`` without one.
+        sampling: of the world model.
+    """
+
+    policy: Policy | None = None
+    cost: Cost | None = None
+    backbone: Backbone | None = None
+    factory: MemoryFactory | None = None
+    sampling: Sampling = field(default_factory=Sampling)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What an agent decided.
+
+    Args:
+        actions: to do; empty means: stop.
+        frames: that were imagined for it.
+        seconds: that it took.
+    """
+
+    actions: tuple[str, ...]
+    frames: int
+    seconds: float
+
+
+class Navigator:
+    """An agent at the start of an episode, which has been given what its row is given.
+
+    Args:
+        row: the row.
+        parts: of that row.
+        settings: of planning.
+        scene: the true scene; the agent sees its start, goal and walk, and the rows of the simulator plan in it.
+        horizon: most actions that a decision looks ahead.
+    """
+
+    def __init__(
+        self, row: PlanningRow, parts: RowParts, settings: PlanSettings, scene: TrueScene, horizon: int
+    ) -> None:
+        self.row, self.parts, self.settings = row, parts, settings
+        self.info, self.seed = scene.info, scene.episode.seed
+        self.goal = told_goal(scene.goal, row)
+        self.seen = scene.look()
+        walk = scene.walk() if row.walk else self.seen[:0]
+        body = body_of(self.info)
+        self.ground = GroundMapper(self.info.world_up, body)
+        self.world = make_world(parts, walk, self.seen, self.info, self.seed)
+        memory = self.world.agents[0].memory if self.world else None
+        if memory is not None:
+            self._add_points(memory, body)
+        elif not row.imagines:
+            self.ground.add(walk)
+        self.ground.add(self.seen)
+        self.body = body if settings.body else None
+        self.decisions = 0
+        self.decide_once = self._decider(scene.simulator, horizon)
+
+    def saw(self, frames: Observations, executed: int) -> None:
+        """Take in the frames after ``executed`` actions: they are written to the memory and to the ground map."""
+        kept = self.parts.policy.frames if self.parts.policy is not None else 1
+        self.seen = Observations.concatenate([self.seen, frames])[-kept:]
+        self.ground.add(frames)
+        if self.world is not None:
+            agent = self.world.agents[0]
+            agent.observe(frames)
+            agent.memorize(frames, self.world.backbone.device)
+        if self.planner is not None:
+            self.planner.executed(executed)
+
+    def decide(self) -> Decision:
+        """Return the next actions."""
+        generator = torch.Generator().manual_seed(self.seed * DECISIONS + self.decisions)
+        situation = Situation(self.seen, self.info, self.goal, self.ground.map())
+        self.decisions += 1
+        begun = time.monotonic()
+        with torch.no_grad():
+            actions, frames = self.decide_once(situation, generator)
+        return Decision(actions, frames, time.monotonic() - begun)
+
+    def _decider(
+        self, simulator: Simulator, horizon: int
+    ) -> Callable[[Situation, torch.Generator], tuple[tuple[str, ...], int]]:
+        """Return what decides: a function of situation and generator that gives actions and imagined frames."""
+        policy, self.planner = self.parts.policy, None
+        if policy is not None and policy.longest is not None:
+            horizon = min(horizon, policy.longest)
+        if not self.row.imagines:
+            return lambda situation, generator: (_first_proposal(policy, situation, horizon, generator), 0)
+        planner = self.planner = make_planner(self.row, policy, self.settings, horizon)
+
+        def imagine(situation: Situation, generator: torch.Generator) -> tuple[tuple[str, ...], int]:
+            judge = self._judge(self._model(simulator, situation), situation)
+            plan = planner.plan(situation, judge, generator, _no_notice)
+            return plan.actions, plan.frames
+
+        return imagine
+
+    def _model(self, simulator: Simulator, situation: Situation) -> FutureModel:
+        """Return the model under which candidates are judged."""
+        if self.world is None:
+            return SimulatorFutures(simulator)
+        return WorldFutures(self.world, situation.ground, self.body)
+
+    def _judge(self, model: FutureModel, situation: Situation) -> Judge:
+        cost, settings = self.parts.cost, self.settings
+        if cost is None:
+            raise ValueError(f"row {self.row.name!r} imagines and has no cost")
+        return Judge(model, cost, self.goal, situation.ground, settings.over, settings.budget, settings.batch)
+
+    def _add_points(self, memory: Memory, body: Body) -> None:
+        """Add what a memory knows of the ground, whose floor lies below the present camera."""
+        height = float((self.ground.axes @ self.seen.cameras.centers[0].double())[2])
+        self.ground.add_points(memory.points(), height - body.camera_height)
+
+
+def told_goal(goal: Goal, row: PlanningRow) -> Goal:
+    """Return of a goal what a row is told: the image or the place."""
+    return Goal(goal.rgb, None, goal.scene) if row.goal == "image" else Goal(None, goal.position, goal.scene)
+
+
+def make_world(
+    parts: RowParts, walk: Observations, seen: Observations, info: TrajectoryInfo, seed: int
+) -> WorldModel | None:
+    """Return a world model at the present frame whose memory holds a walk and that frame; ``None`` without one."""
+    if parts.backbone is None:
+        return None
+    memory = None if parts.factory is None else parts.factory.empty(info)
+    agent = Agent(memory, seed % MOST_SEEDS)
+    if len(walk):
+        agent.memorize(walk, parts.backbone.device)
+    world = WorldModel(parts.backbone, [agent], parts.sampling)
+    world.reset([seen], [info])
+    return world
+
+
+def make_planner(row: PlanningRow, policy: Policy | None, settings: PlanSettings, horizon: int) -> Planner:
+    """Return the planner of a row that imagines."""
+    if row.planner == "cem":
+        return Cem(CemSettings(horizon=horizon, candidates=row.candidates, rounds=settings.rounds))
+    if policy is None:
+        raise ValueError(f"row {row.name!r} ranks and has no policy")
+    return Rank(policy, RankSettings(horizon=horizon, candidates=row.candidates))
+
+
+def _first_proposal(
+    policy: Policy | None, situation: Situation, horizon: int, generator: torch.Generator
+) -> tuple[str, ...]:
+    if policy is None:
+        raise ValueError("a row that does not imagine needs a policy")
+    return tuple(policy.propose(situation, horizon, 1, generator)[0])
+
+
+def _no_notice(number: int, cost: float) -> None:
+    """Take no notice of a round."""

@@ -1,0 +1,334 @@
+"""``persist bench plan`` from its options to what is measured: all that is checked before, and every episode once."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
+from persist_cli.api.cost import Cost
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.simulator import Simulator
+from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.bench.find_episodes import EpisodeSearch
+from persist_cli.bench.make_episodes import draw_episodes
+from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
+from persist_cli.bench.planning_journal import PlanningJournal
+from persist_cli.bench.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
+from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_open_loop
+from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThreshold, stop_threshold
+from persist_cli.bench.true_scene import TrueScene
+from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter
+from persist_cli.errors import DataError, PersistError, PluginError, hint
+from persist_cli.evaluate.backbones import BackboneLoader
+from persist_cli.evaluate.journal import Processes
+from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.plugins import load_plugin, make_cost, make_policy, make_simulator
+from persist_cli.simulators.collect import CollectPlan
+from persist_cli.viewing.console import add_task, busy, progress
+
+LOOPS: Final = ("closed", "open")
+
+
+@dataclass(frozen=True)
+class EpisodeSource:
+    """Where episodes come from: a file, or scenes that they are drawn in.
+
+    Args:
+        file: of episodes; ``None`` to draw them.
+        scenes: to draw them in.
+        search: which ones to draw.
+        bins: of the file's episodes; ``None`` for all.
+    """
+
+    file: Path | None
+    scenes: CollectPlan
+    search: EpisodeSearch
+    bins: tuple[int, ...] | None = None
+
+    def identity(self) -> dict[str, Any]:
+        """Return JSON values that are equal for equal episodes.
+
+        Raises:
+            DataError: when the file is missing or damaged.
+        """
+        if self.file is None:
+            return {"scenes": asdict(self.scenes), "search": asdict(self.search)}
+        values = read_episodes(self.file).chosen(self.bins).model_dump(mode="json")
+        return {"sha256": hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()}
+
+    def episodes(self) -> EpisodeSet:
+        """Return the episodes."""
+        if self.file is None:
+            return draw_episodes(self.scenes, self.search)
+        return read_episodes(self.file).chosen(self.bins)
+
+
+@dataclass(frozen=True)
+class BenchPlan:
+    """The options of ``persist bench plan``.
+
+    Args:
+        source: of the episodes.
+        checkpoint: of the world model.
+        rows: names of the rows; ``None`` for the default ones.
+        memories: of the world model, and ``simulator``.
+        policy: proposes; a name or the folder of a trained one.
+        cost: name of the cost.
+        cem_candidates: candidates of a round of ``cem``.
+        planning: how rows plan.
+        loops: of ``LOOPS``.
+        loop: how episodes are run.
+        stop_cost: largest cost of a view at which an agent stops; ``None`` to choose it on validation houses.
+        sampling: what the command says of sampling.
+        placement: device and precision.
+        allow_training_scenes: whether scenes that the model was trained on may be measured.
+    """
+
+    source: EpisodeSource
+    checkpoint: Path
+    rows: tuple[str, ...] | None
+    memories: tuple[str, ...]
+    policy: str | None
+    cost: str
+    cem_candidates: int
+    planning: PlanSettings
+    loops: tuple[str, ...]
+    loop: LoopSettings
+    stop_cost: float | None
+    sampling: SamplingOverrides
+    placement: InferenceOptions
+    allow_training_scenes: bool = False
+
+
+@dataclass(frozen=True)
+class PlanningBench:
+    """A benchmark that was checked and is ready to be run.
+
+    Args:
+        plan: the options.
+        checkpoint: of the world model; ``None`` where no row has one.
+        episodes: to run.
+        rows: of the tables.
+        cost: of the rows that imagine, by which agents that are shown an image stop.
+        simulator: of the episodes.
+        journal: keeps what was run.
+        threshold: at which such agents stop; ``None`` where the cost reads a place and none is needed.
+    """
+
+    plan: BenchPlan
+    checkpoint: Checkpoint | None
+    episodes: EpisodeSet
+    rows: Sequence[PlanningRow]
+    cost: Cost
+    simulator: Simulator
+    journal: PlanningJournal
+    threshold: StopThreshold | None
+
+    def stop_rule(self, row: PlanningRow) -> StopRule:
+        """Return the rule by which the agents of a row stop."""
+        if row.goal == "place" or self.threshold is None:
+            return StopAtPlace()
+        return StopByCost(self.cost, self.threshold.value)
+
+    def units(self, row: PlanningRow, processes: Processes) -> Iterator[Episode]:
+        """Yield the episodes of a row that this process runs and the journal lacks."""
+        for number, episode in enumerate(self.episodes.episodes):
+            if processes.owns(number) and not self.journal.has(row, episode):
+                yield episode
+
+
+def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
+    """Check everything that can be checked before anything is run, and find the episodes.
+
+    Raises:
+        PersistError: one line for whatever does not fit.
+    """
+    plan.placement.device()
+    for loop in plan.loops:
+        if loop not in LOOPS:
+            raise PersistError(f"unknown loop {loop!r}; {hint(loop, LOOPS)}")
+    cost = make_cost(plan.cost, {})
+    names = plan.rows if plan.rows is not None else default_rows(plan.policy, cost.reads)
+    rows = RowChoice(names, plan.memories, plan.policy, cost.reads, plan.cem_candidates).rows()
+    if missing := cost.missing():
+        raise PersistError(f"cost {cost.name!r}: {missing}")
+    check_policies(rows, plan.planning)
+    checkpoint = find_checkpoint(plan.checkpoint) if any(row.uses_world_model for row in rows) else None
+    journal = PlanningJournal(out)
+    if processes.main:
+        values = identity(plan, cost, checkpoint)
+        journal.check(values)
+        if not journal.begun:
+            episodes = plan.source.episodes()
+            check_scenes(episodes, checkpoint, plan.allow_training_scenes)
+            if checkpoint is not None:
+                check_model(checkpoint, rows, episodes)
+            journal.begin(values, episodes)
+    processes.wait()
+    episodes = journal.episodes()
+    simulator = open_simulator(episodes)
+    threshold = find_threshold(plan, cost, rows, simulator, journal) if processes.main else None
+    processes.wait()
+    if not processes.main and (kept := journal.stop()) is not None:
+        threshold = StopThreshold(**kept)
+    return PlanningBench(plan, checkpoint, episodes, rows, cost, simulator, journal, threshold)
+
+
+def check_policies(rows: Sequence[PlanningRow], settings: PlanSettings) -> None:
+    """Raise ``PersistError`` when a policy does not look as far ahead as the horizon, or reads no such goal."""
+    for row in rows:
+        policy = make_policy(row.policy, {}) if row.policy is not None else None
+        if policy is None:
+            continue
+        if policy.longest is not None and settings.horizon > policy.longest:
+            raise PersistError(
+                f"policy {row.policy!r} looks at most {policy.longest} actions ahead, not {settings.horizon}; give "
+                f"--horizon {policy.longest}"
+            )
+        if policy.reads and row.goal not in policy.reads and row.name not in ALONE:
+            raise PersistError(
+                f"policy {row.policy!r} needs a goal with {' or '.join(sorted(policy.reads))}, and the cost reads the "
+                f"{row.goal}; take another --cost"
+            )
+
+
+def check_model(checkpoint: Checkpoint, rows: Sequence[PlanningRow], episodes: EpisodeSet) -> None:
+    """Raise ``PersistError`` when the model lacks an adapter of a row, or takes images of another size."""
+    for row in rows:
+        if row.uses_world_model and (adapter := adapter_of(checkpoint, row)) is not None:
+            adapter_memory(checkpoint, adapter)
+    size = empty_backbone(checkpoint).image_size
+    ours = tuple(episodes.settings.get(side, 64) for side in ("height", "width"))
+    if ours != tuple(size):
+        raise DataError(
+            f"the episodes have images of {ours[0]}x{ours[1]} pixels, {checkpoint.folder} takes {size[0]}x{size[1]}; "
+            f"draw episodes with --size {size[0]}x{size[1]}"
+        )
+
+
+def check_scenes(episodes: EpisodeSet, checkpoint: Checkpoint | None, allowed: bool) -> None:
+    """Raise ``DataError`` when the model was trained on a scene of the episodes, unless that is allowed."""
+    trained = training_scenes([checkpoint]) if checkpoint is not None else frozenset[str]()
+    known = next((scene for scene in episodes.scenes if scene in trained), None)
+    if known is not None and not allowed:
+        raise DataError(
+            f"scene {known!r}: the model was trained on it; take episodes of another split, or measure it all the same "
+            "with --allow-training-scenes"
+        )
+
+
+def open_simulator(episodes: EpisodeSet) -> Simulator:
+    """Return the simulator of some episodes.
+
+    Raises:
+        PluginError: when it is not installed.
+    """
+    needs = load_plugin("simulator", episodes.simulator).missing()
+    if needs:
+        raise PluginError(f"simulator {episodes.simulator!r} {needs}")
+    return make_simulator(episodes.simulator, episodes.settings)
+
+
+def find_threshold(
+    plan: BenchPlan, cost: Cost, rows: Sequence[PlanningRow], simulator: Simulator, journal: PlanningJournal
+) -> StopThreshold | None:
+    """Return the threshold at which agents that are shown an image stop; ``None`` where there are none."""
+    if cost.reads != "image" or all(row.goal == "place" for row in rows):
+        return None
+    if plan.stop_cost is not None:
+        return StopThreshold(plan.stop_cost, 0, 0)
+    kept = journal.stop()
+    if kept is None:
+        with busy("choosing on validation houses when to stop"):
+            kept = asdict(stop_threshold(simulator, cost))
+        journal.keep_stop(kept)
+    return StopThreshold(**kept)
+
+
+def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict[str, Any]:
+    """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
+    sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
+    values = {
+        "episodes": plan.source.identity(),
+        "cost": {"name": cost.name, "settings": asdict(cost.settings)},
+        "policy": plan.policy,
+        "cem candidates": plan.cem_candidates,
+        "planning": asdict(plan.planning),
+        "loop": asdict(plan.loop) | {"loops": list(plan.loops)},
+        "stop cost": plan.stop_cost,
+        "checkpoint": None if checkpoint is None else checkpoint_json(checkpoint),
+        "sampling": None if sampling is None else asdict(sampling) | plan.placement.changes(),
+    }
+    return dict(json.loads(json.dumps(values, default=str)))
+
+
+def adapter_of(checkpoint: Checkpoint, row: PlanningRow) -> str | None:
+    """Return the adapter that a row of the world model uses; ``None`` for the model without one.
+
+    ``none`` is the adapter of that name, or the model without one where there is no such adapter.
+
+    Raises:
+        CheckpointError: when the checkpoint has no such adapter.
+    """
+    if row.memory in (None, PLAIN) or (row.memory == NO_MEMORY and NO_MEMORY not in checkpoint.adapters):
+        return None
+    return checkpoint.chosen_adapter(row.memory)
+
+
+class RowLoader:
+    """Loads what rows are made of, one backbone for all."""
+
+    def __init__(self, bench: PlanningBench) -> None:
+        self.bench, self.loader = bench, BackboneLoader(bench.plan.placement)
+
+    def load(self, row: PlanningRow) -> RowParts:
+        """Return the parts of a row; the backbone has its adapter until another row is loaded."""
+        policy = make_policy(row.policy, {}) if row.policy is not None else None
+        parts, checkpoint = RowParts(policy, self.bench.cost if row.imagines else None), self.bench.checkpoint
+        if checkpoint is None or not row.uses_world_model:
+            return parts
+        backbone, adapter = self.loader.load(checkpoint), adapter_of(checkpoint, row)
+        load_adapter(backbone, checkpoint, adapter)
+        backbone.prepare_inference(self.bench.plan.placement)
+        sampling = checkpoint.sampling_with(self.bench.plan.sampling)
+        backbone.check_sampling(sampling)
+        memory = None if adapter is None else MemoryFactory.of(adapter_memory(checkpoint, adapter), backbone.device)
+        return dataclasses.replace(parts, backbone=backbone, factory=memory, sampling=sampling)
+
+
+def run_rows(bench: PlanningBench, processes: Processes) -> None:
+    """Run this process's share of the episodes that the journal does not have yet."""
+    todo = [list(bench.units(row, processes)) for row in bench.rows]
+    loader = RowLoader(bench)
+    with progress() as bar:
+        task = add_task(bar, "bench", sum(map(len, todo)), "episodes")
+        for row, episodes in zip(bench.rows, todo, strict=True):
+            if not episodes:
+                continue
+            bar.update(task, note=row.name)
+            parts = loader.load(row)
+            for episode in episodes:
+                bench.journal.write(row, episode, run_episode(bench, row, parts, episode))
+                bar.advance(task)
+    if processes.count > 1:
+        with busy("waiting for the other processes"):
+            processes.wait()
+
+
+def run_episode(bench: PlanningBench, row: PlanningRow, parts: RowParts, episode: Episode) -> dict[str, Any]:
+    """Run the loops of one episode of one row, and return what happened as JSON values."""
+    plan, scene = bench.plan, TrueScene(bench.simulator, episode)
+    record: dict[str, Any] = {"row": row.name, "episode": episode.name, "open": None, "closed": None}
+    if "open" in plan.loops and episode.bin <= plan.loop.open_longest:
+        record["open"] = run_open_loop(scene, Navigator(row, parts, plan.planning, scene, episode.bin))
+    if "closed" in plan.loops:
+        navigator = Navigator(row, parts, plan.planning, scene, plan.planning.horizon)
+        record["closed"] = run_closed_loop(scene, navigator, bench.stop_rule(row), plan.loop)
+    return record

@@ -1,0 +1,92 @@
+"""The report of a benchmark of plans: one page that needs no other file, and the maps beside it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from persist_cli.bench.planning_pictures import EpisodePictures
+from persist_cli.bench.planning_tables import (
+    amount,
+    cell,
+    columns_of,
+    counted,
+    difference_columns,
+    difference_rows,
+    heading,
+    success_rows,
+)
+from persist_cli.io.files import write_text
+
+PAGE: Final = "report.html"
+
+MAPS: Final = "maps"
+
+
+def write_planning_report(results: Mapping[str, Any], pictures: Sequence[EpisodePictures], folder: Path) -> None:
+    """Write the page, whole or not at all.
+
+    Args:
+        results: as ``results_json`` returns them.
+        pictures: of some episodes.
+        folder: of the page.
+    """
+    write_text(folder / PAGE, report_page(results, pictures))
+
+
+def report_page(results: Mapping[str, Any], pictures: Sequence[EpisodePictures]) -> str:
+    """Return the page's HTML."""
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+    packages = ("persist_cli.bench", "persist_cli.evaluate.report")  # the latter for the style of its pages
+    jinja = Environment(
+        loader=ChoiceLoader([PackageLoader(package, ".") for package in packages]), autoescape=True,
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    jinja.filters["shell"] = shlex.join
+    closed = "closed" in results["settings"]["loops"]
+    return jinja.get_template("planning_report.html.jinja").render(
+        results=results, sections=[section(table, results) for table in results["tables"]], pictures=pictures,
+        success=success_rows(results) if closed else None, facts=facts(results["environment"]),
+    )  # fmt: skip
+
+
+def section(table: Mapping[str, Any], results: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the page shows of a table."""
+    names = columns_of(table)
+    definitions = {row["name"]: row["definition"] for row in results["rows"]}
+    return {
+        "name": table["name"],
+        "counted": counted(table),
+        "columns": [
+            {"heading": heading(name), "definition": results["columns"][name]["definition"]} for name in names
+        ],
+        "rows": [
+            {
+                "name": row,
+                "definition": definitions[row],
+                "cells": [parts_of(figures.get(name), name) for name in names],
+            }
+            for row, figures in table["rows"].items()
+        ],
+        "differences": difference_rows(table),
+        "difference_heads": [heading(name) for name in difference_columns(table)],
+    }  # fmt: skip
+
+
+def parts_of(figure: Mapping[str, Any] | None, name: str) -> dict[str, str]:
+    """Return the text of a figure and of its interval, empty where it has none."""
+    has_interval = figure is not None and figure["low"] is not None
+    interval = f"[{amount(figure['low'], name)}, {amount(figure['high'], name)}]" if figure and has_interval else ""
+    return {"text": cell(figure, name, interval=False), "interval": interval}
+
+
+def facts(environment: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return name and text of each entry of the environment, packages one by one."""
+    found: list[tuple[str, str]] = []
+    for name, value in environment.items():
+        entries = value if isinstance(value, Mapping) else {name: value}
+        found += [(str(key), str(entry)) for key, entry in entries.items()]
+    return found

@@ -1,0 +1,215 @@
+"""The results of a benchmark of plans: figures of each row over all episodes and over each kind of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from persist_cli.bench.episodes import Episode
+from persist_cli.bench.navigation_metrics import SUCCESS_METRES
+from persist_cli.bench.plan_bench import PlanningBench
+from persist_cli.bench.rows import NO_MEMORY, SIMULATOR, PlanningRow
+from persist_cli.bench.stop_rules import AT_PLACE
+from persist_cli.evaluate.provenance import checkpoint_json, command, environment, weight_hashes, weight_sources
+from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, Draws, Figure, difference, mean_figure
+from persist_cli.metrics.src import chosen_encoder
+
+FORMAT: Final = "persist-planning"
+
+VERSION: Final = 1
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of the tables.
+
+    Args:
+        title: in the head of its column.
+        loop: that it is measured in.
+        better: ``higher``, ``lower``, or ``None`` where neither is.
+        percent: whether it is a share, shown in per cent.
+        definition: what it says, as a sentence without a full stop.
+    """
+
+    title: str
+    loop: Literal["closed", "open"]
+    better: Literal["higher", "lower"] | None
+    percent: bool
+    definition: str
+
+
+COLUMNS: Final = {
+    "success": Column(
+        "success", "closed", "higher", True, f"the agent stopped within {SUCCESS_METRES:g} m (geodesic) of the goal"
+    ),
+    "spl": Column("SPL", "closed", "higher", True, "S · l / max(l, p): S success, l shortest way, p its way, metres"),
+    "soft_spl": Column("SoftSPL", "closed", "higher", True, "max(0, 1 − d / l) · l / max(l, p): d metres left"),
+    "reached": Column("reached", "closed", "higher", True, f"it was within {SUCCESS_METRES:g} m at any time"),
+    "end_metres": Column("metres left", "closed", "lower", False, "geodesic metres to the goal at the end"),
+    "collisions": Column("collisions", "closed", "lower", False, "actions that the scene refused, an episode"),
+    "collisions_per_action": Column("collisions/action", "closed", "lower", True, "these by all actions"),
+    "actions": Column("actions", "closed", None, False, "actions an episode, refused ones included"),
+    "decisions": Column("decisions", "closed", None, False, "plans an episode"),
+    "frames_per_decision": Column("frames/decision", "closed", None, False, "frames imagined for a plan"),
+    "seconds_per_decision": Column("s/decision", "closed", "lower", False, "seconds that a plan took"),
+    "ate": Column("ATE", "open", "lower", False, "root mean square of metres to the shortest way, pose by pose"),
+    "rpe": Column("RPE", "open", "lower", False, "the same of translations from one pose to the next, metres"),
+    "sim": Column("SIM", "open", "higher", False, "100 · cos(f(v), f(g)): v true view at the plan's end, g goal image"),
+    "lpips": Column("LPIPS", "open", "lower", False, "LPIPS-Alex of v and g"),
+    "open_collisions": Column("collisions", "open", "lower", False, "actions of the plan that the scene refused"),
+    "open_seconds": Column("s/plan", "open", "lower", False, "seconds that the plan took"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Group:
+    """Episodes of one kind, which have a table of their own.
+
+    Args:
+        name: title of the table.
+        bin: of its episodes; ``None`` for all.
+        in_sight: of its episodes; ``None`` for both.
+        numbers: of its episodes.
+    """
+
+    name: str
+    bin: int | None
+    in_sight: bool | None
+    numbers: tuple[int, ...]
+
+
+def groups(episodes: Sequence[Episode]) -> Iterator[Group]:
+    """Yield the kinds of episodes that there are: all, each bin, in sight or hidden, and each of both."""
+    bins = sorted({episode.bin for episode in episodes})
+    sights = {None: "", True: "in sight", False: "hidden"}
+    for number in (None, *bins):
+        for sight, words in sights.items():
+            chosen = tuple(
+                place
+                for place, episode in enumerate(episodes)
+                if number in (None, episode.bin) and sight in (None, episode.in_sight)
+            )
+            name = ", ".join(part for part in (f"{number} actions" if number else "", words) if part)
+            if chosen:
+                yield Group(name or "all episodes", number, sight, chosen)
+
+
+def results_json(bench: PlanningBench, processes: int) -> dict[str, Any]:
+    """Return the results and all that is needed to measure them again, as JSON values."""
+    episodes = bench.episodes.episodes
+    records = {row.name: [bench.journal.read(row, episode) for episode in episodes] for row in bench.rows}
+    tables = [table_json(group, episodes, bench.rows, records) for group in groups(episodes)]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "episodes": {
+            "count": len(episodes), "scenes": bench.episodes.scenes, "split": bench.episodes.split,
+            "simulator": bench.episodes.simulator, "settings": bench.episodes.settings, "seed": bench.episodes.seed,
+            "definitions": bench.episodes.definitions, "names": [episode.name for episode in episodes],
+        },
+        "settings": settings_json(bench),
+        "rows": [row.to_json() | {"definition": define(row, bench)} for row in bench.rows],
+        "columns": {name: asdict(column) for name, column in COLUMNS.items()},
+        "statistics": {"resamples": RESAMPLES, "least_scenes": LEAST_UNITS, "drawn": "scenes"},
+        "tables": tables,
+        "checkpoint": None if bench.checkpoint is None else checkpoint_json(bench.checkpoint),
+        "environment": environment(processes),
+        "command": command(),
+    }  # fmt: skip
+
+
+def settings_json(bench: PlanningBench) -> dict[str, Any]:
+    """Return how plans were made and episodes were run, as JSON values."""
+    plan, encoder = bench.plan, chosen_encoder()
+    sampling = bench.checkpoint.sampling_with(plan.sampling) if bench.checkpoint is not None else None
+    return {
+        "cost": {"name": bench.cost.name, "settings": asdict(bench.cost.settings), "reads": bench.cost.reads},
+        "policy": plan.policy,
+        "planning": asdict(plan.planning),
+        "loops": list(plan.loops),
+        "loop": asdict(plan.loop),
+        "stop": stop_words(bench),
+        "sampling": None if sampling is None else asdict(sampling) | plan.placement.changes(),
+        "sim": {
+            "definition": "SIM = mean over episodes of 100 · cos(f(v), f(g)); f: mean of the patch features of "
+            f"{encoder.title} with the final layer norm, images resized to 224 px; v: true view at the end of the plan",
+            "weights": weight_hashes([encoder.name]), "sources": weight_sources([encoder.name]),
+        },
+    }  # fmt: skip
+
+
+def stop_words(bench: PlanningBench) -> list[str]:
+    """Return sentences that say when agents stop."""
+    words = [f"an agent that is told the goal's place stops within {AT_PLACE:g} m of it"]
+    if bench.threshold is not None and bench.threshold.episodes:
+        words.insert(0, bench.threshold.definition)
+    elif bench.threshold is not None:
+        words.insert(0, f"an agent that is shown the goal image stops when its view costs {bench.threshold.value:g}")
+    return [*words, "any agent stops when its plan is empty"]
+
+
+def define(row: PlanningRow, bench: PlanningBench) -> str:
+    """Return a few words that say what a row is."""
+    given = "the given walk" if row.walk else "nothing of the scene but its own frames"
+    told = f"told the goal's {row.goal}, given {given}"
+    if not row.imagines:
+        return f"policy {row.policy!r} without imagination; {told}"
+    model = "the simulator itself as the model" if row.memory == SIMULATOR else f"memory {row.memory!r}"
+    how = f"ranks {row.candidates} proposals of {row.policy!r}"
+    if row.planner == "cem":
+        how = f"cross-entropy method, {row.candidates} candidates a round, at most {bench.plan.planning.rounds} rounds"
+    return f"{how} by {bench.cost.name}; {model}; {told}"
+
+
+def table_json(
+    group: Group, episodes: Sequence[Episode], rows: Sequence[PlanningRow], records: Mapping[str, Sequence[Any]]
+) -> dict[str, Any]:
+    """Return the figures of all rows over the episodes of a group, as JSON values."""
+    scenes = {scene: number for number, scene in enumerate(dict.fromkeys(episode.scene for episode in episodes))}
+    draws = Draws.of([scenes[episodes[number].scene] for number in group.numbers])
+    figures = {row.name: row_figures([records[row.name][number] for number in group.numbers], draws) for row in rows}
+    return {
+        "name": group.name, "bin": group.bin, "in_sight": group.in_sight, "episodes": list(group.numbers),
+        "scenes": len({episodes[number].scene for number in group.numbers}),
+        "rows": {row.name: row_json(row, rows, figures) for row in rows},
+    }  # fmt: skip
+
+
+def row_figures(records: Sequence[Mapping[str, Any]], draws: Draws) -> dict[str, Figure]:
+    """Return the figures of a row by column, of those columns that some episode has."""
+    found = {}
+    for name, column in COLUMNS.items():
+        loops = [record[column.loop] for record in records]
+        values = [np.nan if loop is None else loop["figures"].get(name, np.nan) for loop in loops]
+        finite = np.array([np.nan if value is None else value for value in values], np.float64)
+        if np.isfinite(finite).any():
+            found[name] = mean_figure(finite[None, None], draws)
+    return found
+
+
+def row_json(
+    row: PlanningRow, rows: Sequence[PlanningRow], figures: Mapping[str, Mapping[str, Figure]]
+) -> dict[str, Any]:
+    """Return the figures of a row with its differences to others, as JSON values."""
+    others = [other for other in compared_with(row, rows) if other in figures]
+    return {
+        name: figure.to_json()
+        | {
+            "differences": {
+                other: difference(figure, figures[other][name]) for other in others if name in figures[other]
+            }
+        }
+        for name, figure in figures[row.name].items()
+    }
+
+
+def compared_with(row: PlanningRow, rows: Sequence[PlanningRow]) -> list[str]:
+    """Return the names of the rows that a row is compared with: its planner without memory, and the policy alone."""
+    names = [other.name for other in rows]
+    alone = next((name for name in ("policy", "random") if name in names), None)
+    head = row.name.partition(",")[0]
+    wanted = [f"{head}, {NO_MEMORY}", alone, "shortest-path"] if row.imagines else [alone]
+    return [name for name in wanted if name is not None and name in names and name != row.name]

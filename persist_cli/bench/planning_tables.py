@@ -1,0 +1,136 @@
+"""The tables of a benchmark of plans, as Markdown and on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from persist_cli.bench.planning_results import COLUMNS
+from persist_cli.viewing.console import print_table, say
+
+SHORT: Final = ("success", "spl", "soft_spl", "reached", "collisions", "seconds_per_decision", "ate", "rpe", "sim")
+
+MISSING: Final = "n/a"
+
+
+def cell(figure: Mapping[str, Any] | None, name: str, interval: bool = True) -> str:
+    """Return the text of a figure, with its interval where it has one."""
+    if figure is None or figure["mean"] is None:
+        return MISSING
+    text = amount(figure["mean"], name)
+    if not interval or figure["low"] is None:
+        return text
+    return f"{text} [{amount(figure['low'], name)}, {amount(figure['high'], name)}]"
+
+
+def gap(difference: Mapping[str, Any] | None, name: str) -> str:
+    """Return the text of a paired difference, starred where its interval leaves zero out."""
+    if difference is None or difference["mean"] is None:
+        return MISSING
+    text = amount(difference["mean"], name, sign=True)
+    if difference["low"] is None:
+        return text
+    star = "*" * (difference["low"] > 0 or difference["high"] < 0)
+    return f"{text}{star} [{amount(difference['low'], name, True)}, {amount(difference['high'], name, True)}]"
+
+
+def amount(value: float, name: str, sign: bool = False) -> str:
+    """Return a number as the column shows it."""
+    if COLUMNS[name].percent:
+        return f"{100 * value:{'+' * sign}.0f} %"
+    return f"{value:{'+' * sign}.2f}" if abs(value) < 10 else f"{value:{'+' * sign}.1f}"
+
+
+def heading(name: str) -> str:
+    """Return the head of a column, with an arrow to what is better."""
+    arrow = {"higher": " ↑", "lower": " ↓", None: ""}[COLUMNS[name].better]
+    return f"{COLUMNS[name].title}{arrow}"
+
+
+def columns_of(table: Mapping[str, Any], names: Sequence[str] = tuple(COLUMNS)) -> list[str]:
+    """Return those of some columns that a row of the table has."""
+    return [name for name in names if any(name in row for row in table["rows"].values())]
+
+
+def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def counted(table: Mapping[str, Any]) -> str:
+    """Return how many episodes of how many scenes a table is of."""
+    return f"{len(table['episodes'])} episodes, {table['scenes']} scenes"
+
+
+def group_text(table: Mapping[str, Any]) -> str:
+    """Return one table of figures and one of differences as Markdown."""
+    names = columns_of(table)
+    rows = [[row, *(cell(figures.get(name), name) for name in names)] for row, figures in table["rows"].items()]
+    parts = [f"## {table['name']} ({counted(table)})", markdown_table(["row", *map(heading, names)], rows)]
+    differences = difference_rows(table)
+    if differences:
+        heads = ["difference", *map(heading, difference_columns(table))]
+        parts.append(markdown_table(heads, differences))
+    return "\n\n".join(parts)
+
+
+def difference_columns(table: Mapping[str, Any]) -> list[str]:
+    """Return the columns whose differences are shown."""
+    return columns_of(table, ("success", "spl", "soft_spl", "collisions", "ate", "rpe", "sim", "lpips"))
+
+
+def difference_rows(table: Mapping[str, Any]) -> list[list[str]]:
+    """Return the rows of a table of paired differences."""
+    rows = []
+    for row, figures in table["rows"].items():
+        others = dict.fromkeys(other for figure in figures.values() for other in figure["differences"])
+        for other in others:
+            gaps = [figures.get(name, {}).get("differences", {}).get(other) for name in difference_columns(table)]
+            texts = [gap(value, name) for value, name in zip(gaps, difference_columns(table), strict=True)]
+            rows.append([f"{row} − {other}", *texts])
+    return rows
+
+
+def success_rows(results: Mapping[str, Any], name: str = "success") -> tuple[list[str], list[list[str]]]:
+    """Return heads and rows of one figure by bin and sight."""
+    kinds = [table for table in results["tables"] if table["bin"] is not None and table["in_sight"] is not None]
+    heads = [f"{table['bin']} {'in sight' if table['in_sight'] else 'hidden'}" for table in kinds]
+    rows = [
+        [row["name"], *(cell(table["rows"][row["name"]].get(name), name, interval=False) for table in kinds)]
+        for row in results["rows"]
+    ]
+    return ["row", *heads], rows
+
+
+def tables_text(results: Mapping[str, Any]) -> str:
+    """Return all tables with what their rows and columns mean, as Markdown."""
+    settings = results["settings"]
+    lines = [
+        "# Plans in held-out scenes",
+        f"{results['episodes']['count']} episodes of {len(results['episodes']['scenes'])} scenes; in brackets 95 % "
+        "intervals by bootstrap over scenes; * leaves zero out.",
+        "\n".join(f"- {line}." for line in settings["stop"]),
+        f"- {settings['sim']['definition']}.",
+        "## Rows",
+        "\n".join(f"- **{row['name']}**: {row['definition']}" for row in results["rows"]),
+        "## Columns",
+        "\n".join(f"- **{column['title']}** ({column['loop']} loop): {column['definition']}"
+                  for column in results["columns"].values()),
+        "## Success by kind of goal",
+        markdown_table(*success_rows(results)),
+        *map(group_text, results["tables"]),
+    ]  # fmt: skip
+    return "\n\n".join(lines) + "\n"
+
+
+def print_results(results: Mapping[str, Any]) -> None:
+    """Print the table over all episodes, and success by kind of goal."""
+    table = results["tables"][0]
+    names = columns_of(table, SHORT)
+    rows = [[row, *(cell(figures.get(name), name) for name in names)] for row, figures in table["rows"].items()]
+    print_table(f"Plans, {counted(table)}", ["row", *map(heading, names)], rows)
+    if "closed" in results["settings"]["loops"]:
+        print_table("Success by actions of the shortest way", *success_rows(results))
+    for line in results["settings"]["stop"]:
+        say(f"{line}.")

@@ -1,0 +1,131 @@
+"""The rows of the benchmark of plans: what decides, what it imagines with, and what it is told."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal
+
+from persist_cli.api.policy import GoalKind
+from persist_cli.errors import PersistError, hint
+
+SIMULATOR: Final = "simulator"  # in place of a memory: the simulator itself is the model
+
+NO_MEMORY: Final = "none"
+
+POLICY: Final = "policy"  # the row of the policy that ``--policy`` names, without imagination
+
+RANK = re.compile(r"rank-(?P<count>[1-9]\d*)")
+
+Planning = Literal["policy", "rank", "cem"]
+
+
+@dataclass(frozen=True)
+class PlanningRow:
+    """One row of the tables.
+
+    Args:
+        name: unique among the rows.
+        planner: ``policy`` follows the first proposal of a policy, ``rank`` and ``cem`` imagine candidates.
+        policy: name or folder of the policy that proposes; ``None`` for ``cem``.
+        memory: of the world model, or ``simulator`` for the simulator in its place; ``None`` without a model.
+        goal: what it is told of the goal.
+        walk: whether it is given the walk.
+        candidates: that a round imagines; 0 without a model.
+    """
+
+    name: str
+    planner: Planning
+    policy: str | None
+    memory: str | None
+    goal: GoalKind
+    walk: bool
+    candidates: int = 0
+
+    @property
+    def imagines(self) -> bool:
+        """Whether a model judges candidates."""
+        return self.planner != "policy"
+
+    @property
+    def uses_world_model(self) -> bool:
+        """Whether that model is the checkpoint's."""
+        return self.imagines and self.memory != SIMULATOR
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the row as JSON values."""
+        return asdict(self)
+
+
+ALONE: Final[dict[str, tuple[str, GoalKind | None, bool]]] = {
+    "random": ("random", None, False),
+    "straight": ("straight", None, False),
+    "shortest-path": ("shortest-path", "place", True),
+    "shortest-path-no-walk": ("shortest-path", "place", False),
+    "shortest-path-image": ("shortest-path", "image", True),
+}
+"""Rows without imagination: the policy, what it is told of the goal (``None``: what the cost reads), and whether it is
+given the walk."""
+
+PLANNED: Final = ("rank-8", "rank-16", "cem")
+
+
+def default_rows(policy: str | None, goal: GoalKind) -> tuple[str, ...]:
+    """Return the names of the rows where none are named."""
+    alone = [name for name, (_, told, _) in ALONE.items() if told in (None, "place", goal)]
+    return (*alone, *([POLICY] if policy else []), *PLANNED)
+
+
+@dataclass(frozen=True)
+class RowChoice:
+    """What the rows are made of.
+
+    Args:
+        names: of ``ALONE``, ``policy``, ``rank-N`` or ``cem``.
+        memories: of the world model, and ``simulator``; each makes a row of every ``rank-N`` and of ``cem``.
+        policy: name or folder of the policy of ``policy`` and ``rank-N``; ``None`` where none is named, which ranks
+            ``random``.
+        goal: what the cost reads.
+        cem_candidates: candidates of a round of ``cem``.
+    """
+
+    names: Sequence[str]
+    memories: Sequence[str]
+    policy: str | None
+    goal: GoalKind
+    cem_candidates: int
+
+    def rows(self) -> list[PlanningRow]:
+        """Return the rows in order, each once.
+
+        Raises:
+            PersistError: for an unknown name, no row, no memory where one is needed, or ``policy`` without a policy.
+        """
+        names, memories = list(dict.fromkeys(self.names)), list(dict.fromkeys(self.memories))
+        for name in names:
+            if name not in (*ALONE, POLICY, "cem") and not RANK.fullmatch(name):
+                raise PersistError(f"unknown row {name!r}; {hint(name, [*ALONE, POLICY, *PLANNED])}")
+            if self.goal == "place" and ALONE.get(name, ("", "", False))[1] == "image":
+                raise PersistError(f"row {name!r} is shown the goal image, and the cost reads a place; leave it out")
+        if POLICY in names and self.policy is None:
+            raise PersistError("the row 'policy' needs a policy; give --policy a name or the folder of a trained one")
+        rows = [row for name in names for row in self._rows_of(name, memories)]
+        if not rows:
+            raise PersistError("no row is left; name --rows such as random,rank-8 and --memories such as none,voxel")
+        return rows
+
+    def _rows_of(self, name: str, memories: Sequence[str]) -> Iterator[PlanningRow]:
+        if name == POLICY:
+            yield PlanningRow(name, "policy", self.policy, None, self.goal, False)
+        elif name in ALONE:
+            policy, goal, walk = ALONE[name]
+            yield PlanningRow(name, "policy", policy, None, goal or self.goal, walk)
+        else:
+            ranked = RANK.fullmatch(name)
+            count = int(ranked["count"]) if ranked else self.cem_candidates
+            for memory in memories:
+                yield PlanningRow(
+                    f"{name}, {memory}", "rank" if ranked else "cem", (self.policy or "random") if ranked else None,
+                    memory, self.goal, memory not in (NO_MEMORY, SIMULATOR), count,
+                )  # fmt: skip

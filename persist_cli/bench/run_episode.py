@@ -1,0 +1,146 @@
+"""One episode of one row: the open loop makes a plan; the closed loop acts, looks and plans again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from persist_cli.api.actions import format_actions
+from persist_cli.api.observations import Observations
+from persist_cli.bench.navigation_metrics import (
+    WalkRecord,
+    absolute_error,
+    closed_loop_figures,
+    relative_error,
+    similarity,
+)
+from persist_cli.bench.navigator import Navigator
+from persist_cli.bench.stop_rules import StopRule
+from persist_cli.bench.true_scene import TrueScene
+from persist_cli.metrics.networks import missing_weights
+from persist_cli.metrics.src import ENCODERS, VideoFeatures
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How episodes are run.
+
+    Args:
+        execute: actions that the closed loop does before it plans again.
+        patience: most actions of the closed loop, as a multiple of those of the shortest way.
+        open_longest: longest bin of the open loop, in actions.
+    """
+
+    execute: int = 4
+    patience: float = 4.0
+    open_longest: int = 16
+
+
+@dataclass
+class Trace:
+    """What happened in a closed loop so far."""
+
+    distances: list[float]
+    places: list[tuple[float, float]]
+    actions: list[str] = field(default_factory=list)
+    refused: list[int] = field(default_factory=list)  # numbers of the actions that the scene refused
+    decisions: int = 0
+    frames: int = 0  # imagined
+    seconds: float = 0.0  # of deciding
+
+    def to_json(self, ended: str, figures: dict[str, float]) -> dict[str, Any]:
+        """Return the trace with its figures as JSON values."""
+        decisions = max(self.decisions, 1)
+        figures |= {
+            "decisions": float(self.decisions), "frames_per_decision": self.frames / decisions,
+            "seconds_per_decision": self.seconds / decisions,
+        }  # fmt: skip
+        return {
+            "figures": figures, "ended": ended, "actions": format_actions(self.actions), "refused": self.refused,
+            "places": [[round(value, 4) for value in place] for place in self.places],
+        }  # fmt: skip
+
+
+def run_closed_loop(scene: TrueScene, navigator: Navigator, stop: StopRule, settings: LoopSettings) -> dict[str, Any]:
+    """Let an agent act until it stops or has no actions left, and return what happened as JSON values.
+
+    After each action the agent looks. It stops when its stop rule says so, or when it decides to do nothing.
+
+    Args:
+        scene: with the agent at the start.
+        navigator: of an agent that was given what its row is given.
+        stop: rule of the row.
+        settings: of the loop.
+    """
+    trace = Trace([scene.distance], [scene.simulator.agent[0]])
+    most = math.ceil(settings.patience * scene.episode.bin)
+    ended = "stopped" if stop.stops(navigator.seen[-1:], navigator.goal, scene.info.world_up) else ""
+    while not ended and len(trace.actions) < most:
+        decision = navigator.decide()
+        trace.decisions += 1
+        trace.frames, trace.seconds = trace.frames + decision.frames, trace.seconds + decision.seconds
+        count = min(settings.execute, most - len(trace.actions))
+        ended = _act(scene, navigator, stop, trace, decision.actions[:count]) if decision.actions else "gave no action"
+    metres = sum(math.dist(*pair) for pair in zip(trace.places, trace.places[1:], strict=False))
+    walk = WalkRecord(trace.distances, metres, len(trace.refused), bool(ended))
+    return trace.to_json(ended or "out of actions", closed_loop_figures(walk, scene.episode.metres))
+
+
+def _act(scene: TrueScene, navigator: Navigator, stop: StopRule, trace: Trace, actions: tuple[str, ...]) -> str:
+    """Do actions and look after each; return ``stopped`` when the agent stopped, else an empty text."""
+    frames = []
+    for action in actions:
+        if not scene.simulator.act(action):
+            trace.refused.append(len(trace.actions))
+        trace.actions.append(action)
+        trace.places.append(scene.simulator.agent[0])
+        trace.distances.append(scene.distance)
+        frames.append(scene.look())
+        if stop.stops(frames[-1], navigator.goal, scene.info.world_up):
+            return "stopped"
+    navigator.saw(Observations.concatenate(frames), len(frames))
+    return ""
+
+
+def run_open_loop(scene: TrueScene, navigator: Navigator) -> dict[str, Any]:
+    """Make one plan as long as the shortest way, follow it in the true scene, and return its figures as JSON values.
+
+    The agent is back at the start afterwards.
+    """
+    decision = navigator.decide()
+    true = scene.shortest_way()
+    frames, allowed = scene.follow(decision.actions[: scene.episode.bin])
+    scene.back_to_start()
+    poses = frames.cameras.world_from_camera
+    poses = torch.cat([poses, poses[-1:].expand(len(true) - len(poses), 4, 4)])  # who has stopped stays
+    return {
+        "actions": format_actions(decision.actions),
+        "figures": {
+            "ate": absolute_error(poses, true.cameras.world_from_camera),
+            "rpe": relative_error(poses, true.cameras.world_from_camera),
+            "open_collisions": float(len(allowed) - sum(allowed)),
+            "open_frames": float(decision.frames),
+            "open_seconds": decision.seconds,
+        }
+        | view_figures(frames[-1:], scene.goal_view),
+    }
+
+
+def view_figures(view: Observations, goal: Observations) -> dict[str, float]:
+    """Return SIM and LPIPS of the view at the end of a plan and the goal image; without those whose weights miss."""
+    from persist_cli.metrics.lpips import ALEX, LpipsAlex, perceptual_distance, tensor_shapes
+    from persist_cli.metrics.networks import network_weights, run_network
+
+    figures = {}
+    if missing_weights(*(encoder.name for encoder in ENCODERS)) is None:
+        seen, wanted = (VideoFeatures(frame.rgb).encode(0) for frame in (view, goal))
+        figures["sim"] = similarity(seen, wanted)
+    least = min(view.rgb.shape[1:3])
+    if missing_weights(LpipsAlex.name) is None and least >= LpipsAlex.least_size:
+        weights = network_weights(LpipsAlex.name, tensor_shapes(ALEX))
+        distance = run_network(lambda a, b: perceptual_distance(weights, ALEX, a, b), view.rgb, goal.rgb)
+        figures["lpips"] = float(distance[0])
+    return figures
