@@ -59,7 +59,7 @@ COLUMNS: Final = {
     "rpe": Column("RPE", "open", "lower", False, "the same of translations from one pose to the next, metres"),
     "sim": Column("SIM", "open", "higher", False, "100 · cos(f(v), f(g)): v true view at the plan's end, g goal image"),
     "lpips": Column("LPIPS", "open", "lower", False, "LPIPS-Alex of v and g"),
-    "open_collisions": Column("collisions", "open", "lower", False, "actions of the plan that the scene refused"),
+    "open_collisions": Column("open collisions", "open", "lower", False, "actions of the plan that the scene refused"),
     "open_seconds": Column("s/plan", "open", "lower", False, "seconds that the plan took"),
 }  # fmt: skip
 

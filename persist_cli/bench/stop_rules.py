@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -14,10 +15,10 @@ from persist_cli.api.ground import GroundMap, ground_axes
 from persist_cli.api.observations import Observations
 from persist_cli.api.policy import Goal
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode
+from persist_cli.bench.episodes import Episode, Stand
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.bench.navigation_metrics import SUCCESS_METRES
-from persist_cli.bench.true_scene import TrueScene, stand
+from persist_cli.bench.true_scene import TrueScene, look_from, stand
 from persist_cli.errors import PersistError
 from persist_cli.simulators.collect import FIRST_SEED
 
@@ -26,6 +27,12 @@ AT_PLACE: Final = 0.5  # metres from the goal's place at which an agent that is 
 VALIDATION_SEARCH: Final = EpisodeSearch(bins=(8, 16), each=12, walk_frames=24)
 
 VALIDATION_SCENES: Final = 12
+
+BESIDE: Final = (0.2, 0.8)  # metres from the goal of the views at which an agent shall stop
+
+TURNED: Final = 20.0  # degrees from the goal's heading up to which they are turned
+
+TRIES: Final = 50
 
 
 class StopRule(Protocol):
@@ -61,16 +68,7 @@ class StopByCost:
 
     def stops(self, view: Observations, goal: Goal, world_up: Sequence[float]) -> bool:
         """Return whether the view costs so little."""
-        return view_cost(self.cost, view, goal) <= self.threshold
-
-
-def view_cost(cost: Cost, views: Observations, goal: Goal) -> float:
-    """Return the least cost of some views that were truly seen.
-
-    Raises:
-        PersistError: when it is NaN.
-    """
-    return min(view_costs(cost, views, goal))
+        return view_costs(self.cost, view, goal)[0] <= self.threshold
 
 
 def view_costs(cost: Cost, views: Observations, goal: Goal) -> list[float]:
@@ -89,20 +87,19 @@ def view_costs(cost: Cost, views: Observations, goal: Goal) -> list[float]:
 
 @dataclass(frozen=True)
 class Approach:
-    """The views of one validation episode in the order in which an agent might have them.
+    """What views of one validation episode cost.
 
     Args:
-        costs: of each view.
-        near: whether each was seen within ``SUCCESS_METRES`` of the goal.
+        far: least cost of the views from farther than ``SUCCESS_METRES`` of the goal.
+        near: cost of a view from beside the goal.
     """
 
-    costs: Sequence[float]
-    near: Sequence[bool]
+    far: float
+    near: float
 
     def succeeds(self, threshold: float) -> bool:
-        """Return whether the first view that costs at most the threshold is one near the goal."""
-        first = next((number for number, cost in enumerate(self.costs) if cost <= threshold), None)
-        return first is not None and self.near[first]
+        """Return whether an agent would stop at the near view and at none of the far ones."""
+        return self.near <= threshold < self.far
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ class StopThreshold:
 
     Args:
         value: the threshold.
-        successes: validation episodes in which the first view below it is near the goal.
+        successes: validation episodes in which the agent stops near the goal and not before.
         episodes: all validation episodes.
     """
 
@@ -124,9 +121,9 @@ class StopThreshold:
         """A sentence that says how it was chosen."""
         return (
             "an agent that is shown the goal image stops when the cost of its view is at most "
-            f"{self.value:.4g}: the threshold at which most of {self.episodes} validation episodes end well "
-            f"({self.successes}) when the agent sees the given walk's views from farther than {SUCCESS_METRES:g} m and "
-            "then walks the shortest way"
+            f"{self.value:.4g}: chosen in validation houses, where {self.successes} of {self.episodes} agents stop at "
+            f"a view {BESIDE[0]:g} to {BESIDE[1]:g} m and up to {TURNED:g}° beside the goal's pose, and at none of "
+            f"those from farther than {SUCCESS_METRES:g} m on the shortest way and on the given walk"
         )
 
 
@@ -138,24 +135,39 @@ def choose_threshold(approaches: Sequence[Approach]) -> StopThreshold:
     """
     if not approaches:
         raise PersistError("no validation episode was found to choose when to stop; give --stop-cost")
-    costs = np.unique([cost for approach in approaches for cost in approach.costs])
+    costs = np.unique([approach.near for approach in approaches])
     counts = np.array([sum(approach.succeeds(cost) for approach in approaches) for cost in costs])
     best = np.flatnonzero(counts == counts.max())
     chosen = best[len(best) // 2]
     return StopThreshold(float(costs[chosen]), int(counts[chosen]), len(approaches))
 
 
-def approach(scene: TrueScene, cost: Cost) -> Approach:
-    """Return the approach of an episode: far views of the given walk, then the shortest way."""
+def approach(scene: TrueScene, cost: Cost) -> Approach | None:
+    """Return what the views of an episode cost; ``None`` where nothing beside the goal is free."""
     walk, vocabulary = scene.episode.walk, scene.info.vocabulary
     stand(scene.simulator, walk.start)
     shown = [scene.look_and_measure(), *scene.act_and_measure(vocabulary.parse(walk.actions) if walk.actions else ())]
-    far = [view for view in shown if view[1] > SUCCESS_METRES]
     scene.back_to_start()
     way = [scene.look_and_measure(), *scene.act_and_measure(vocabulary.parse(scene.episode.actions))]
-    views = Observations.concatenate([view for view, _ in (*far, *way)])
-    near = [metres <= SUCCESS_METRES for _, metres in (*far, *way)]
-    return Approach(view_costs(cost, views, scene.goal), near)
+    far = [view for view, metres in (*shown, *way) if metres > SUCCESS_METRES]
+    near = look_beside(scene)
+    if near is None or not far:
+        return None
+    *costs, last = view_costs(cost, Observations.concatenate([*far, near]), scene.goal)
+    return Approach(min(costs), last)
+
+
+def look_beside(scene: TrueScene) -> Observations | None:
+    """Return a view from a random pose beside the goal's; ``None`` where none of many is free."""
+    goal, random = scene.episode.goal, np.random.default_rng(scene.episode.seed)
+    for _ in range(TRIES):
+        way, apart = random.uniform(-math.pi, math.pi), random.uniform(*BESIDE)
+        x, y = scene.simulator.ahead(way)
+        ground = goal.ground[0] + apart * x, goal.ground[1] + apart * y
+        turned = math.radians(random.uniform(-TURNED, TURNED))
+        if scene.simulator.is_free(ground) and scene.geodesic.metres(ground) <= SUCCESS_METRES:
+            return look_from(scene.simulator, Stand(ground=ground, heading=goal.heading + turned))
+    return None
 
 
 def validation_episodes(simulator: Simulator) -> list[Episode]:
@@ -171,6 +183,5 @@ def stop_threshold(simulator: Simulator, cost: Cost) -> StopThreshold:
     Raises:
         PersistError: when these houses have no episodes, or a cost is NaN.
     """
-    return choose_threshold(
-        [approach(TrueScene(simulator, episode), cost) for episode in validation_episodes(simulator)]
-    )
+    approaches = [approach(TrueScene(simulator, episode), cost) for episode in validation_episodes(simulator)]
+    return choose_threshold([one for one in approaches if one is not None])
