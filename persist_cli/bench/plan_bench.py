@@ -29,7 +29,8 @@ from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.plugins import load_plugin, make_cost, make_policy, make_simulator
+from persist_cli.plugins import load_plugin, make_cost, make_simulator
+from persist_cli.policies.open_policy import open_policy
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, busy, progress
 
@@ -184,7 +185,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
 def check_policies(rows: Sequence[PlanningRow], settings: PlanSettings) -> None:
     """Raise ``PersistError`` when a policy does not look as far ahead as the horizon, or reads no such goal."""
     for row in rows:
-        policy = make_policy(row.policy, {}) if row.policy is not None else None
+        policy = open_policy(row.policy) if row.policy is not None else None
         if policy is None:
             continue
         if policy.longest is not None and settings.horizon > policy.longest:
@@ -290,7 +291,7 @@ class RowLoader:
 
     def load(self, row: PlanningRow) -> RowParts:
         """Return the parts of a row; the backbone has its adapter until another row is loaded."""
-        policy = make_policy(row.policy, {}) if row.policy is not None else None
+        policy = open_policy(row.policy) if row.policy is not None else None
         parts, checkpoint = RowParts(policy, self.bench.cost if row.imagines else None), self.bench.checkpoint
         if checkpoint is None or not row.uses_world_model:
             return parts

@@ -1,0 +1,126 @@
+"""``persist bench plan`` in a small house: rows, resuming, files and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from persist_cli.bench.episodes import EpisodeSet
+from tests.bench.conftest import SETTINGS
+from tests.conftest import CommandResult, Persist
+
+Bench = Callable[..., CommandResult]
+
+PLACE = ("--cost", "distance", "--rows", "random,rank-12", "--memories", "simulator", "--loops", "closed")
+
+TIMES = {"seconds_per_decision", "open_seconds"}
+
+
+@pytest.fixture
+def bench(persist: Persist, episodes: EpisodeSet, tmp_path: Path) -> Bench:
+    """A function that runs the benchmark on the episodes of the small house."""
+    episodes.write(tmp_path / "episodes.json")
+
+    def run(*options: object, out: str = "bench") -> CommandResult:
+        return persist("bench", "plan", "--episodes", tmp_path / "episodes.json", "--out", tmp_path / out, *options)
+
+    return run
+
+
+def records(folder: Path) -> dict[str, Any]:
+    """All that was kept of the episodes, without times."""
+    found = {}
+    for file in sorted((folder / "parts").glob("*/*.json")):
+        record = json.loads(file.read_text())
+        for loop in ("closed", "open"):
+            for name in TIMES & set((record[loop] or {"figures": {}})["figures"]):
+                del record[loop]["figures"][name]
+        found[f"{file.parent.name}/{file.name}"] = record
+    return found
+
+
+def test_the_simulator_as_the_model_beats_random_on_easy_goals(bench: Bench, tmp_path: Path) -> None:
+    ended = bench(*PLACE, "--json", "--report", tmp_path / "report")
+    assert ended.code == 0, ended.err
+    results = json.loads(ended.out)
+    rows = results["tables"][0]["rows"]
+    assert rows["rank-12, simulator"]["success"]["mean"] == 1 > rows["random"]["success"]["mean"]
+    assert rows["rank-12, simulator"]["frames_per_decision"]["mean"] > 12
+    assert "rank-12, simulator − random" in (tmp_path / "bench/tables.md").read_text()
+    assert json.loads((tmp_path / "bench/metrics.json").read_text())["tables"] == results["tables"]
+    page = (tmp_path / "report/report.html").read_text()
+    assert len(list((tmp_path / "report/maps").glob("*.png"))) == page.count('class="map"') == 3
+    assert not re.search(r'(src|href)="(?!data:)', page)  # it needs no other file
+
+
+def test_a_stopped_run_that_goes_on_ends_as_an_uninterrupted_one(bench: Bench, tmp_path: Path) -> None:
+    short = (*PLACE, "--patience", 1, "--bins", 8)
+    for out in ("whole", "stopped"):
+        assert bench(*short, out=out).code == 0
+    whole, files = records(tmp_path / "whole"), sorted((tmp_path / "stopped/parts").glob("*/*.json"))
+    kept = files[0].stat().st_mtime_ns
+    for file in files[1:]:
+        file.unlink()
+    assert bench(*short, out="stopped").code == 0
+    assert records(tmp_path / "stopped") == whole
+    assert files[0].stat().st_mtime_ns == kept
+
+
+def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--patience", 1)
+    assert bench(*options, "--rows", "random").code == 0
+    added = bench(*options, "--rows", "random,straight", "--json")
+    assert list(json.loads(added.out)["tables"][0]["rows"]) == ["random", "straight"]
+    refused = bench(*options, "--rows", "random", "--horizon", 5)
+    assert refused.code == 1
+    assert "holds another benchmark (planning horizon: 8, now 5)" in refused.err
+
+
+def test_a_world_model_is_ranked_by_what_it_imagines(
+    bench: Bench, voxel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from persist_cli.metrics.lpips import ALEX, tensor_shapes
+    from tests.support.predictions import cache_random
+
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
+    cache_random(tmp_path / "cache", "lpips-alex", tensor_shapes(ALEX))
+    model = (voxel, "--steps", 1, "--rows", "rank-2,cem", "--memories", "none,voxel", "--candidates", 3, "--rounds", 1)
+    limits = ("--bins", 8, "--patience", 1, "--horizon", 3, "--stop-cost", -1, "--open-longest", 8)
+    ended = bench(*model, *limits, "--json")
+    assert ended.code == 0, ended.err
+    results = json.loads(ended.out)
+    rows = results["tables"][0]["rows"]
+    assert list(rows) == ["rank-2, none", "rank-2, voxel", "cem, none", "cem, voxel"]
+    assert {row["success"]["mean"] for row in rows.values()} == {0.0}  # no view costs less than nothing
+    assert set(rows["rank-2, voxel"]["success"]["differences"]) == {"rank-2, none"}
+    assert "lpips" in rows["cem, none"]
+    assert "sim" not in rows["cem, none"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((*PLACE, "--loops", "shut"), "unknown loop 'shut'"),
+        ((*PLACE[:2], "--rows", "random", "--bins", "64"), "no episode of 64 actions"),
+        (("--cost", "distanc"), "did you mean 'distance'"),
+        (("--cost", "distance", "--rows", "policy", "--policy", "rndom"), "unknown policy 'rndom'"),
+    ],
+)
+def test_bad_options_are_one_line(bench: Bench, tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+    ended = bench(*options)
+    assert ended.code == 1
+    assert message in ended.err
+    assert len(ended.err.strip().splitlines()) == 1
+    assert not (tmp_path / "bench/metrics.json").exists()
+
+
+def test_episodes_of_another_image_size_are_refused(bench: Bench, voxel: Path, episodes: EpisodeSet) -> None:
+    assert SETTINGS["height"] == 32
+    ended = bench(voxel, "--cost", "geodesic", "--rows", "rank-2", "--memories", "map2d")
+    assert ended.code == 1
+    assert "map2d" in ended.err

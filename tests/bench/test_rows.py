@@ -1,0 +1,58 @@
+"""Rows are what their names say, and names that cannot be rows are refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from persist_cli.bench.rows import RowChoice, default_rows
+from persist_cli.errors import PersistError
+
+
+def choice(*names: str, memories: tuple[str, ...] = ("none", "voxel"), **options: str | None) -> RowChoice:
+    return RowChoice(names, memories, options.get("policy"), options.get("goal") or "image", 60)  # type: ignore[arg-type]
+
+
+def test_rows_that_imagine_come_with_each_memory_and_others_once() -> None:
+    names = [row.name for row in choice("random", "rank-8", "cem", "random").rows()]
+    assert names == ["random", "rank-8, none", "rank-8, voxel", "cem, none", "cem, voxel"]
+
+
+def test_only_a_memory_is_given_the_walk() -> None:
+    rows = choice("rank-16", memories=("none", "voxel", "simulator")).rows()
+    assert [row.walk for row in rows] == [False, True, False]
+    assert [row.uses_world_model for row in rows] == [True, True, False]
+    assert {row.candidates for row in rows} == {16}
+
+
+def test_the_classical_planner_is_told_the_place_whatever_the_others_see() -> None:
+    place, image = choice("shortest-path", "shortest-path-image").rows()
+    assert (place.goal, image.goal) == ("place", "image")
+    assert place.walk
+    assert image.walk
+
+
+def test_a_named_policy_proposes_what_is_ranked_and_has_a_row() -> None:
+    alone, ranked = choice("policy", "rank-8", memories=("none",), policy="straight").rows()
+    assert (alone.policy, ranked.policy) == ("straight", "straight")
+    assert "policy" in default_rows("straight", "image")
+    assert "policy" not in default_rows(None, "image")
+
+
+def test_default_rows_can_be_made_whatever_the_cost_reads() -> None:
+    for goal in ("image", "place"):
+        assert choice(*default_rows(None, goal), goal=goal).rows()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("names", "goal", "message"),
+    [
+        (("randm",), None, "unknown row 'randm'; did you mean 'random'?"),
+        (("rank-0",), None, "unknown row 'rank-0'"),
+        (("policy",), None, "needs a policy; give --policy"),
+        (("shortest-path-image",), "place", "is shown the goal image, and the cost reads a place"),
+        ((), None, "no row is left"),
+    ],
+)
+def test_names_that_cannot_be_rows_are_refused(names: tuple[str, ...], goal: str | None, message: str) -> None:
+    with pytest.raises(PersistError, match=message.replace("?", r"\?")):
+        choice(*names, goal=goal).rows()

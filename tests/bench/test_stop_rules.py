@@ -1,0 +1,64 @@
+"""Agents stop at the goal's place, or at a threshold that is chosen where it can be told what is near."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from persist_cli.api.cost import Cost, Futures
+from persist_cli.api.ground import GroundMap
+from persist_cli.api.policy import Goal
+from persist_cli.bench.episodes import Episode
+from persist_cli.bench.stop_rules import (
+    Approach,
+    StopAtPlace,
+    StopByCost,
+    approach,
+    choose_threshold,
+)
+from persist_cli.bench.true_scene import TrueScene
+from persist_cli.errors import PersistError
+from persist_cli.simulators.miniworld import MiniWorld
+
+UP = (0.0, 1.0, 0.0)
+
+
+class PixelCost(Cost):
+    """The mean difference of pixels, which needs no weights."""
+
+    name = "pixels"
+
+    def measure(self, futures: Futures, goal: Goal, ground: GroundMap) -> torch.Tensor:
+        assert goal.rgb is not None
+        return (futures.rgb.double() - goal.rgb.double()).abs().mean((2, 3, 4))
+
+
+def test_the_threshold_is_one_at_which_most_agents_stop_near_and_only_there() -> None:
+    approaches = [Approach(far=5.0, near=1.0), Approach(far=4.0, near=2.0), Approach(far=1.5, near=9.0)]
+    chosen = choose_threshold(approaches)
+    assert (chosen.value, chosen.successes, chosen.episodes) == (2.0, 2, 3)
+
+
+def test_without_validation_episodes_a_threshold_must_be_given() -> None:
+    with pytest.raises(PersistError, match="give --stop-cost"):
+        choose_threshold([])
+
+
+def test_an_agent_that_knows_the_place_stops_half_a_metre_from_it(small_world: MiniWorld, found: list[Episode]) -> None:
+    scene, rule = TrueScene(small_world, found[0]), StopAtPlace()
+    assert not rule.stops(scene.look(), scene.goal, UP)
+    way = scene.shortest_way()
+    assert rule.stops(way[-2:-1], scene.goal, UP)  # a step before the goal
+    assert not rule.stops(way[-1:], Goal(scene.goal.rgb, None, scene.goal.scene), UP)
+
+
+def test_an_agent_that_is_shown_the_goal_stops_at_its_view(small_world: MiniWorld, found: list[Episode]) -> None:
+    scene, rule = TrueScene(small_world, found[0]), StopByCost(PixelCost(None), 1.0)
+    assert rule.stops(scene.goal_view, scene.goal, UP)
+    assert not rule.stops(scene.look(), scene.goal, UP)
+
+
+def test_a_view_beside_the_goal_costs_less_than_most(small_world: MiniWorld, found: list[Episode]) -> None:
+    costs = [approach(TrueScene(small_world, episode), PixelCost(None)) for episode in found]
+    assert costs == [approach(TrueScene(small_world, episode), PixelCost(None)) for episode in found]
+    assert all(one is not None and one.near > 0 and one.far > 0 for one in costs)
