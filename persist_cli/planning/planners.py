@@ -183,9 +183,11 @@ class Cem:
             drawn = draw(probabilities, names, settings.candidates - len(kept), generator)
             candidates = judge.judge([*kept, *drawn], number)
             on_round(number, least(judge))
+            if judge.exhausted:
+                break
             # every draw counts, the repeated too, as the distributions say how often they come
             costs = {candidate.actions: candidate.cost for candidate in candidates}
-            ranked = sorted((actions for actions in [*kept, *drawn] if actions in costs), key=lambda one: costs[one])
+            ranked = sorted([*kept, *drawn], key=lambda one: costs[one])
             elites = ranked[: max(1, round(settings.elites * len(ranked)))]
             share = settings.smoothing
             probabilities = share * probabilities + (1 - share) * frequencies(elites, names)
@@ -249,5 +251,7 @@ def least(judge: Judge) -> float:
 
 
 def finished(judge: Judge, rounds: int) -> Plan:
-    """Return the plan of all that was judged."""
-    return Plan(list(judge.judged.values()), rounds, judge.frames, judge.seconds, judge.exhausted)
+    """Return the plan of all that was judged; a round for which no budget was left does not count."""
+    candidates = list(judge.judged.values())
+    begun = max(candidate.round for candidate in candidates) if judge.exhausted else rounds
+    return Plan(candidates, begun, judge.frames, judge.seconds, judge.exhausted)

@@ -124,6 +124,14 @@ def test_a_budget_of_frames_is_kept_to_the_frame(judge, situation):
         Cem(CemSettings(horizon=4)).plan(situation, judge(budget=Budget(3)), seeded())
 
 
+def test_a_budget_that_a_round_uses_up_ends_the_plan_there(judge, situation):
+    settings, names = CemSettings(horizon=4, candidates=20, rounds=6), ["forward", "left", "right"]
+    first = {*draw(torch.full((4, 3), 1 / 3, dtype=torch.float64), names, 20, seeded())}
+    plan = Cem(settings).plan(situation, judge(budget=Budget(4 * len(first))), seeded())
+    assert {candidate.actions for candidate in plan.candidates} == first
+    assert (plan.rounds, plan.exhausted) == (1, True)
+
+
 def test_a_budget_of_seconds_ends_a_plan_after_its_first_batch_at_least(judge, situation):
     one = judge(budget=Budget(seconds=1e-9), batch=5)
     plan = Rank(make_policy("random", {}), RankSettings(4, 40)).plan(situation, one, seeded())
