@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
@@ -72,7 +72,9 @@ class WorldFutures:
     """The futures that a world model imagines.
 
     The candidates are imagined as one batch, which encodes the present frame once and reads the memory once. Only what
-    ``over`` asks for is decoded. Frames are written into a copy of the memory as long as a further clip reads it.
+    ``over`` asks for is decoded. Frames are written into a copy of the memory as long as a further clip reads it. After
+    a blocked action the frame before it is seen again, as in ``WorldModel.step``, and candidates that differ in blocked
+    actions alone are imagined once.
 
     Args:
         model: its first agent stands at the present frame.
@@ -88,26 +90,36 @@ class WorldFutures:
         agent = self.model.agents[0]
         walks = walk_all(agent.now.cameras, agent.info, candidates, self.ground, self.body)
         poses, free = padded(walks, agent.now.cameras.world_from_camera[0], over)
-        count, frames = poses.shape[:2]
         if not sees:
             return Imagined(without_images(poses, free), walks)
-        rgb = agent.now.rgb.expand(count, -1, -1, -1)[:, None].repeat(1, frames, 1, 1, 1)
-        depth = agent.now.depth.expand(count, -1, -1)[:, None].repeat(1, frames, 1, 1)
-        length = self.model.backbone.frames_per_clip - 1
-        clips = [-(-len(names) // length) for names in candidates]
-        for together in sorted(set(clips) - {0}):
-            numbers = [number for number, count in enumerate(clips) if count == together]
-            seen = self._see([walks[number] for number in numbers], [candidates[number] for number in numbers], over)
-            for number, (images, depths) in zip(numbers, seen, strict=True):
-                rgb[number, : len(images)], rgb[number, len(images) :] = images, images[-1]
-                depth[number, : len(images)], depth[number, len(images) :] = depths, depths[-1]
+        moves = [free_actions(names, walk) for names, walk in zip(candidates, walks, strict=True)]
+        seen = self._see_all({names: walk.poses[walk.free] for names, walk in zip(moves, walks, strict=True)}, over)
+        chosen = [frame_numbers(walk, poses.shape[1], over) for walk in walks]
+        videos = [tuple(part[numbers] for part in seen[names]) for names, numbers in zip(moves, chosen, strict=True)]
+        rgb, depth = (torch.stack(parts) for parts in zip(*videos, strict=True))
         return Imagined(Futures(rgb, depth, poses, free), walks)
 
-    def _see(self, walks: Sequence[Walk], candidates: Sequence[Actions], over: Over) -> list[tuple[Tensor, Tensor]]:
-        """Return RGB and depth of the frames to judge, of candidates that take equally many clips."""
-        branches = self.model.branches(len(walks))
+    def _see_all(
+        self, paths: Mapping[tuple[str, ...], Float[Tensor, "action 4 4"]], over: Over
+    ) -> dict[tuple[str, ...], tuple[Tensor, Tensor]]:
+        """Return for each way of free actions RGB and depth of the present frame, and of those after it to judge."""
+        now, length = self.model.agents[0].now, self.model.backbone.frames_per_clip - 1
+        seen = {names: (now.rgb, now.depth) for names in paths}
+        clips = {names: -(-len(names) // length) for names in paths}
+        for count in sorted(set(clips.values()) - {0}):
+            together = [names for names in paths if clips[names] == count]
+            videos = self._see([paths[names] for names in together], together, over)
+            for names, (rgb, depth) in zip(together, videos, strict=True):
+                seen[names] = torch.cat([now.rgb, rgb]), torch.cat([now.depth, depth])
+        return seen
+
+    def _see(
+        self, poses: Sequence[Float[Tensor, "action 4 4"]], candidates: Sequence[Actions], over: Over
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Return RGB and depth of the frames to judge, of ways that take equally many clips."""
+        branches = self.model.branches(len(poses))
         length, agents = branches.backbone.frames_per_clip - 1, branches.agents
-        paths = [cameras_at(agent.now.cameras, walk.poses) for agent, walk in zip(agents, walks, strict=True)]
+        paths = [cameras_at(agent.now.cameras, way) for agent, way in zip(agents, poses, strict=True)]
         interactions = [interactions_of(names, agents[0].info.vocabulary) for names in candidates]
         lead = (max(map(len, candidates)) - 1) // length * length
         before, rest = [path[:lead] for path in paths], [path[lead:] for path in paths]
@@ -216,6 +228,25 @@ def ways_are_free(
     blocked = way_is_free(ground, first, last, body.radius) == Cover.OCCUPIED
     moves = (last - first).norm(dim=-1) > 1e-6
     return [not stopped for stopped in (blocked & moves).tolist()]
+
+
+def free_actions(names: Actions, walk: Walk) -> tuple[str, ...]:
+    """Return the actions of a candidate that were free."""
+    return tuple(name for name, free in zip(names, walk.free.tolist(), strict=True) if free)
+
+
+def frame_numbers(walk: Walk, count: int, over: Over) -> Int64[Tensor, " frame"]:
+    """Return which frames of its free actions a candidate sees, 0 for the present one; ``count`` of them.
+
+    Args:
+        walk: of the candidate.
+        count: number of frames to judge; shorter candidates repeat their last.
+        over: with ``last`` only the last frame was imagined, which has number 1.
+    """
+    numbers = walk.free.cumsum(0) if len(walk.free) else torch.zeros(1, dtype=torch.int64)
+    if over == "last":
+        return numbers[-1:].clamp_max(1)
+    return torch.cat([numbers, numbers[-1:].repeat(count - len(numbers))])
 
 
 def cameras_at(camera: Cameras, poses: Float[Tensor, "frame 4 4"]) -> Cameras:

@@ -9,6 +9,7 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.ground import Body, Cover, GroundMap, ground_axes
 from persist_cli.errors import DataError
 from persist_cli.planning.futures import SimulatorFutures, WorldFutures, walk_all
+from persist_cli.rollout.world_model import WorldModel
 from tests.support.micro_model import micro, random_clips, shaken
 from tests.support.micro_runs import SIZE
 from tests.support.miniworlds import make_world, put_somewhere
@@ -93,6 +94,22 @@ def test_a_move_into_a_known_wall_stays_where_it_is(model):
     expected = agent.cameras_after(names[0]).world_from_camera
     torch.testing.assert_close(through.poses, expected)
     assert torch.equal(WorldFutures(model, ground, Body()).imagine(names, "best", False).walks[0].poses, walk.poses)
+
+
+def test_blocked_actions_show_what_a_rollout_with_a_body_does_and_cost_no_frames(model, monkeypatch):
+    ground, imagined = wall_before(model, 0.6), []
+    futures = WorldFutures(model, ground, Body())
+    names = [["forward"] * 4 + ["left"], ["forward"] * 2 + ["left"], ["forward", "forward", "forward", "left"]]
+    recall = WorldModel.recall
+    monkeypatch.setattr(
+        WorldModel, "recall", lambda self, *parts: imagined.append(len(parts[0])) or recall(self, *parts)
+    )
+    last, every = (futures.imagine(names, over).futures.rgb for over in ("last", "best"))
+    assert imagined == [1, 1]  # all three lead the same way
+    expected = model.branches(1).step([["forward", "forward", "left"]])[0].seen.rgb
+    assert all(alike(last[number, 0], expected[-1]) for number in range(3))
+    assert alike(every[0], expected[[0, 1, 1, 1, 2]])
+    assert alike(every[1], expected[[0, 1, 2, 2, 2]])
 
 
 def test_the_simulator_shows_what_is_there_and_the_agent_stands_where_it_stood():
