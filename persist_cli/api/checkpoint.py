@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from persist_cli.api.backbone import Sampling
 
 CARD: Final = "persist.json"
+POLICY_CARD: Final = "policy.json"  # of a trained policy, which is no world model
 WEIGHTS: Final = ".safetensors"
 VERSION: Final = 1
 STEP: Final = "step-"  # start of the names of the folders of a run's checkpoints
@@ -288,6 +289,8 @@ def read_card(folder: Path) -> dict[str, Any]:
     All small files of the folder, the card among them, are verified by ``SHA256SUMS`` where there is one.
     """
     path = folder / CARD
+    if (folder / POLICY_CARD).is_file() and not path.is_file():
+        raise CheckpointError(f"{run_folder(folder)}: a trained policy, no world model; name it as --policy")
     check_sums(folder, lambda name: not name.endswith(WEIGHTS))
     card = read_json(path)
     if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
@@ -360,7 +363,10 @@ def _model_folders(place: Path) -> list[Path]:
 
 def _own_folder(place: Path) -> Path | None:
     """Return the folder with the card of the place itself, which may be the ``step-…`` folder around it."""
-    return next((folder for folder in (place, place / "model") if (folder / CARD).is_file()), None)
+    cards = (CARD, POLICY_CARD)  # the latter is refused when it is read
+    return next(
+        (folder for folder in (place, place / "model") if any((folder / card).is_file() for card in cards)), None
+    )
 
 
 def _fingerprint(folder: Path) -> str:

@@ -36,8 +36,10 @@ from persist_cli.io.files import (
     read_tensors,
     write_json,
     write_tensors,
+    write_text,
 )
 from persist_cli.io.sha256sums import SUMS, write_sums
+from persist_cli.policies.trained import find_policy, is_policy, write_policy_card
 from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
@@ -91,6 +93,9 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     if out.exists():
         raise PersistError(f"{out}: exists already; choose another --out")
     check_folder(out)
+    if is_policy(plan.checkpoint):
+        export_policy(plan, out, json)
+        return
     base = find_checkpoint(plan.checkpoint)
     adapters = _find_adapters(base, plan.runs)
     defaults = {
@@ -112,6 +117,27 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
             hashes = write_sums(folder, hashes)
         files = {name: {"bytes": (folder / name).stat().st_size, "sha256": hashes[name]} for name in sorted(hashes)}
     _print_files(out, {"fingerprint": card["fingerprint"]} | defaults, files, json)
+
+
+def export_policy(plan: ExportPlan, out: Path, json: bool) -> None:
+    """Write a trained policy as a folder that stands alone, and print a table of its files.
+
+    Raises:
+        PersistError: when options of world models are given.
+    """
+    if plan.runs or plan.default or plan.sampling.requested() or plan.protocol_sampling:
+        raise PersistError(f"{plan.checkpoint}: a policy has no adapters and no sampling; give --dtype and --out alone")
+    policy = find_policy(plan.checkpoint)
+    with folder_aside(out) as folder:
+        for source in sorted(policy.folder.glob("*.safetensors")):
+            _convert(source, folder / source.name, PRECISIONS[plan.dtype])
+        recipe = policy.folder / RECIPE
+        if recipe.is_file():
+            write_text(folder / RECIPE, _without_absolute_paths(recipe.read_text(encoding="utf-8"), str(recipe)))
+        write_policy_card(folder, policy.policy, policy.settings, policy.training_scenes)
+        hashes = write_sums(folder)
+        files = {name: {"bytes": (folder / name).stat().st_size, "sha256": hashes[name]} for name in sorted(hashes)}
+    _print_files(out, {"policy": policy.policy, "dtype": plan.dtype}, files, json)
 
 
 def _find_adapters(base: Checkpoint, runs: Sequence[str]) -> dict[str, AdapterSource]:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import TrainingScenes, run_folder, step_folders
+from persist_cli.api.checkpoint import POLICY_CARD, TrainingScenes, run_folder, step_folders
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import bundled_folder, file_sha256, read_json, write_json
@@ -18,7 +18,6 @@ from persist_cli.io.settings import parse_settings
 from persist_cli.io.sha256sums import check_sums, write_sums
 from persist_cli.plugins import network_type
 
-CARD: Final = "policy.json"
 FORMAT: Final = "persist-policy"
 VERSION: Final = 1
 PACKAGED: Final = "policy"  # the folder of the policy that comes with the package
@@ -94,7 +93,7 @@ def write_policy_card(folder: Path, policy: str, settings: dict[str, Any], scene
     fingerprint = hashlib.sha256(hashes.encode()).hexdigest()
     card: dict[str, Any] = {"format": FORMAT, "version": VERSION, "policy": policy, "fingerprint": fingerprint}
     lineage = {} if scenes is None else {"training_scenes": scenes.to_json()}
-    write_json(folder / CARD, card | {"settings": settings} | lineage)
+    write_json(folder / POLICY_CARD, card | {"settings": settings} | lineage)
 
 
 def find_policy(path: Path) -> TrainedPolicy:
@@ -103,14 +102,12 @@ def find_policy(path: Path) -> TrainedPolicy:
     Raises:
         CheckpointError: when there is none, or its card is damaged.
     """
-    steps = step_folders(path)
-    places = (path, path / "model", *([steps[-1] / "model"] if steps else []))
-    folder = next((place for place in places if (place / CARD).is_file()), None)
+    folder = _policy_folder(path)
     if folder is None:
-        raise CheckpointError(f"{path}: no trained policy there (no {CARD}); train one: {TRAIN}")
-    card = read_json(folder / CARD)
+        raise CheckpointError(f"{path}: no trained policy there (no {POLICY_CARD}); train one: {TRAIN}")
+    card = read_json(folder / POLICY_CARD)
     if not isinstance(card, dict) or card.get("format") != FORMAT or card.get("version") != VERSION:
-        raise CheckpointError(f"{folder / CARD}: not the card of a trained policy of version {VERSION}")
+        raise CheckpointError(f"{folder / POLICY_CARD}: not the card of a trained policy of version {VERSION}")
     scenes = card.get("training_scenes")
     try:
         return TrainedPolicy(
@@ -118,7 +115,12 @@ def find_policy(path: Path) -> TrainedPolicy:
             None if scenes is None else TrainingScenes.from_json(scenes),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{folder / CARD}: the card is damaged ({error})") from error
+        raise CheckpointError(f"{folder / POLICY_CARD}: the card is damaged ({error})") from error
+
+
+def is_policy(path: Path) -> bool:
+    """Whether a run or folder is that of a trained policy."""
+    return _policy_folder(path) is not None
 
 
 def packaged_policy() -> TrainedPolicy:
@@ -128,6 +130,12 @@ def packaged_policy() -> TrainedPolicy:
         CheckpointError: when this installation has none.
     """
     folder = bundled_folder(PACKAGED)
-    if not (folder / CARD).is_file():
+    if not (folder / POLICY_CARD).is_file():
         raise CheckpointError(f"no trained policy comes with this installation; train one and give its folder: {TRAIN}")
     return find_policy(folder)
+
+
+def _policy_folder(path: Path) -> Path | None:
+    steps = step_folders(path)
+    places = (path, path / "model", *([steps[-1] / "model"] if steps else []))
+    return next((place for place in places if (place / POLICY_CARD).is_file()), None)

@@ -12,6 +12,7 @@ from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError, PluginError, RecipeError
+from persist_cli.io.files import read_tensors
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.policies.trained import find_policy, save_policy
 from tests.support.rooms import UP
@@ -88,6 +89,27 @@ def test_a_policy_that_is_not_there_is_refused_in_one_line_that_says_what_to_do(
             open_policy(str(place))
     with pytest.raises(CheckpointError, match="no trained policy comes with this installation"):
         open_policy("nomad")
+
+
+def test_a_policy_where_a_world_model_belongs_is_refused_in_one_line(persist, policy_run, walks):
+    ended = persist("rollout", policy_run, "--start", f"{walks}#0:4", "--actions", "left", "--out", walks / "never")
+    assert (ended.code, "a trained policy, no world model; name it as --policy" in ended.err) == (1, True)
+    assert "a trained policy of 'nomad'" in persist("inspect", policy_run).out
+
+
+def test_an_exported_policy_stands_alone_in_half_precision_and_acts_alike(persist, policy_run, situation, tmp_path):
+    assert persist("export", policy_run, "--out", tmp_path / "policy").code == 0
+    names = {path.name for path in (tmp_path / "policy").iterdir()}
+    assert names == {"model.safetensors", "policy.json", "recipe.yaml", "SHA256SUMS"}
+    weights = read_tensors(tmp_path / "policy/model.safetensors")[0]
+    assert {value.dtype for value in weights.values()} == {torch.float16}
+    ways = [
+        open_policy(str(place), {"stop": 0}).propose(situation, 8, 8, draw())
+        for place in (policy_run, tmp_path / "policy")
+    ]
+    assert sum(one == other for one, other in zip(*ways, strict=True)) >= 6
+    ended = persist("export", policy_run, "--out", tmp_path / "other", "--steps", 4)
+    assert (ended.code, "a policy has no adapters and no sampling" in ended.err) == (1, True)
 
 
 def test_a_damaged_policy_is_refused(tmp_path, policy_run):
