@@ -15,7 +15,7 @@ from persist_cli.api.actions import format_actions
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.cost import Cost
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.api.observations import Trajectory
+from persist_cli.api.observations import Observations, Trajectory
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.data.cameras import unfamiliar_view
@@ -90,6 +90,7 @@ class PlanParts:
 
     Args:
         start: the start frame.
+        seen: the frames of its trajectory up to it, as many as the policy looks at.
         goal: what is looked for.
         planner: the method.
         policy: proposes candidates; ``None`` where the method needs none.
@@ -99,6 +100,7 @@ class PlanParts:
     """
 
     start: Trajectory
+    seen: Observations
     goal: Goal
     planner: Rank | Cem
     policy: Policy | None
@@ -150,7 +152,9 @@ def plan_parts(options: PlanOptions) -> PlanParts:
     name = options.cost or ("lpips" if goal.rgb is not None else "geodesic")
     cost = make_cost(name, settings["cost"])
     check_goal(goal, cost, policy)
-    return PlanParts(start, goal, planner, policy, cost, budget, OVER[options.over])
+    first = max(0, reference.frame + 1 - (policy.frames if policy is not None else 1))
+    seen = file.read(range(first, reference.frame + 1)).observations
+    return PlanParts(start, seen, goal, planner, policy, cost, budget, OVER[options.over])
 
 
 def chosen_policy(options: PlanOptions, settings: dict[str, Any]) -> Policy | None:
@@ -195,7 +199,7 @@ def make_plan(model: WorldModel, parts: PlanParts, options: PlanOptions) -> Plan
     ground = Surroundings(body, agent.now, info, agent.memory).map()
     futures = WorldFutures(model, ground, body if options.body else None)
     judge = Judge(futures, parts.cost, parts.goal, ground, parts.over, parts.budget, options.batch)
-    situation = Situation(agent.now, info, parts.goal, ground)
+    situation = Situation(parts.seen, info, parts.goal, ground)
     generator = torch.Generator().manual_seed(options.seed)
     with shown_progress(parts, judge) as on_round:
         plan = parts.planner.plan(situation, judge, generator, on_round)

@@ -8,6 +8,7 @@ from PIL import Image
 
 from persist_cli.viewing.video import read_video
 from tests.support.micro_runs import SIZE
+from tests.support.packages import install
 
 SMALL = ("--steps", 1, "--candidates", 6, "--rounds", 2, "--horizon", 3)
 
@@ -61,6 +62,23 @@ def test_a_ranked_policy_towards_a_place_on_the_map(plan, tmp_path):
     assert record["cost"] == {"name": "geodesic", "settings": {"unknown": 1.5, "radius": 0.2}, "over": "last"}
     assert record["policy"]["name"] == "straight"
     assert record["goal"]["kinds"] == ["place"]
+
+
+def test_a_policy_sees_the_frames_before_the_start(plan, walks, site, tmp_path):
+    counts = """
+        from persist_cli.api.policy import Policy
+
+        class Counts(Policy):
+            frames = 5
+            def propose(self, situation, horizon, count, generator):
+                return [("left",) * min(horizon, len(situation.seen))] * count
+    """
+    install(site, "persist-counts", "persist.policies", "counts = counts:Counts", counts)
+    for frame, seen in ((1, 2), (9, 5)):
+        options = ("--method", "rank", "--policy", "counts", "--cost", "distance", "--horizon", 8)
+        out = tmp_path / f"{frame}"
+        assert plan(*options, start=f"{walks}#0:{frame}", out=out).code == 0
+        assert json.loads((out / "plan.json").read_text())["text"] == f"left*{seen}"
 
 
 def test_an_image_of_another_size_is_resized_and_said_so(plan, tmp_path, monkeypatch):
