@@ -169,16 +169,16 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         if not journal.begun:
             episodes = plan.source.episodes()
             check_scenes(episodes, checkpoint, plan.allow_training_scenes)
-            if checkpoint is not None:
-                check_model(checkpoint, rows, episodes)
             journal.begin(values, episodes)
     processes.wait()
     episodes = journal.episodes()
+    if checkpoint is not None:
+        check_model(checkpoint, rows, episodes)
     simulator = open_simulator(episodes)
-    threshold = find_threshold(plan, cost, rows, simulator, journal) if processes.main else None
-    processes.wait()
-    if not processes.main and (kept := journal.stop()) is not None:
-        threshold = StopThreshold(**kept)
+    if processes.main:
+        find_threshold(plan, cost, rows, simulator, journal)
+    processes.wait()  # the others find what the main process kept
+    threshold = find_threshold(plan, cost, rows, simulator, journal)
     return PlanningBench(plan, checkpoint, episodes, rows, cost, simulator, journal, threshold)
 
 

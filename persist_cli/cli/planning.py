@@ -193,6 +193,7 @@ def bench_plan(
     context_noise: ContextNoiseOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
+    verify: VerifyOption = False,
     batch: Annotated[int, typer.Option(min=1, help="Candidates imagined at once.")] = 20,
     allow_training_scenes: TrainingScenesOption = False,
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-plan"),

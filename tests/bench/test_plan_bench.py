@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.bench.episodes import EpisodeSet
-from tests.bench.conftest import SETTINGS
+from persist_cli.bench.plan_bench import check_scenes
+from persist_cli.errors import DataError
 from tests.conftest import CommandResult, Persist
 
 Bench = Callable[..., CommandResult]
@@ -119,8 +121,29 @@ def test_bad_options_are_one_line(bench: Bench, tmp_path: Path, options: tuple[s
     assert not (tmp_path / "bench/metrics.json").exists()
 
 
-def test_episodes_of_another_image_size_are_refused(bench: Bench, voxel: Path, episodes: EpisodeSet) -> None:
-    assert SETTINGS["height"] == 32
+def test_a_memory_that_the_model_lacks_is_refused(bench: Bench, voxel: Path) -> None:
     ended = bench(voxel, "--cost", "geodesic", "--rows", "rank-2", "--memories", "map2d")
     assert ended.code == 1
     assert "map2d" in ended.err
+    assert len(ended.err.strip().splitlines()) == 1
+
+
+def test_episodes_of_another_image_size_are_refused(
+    persist: Persist, voxel: Path, episodes: EpisodeSet, tmp_path: Path
+) -> None:
+    larger = episodes.model_copy(update={"settings": {"height": 64, "width": 64}})
+    larger.write(tmp_path / "larger.json")
+    options = ("--cost", "distance", "--rows", "rank-2", "--memories", "voxel", "--out", tmp_path / "bench")
+    ended = persist("bench", "plan", voxel, "--episodes", tmp_path / "larger.json", *options)
+    assert ended.code == 1
+    assert "images of 64x64 pixels" in ended.err
+    assert "--size 32x32" in ended.err
+
+
+def test_scenes_that_the_model_was_trained_on_are_refused(episodes: EpisodeSet, voxel: Path) -> None:
+    trained = episodes.episodes[0].model_copy(update={"scene_name": "room-0"})
+    known = episodes.model_copy(update={"episodes": [trained]})
+    with pytest.raises(DataError, match="'room-0': the model was trained on it"):
+        check_scenes(known, find_checkpoint(voxel), allowed=False)
+    check_scenes(known, find_checkpoint(voxel), allowed=True)
+    check_scenes(episodes, find_checkpoint(voxel), allowed=False)
