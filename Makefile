@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo demo-train table1 table1-reference ablations gain-curve test test-slow lint bench docs clean
+.PHONY: demo demo-train table1 table1-reference ablations gain-curve planning test test-slow lint bench docs clean
 
 demo: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.demo runs/demo
@@ -23,6 +23,9 @@ ablations: $(STAMP)
 gain-curve: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.ablations runs/gain-curve --only paper,improved \
 		--samples 1000,2000,5000,10000,20000,50000
+
+planning: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.reproduce.planning runs/planning
 
 # two processes of one thread each take about half the time of one, and each file stays in one process
 test: $(STAMP) lint

@@ -38,16 +38,16 @@ class PlanSettings:
         horizon: most actions that a decision looks ahead.
         over: which frame of a candidate is judged.
         rounds: most rounds of ``cem``.
-        budget: the most that a decision may imagine.
-        batch: candidates imagined together.
+        frames: most imagined frames of a decision; ``None`` for no bound.
+        seconds: most seconds of a decision, likewise.
         body: whether imagined moves over ground known to be occupied do not move.
     """
 
     horizon: int = 8
     over: Literal["last", "best"] = "last"
     rounds: int = 3
-    budget: Budget = field(default_factory=Budget)
-    batch: int = 20
+    frames: int | None = None
+    seconds: float | None = None
     body: bool = True
 
 
@@ -167,7 +167,8 @@ class Navigator:
         cost, settings = self.parts.cost, self.settings
         if cost is None:
             raise ValueError(f"row {self.row.name!r} imagines and has no cost")
-        return Judge(model, cost, self.goal, situation.ground, settings.over, settings.budget, settings.batch)
+        budget = Budget(settings.frames, settings.seconds)
+        return Judge(model, cost, self.goal, situation.ground, settings.over, budget)
 
     def _add_points(self, memory: Memory, body: Body) -> None:
         """Add what a memory knows of the ground, whose floor lies below the present camera."""

@@ -53,6 +53,21 @@ class EpisodeSource:
     search: EpisodeSearch
     bins: tuple[int, ...] | None = None
 
+    @staticmethod
+    def of(file: Path | None, scenes: str, bins: Sequence[int] | None, each: int) -> EpisodeSource:
+        """Return where episodes come from, by the options of a command; scenes are test houses of ``miniworld``.
+
+        Args:
+            file: of episodes; ``None`` to draw them.
+            scenes: ``A:B``, B not included.
+            bins: actions of the shortest ways; ``None`` for the file's, or the usual ones.
+            each: most drawn episodes of each kind.
+        """
+        search = EpisodeSearch(each=each) if bins is None else EpisodeSearch(tuple(bins), each)
+        return EpisodeSource(
+            file, CollectPlan("miniworld", scenes, split="test"), search, None if bins is None else tuple(bins)
+        )
+
     def identity(self) -> dict[str, Any]:
         """Return JSON values that are equal for equal episodes.
 

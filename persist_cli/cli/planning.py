@@ -24,6 +24,8 @@ from persist_cli.cli.options import (
 )
 from persist_cli.errors import PersistError
 
+PLAN_MEMORIES = "none,voxel,simulator"
+
 planning_app = typer.Typer()
 bench_app = typer.Typer(no_args_is_help=True, help="Measure plans and collisions against the simulator.")
 planning_app.add_typer(bench_app, name="bench")
@@ -162,17 +164,11 @@ def bench_collisions(
 def bench_plan(
     checkpoint: Annotated[Path, typer.Argument(help="Run or checkpoint of the world model.")] = Path("reference"),
     episodes: Annotated[Path | None, typer.Option(help="File of episodes; else they are drawn.")] = None,
-    scenes: Annotated[str, typer.Option(help="Scene seeds A:B to draw episodes in.")] = "0:24",
-    split: Annotated[str, typer.Option(help="Split of these scenes.")] = "test",
-    simulator: Annotated[str, typer.Option(help="Simulator of these scenes.")] = "miniworld",
-    size: Annotated[str, typer.Option(help="Image size HxW of these scenes.")] = "64x64",
+    scenes: Annotated[str, typer.Option(help="Test houses A:B of miniworld to draw episodes in.")] = "0:24",
     bins: Annotated[str | None, typer.Option(help="Actions of the shortest ways; 8,16,32,64, or the file's.")] = None,
-    each: Annotated[int, typer.Option(min=1, help="Most episodes of each bin, in sight and hidden.")] = 16,
-    episode_seed: Annotated[int, typer.Option(min=0, help="Seed of starts and goals.")] = 0,
+    each: Annotated[int, typer.Option(min=1, help="Most drawn episodes of each bin, in sight and hidden.")] = 16,
     rows: Annotated[str | None, typer.Option(help="Rows, as in random,shortest-path,policy,rank-8,cem.")] = None,
-    memories: Annotated[
-        str, typer.Option(help="Memories of the model; simulator: the true scene in its place.")
-    ] = "none,voxel,simulator",
+    memories: Annotated[str, typer.Option(help="Memories; simulator: the true scene is the model.")] = PLAN_MEMORIES,
     policy: Annotated[str | None, typer.Option(help="A policy, or a trained one's folder; else random.")] = None,
     cost: Annotated[str, typer.Option(help="lpips, dreamsim, dino, distance or geodesic.")] = "lpips",
     over: Annotated[Literal["last", "best"], typer.Option(help="Frame of a candidate that is judged.")] = "last",
@@ -183,44 +179,34 @@ def bench_plan(
     rounds: Annotated[int, typer.Option(min=1, help="Most rounds of cem.")] = 3,
     frames: Annotated[int | None, typer.Option(min=1, help="Most imagined frames of a decision.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.001, help="Most seconds of a decision.")] = None,
-    loops: Annotated[str, typer.Option(help="closed, open or both.")] = "closed,open",
-    open_longest: Annotated[int, typer.Option(min=1, help="Longest bin of the open loop.")] = 16,
+    loops: Annotated[str, typer.Option(help="closed, open or both; open: up to 16 actions.")] = "closed,open",
     stop_cost: Annotated[float | None, typer.Option(help="Cost of a view to stop at; else chosen.")] = None,
     body: Annotated[bool, typer.Option(help="Imagined moves into known obstacles do not move.")] = True,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
-    context_noise: ContextNoiseOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
-    batch: Annotated[int, typer.Option(min=1, help="Candidates imagined at once.")] = 20,
     allow_training_scenes: TrainingScenesOption = False,
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-plan"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html and maps.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Let agents plan their way to goals in held-out scenes, with other memories, policies and none, and compare them.
+    """Compare plans with other memories, policies and no model, by episodes in held-out houses.
 
-    persist bench plan reference --scenes 0:24 --rows random,rank-8 --memories none,voxel --report runs/plans
+    persist bench plan --scenes 0:24 --rows random,rank-8 --memories none,voxel --report runs/plans
     """
-    from persist_cli.bench.find_episodes import EpisodeSearch
     from persist_cli.bench.navigator import PlanSettings
     from persist_cli.bench.plan_bench import BenchPlan, EpisodeSource
     from persist_cli.bench.run_episode import LoopSettings
     from persist_cli.bench.run_plan_bench import run_plan_bench
-    from persist_cli.planning.judge import Budget
-    from persist_cli.simulators.collect import CollectPlan
 
-    chosen = None if bins is None else whole_numbers("--bins", bins)
-    search = EpisodeSearch(chosen or (8, 16, 32, 64), each, seed=episode_seed)
     plan = BenchPlan(
-        source=EpisodeSource(episodes, CollectPlan(simulator, scenes, size=size, split=split), search, chosen),
-        checkpoint=checkpoint, rows=None if rows is None else split_names(rows), memories=split_names(memories),
-        policy=policy, cost=cost, cem_candidates=candidates, loops=split_names(loops), stop_cost=stop_cost,
-        planning=PlanSettings(horizon, over, rounds, Budget(frames, seconds), batch, body),
-        loop=LoopSettings(execute, patience, open_longest),
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
-        placement=InferenceOptions.of(dtype, save_memory), allow_training_scenes=allow_training_scenes,
+        EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each), checkpoint,
+        split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
+        PlanSettings(horizon, over, rounds, frames, seconds, body), split_names(loops), LoopSettings(execute, patience),
+        stop_cost, SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory),
+        allow_training_scenes,
     )  # fmt: skip
     run_plan_bench(plan, out, report, json)

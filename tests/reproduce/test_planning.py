@@ -1,0 +1,39 @@
+"""The figures of plans are made by commands that persist has."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import typer.main
+
+from persist_cli.bench.rows import RowChoice
+from persist_cli.cli.app import app
+from persist_cli.reproduce.planning import PlanningFigures, commands
+
+OUT = Path("my runs/planning")
+
+
+def test_every_command_and_option_exists() -> None:
+    for line in commands(PlanningFigures(OUT, policy="runs/policy")):
+        command, words = typer.main.get_command(app), shlex.split(line)
+        while hasattr(command, "commands"):
+            command = command.commands[words.pop(0)]
+        known = {option for parameter in command.params for option in parameter.opts}
+        assert {word for word in words if word.startswith("--")} <= known
+
+
+def test_every_row_of_the_figures_can_be_made() -> None:
+    for line in commands(PlanningFigures(OUT, policy="straight")):
+        rows = re.search(r"--rows (\S+) --memories (\S+)", line)
+        if rows:
+            names, memories = (text.split(",") for text in rows.groups())
+            assert RowChoice(names, memories, "straight", "image", 60).rows()
+
+
+def test_episodes_that_are_drawn_are_not_drawn_again(tmp_path: Path) -> None:
+    figures = PlanningFigures(tmp_path)
+    assert any(line.startswith("bench episodes") for line in commands(figures))
+    (tmp_path / "episodes.json").touch()
+    assert not any(line.startswith("bench episodes") for line in commands(figures))
