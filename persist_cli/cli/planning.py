@@ -75,9 +75,9 @@ def plan(
     step: StepOption = None,
     turn: TurnOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of candidates and sampling noise.")] = 0,
-    steps: StepsOption = None,
+    steps: Annotated[int, typer.Option(min=1, help="Denoising steps; one orders candidates about as well as 20.")] = 1,
     sampler: SamplerOption = None,
-    guidance: GuidanceOption = None,
+    guidance: Annotated[float, typer.Option(min=0, help="Of guidance over memory; 1: none.")] = 1.0,
     context_noise: ContextNoiseOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
@@ -86,7 +86,7 @@ def plan(
 ) -> None:
     """Plan inside the model: imagine candidates from a start, and choose the one that comes nearest to a goal.
 
-    persist plan --start sample#0:32 --goal sample#0:40 --steps 1 --guidance 1 --out runs/plan
+    persist plan --start sample#0:20 --goal sample#0:28 --memory runs/house.safetensors --out runs/plan
     """
     from persist_cli.planning.plan import PlanOptions, run_plan
 

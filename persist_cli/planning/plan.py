@@ -278,7 +278,8 @@ def show(planned: Planned, record: dict[str, Any], out: Path) -> None:
     say(f"chosen: {format_actions(plan.actions) or 'stay here'}")
     say(
         f"{len(plan.candidates)} videos, {plan.frames} imagined frames in {plan.seconds:.1f} s "
-        f"({plan.rounds} rounds{', ended by the budget' if plan.exhausted else ''}); written to {out}"
+        f"({plan.rounds} rounds{', ended by the budget' if plan.exhausted else ''}), "
+        f"{planned.futures.model.sampling.words}; written to {out}"
     )
     unknown = record["truth"]["unknown"]
     if unknown:

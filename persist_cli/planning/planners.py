@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -211,9 +211,6 @@ class Cem:
             return uniform, []
         probabilities, best = self._last
         return self.settings.shift * probabilities + (1 - self.settings.shift) * uniform, [best]
-
-
-METHODS: Final = ("rank", "cem")
 
 
 def action_names(vocabulary: ActionVocabulary, chosen: Sequence[str]) -> list[str]:

@@ -43,7 +43,6 @@ from persist_cli.plugins import make_cost
 from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import print_table, say, watched
-from tests.benchmarks.timing import say_conditions
 
 AHEAD = 8  # frames from the start to the goal, along the trajectory
 
@@ -70,7 +69,7 @@ class Decision:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print the tables and write what ``--out`` asks for."""
     options = parse(arguments)
-    say_conditions(f"{options.candidates} candidates of {options.horizon} actions")
+    say(f"{options.candidates} candidates of {options.horizon} actions; torch uses {torch.get_num_threads()} thread(s)")
     checkpoint = find_checkpoint(options.checkpoint or reference_checkpoint())
     adapter = checkpoint.chosen_adapter(options.adapter)
     backbone = load_backbone(checkpoint, adapter=adapter)

@@ -1,5 +1,6 @@
 """Costs on random weights, and on places that can be computed by hand."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -135,3 +136,10 @@ def test_the_geodesic_cost_knows_places_off_the_map_and_ways_that_are_shut():
     walls = GroundMap(shut, ground.origin, ground.spacing, ground.axes)
     inside = cost.measure(futures_at((2.5, 2.5, 0.0)), Goal(None, torch.tensor([0.5, 0.5, 0.0]), "room"), walls)
     assert float(inside) == float("inf")
+
+
+def test_the_listing_of_plugins_says_which_weights_a_cost_lacks(persist, tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
+    rows = {row["name"]: row["state"] for row in json.loads(persist("plugins", "--json").out) if row["kind"] == "cost"}
+    assert "persist weights fetch lpips-alex" in rows["lpips"]
+    assert rows["geodesic"] == rows["distance"] == "ok"

@@ -81,6 +81,15 @@ def test_a_policy_sees_the_frames_before_the_start(plan, walks, site, tmp_path):
         assert json.loads((out / "plan.json").read_text())["text"] == f"left*{seen}"
 
 
+def test_a_model_without_memory_plans_with_the_paths_alone_on_its_map(plan, tmp_path):
+    result = plan("--cost", "distance", "--over", "best", "--adapter", "stage1", "--no-body", "--frames", 12)
+    assert result.code == 0, result.err
+    record = json.loads((tmp_path / "plan/plan.json").read_text())
+    assert (record["adapter"], record["imagined_frames"], record["ended_by_budget"]) == (None, 12, True)
+    assert "ended by the budget" in result.out
+    assert (tmp_path / "plan/map.png").stat().st_size > 0
+
+
 def test_an_image_of_another_size_is_resized_and_said_so(plan, tmp_path, monkeypatch):
     from persist_cli.metrics.lpips import ALEX, tensor_shapes
     from tests.support.predictions import cache_random
