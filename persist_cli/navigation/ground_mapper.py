@@ -124,6 +124,24 @@ class GroundMapper:
             side = points.spread / 2 if vote in (Vote.REMEMBERED_OCCUPIED, Vote.IMAGINED_OCCUPIED) else points.spread
             self._count(vote, self._squares(places[chosen], side))
 
+    def add_collision(self, camera: Cameras, forward: float) -> None:
+        """Add that a true agent was stopped: what is right before its body, to half its width, is occupied.
+
+        Low things hide below the image, where only a collision tells of them.
+
+        Args:
+            camera: the agent's camera, single, where it was stopped.
+            forward: metres that the step would have gone along the heading; negative values go backward.
+        """
+        place = (self.axes @ camera.centers.double())[:2]
+        heading = (self.axes @ camera.world_from_camera[:3, 2].double())[:2]
+        ahead = heading / heading.norm().clamp_min(1e-9) * math.copysign(1.0, forward)
+        aside = torch.stack([-ahead[1], ahead[0]])
+        half = round(self.body.radius / 2 / self.spacing)
+        across = torch.arange(-half, half + 1, dtype=torch.float64)[:, None] * self.spacing
+        front = place + (self.body.radius + self.spacing) * ahead
+        self._count(Vote.OBSERVED_OCCUPIED, self._squares(front + across * aside))
+
     def map(self) -> GroundMap:
         """Return what is known now."""
         if self._map is None:

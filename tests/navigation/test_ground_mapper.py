@@ -137,3 +137,13 @@ def test_a_body_has_the_camera_height_that_its_data_set_tells():
     assert body_of(ROOM.info) == Body()
     told = body_of(replace(ROOM.info, source={"camera_height": 1.7}))
     assert (told.camera_height, told.height) == (1.7, 1.7)
+
+
+def test_a_collision_makes_what_is_right_before_the_body_occupied():
+    mapper, frames = GroundMapper(UP, BODY), seen(look((0.0, 1.25, 0.0), 90.0, 0.0))  # looks along -x
+    mapper.add(frames)
+    mapper.add_collision(frames.cameras[0], 0.25)
+    assert cover_at(mapper.map(), -0.25, 0.0) == Cover.OCCUPIED
+    assert cover_at(mapper.map(), 0.0, 0.0) == cover_at(mapper.map(), -0.5, 0.0) == Cover.FREE
+    mapper.add_collision(frames.cameras[0], -0.25)
+    assert cover_at(mapper.map(), 0.25, 0.0) == Cover.OCCUPIED
