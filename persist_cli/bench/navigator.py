@@ -129,6 +129,19 @@ class Navigator:
         if self.planner is not None:
             self.planner.executed(executed)
 
+    def collided(self, frame: Observations, action: str) -> None:
+        """Take in that something was in the way of an action: its ground counts as occupied from now on.
+
+        Without it an agent would push for ever against a low thing that hides below its image.
+
+        Args:
+            frame: seen where it stands.
+            action: that was refused; one that does not walk says nothing.
+        """
+        forward = self.info.vocabulary[action].forward
+        if forward:
+            self.ground.add_collision(frame.cameras[0], forward)
+
     def decide(self) -> Decision:
         """Return the next actions."""
         generator = torch.Generator().manual_seed(self.seed * DECISIONS + self.decisions)

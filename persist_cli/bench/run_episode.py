@@ -93,12 +93,14 @@ def _act(scene: TrueScene, navigator: Navigator, stop: StopRule, trace: Trace, a
     """Do actions and look after each; return ``stopped`` when the agent stopped, else an empty text."""
     frames = []
     for action in actions:
-        if not scene.simulator.act(action):
+        if not (allowed := scene.simulator.act(action)):
             trace.refused.append(len(trace.actions))
         trace.actions.append(action)
         trace.places.append(scene.simulator.agent[0])
         trace.distances.append(scene.distance)
         frames.append(scene.look())
+        if not allowed:
+            navigator.collided(frames[-1], action)
         if stop.stops(frames[-1], navigator.goal, scene.info.world_up):
             return "stopped"
     navigator.saw(Observations.concatenate(frames), len(frames))

@@ -11,14 +11,22 @@ from typing import Any
 import pytest
 
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.ground import Cover
 from persist_cli.bench.episodes import EpisodeSet
+from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
 from persist_cli.bench.plan_bench import check_scenes
+from persist_cli.bench.rows import PlanningRow
+from persist_cli.bench.true_scene import TrueScene
 from persist_cli.errors import DataError
+from persist_cli.plugins import make_policy
+from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult, Persist
 
 Bench = Callable[..., CommandResult]
 
 PLACE = ("--cost", "distance", "--rows", "random,rank-12", "--memories", "simulator", "--loops", "closed")
+
+ALONE_STRAIGHT = PlanningRow("straight", "policy", "straight", None, "place", walk=False)
 
 TIMES = {"seconds_per_decision", "open_seconds"}
 
@@ -58,6 +66,25 @@ def test_the_simulator_as_the_model_beats_random_on_easy_goals(bench: Bench, tmp
     page = (tmp_path / "report/report.html").read_text()
     assert len(list((tmp_path / "report/maps").glob("*.png"))) == page.count('class="map"') == 3
     assert not re.search(r'(src|href)="(?!data:)', page)  # it needs no other file
+
+
+def test_the_classical_policy_finds_goals_whose_place_is_given(bench: Bench) -> None:
+    ended = bench("--cost", "distance", "--rows", "shortest-path", "--loops", "closed", "--json")
+    assert ended.code == 0, ended.err
+    row = json.loads(ended.out)["tables"][0]["rows"]["shortest-path"]
+    assert (row["success"]["mean"], row["spl"]["mean"] > 0.6) == (1.0, True)
+
+
+def test_an_agent_that_hit_something_knows_it(episodes: EpisodeSet, small_world: MiniWorld) -> None:
+    scene = TrueScene(small_world, episodes.episodes[0])
+    scene.back_to_start()
+    row, parts = ALONE_STRAIGHT, RowParts(make_policy("straight", {}))
+    navigator = Navigator(row, parts, PlanSettings(), scene, 8)
+    navigator.collided(scene.look(), "left")
+    occupied = [int((navigator.ground.map().states == Cover.OCCUPIED).sum())]
+    navigator.collided(scene.look(), "forward")
+    occupied.append(int((navigator.ground.map().states == Cover.OCCUPIED).sum()))
+    assert occupied[1] > occupied[0]
 
 
 def test_a_stopped_run_that_goes_on_ends_as_an_uninterrupted_one(bench: Bench, tmp_path: Path) -> None:
