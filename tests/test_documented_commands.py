@@ -77,6 +77,7 @@ NOT_RUN = {
     "hf download": "needs the hub",
     "persist weights fetch": "downloads",
     "persist doctor": "takes half a minute for a published model; tests/doctor runs it on them",
+    "persist bench ": "walks through houses for minutes; tests/bench run them small",
     "persist --install-completion": "changes the files of the shell",
     "sbatch ": "needs Slurm",
     "open ": "opens a window",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from persist_cli.bench.plan_bench import LOOPS
 from persist_cli.bench.planning_pictures import EpisodePictures
 from persist_cli.bench.planning_tables import (
     amount,
@@ -16,6 +17,7 @@ from persist_cli.bench.planning_tables import (
     difference_columns,
     difference_rows,
     heading,
+    loop_columns,
     success_rows,
 )
 from persist_cli.io.files import write_text
@@ -54,15 +56,23 @@ def report_page(results: Mapping[str, Any], pictures: Sequence[EpisodePictures])
 
 
 def section(table: Mapping[str, Any], results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the page shows of a table."""
-    names = columns_of(table)
-    definitions = {row["name"]: row["definition"] for row in results["rows"]}
+    """Return what the page shows of the episodes of one kind."""
     return {
         "name": table["name"],
         "counted": counted(table),
-        "columns": [
-            {"heading": heading(name), "definition": results["columns"][name]["definition"]} for name in names
-        ],
+        "parts": [loop_table(table, results, loop) for loop in LOOPS if columns_of(table, loop_columns(loop))],
+        "differences": difference_rows(table),
+        "difference_heads": [heading(name) for name in difference_columns(table)],
+    }
+
+
+def loop_table(table: Mapping[str, Any], results: Mapping[str, Any], loop: str) -> dict[str, Any]:
+    """Return the table of one loop."""
+    names = columns_of(table, loop_columns(loop))
+    definitions = {row["name"]: row["definition"] for row in results["rows"]}
+    return {
+        "title": f"{loop.capitalize()} loop",
+        "columns": [{"heading": heading(name), "definition": results["columns"][name]["definition"]} for name in names],
         "rows": [
             {
                 "name": row,
@@ -71,9 +81,7 @@ def section(table: Mapping[str, Any], results: Mapping[str, Any]) -> dict[str, A
             }
             for row, figures in table["rows"].items()
         ],
-        "differences": difference_rows(table),
-        "difference_heads": [heading(name) for name in difference_columns(table)],
-    }  # fmt: skip
+    }
 
 
 def parts_of(figure: Mapping[str, Any] | None, name: str) -> dict[str, str]:

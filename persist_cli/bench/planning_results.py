@@ -153,8 +153,8 @@ def stop_words(bench: PlanningBench) -> list[str]:
 
 def define(row: PlanningRow, bench: PlanningBench) -> str:
     """Return a few words that say what a row is."""
-    given = "the given walk" if row.walk else "nothing of the scene but its own frames"
-    told = f"told the goal's {row.goal}, given {given}"
+    given = "given the walk" if row.walk else "given nothing of the scene but its own frames"
+    told = f"{'shown the goal image' if row.goal == 'image' else 'told the place of the goal'}, {given}"
     if not row.imagines:
         return f"policy {row.policy!r} without imagination; {told}"
     model = "the simulator itself as the model" if row.memory == SIMULATOR else f"memory {row.memory!r}"

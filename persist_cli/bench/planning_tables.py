@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from persist_cli.bench.plan_bench import LOOPS
 from persist_cli.bench.planning_results import COLUMNS
 from persist_cli.viewing.console import print_table, say
 
@@ -47,7 +48,7 @@ def heading(name: str) -> str:
     return f"{COLUMNS[name].title}{arrow}"
 
 
-def columns_of(table: Mapping[str, Any], names: Sequence[str] = tuple(COLUMNS)) -> list[str]:
+def columns_of(table: Mapping[str, Any], names: Sequence[str]) -> list[str]:
     """Return those of some columns that a row of the table has."""
     return [name for name in names if any(name in row for row in table["rows"].values())]
 
@@ -63,15 +64,22 @@ def counted(table: Mapping[str, Any]) -> str:
     return f"{len(table['episodes'])} episodes, {table['scenes']} scenes"
 
 
+def loop_columns(loop: str) -> list[str]:
+    """Return the columns that are measured in a loop."""
+    return [name for name, column in COLUMNS.items() if column.loop == loop]
+
+
 def group_text(table: Mapping[str, Any]) -> str:
-    """Return one table of figures and one of differences as Markdown."""
-    names = columns_of(table)
-    rows = [[row, *(cell(figures.get(name), name) for name in names)] for row, figures in table["rows"].items()]
-    parts = [f"## {table['name']} ({counted(table)})", markdown_table(["row", *map(heading, names)], rows)]
+    """Return the figures of each loop and the differences over the episodes of one kind, as Markdown."""
+    parts = [f"## {table['name']} ({counted(table)})"]
+    for loop in LOOPS:
+        names = columns_of(table, loop_columns(loop))
+        rows = [[row, *(cell(figures.get(name), name) for name in names)] for row, figures in table["rows"].items()]
+        if names:
+            parts.append(markdown_table([f"row ({loop} loop)", *map(heading, names)], rows))
     differences = difference_rows(table)
     if differences:
-        heads = ["difference", *map(heading, difference_columns(table))]
-        parts.append(markdown_table(heads, differences))
+        parts.append(markdown_table(["difference", *map(heading, difference_columns(table))], differences))
     return "\n\n".join(parts)
 
 
