@@ -21,6 +21,7 @@ from persist_cli.errors import DataError
 from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult, Persist
+from tests.support.processes import run_command, run_in_pair
 
 Bench = Callable[..., CommandResult]
 
@@ -98,6 +99,14 @@ def test_a_stopped_run_that_goes_on_ends_as_an_uninterrupted_one(bench: Bench, t
     assert bench(*short, out="stopped").code == 0
     assert records(tmp_path / "stopped") == whole
     assert files[0].stat().st_mtime_ns == kept
+
+
+def test_two_processes_keep_what_one_does(bench: Bench, tmp_path: Path) -> None:
+    short = ("--cost", "distance", "--rows", "random,straight", "--loops", "closed", "--patience", "1")
+    assert bench(*short, out="one").code == 0
+    command = ("bench", "plan", "--episodes", str(tmp_path / "episodes.json"), "--out", str(tmp_path / "two"), *short)
+    assert run_in_pair(run_command, [*command], output=tmp_path) == [0, 0], (tmp_path / "0.log").read_text()
+    assert records(tmp_path / "two") == records(tmp_path / "one")
 
 
 def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
