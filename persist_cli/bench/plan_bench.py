@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -31,8 +31,9 @@ from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import load_plugin, make_cost, make_simulator
 from persist_cli.policies.open_policy import open_policy
+from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.simulators.collect import CollectPlan
-from persist_cli.viewing.console import add_task, busy, progress
+from persist_cli.viewing.console import add_task, busy, progress, warn
 
 LOOPS: Final = ("closed", "open")
 
@@ -183,7 +184,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         journal.check(values)
         if not journal.begun:
             episodes = plan.source.episodes()
-            check_scenes(episodes, checkpoint, plan.allow_training_scenes)
+            check_scenes(episodes, trained_on(checkpoint, plan.policy), plan.allow_training_scenes)
             journal.begin(values, episodes)
     processes.wait()
     episodes = journal.episodes()
@@ -229,15 +230,41 @@ def check_model(checkpoint: Checkpoint, rows: Sequence[PlanningRow], episodes: E
         )
 
 
-def check_scenes(episodes: EpisodeSet, checkpoint: Checkpoint | None, allowed: bool) -> None:
-    """Raise ``DataError`` when the model was trained on a scene of the episodes, unless that is allowed."""
-    trained = training_scenes([checkpoint]) if checkpoint is not None else frozenset[str]()
-    known = next((scene for scene in episodes.scenes if scene in trained), None)
-    if known is not None and not allowed:
-        raise DataError(
-            f"scene {known!r}: the model was trained on it; take episodes of another split, or measure it all the same "
-            "with --allow-training-scenes"
-        )
+def check_scenes(episodes: EpisodeSet, trained: Mapping[str, Collection[str]], allowed: bool) -> None:
+    """Raise ``DataError`` when something was trained on a scene of the episodes, unless that is allowed.
+
+    Args:
+        episodes: the episodes.
+        trained: names of the scenes that model and policy were trained on, by words for each.
+        allowed: whether such scenes may be measured.
+    """
+    for words, names in trained.items():
+        known = next((scene for scene in episodes.scenes if scene in names), None)
+        if known is not None and not allowed:
+            raise DataError(
+                f"scene {known!r}: {words} was trained on it; take episodes of another split, or measure it all the "
+                "same with --allow-training-scenes"
+            )
+
+
+def trained_on(checkpoint: Checkpoint | None, policy: str | None) -> dict[str, Collection[str]]:
+    """Return the names of the scenes that model and policy were trained on, by words for each."""
+    names: dict[str, Collection[str]] = {} if checkpoint is None else {"the model": training_scenes([checkpoint])}
+    trained = None if policy is None else trained_policy(policy)
+    if trained is not None:
+        scenes = trained.training_scenes
+        if scenes is None or not scenes.complete:
+            warn(f"{trained.folder}: not all scenes that this policy was trained on are known")
+        names[f"policy {policy!r}"] = scenes.names if scenes is not None else ()
+    return names
+
+
+def trained_policy(name: str) -> TrainedPolicy | None:
+    """Return the trained policy behind a name or folder; ``None`` for a policy that is not trained."""
+    settings = open_policy(name).settings
+    if not hasattr(settings, "checkpoint"):
+        return None
+    return packaged_policy() if settings.checkpoint is None else find_policy(Path(settings.checkpoint))
 
 
 def open_simulator(episodes: EpisodeSet) -> Simulator:
@@ -271,10 +298,13 @@ def find_threshold(
 def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict[str, Any]:
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
+    trained = None if plan.policy is None else trained_policy(plan.policy)
     values = {
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
-        "policy": plan.policy,
+        "policy": None
+        if plan.policy is None
+        else {"name": plan.policy, "fingerprint": trained and trained.fingerprint},
         "cem candidates": plan.cem_candidates,
         "planning": asdict(plan.planning),
         "loop": asdict(plan.loop) | {"loops": list(plan.loops)},

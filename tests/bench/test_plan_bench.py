@@ -14,7 +14,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Cover
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
-from persist_cli.bench.plan_bench import check_scenes
+from persist_cli.bench.plan_bench import check_scenes, trained_on
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.errors import DataError
@@ -177,9 +177,10 @@ def test_episodes_of_another_image_size_are_refused(
 
 
 def test_scenes_that_the_model_was_trained_on_are_refused(episodes: EpisodeSet, voxel: Path) -> None:
-    trained = episodes.episodes[0].model_copy(update={"scene_name": "room-0"})
-    known = episodes.model_copy(update={"episodes": [trained]})
+    trained = trained_on(find_checkpoint(voxel), policy=None)
+    room = episodes.episodes[0].model_copy(update={"scene_name": "room-0"})
+    known = episodes.model_copy(update={"episodes": [room]})
     with pytest.raises(DataError, match="'room-0': the model was trained on it"):
-        check_scenes(known, find_checkpoint(voxel), allowed=False)
-    check_scenes(known, find_checkpoint(voxel), allowed=True)
-    check_scenes(episodes, find_checkpoint(voxel), allowed=False)
+        check_scenes(known, trained, allowed=False)
+    check_scenes(known, trained, allowed=True)
+    check_scenes(episodes, trained, allowed=False)
