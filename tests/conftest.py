@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.support.micro_policies import policy_stage
 from tests.support.micro_runs import MICRO_SETTINGS, run_persist, stage, write_loops, write_walks
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
@@ -119,3 +120,11 @@ def voxel(walks: Path, stage1: Path) -> Path:
     """A stage-2 run of four steps with a voxel memory on that stage-1 run."""
     run_persist(*stage("stage2-voxel", walks, stage1.parent / "voxel", f"base={stage1}"))
     return stage1.parent / "voxel"
+
+
+@pytest.fixture(scope="session")
+def policy_run(walks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a policy's micro network of four steps."""
+    run = tmp_path_factory.mktemp("policies") / "policy"
+    run_persist(*policy_stage(walks, run))
+    return run

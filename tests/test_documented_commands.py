@@ -51,12 +51,17 @@ SHORTER = {
     "plan": ("--candidates", "5", "--rounds", "1"),
     "eval": ("--clips", "1", "--seeds", "1", "--steps", "1"),
     "collect": ("--workers", "1"),
+    "learn": (
+        "--steps", "1", "--guidance", "1", "--walks", "2", "--actions", "8", "--rounds", "1", "--training-steps", "1",
+        "--set", "training.batch=2", "--set", "training.workers=0", "--patience", "1",
+    ),
 }  # fmt: skip
 
 # and what is put in the place of single words
 REPLACED = {
     "--scenes 0:200": "--scenes 0:2",
     "--scenes 0:20": "--scenes 0:2",
+    "--bins 8,16 --each 4": "--bins 8 --each 1",
     "--data DATA": "--data DATA backbone.settings.height=32 backbone.settings.width=32",  # as the walks in GIVEN
     "cogvideox-5b-i2v-stage1-lora --data": "cogvideox-5b-i2v-stage1-lora lora.rank=2 --data",
     "cogvideox-5b-i2v-stage2-voxel --data": "cogvideox-5b-i2v-stage2-voxel memory.encoder=patches "

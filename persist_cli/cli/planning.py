@@ -100,6 +100,54 @@ def plan(
     run_plan(checkpoint, options, out, json)
 
 
+@planning_app.command()
+def learn(
+    views: Annotated[list[str], typer.Option(help="Posed images of the house: DATA#trajectory[:frames]; repeatable.")],
+    out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")],
+    checkpoint: Annotated[Path, typer.Argument(help="Run or checkpoint of the world model.")] = Path("reference"),
+    policy: Annotated[str | None, typer.Option(help="Folder of the trained policy; else the package's.")] = None,
+    inside: Annotated[str, typer.Option(help="model; or simulator: practice in the true house.")] = "model",
+    adapter: Annotated[str | None, typer.Option(help="Memory adapter; stage1: no memory.")] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of practice and training.")] = 3,
+    walks: Annotated[int, typer.Option(min=1, help="Walks of a round.")] = 32,
+    actions: Annotated[int, typer.Option(min=1, help="Actions of a walk.")] = 32,
+    execute: Annotated[int, typer.Option(min=1, help="Actions done before the policy looks again.")] = 8,
+    explore: Annotated[float, typer.Option(min=0, max=1, help="Share of random proposals.")] = 0.2,
+    training_steps: Annotated[int, typer.Option(min=1, help="Training steps of a round.")] = 200,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Of the training, as in training.learning_rate=3e-5.")
+    ] = None,
+    episodes: Annotated[
+        Path | None, typer.Option(help="Episodes (`persist bench episodes`) to evaluate with in the true house.")
+    ] = None,
+    patience: Annotated[
+        float, typer.Option(min=1, help="Most actions of one, as a multiple of the shortest way's.")
+    ] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    steps: StepsOption = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
+    context_noise: ContextNoiseOption = None,
+    batch: Annotated[int, typer.Option(min=1, help="Walks imagined at once.")] = 16,
+    json: JsonOption = False,
+) -> None:
+    """Let a policy practise in a new house inside the model, learn from what it reached, and repeat.
+
+    persist learn --views sample#0:0-24 --policy runs/policy --out runs/learn
+    """
+    from persist_cli.bench.run_episode import LoopSettings
+    from persist_cli.learn.learn import LearnPlan, run_learn
+    from persist_cli.learn.practice import PracticeSettings
+
+    plan = LearnPlan(
+        views=tuple(views), policy=policy, inside=inside, checkpoint=checkpoint, adapter=adapter, rounds=rounds,
+        practice=PracticeSettings(walks, actions, execute, explore, batch), steps=training_steps,
+        training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed,
+    )  # fmt: skip
+    run_learn(plan, out, json)
+
+
 @bench_app.command("episodes")
 def bench_episodes(
     out: Annotated[Path, typer.Option(help="File of the episodes.")] = Path("episodes.json"),

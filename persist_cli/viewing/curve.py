@@ -29,14 +29,15 @@ class Curve:
     points: Sequence[CurvePoint]
 
 
-def draw_curves(curves: Sequence[Curve], across: str, along: str, out: Path) -> None:
-    """Write a PNG of the curves over a logarithmic axis.
+def draw_curves(curves: Sequence[Curve], across: str, along: str, out: Path, logarithmic: bool = True) -> None:
+    """Write a PNG of the curves.
 
     Args:
         curves: the curves, in the order of the legend.
         across: label of the axis of places.
         along: label of the axis of means.
         out: path of the PNG file.
+        logarithmic: whether the axis of places is logarithmic.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -52,7 +53,8 @@ def draw_curves(curves: Sequence[Curve], across: str, along: str, out: Path) -> 
         above = [0 if high is None else high - mean for _, mean, _, high in known]
         places, line = [x for x, *_ in known], LINES[number // 10 % len(LINES)]
         axes.errorbar(places, means, yerr=[below, above], label=curve.name, fmt="o", linestyle=line, capsize=3)
-    axes.set_xscale("log")
+    if logarithmic:
+        axes.set_xscale("log")
     axes.set_xlabel(across)
     axes.set_ylabel(along)
     axes.grid(alpha=0.3)

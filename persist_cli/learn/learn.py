@@ -1,0 +1,307 @@
+"""``persist learn``: a policy practises in a new house inside the model, learns from what it reached, and repeats.
+
+A round practises, adds its walks to those of the rounds before, fine-tunes the policy on all of them, and evaluates it
+in the true scene. What is done is not done again, so a stopped run goes on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from persist_cli.api.checkpoint import PLAIN, find_checkpoint
+from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.api.simulator import Simulator
+from persist_cli.bench.episodes import Episode, read_episodes
+from persist_cli.bench.run_episode import LoopSettings
+from persist_cli.checkpoints.load import adapter_memory, load_backbone
+from persist_cli.data.clips import check_size
+from persist_cli.data.store import write_trajectory
+from persist_cli.errors import DataError, PersistError
+from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
+from persist_cli.learn.evaluation import evaluate_policy, mean_figures
+from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
+from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.memorize.sources import common_reference, find_sources
+from persist_cli.planning.true_futures import simulator_settings
+from persist_cli.plugins import make_policy, make_simulator
+from persist_cli.policies.open_policy import open_policy
+from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
+from persist_cli.train.finetune import FinetunePlan, run_finetune
+from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say
+from persist_cli.viewing.curve import Curve, draw_curves
+
+PLAN: Final = "plan.json"
+RESULTS: Final = "learn.json"
+CURVE: Final = "success.png"
+FIGURES: Final = ("success", "reached", "spl", "soft_spl", "collisions_per_action", "end_metres")
+MODEL, SIMULATOR = "model", "simulator"  # where a policy may practise
+
+
+@dataclass(frozen=True)
+class LearnPlan:
+    """The options of ``persist learn``.
+
+    Args:
+        views: references to the given posed frames of one scene.
+        policy: run or folder of the trained policy to begin with; ``None`` for the package's.
+        inside: ``model``, or ``simulator`` for the true scene.
+        checkpoint: of the world model.
+        adapter: its memory adapter; ``None`` for the default, ``stage1`` for none.
+        rounds: of practice and fine-tuning.
+        practice: of each round.
+        steps: training steps of each round.
+        training: other settings of the training, as in ``training.learning_rate=1e-4``.
+        episodes: file of episodes, of which those in the scene of the views are run; ``None`` evaluates nothing.
+        loop: how they are run.
+        sampling: of the world model.
+        seed: of all that is random.
+    """
+
+    views: tuple[str, ...]
+    policy: str | None
+    inside: str
+    checkpoint: Path
+    adapter: str | None
+    rounds: int
+    practice: PracticeSettings
+    steps: int
+    training: tuple[str, ...]
+    episodes: Path | None
+    loop: LoopSettings
+    sampling: SamplingOverrides
+    seed: int
+
+
+@dataclass(frozen=True)
+class Learning:
+    """A plan that was checked, with all that a round needs.
+
+    Args:
+        plan: the options.
+        out: the folder of all results.
+        info: scene, up axis and vocabulary of the views.
+        views: the given posed frames.
+        begin: the policy to begin with.
+        simulator: of the scene, for practice or evaluation; ``None`` where neither needs it.
+        episodes: to evaluate with.
+    """
+
+    plan: LearnPlan
+    out: Path
+    info: TrajectoryInfo
+    views: Observations
+    begin: TrainedPolicy
+    simulator: Simulator | None
+    episodes: Sequence[Episode]
+
+    def folder(self, number: int) -> Path:
+        """Return the folder of a round, counted from 1; that of 0 holds the figures of the policy to begin with."""
+        return self.out / f"round-{number:02d}"
+
+    def policy(self, number: int) -> TrainedPolicy:
+        """Return the policy after a round, or the one to begin with after round 0."""
+        return find_policy(self.folder(number) / "policy") if number else self.begin
+
+
+def run_learn(plan: LearnPlan, out: Path, as_json: bool) -> None:
+    """Run all rounds that are not done yet, and leave ``learn.json``, ``success.png`` and the last policy.
+
+    Raises:
+        PersistError: one line for whatever does not fit.
+    """
+    learning = prepare(plan, out)
+    place: PracticePlace | None = None
+    evaluate(learning, 0)
+    for number in range(1, plan.rounds + 1):
+        if not (learning.folder(number) / "walks.json").is_file():
+            place = place or open_place(learning)
+            walk(learning, place, number)
+        train(learning, number)
+        evaluate(learning, number)
+    results = summary(learning)
+    write_json(out / RESULTS, results)
+    if learning.episodes:
+        draw_curves(success_curves(results), "actions of practice", "share of episodes", out / CURVE, False)
+    report(learning, results, as_json)
+
+
+def prepare(plan: LearnPlan, out: Path) -> Learning:
+    """Check everything that can be checked before anything is imagined."""
+    check_folder(out)
+    if plan.inside not in (MODEL, SIMULATOR):
+        raise PersistError(f"--inside {plan.inside!r}: a policy practises inside the {MODEL} or the {SIMULATOR}")
+    begin = packaged_policy() if plan.policy is None else find_policy(Path(plan.policy))
+    sources = find_sources(list(plan.views))
+    common_reference(sources)
+    info = sources[0].file.info
+    views = Observations.concatenate([source.file.read(list(source.frames)).observations for source in sources])
+    episodes = [] if plan.episodes is None else episodes_of(plan.episodes, info)
+    simulator = None
+    if episodes or plan.inside == SIMULATOR:
+        simulator = open_simulator(plan, info)
+    check_plan(plan, out, begin)
+    return Learning(plan, out, info, views, begin, simulator, episodes)
+
+
+def check_plan(plan: LearnPlan, out: Path, begin: TrainedPolicy) -> None:
+    """Write down what is to be learned, or raise ``PersistError`` when the folder holds another learning."""
+    identity = asdict(plan) | {"policy": begin.fingerprint, "checkpoint": None, "episodes": None, "rounds": None}
+    if plan.inside == MODEL:
+        identity["checkpoint"] = find_checkpoint(plan.checkpoint).fingerprint
+    if plan.episodes is not None:
+        identity["episodes"] = file_sha256(plan.episodes)
+    identity = json.loads(json.dumps(identity, default=str))
+    file = out / PLAN
+    if not file.is_file():
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(file, identity)
+        return
+    stored = read_json(file)
+    changed = sorted(key for key in identity if stored.get(key) != identity[key])
+    if changed:
+        raise PersistError(f"{out}: holds a learning with another {', '.join(changed)}; take another --out")
+
+
+def episodes_of(file: Path, info: TrajectoryInfo) -> list[Episode]:
+    """Return the episodes of a file that are in the scene of the views."""
+    found = [episode for episode in read_episodes(file).episodes if episode.scene_name == info.scene]
+    if not found:
+        raise DataError(
+            f"{file}: no episode in scene {info.scene!r}, which the views show; draw some with its --scenes"
+        )
+    return found
+
+
+def open_simulator(plan: LearnPlan, info: TrajectoryInfo) -> Simulator:
+    """Return the simulator of the views with their scene open."""
+    name, scene = info.source.get("simulator"), info.source.get("house")
+    if not isinstance(name, str) or not isinstance(scene, int):
+        raise DataError(f"{' '.join(plan.views)}: of no simulator; leave --episodes and --inside {SIMULATOR} out")
+    simulator = make_simulator(name, simulator_settings(name, info))
+    simulator.open_scene(scene)
+    return simulator
+
+
+def open_place(learning: Learning) -> PracticePlace:
+    """Return where the policy practises."""
+    plan, info = learning.plan, learning.info
+    if plan.inside == SIMULATOR:
+        assert learning.simulator is not None
+        return TruePlace(learning.simulator, info)
+    checkpoint = find_checkpoint(plan.checkpoint)
+    adapter = checkpoint.chosen_adapter(plan.adapter)
+    with busy("loading the model"):
+        backbone = load_backbone(checkpoint, adapter=adapter)
+    check_size(info, backbone.image_size, plan.views[0])
+    sampling = checkpoint.sampling_with(plan.sampling)
+    backbone.check_sampling(sampling)
+    backbone.eval()
+    memory = None
+    if adapter is not None:
+        memory = MemoryFactory.of(adapter_memory(checkpoint, adapter), backbone.device).empty(info)
+        memory.memorize(learning.views.to(backbone.device))
+    origin = {"model": checkpoint.fingerprint, "adapter": adapter or PLAIN}
+    return ImaginedPlace(backbone, memory, sampling, info, origin)
+
+
+def walk(learning: Learning, place: PracticePlace, number: int) -> None:
+    """Practise with the policy of the round before, and write its walks as a data set."""
+    trained = learning.policy(number - 1)
+    policies = open_policy(str(trained.folder)), make_policy("random", {})
+    settings, folder = learning.plan.practice, learning.folder(number) / "walks"
+    seed = learning.plan.seed * 1000 + number
+    blocked = goals = actions = 0
+    info = info_of_walks(learning.info, place)
+    folder.mkdir(parents=True, exist_ok=True)
+    with progress() as bar:
+        task = add_task(bar, f"round {number}: practising", settings.walks, "walks")
+        for index, one in enumerate(practise(place, policies, learning.views, settings, seed)):
+            blocked, goals, actions = blocked + one.blocked, goals + one.goals, actions + len(one.actions)
+            write_trajectory(folder / f"walk-{index:05d}.parquet", info, one.frames())
+            bar.advance(task)
+    counts = {"walks": settings.walks, "actions": actions, "blocked": blocked, "goals": goals}
+    write_json(learning.folder(number) / "walks.json", counts)
+
+
+def train(learning: Learning, number: int) -> None:
+    """Fine-tune the policy of the round before on the walks of all rounds so far."""
+    run, before = learning.folder(number) / "policy", learning.policy(number - 1)
+    plan = learning.plan
+    recipe = {
+        "stage": "policy", "description": f"round {number} of a policy that practises", "base": str(before.folder),
+        "policy": {"name": before.policy, "settings": before.settings},
+        "training": {"steps": plan.steps, "seed": plan.seed, "precision": "no", "learning_rate": 1e-4, "warmup": 20,
+                     "batch": 64, "ema": 0.99},
+    }  # fmt: skip
+    file = learning.folder(number) / "policy.yaml"
+    if not file.is_file():
+        write_text(file, yaml.safe_dump(recipe, sort_keys=False))
+    data = [learning.folder(one) / "walks" for one in range(1, number + 1)]
+    run_finetune(FinetunePlan(str(file), plan.training, data, run, resume=bool(list(run.glob("step-*")))))
+
+
+def evaluate(learning: Learning, number: int) -> None:
+    """Run the episodes with the policy after a round, unless that is done."""
+    file = learning.folder(number) / "episodes.json"
+    if not learning.episodes or file.is_file():
+        return
+    assert learning.simulator is not None
+    policy = open_policy(str(learning.policy(number).folder))
+    records = evaluate_policy(policy, learning.simulator, learning.episodes, learning.plan.loop)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_json(file, {"figures": mean_figures(records), "episodes": records})
+
+
+def summary(learning: Learning) -> dict[str, Any]:
+    """Return what was learned as JSON values, a row for each round and one before them."""
+    rows: list[dict[str, Any]] = []
+    walked = 0
+    for number in range(learning.plan.rounds + 1):
+        folder = learning.folder(number)
+        row: dict[str, Any] = {"round": number}
+        if number:
+            row["practice"] = read_json(folder / "walks.json")
+            walked += row["practice"]["actions"] + row["practice"]["blocked"]
+        if learning.episodes:
+            row["figures"] = read_json(folder / "episodes.json")["figures"]
+        rows.append(row | {"walked": walked, "policy": str(learning.policy(number).folder)})
+    return {
+        "format": "persist-learning", "version": 1, "inside": learning.plan.inside, "scene": learning.info.scene,
+        "views": len(learning.views), "episodes": len(learning.episodes), "rounds": rows,
+    }  # fmt: skip
+
+
+def success_curves(results: dict[str, Any]) -> list[Curve]:
+    """Return the curves of success, and of how often the goal was reached at all, over the actions of practice."""
+    rows = results["rounds"]
+    return [
+        Curve(name, [(row["walked"], row["figures"][name], None, None) for row in rows])
+        for name in ("success", "reached")
+    ]
+
+
+def report(learning: Learning, results: dict[str, Any], as_json: bool) -> None:
+    """Print the rounds as a table, or the results as JSON."""
+    if as_json:
+        print_json(results)
+        return
+    columns = ["round", "actions of practice", "blocked", *(FIGURES if learning.episodes else ())]
+    rows = []
+    for row in results["rounds"]:
+        figures = [f"{row['figures'][name]:.2f}" for name in FIGURES] if learning.episodes else []
+        blocked = str(row["practice"]["blocked"]) if row["round"] else "–"
+        rows.append([str(row["round"]), str(row["walked"]), blocked, *figures])
+    print_table(
+        f"learned inside the {results['inside']}, {results['views']} views of {results['scene']}", columns, rows
+    )
+    if learning.episodes:
+        say(f"{results['episodes']} episodes in the true scene; curves: {learning.out / CURVE}")
+    say(f"the last policy: {results['rounds'][-1]['policy']}; all figures: {learning.out / RESULTS}")

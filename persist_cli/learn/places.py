@@ -1,0 +1,125 @@
+"""Where a policy practises: inside the model that remembers the given views, or in the true scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import torch
+
+from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.ground import Body, GroundMap
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
+from persist_cli.api.simulator import Simulator
+from persist_cli.bench.true_scene import observations_of
+from persist_cli.errors import DataError
+from persist_cli.navigation.ground_mapper import GroundMapper, body_of
+from persist_cli.rollout.world_model import Agent, StepResult, WorldModel
+
+
+class PracticePlace(Protocol):
+    """A place in which several walks go on at once."""
+
+    info: TrajectoryInfo
+    origin: dict[str, Any]  # JSON values that say what it is
+
+    def begin(self, starts: Sequence[Observations], seeds: Sequence[int]) -> None:
+        """Begin walks at given frames; ``seeds`` are those of what is imagined."""
+        ...
+
+    def act(self, ways: Sequence[Sequence[str]]) -> list[StepResult]:
+        """Do the actions of each walk, and return what is seen and which were free."""
+        ...
+
+    def ground(self, number: int) -> GroundMap:
+        """Return what the agent of a walk knows to be free."""
+        ...
+
+
+class ImaginedPlace:
+    """The world model; every walk begins with the memory of the given views, and writes into a copy of its own.
+
+    Args:
+        backbone: with its adapter, if any.
+        memory: of the given views; ``None`` without an adapter.
+        sampling: of the world model.
+        info: of the given views.
+        origin: says which model and memory these are.
+    """
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        memory: Memory | None,
+        sampling: Sampling,
+        info: TrajectoryInfo,
+        origin: dict[str, Any],
+    ) -> None:
+        self.backbone, self.memory, self.sampling, self.info, self.origin = backbone, memory, sampling, info, origin
+        self.body: Body = body_of(info)
+        self.world = WorldModel(backbone, [], sampling)
+
+    def begin(self, starts: Sequence[Observations], seeds: Sequence[int]) -> None:
+        """Begin walks; see ``PracticePlace``."""
+        shared = self.memory is not None
+        agents = [Agent(self.memory, seed, shared=shared, body=self.body) for seed in seeds]
+        self.world = WorldModel(self.backbone, agents, self.sampling)
+        self.world.reset(starts, [self.info] * len(starts))
+
+    @torch.no_grad()
+    def act(self, ways: Sequence[Sequence[str]]) -> list[StepResult]:
+        """Imagine the actions of all walks in one batch."""
+        return self.world.step(ways)
+
+    def ground(self, number: int) -> GroundMap:
+        """Return the map of the memory's points and of what the walk imagined."""
+        surroundings = self.world.agents[number].surroundings
+        assert surroundings is not None  # agents here have bodies
+        return surroundings.map()
+
+
+class TruePlace:
+    """The true scene in a simulator, where walks take turns.
+
+    Args:
+        simulator: with the scene open.
+        info: of the given views.
+    """
+
+    def __init__(self, simulator: Simulator, info: TrajectoryInfo) -> None:
+        self.simulator, self.info = simulator, info
+        self.origin: dict[str, Any] = {"simulator": simulator.name}
+        self._stances: list[tuple[tuple[float, float], float]] = []
+        self._mappers: list[GroundMapper] = []
+
+    def begin(self, starts: Sequence[Observations], seeds: Sequence[int]) -> None:
+        """Begin walks at given frames of this scene; nothing is imagined."""
+        self._stances, self._mappers = [], []
+        for start in starts:
+            stance = self.simulator.stance(start.cameras.world_from_camera[0].numpy())
+            if stance is None:
+                raise DataError(f"simulator {self.simulator.name!r} cannot be put at a camera's pose")
+            self._stances.append(stance)
+            self._mappers.append(GroundMapper(self.info.world_up, body_of(self.info)))
+            self._mappers[-1].add(start)
+
+    def act(self, ways: Sequence[Sequence[str]]) -> list[StepResult]:
+        """Do the actions of each walk in turn."""
+        return [self._walk(number, way) for number, way in enumerate(ways)]
+
+    def ground(self, number: int) -> GroundMap:
+        """Return the map of what the walk has seen."""
+        return self._mappers[number].map()
+
+    def _walk(self, number: int, way: Sequence[str]) -> StepResult:
+        self.simulator.place(*self._stances[number])
+        frames: list[Frame] = []
+        free: list[bool] = []
+        for name in way:
+            free.append(self.simulator.act(name))
+            frames.append(self.simulator.observe())
+        self._stances[number] = self.simulator.agent
+        seen = observations_of(frames, self.info)
+        self._mappers[number].add(seen)
+        return StepResult(seen, torch.tensor(free))

@@ -1,0 +1,162 @@
+"""Practice walks: a policy acts inside the model, or in the true scene, and what it saw becomes trajectories.
+
+Practice has no teacher. Whatever a walk reached serves as its goal afterwards (hindsight relabelling): training draws
+the goal of a sample from the later frames of the same walk, so that also a walk that missed its goal shows a way to
+somewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from persist_cli.api.ground import GroundMap
+from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
+from persist_cli.api.policy import Goal, Policy, Situation
+from persist_cli.learn.places import PracticePlace
+
+MOST_SEEDS = 2**31
+
+
+@dataclass(frozen=True)
+class PracticeSettings:
+    """How a policy practises.
+
+    Args:
+        walks: number of walks in a round.
+        actions: actions of a walk.
+        execute: actions of a proposal that are done before the policy proposes again.
+        explore: share of proposals that are random instead.
+        batch: walks imagined together.
+    """
+
+    walks: Annotated[int, Field(ge=1)] = 32
+    actions: Annotated[int, Field(ge=1)] = 32
+    execute: Annotated[int, Field(ge=1)] = 8
+    explore: Annotated[float, Field(ge=0, le=1)] = 0.2
+    batch: Annotated[int, Field(ge=1)] = 16
+
+
+@dataclass(frozen=True)
+class PracticeWalk:
+    """One walk, without the actions that something blocked.
+
+    Args:
+        seen: the given frame at which it begins, and the frame after each action.
+        actions: between these frames.
+        blocked: number of actions that were blocked.
+        goals: number of goals that it was given; a new one each time the policy stops.
+    """
+
+    seen: Observations
+    actions: tuple[str, ...]
+    blocked: int
+    goals: int
+
+    def frames(self) -> Iterator[Frame]:
+        """Yield its frames, one second after another."""
+        poses = self.seen.cameras.world_from_camera.double().numpy()
+        for number, action in enumerate([*self.actions, None]):
+            rgb, depth = self.seen.rgb[number].numpy(), self.seen.depth[number].numpy()
+            yield Frame(rgb, depth, poses[number], action, float(number))
+
+
+def practise(
+    place: PracticePlace,
+    policies: tuple[Policy, Policy],
+    views: Observations,
+    settings: PracticeSettings,
+    seed: int,
+) -> Iterator[PracticeWalk]:
+    """Yield walks from random given frames towards the views of others.
+
+    Args:
+        place: where the policy acts.
+        policies: the one that practises, and the one that proposes where it explores.
+        views: the given posed frames.
+        settings: of the practice.
+        seed: of all that is random.
+    """
+    for first in range(0, settings.walks, settings.batch):
+        numbers = range(first, min(first + settings.batch, settings.walks))
+        walkers = [Walker(place.info, policies, views, settings, seed * MOST_SEEDS + number) for number in numbers]
+        place.begin([walker.seen for walker in walkers], [walker.sampling_seed for walker in walkers])
+        while not all(walker.is_done for walker in walkers):
+            ways = [walker.decide(place.ground(number)) for number, walker in enumerate(walkers)]
+            for walker, way, result in zip(walkers, ways, place.act(ways), strict=True):
+                walker.saw(way, result.seen, result.free.tolist())
+        yield from (walker.walk() for walker in walkers)
+
+
+class Walker:
+    """One walk while it goes on.
+
+    Args:
+        info: scene, up axis and vocabulary.
+        policies: as of ``practise``.
+        views: the given frames.
+        settings: of the practice.
+        seed: of its start, goals and proposals.
+    """
+
+    def __init__(
+        self,
+        info: TrajectoryInfo,
+        policies: tuple[Policy, Policy],
+        views: Observations,
+        settings: PracticeSettings,
+        seed: int,
+    ) -> None:
+        self.info, self.views, self.settings = info, views, settings
+        self.policy, self.explorer = policies
+        self.random = np.random.default_rng(seed)
+        self.generator = torch.Generator().manual_seed(int(self.random.integers(2**62)))
+        self.sampling_seed = int(self.random.integers(MOST_SEEDS))
+        start = int(self.random.integers(len(views)))
+        self.seen = views[[start]]
+        self.actions: list[str] = []
+        self.taken = self.blocked = self.goals = 0
+        self._new_goal()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it has done its actions."""
+        return self.taken >= self.settings.actions
+
+    def decide(self, ground: GroundMap) -> tuple[str, ...]:
+        """Return its next actions, at least one; where the policy stops, it gets another goal and explores."""
+        situation = Situation(self.seen[-self.policy.frames :], self.info, self.goal, ground)
+        horizon = min(self.settings.execute, self.policy.longest or self.settings.execute)
+        policy = self.explorer if self.random.random() < self.settings.explore else self.policy
+        way = policy.propose(situation, horizon, 1, self.generator)[0]
+        if not way:
+            self._new_goal()
+            way = self.explorer.propose(situation, horizon, 1, self.generator)[0]
+        return tuple(way[: max(1, min(horizon, self.settings.actions - self.taken))])
+
+    def saw(self, way: Sequence[str], seen: Observations, free: Sequence[bool]) -> None:
+        """Take in the frame after each action; of a blocked one nothing is kept but the count."""
+        moved = [number for number, is_free in enumerate(free) if is_free]
+        self.taken, self.blocked = self.taken + len(way), self.blocked + len(way) - len(moved)
+        if moved and len(self.actions) < self.settings.actions:
+            self.seen = Observations.concatenate([self.seen, seen[moved]])
+            self.actions += [way[number] for number in moved]
+
+    def walk(self) -> PracticeWalk:
+        """Return the walk."""
+        return PracticeWalk(self.seen, tuple(self.actions), self.blocked, self.goals)
+
+    def _new_goal(self) -> None:
+        view = self.views[[int(self.random.integers(len(self.views)))]]
+        self.goal = Goal(view.rgb[0], view.cameras.centers[0].double(), self.info.scene)
+        self.goals += 1
+
+
+def info_of_walks(info: TrajectoryInfo, place: PracticePlace) -> TrajectoryInfo:
+    """Return the info of walks, whose source says where they were walked."""
+    return replace(info, source={**info.source, "practice": place.origin})

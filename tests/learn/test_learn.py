@@ -1,0 +1,115 @@
+"""A policy practises inside a micro model, learns from its walks, and goes on where it was stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.inference import SamplingOverrides
+from persist_cli.checkpoints.load import adapter_memory, load_backbone
+from persist_cli.data.store import Store
+from persist_cli.learn.places import ImaginedPlace
+from persist_cli.learn.practice import PracticeSettings, PracticeWalk, practise
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.plugins import make_policy
+from persist_cli.policies.trained import find_policy
+from tests.conftest import CommandResult
+
+SETTINGS = PracticeSettings(walks=3, actions=6, execute=3, explore=0.5, batch=2)
+
+ONE = SamplingOverrides(steps=1, memory_guidance=1.0)
+
+ONE_STEP = ["--steps", "1", "--guidance", "1"]
+
+
+@pytest.fixture
+def learn(persist, walks, policy_run, voxel, tmp_path) -> Callable[..., CommandResult]:
+    """Runs a short learning in a micro model, with results in a folder of ``tmp_path``."""
+    short = ["--walks", "3", "--actions", "10", "--execute", "4", "--training-steps", "2", "--rounds", "1"]
+    training = ["--set", "training.batch=2", "--set", "training.workers=0"]
+
+    def run(out: str, *more: str) -> CommandResult:
+        views, folder = f"{walks}#0:0-12", tmp_path / out
+        given = ["learn", voxel, "--views", views, "--policy", policy_run, "--out", folder]
+        return persist(*given, *ONE_STEP, *short, *training, *more)
+
+    return run
+
+
+@pytest.fixture
+def place(walks, voxel) -> ImaginedPlace:
+    checkpoint = find_checkpoint(voxel)
+    backbone, info = load_backbone(checkpoint, adapter="voxel").eval(), Store(walks)[0].info
+    memory = MemoryFactory.of(adapter_memory(checkpoint, "voxel")).empty(info)
+    memory.memorize(Store(walks)[0].read(range(12)).observations)
+    return ImaginedPlace(backbone, memory, checkpoint.sampling_with(ONE), info, {})
+
+
+def walks_of(place: ImaginedPlace, views, seed: int) -> list[PracticeWalk]:
+    random = make_policy("random", {})
+    return list(practise(place, (random, random), views, SETTINGS, seed))
+
+
+def test_a_walk_begins_at_a_given_view_and_each_frame_follows_from_its_action(place, walks):
+    views = Store(walks)[0].read(range(12)).observations
+    for walk in walks_of(place, views, seed=1):
+        assert any(walk.seen.rgb[0].equal(view) for view in views.rgb)
+        up, pose = torch.tensor(place.info.world_up).double(), walk.seen.cameras.world_from_camera
+        for number, action in enumerate(walk.actions):
+            moved = place.info.vocabulary.move(pose[number], action, up)
+            assert torch.allclose(moved, pose[number + 1].double(), atol=1e-6)
+        assert len(walk.actions) + walk.blocked == SETTINGS.actions
+
+
+def test_practice_follows_from_its_seed_and_does_not_change_the_memory(place, walks):
+    views, before = Store(walks)[0].read(range(12)).observations, place.memory.tensors()
+    first, again, other = (walks_of(place, views, seed) for seed in (1, 1, 2))
+    assert [walk.actions for walk in first] == [walk.actions for walk in again]
+    assert all(a.seen.rgb.equal(b.seen.rgb) for a, b in zip(first, again, strict=True))
+    assert [walk.actions for walk in first] != [walk.actions for walk in other]
+    assert all(tensor.equal(before[name]) for name, tensor in place.memory.tensors().items())
+
+
+def test_a_round_leaves_walks_that_say_where_they_were_walked_and_a_policy_that_learned(learn, policy_run, tmp_path):
+    assert learn("out").code == 0
+    files = list(Store(tmp_path / "out/round-01/walks"))
+    assert len(files) == 3
+    assert files[0].info.source["practice"]["adapter"] == "voxel"
+    results = json.loads((tmp_path / "out/learn.json").read_text())
+    assert results["rounds"][1]["walked"] == 30
+    before, after = (find_policy(run).load().parameters() for run in (policy_run, tmp_path / "out/round-01/policy"))
+    assert not all(a.equal(b) for a, b in zip(before, after, strict=True))
+
+
+def test_a_learning_that_was_stopped_ends_as_one_that_was_not(learn, tmp_path):
+    for rounds, out in (("2", "whole"), ("1", "halves"), ("2", "halves")):
+        assert learn(out, "--rounds", rounds).code == 0
+    whole, halves = (find_policy(tmp_path / out / "round-02/policy").fingerprint for out in ("whole", "halves"))
+    assert whole == halves
+
+
+def test_a_folder_with_another_learning_is_refused(learn):
+    assert learn("out").code == 0
+    result = learn("out", "--seed", "5")
+    assert result.code == 1
+    assert result.err.endswith("holds a learning with another seed; take another --out\n")
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--inside", "dream", "a policy practises inside the model or the simulator"),
+        ("--inside", "simulator", "of no simulator; leave --episodes and --inside simulator out"),
+        ("--policy", "nowhere/policy", "no trained policy there"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(learn, tmp_path, option, value, message):
+    result = learn("out", option, value)
+    assert result.code == 1
+    assert message in result.err
+    assert result.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
