@@ -52,7 +52,7 @@ SHORTER = {
     "eval": ("--clips", "1", "--seeds", "1", "--steps", "1"),
     "collect": ("--workers", "1"),
     "learn": (
-        "--steps", "1", "--guidance", "1", "--walks", "2", "--actions", "8", "--rounds", "1", "--training-steps", "1",
+        "--steps", "1", "--guidance", "1", "--walks", "3", "--actions", "24", "--rounds", "1", "--training-steps", "1",
         "--set", "training.batch=2", "--set", "training.workers=0", "--patience", "1",
     ),
 }  # fmt: skip

@@ -147,6 +147,7 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     simulator = None
     if episodes or plan.inside == SIMULATOR:
         simulator = open_simulator(plan, info)
+    check_horizon(plan, begin)
     check_plan(plan, out, begin)
     return Learning(plan, out, info, views, begin, simulator, episodes)
 
@@ -168,6 +169,17 @@ def check_plan(plan: LearnPlan, out: Path, begin: TrainedPolicy) -> None:
     changed = sorted(key for key in identity if stored.get(key) != identity[key])
     if changed:
         raise PersistError(f"{out}: holds a learning with another {', '.join(changed)}; take another --out")
+
+
+def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
+    """Raise ``PersistError`` when walks are too short for a sample of the policy's training."""
+    form = begin.load().sample_form
+    needed = form.waypoints * form.spacing
+    if plan.practice.actions < needed:
+        raise PersistError(
+            f"walks of {plan.practice.actions} actions: the policy learns from {needed} actions at once, and blocked ones "
+            f"do not count; give --actions {2 * needed} or more"
+        )
 
 
 def episodes_of(file: Path, info: TrajectoryInfo) -> list[Episode]:

@@ -105,6 +105,11 @@ def test_a_folder_with_another_learning_is_refused(learn):
         ("--inside", "dream", "a policy practises inside the model or the simulator"),
         ("--inside", "simulator", "of no simulator; leave --episodes and --inside simulator out"),
         ("--policy", "nowhere/policy", "no trained policy there"),
+        (
+            "--actions",
+            "7",
+            "the policy learns from 8 actions at once, and blocked ones do not count; give --actions 16",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(learn, tmp_path, option, value, message):
