@@ -177,8 +177,8 @@ def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
     needed = form.waypoints * form.spacing
     if plan.practice.actions < needed:
         raise PersistError(
-            f"walks of {plan.practice.actions} actions: the policy learns from {needed} actions at once, and blocked ones "
-            f"do not count; give --actions {2 * needed} or more"
+            f"walks of {plan.practice.actions} actions: the policy learns from {needed} actions at once, and blocked "
+            f"ones do not count; give --actions {2 * needed} or more"
         )
 
 
