@@ -62,6 +62,7 @@ REPLACED = {
     "--scenes 0:200": "--scenes 0:2",
     "--scenes 0:20": "--scenes 0:2",
     "--bins 8,16 --each 4": "--bins 8 --each 1",
+    "--scenes 0:48 --each 16": "--scenes 0:2 --bins 8 --each 1",
     "--data DATA": "--data DATA backbone.settings.height=32 backbone.settings.width=32",  # as the walks in GIVEN
     "cogvideox-5b-i2v-stage1-lora --data": "cogvideox-5b-i2v-stage1-lora lora.rank=2 --data",
     "cogvideox-5b-i2v-stage2-voxel --data": "cogvideox-5b-i2v-stage2-voxel memory.encoder=patches "
@@ -82,7 +83,8 @@ NOT_RUN = {
     "hf download": "needs the hub",
     "persist weights fetch": "downloads",
     "persist doctor": "takes half a minute for a published model; tests/doctor runs it on them",
-    "persist bench ": "walks through houses for minutes; tests/bench run them small",
+    "persist bench plan": "walks through houses for minutes; tests/bench runs it small",
+    "persist bench collisions": "walks through houses for minutes; tests/bench runs it small",
     "persist --install-completion": "changes the files of the shell",
     "sbatch ": "needs Slurm",
     "open ": "opens a window",
