@@ -169,7 +169,7 @@ def finetune(
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter).
+    """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter); or a policy.
 
     persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
 
@@ -193,7 +193,9 @@ def finetune(
 
 @app.command()
 def export(
-    checkpoint: Annotated[Path, typer.Argument(help="A stage-1 run, a checkpoint folder, or reference.")],
+    checkpoint: Annotated[
+        Path, typer.Argument(help="A stage-1 run, a checkpoint folder, reference, or a policy's run.")
+    ],
     out: Annotated[Path, typer.Option(help="Checkpoint folder to write.")],
     runs: Annotated[
         list[str] | None, typer.Argument(metavar="[[NAME=]RUN]...", help="Stage-2 runs on that base.")
@@ -210,7 +212,7 @@ def export(
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Write a base and memory adapters as one checkpoint folder that stands alone.
+    """Write a base and memory adapters as one checkpoint folder that stands alone; or a trained policy.
 
     persist export runs/stage1 runs/none runs/voxel canvas=runs/voxel-canvas --default voxel --out runs/model
     """
