@@ -18,9 +18,11 @@ from persist_cli.bench.plan_bench import check_scenes, trained_on
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.errors import DataError
+from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult, Persist
+from tests.support.predictions import cache_random
 from tests.support.processes import run_command, run_in_pair
 
 Bench = Callable[..., CommandResult]
@@ -119,16 +121,16 @@ def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     assert "holds another benchmark (planning horizon: 8, now 5)" in refused.err
 
 
-def test_a_world_model_is_ranked_by_what_it_imagines(
-    bench: Bench, voxel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from persist_cli.metrics.lpips import ALEX, tensor_shapes
-    from tests.support.predictions import cache_random
-
+@pytest.fixture
+def random_lpips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random weights of LPIPS, and no others."""
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
     cache_random(tmp_path / "cache", "lpips-alex", tensor_shapes(ALEX))
+
+
+def test_a_world_model_is_ranked_by_what_it_imagines(bench: Bench, voxel: Path, random_lpips: None) -> None:
     model = (voxel, "--steps", 1, "--rows", "rank-2,cem", "--memories", "none,voxel", "--candidates", 3, "--rounds", 1)
-    limits = ("--bins", 8, "--patience", 1, "--horizon", 3, "--stop-cost", -1, "--open-longest", 8)
+    limits = ("--bins", 8, "--patience", 1, "--horizon", 3, "--stop-cost", -1)
     ended = bench(*model, *limits, "--json")
     assert ended.code == 0, ended.err
     results = json.loads(ended.out)
@@ -184,3 +186,27 @@ def test_scenes_that_the_model_was_trained_on_are_refused(episodes: EpisodeSet, 
         check_scenes(known, trained, allowed=False)
     check_scenes(known, trained, allowed=True)
     check_scenes(episodes, trained, allowed=False)
+
+
+def test_a_trained_policy_acts_alone_and_proposes_what_is_ranked(
+    bench: Bench, policy_run: Path, random_lpips: None
+) -> None:
+    options = ("--policy", policy_run, "--rows", "policy,rank-2", "--memories", "simulator", "--stop-cost", -1)
+    ended = bench(*options, "--loops", "closed", "--bins", 8, "--patience", 1, "--json")
+    assert ended.code == 0, ended.err
+    rows = json.loads(ended.out)["tables"][0]["rows"]
+    assert list(rows) == ["policy", "rank-2, simulator"]
+    assert set(rows["rank-2, simulator"]["success"]["differences"]) == {"policy"}
+
+
+def test_scenes_that_the_policy_was_trained_on_are_refused(episodes: EpisodeSet, policy_run: Path) -> None:
+    room = episodes.episodes[0].model_copy(update={"scene_name": "room-1"})
+    with pytest.raises(DataError, match=r"'room-1': policy .* was trained on it"):
+        check_scenes(episodes.model_copy(update={"episodes": [room]}), trained_on(None, str(policy_run)), allowed=False)
+    assert trained_on(None, "random") == {}
+
+
+def test_a_policy_that_does_not_look_so_far_is_refused(bench: Bench, policy_run: Path, random_lpips: None) -> None:
+    ended = bench("--policy", policy_run, "--rows", "policy", "--horizon", 9)
+    assert ended.code == 1
+    assert "looks at most 8 actions ahead, not 9; give --horizon 8" in ended.err
