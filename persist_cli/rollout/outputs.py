@@ -117,7 +117,7 @@ def write_pictures(rollout: Rollout, out: Path) -> DepthScale | None:
     if truth is not None:
         write_video(out / "compare.mp4", comparison(rows, colored, scale))
     actions = [f"{number} {action}" for number, action in enumerate(("start", *rollout.path.actions))]
-    actions = [f"{text}, blocked" if n in rollout.blocked else text for n, text in enumerate(actions)]
+    actions = [f"{n} blocked" if n in rollout.blocked else text for n, text in enumerate(actions)]
     write_sheet(out / "sheet.png", rows + colored, actions, bar=None if scale is None else scale.bar)
     return scale
 

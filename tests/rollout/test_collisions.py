@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.backbone import Sampling
 from persist_cli.api.ground import Cover
 from persist_cli.api.memory import FrameOfReference
+from persist_cli.api.observations import Observations
 from persist_cli.data.store import write_trajectory
 from persist_cli.plugins import make_encoder, make_memory
-from persist_cli.rollout.world_model import Agent
+from persist_cli.rollout.world_model import Agent, WorldModel
+from tests.support.micro_model import micro, shaken
 from tests.support.room_worlds import BODY, ROOM, RoomWorld, room_info, room_views, room_world
 from tests.support.rooms import UP, look
 
@@ -144,3 +147,25 @@ def test_the_ground_that_an_agent_knows_grows_with_what_it_imagines(check_again)
     assert ground.at(behind) == Cover.UNKNOWN
     world.step([["left"] * 12], check_again)
     assert world.agents[0].surroundings.map().at(behind) == Cover.FREE
+
+
+@pytest.mark.parametrize(("body", "count"), [(None, 15), (BODY, 8)])  # two clips, and one
+def test_where_nothing_is_in_the_way_actions_imagine_what_their_cameras_do_to_the_bit(body, count):
+    names = (["left", "left", "forward"] * 5)[:count]
+    pose = look((0.0, 1.25, 1.7), -60.0, 0.0)
+    backbone = micro()
+    shaken(backbone)
+
+    def model():
+        world = WorldModel(backbone, [Agent(None, seed=3, body=body)], Sampling(1))
+        world.reset([room_views(pose).without_depth()], [room_info()])
+        return world
+
+    [result] = model().step([names], check_again=False)
+    along = model()
+    cameras = along.agents[0].cameras_after(names)
+    frames = Observations.concatenate([clip[0] for clip in along.imagine([cameras], [(None,) * len(names)])])
+    assert bool(result.free.all())
+    assert torch.equal(result.seen.rgb, frames.rgb)
+    assert torch.equal(result.seen.depth, frames.depth)
+    assert torch.equal(result.seen.cameras.world_from_camera, frames.cameras.world_from_camera)
