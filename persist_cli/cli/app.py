@@ -13,6 +13,7 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
     DEFAULT_CONTROLS,
     ActionsOption,
+    BodyOption,
     CheckpointsArgument,
     Commands,
     CompareOption,
@@ -282,7 +283,7 @@ def rollout(
     frames: Annotated[int, typer.Option(min=0, help="With --follow: how many frames; 0 for all.")] = 0,
     memory: Annotated[Path | None, typer.Option(help="Memory file to start from.")] = None,
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
-    body: Annotated[bool, typer.Option(help="Stop at what is in the way of --actions, or go through walls.")] = True,
+    body: BodyOption = None,
     write: Annotated[bool, typer.Option(help="Write what is generated into the memory beside what it holds.")] = True,
     seed: Annotated[int, typer.Option(help="Seed of the sampling noise.")] = 0,
     steps: StepsOption = None,
@@ -297,7 +298,7 @@ def rollout(
     """Roll out a world model from a start frame along actions, clip by clip.
 
     Several --actions are branches of one start, imagined together, each with its own memory: OUT/0, OUT/1, …
-    An agent stops at walls and things that it sees, remembers or has imagined; --no-body lets it go through them.
+    An agent in a simulator's house stops at walls and things that it sees, remembers or has imagined.
 
     persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
     """

@@ -118,6 +118,15 @@ CompareOption = Annotated[
     typer.Option("--compare", metavar="A.json B.json", help="Compare two results instead."),
 ]
 
+BodyOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--body/--no-body",
+        help="Stop at what is in the way of --actions, or go through walls; by default stop where the data tell how "
+        "high the camera is, as a simulator's do.",
+    ),
+]
+
 DtypeOption = Annotated[
     str | None, typer.Option("--dtype", help="float32, bfloat16 or float16; the checkpoint's, float32 as a rule.")
 ]

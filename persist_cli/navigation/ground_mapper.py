@@ -45,6 +45,15 @@ class Vote(IntEnum):
     IMAGINED_FREE = 6
 
 
+def tells_body(info: TrajectoryInfo) -> bool:
+    """Return whether it is known how high the agent's camera is: in a simulator's data, or where the source tells it.
+
+    In other data, such as captures by hand, the floor may lie anywhere below the camera, and with a wrong height the
+    floor itself would be in the way.
+    """
+    return "simulator" in info.source or "camera_height" in info.source
+
+
 def body_of(info: TrajectoryInfo) -> Body:
     """Return the body of a trajectory's agent, with the camera height and radius that its source tells.
 

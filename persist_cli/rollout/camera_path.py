@@ -29,7 +29,8 @@ class RolloutPlan:
     """The options of ``persist rollout``; see its help.
 
     ``step`` metres and ``turn`` degrees are those of the walking actions; ``None`` for the trajectory's own. ``body``
-    says whether the agent collides; along a trajectory's own poses nothing is in its way.
+    says whether the agent collides, ``None`` where the height of its camera is told; see ``tells_body``. Along a
+    trajectory's own poses nothing is in its way.
     """
 
     start: str
@@ -44,7 +45,7 @@ class RolloutPlan:
     placement: InferenceOptions
     step: float | None = None
     turn: float | None = None
-    body: bool = True
+    body: bool | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_file import load_memory, read_header
-from persist_cli.navigation.ground_mapper import body_of
+from persist_cli.navigation.ground_mapper import body_of, tells_body
 from persist_cli.rollout.camera_path import RolloutPlan
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import busy
@@ -31,7 +31,7 @@ def open_world(
     sampling: SamplingOverrides | None = None,
     seed: int = 0,
 ) -> WorldModel:
-    """Return a world model whose one agent stands at a frame of a data set, with the body of the data's agent.
+    """Return a world model whose one agent stands at a frame of a data set, with a body if ``tells_body``.
 
     For example ``open_world("sample#0:32", memory="runs/house.safetensors").step([["left", "forward"]])``.
 
@@ -77,7 +77,8 @@ def assemble_world(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPla
     sampling = checkpoint.sampling_with(plan.sampling)
     backbone.check_sampling(sampling)
     backbone.prepare_inference(plan.placement)
-    body = body_of(info) if plan.body and not plan.follow else None
+    collides = not plan.follow and (tells_body(info) if plan.body is None else plan.body)
+    body = body_of(info) if collides else None
     agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write, body=body)
     return WorldModel(backbone, [agent], sampling)
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from persist_cli.api.ground import Body
 from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.observations import Frame
+from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.rollout.open_world import open_world
@@ -25,6 +30,21 @@ def test_a_world_that_is_opened_imagines_what_rollout_does(persist, voxel, walks
     world.agents[0].memory.save(tmp_path / "after.safetensors")
     written, remembered = load_memory(out / "memory.safetensors"), load_memory(tmp_path / "after.safetensors")
     assert all((written.tensors()[name] == tensor).all() for name, tensor in remembered.tensors().items())
+
+
+def test_an_agent_has_a_body_where_the_data_tell_how_high_its_camera_is(voxel, walks, tmp_path):
+    assert open_world(f"{walks}#0:2", voxel, sampling=FAST).agents[0].body is None
+    walk = Store(walks)[0].read()
+    for name, source in (("simulator", {"simulator": "rooms"}), ("told", {"camera_height": 1.3})):
+        frames = zip(
+            walk.observations.rgb, walk.observations.depth, walk.observations.cameras.world_from_camera, strict=True
+        )
+        parts = [Frame(rgb.numpy(), depth.numpy(), pose.numpy(), "stay") for rgb, depth, pose in frames]
+        write_trajectory(tmp_path / name / "walk.parquet", replace(walk.info, source=source), parts)
+    simulated, told = (open_world(f"{tmp_path / name}#0:2", voxel, sampling=FAST) for name in ("simulator", "told"))
+    assert simulated.agents[0].body == Body()
+    assert told.agents[0].body == Body(camera_height=1.3)
+    assert told.agents[0].surroundings is not None
 
 
 def test_a_world_without_an_adapter_has_no_memory(voxel, walks):

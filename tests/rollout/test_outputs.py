@@ -108,4 +108,4 @@ def test_a_memory_that_cannot_be_used_is_refused_before_the_model_is_loaded(pers
 def test_the_help_names_the_usual_actions_and_that_walls_stop_the_agent(roll):
     text = " ".join(roll("--help").out.replace("│", " ").split())
     assert "stay, forward, backward, left, right, pick_up, drop, toggle" in text
-    assert "An agent stops at walls" in text
+    assert "stops at walls" in text
