@@ -26,6 +26,7 @@ from persist_cli.api.geometry import unproject
 from persist_cli.api.ground import Body, Cover, GroundMap, ground_axes
 from persist_cli.api.memory import MapPoints
 from persist_cli.api.observations import Observations, Origin, TrajectoryInfo
+from persist_cli.errors import DataError
 
 SPACING = 0.05  # metres of a square's side
 REACH = 6.0  # metres on the ground beyond which a frame's pixels are too coarse to tell
@@ -59,8 +60,14 @@ def body_of(info: TrajectoryInfo) -> Body:
 
     ``persist collect`` tells a ``camera_height`` that is not the default. Where nothing is told, as for captures, the
     defaults of ``Body`` stand. A body is never lower than its camera.
+
+    Raises:
+        DataError: when what is told is no positive number.
     """
-    told = {name: float(info.source[name]) for name in ("camera_height", "radius") if name in info.source}
+    told = {name: info.source[name] for name in ("camera_height", "radius") if name in info.source}
+    for name, value in told.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+            raise DataError(f"{info.scene}: its source tells a {name} of {value!r}; it must be metres above 0")
     body = replace(Body(), **told)
     return replace(body, height=max(body.height, body.camera_height))
 

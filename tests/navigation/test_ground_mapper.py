@@ -11,6 +11,7 @@ import torch
 from persist_cli.api.ground import Body, Cover, GroundMap
 from persist_cli.api.memory import FrameOfReference, MapPoints
 from persist_cli.api.observations import Observations, Origin
+from persist_cli.errors import DataError
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of, ground_from_frames
 from persist_cli.plugins import make_encoder, make_memory
 from tests.support.room_worlds import BODY, ROOM, room_views
@@ -137,6 +138,8 @@ def test_a_body_has_the_camera_height_that_its_data_set_tells():
     assert body_of(ROOM.info) == Body()
     told = body_of(replace(ROOM.info, source={"camera_height": 1.7}))
     assert (told.camera_height, told.height) == (1.7, 1.7)
+    with pytest.raises(DataError, match="camera_height of 'tall'; it must be metres above 0"):
+        body_of(replace(ROOM.info, source={"camera_height": "tall"}))
 
 
 def test_a_collision_makes_what_is_right_before_the_body_occupied():

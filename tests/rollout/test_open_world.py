@@ -36,10 +36,9 @@ def test_an_agent_has_a_body_where_the_data_tell_how_high_its_camera_is(voxel, w
     assert open_world(f"{walks}#0:2", voxel, sampling=FAST).agents[0].body is None
     walk = Store(walks)[0].read()
     for name, source in (("simulator", {"simulator": "rooms"}), ("told", {"camera_height": 1.3})):
-        frames = zip(
-            walk.observations.rgb, walk.observations.depth, walk.observations.cameras.world_from_camera, strict=True
-        )
-        parts = [Frame(rgb.numpy(), depth.numpy(), pose.numpy(), "stay") for rgb, depth, pose in frames]
+        seen = walk.observations
+        frames = zip(seen.rgb.numpy(), seen.depth.numpy(), seen.cameras.world_from_camera.numpy(), strict=True)
+        parts = [Frame(rgb, depth, pose, "stay") for rgb, depth, pose in frames]
         write_trajectory(tmp_path / name / "walk.parquet", replace(walk.info, source=source), parts)
     simulated, told = (open_world(f"{tmp_path / name}#0:2", voxel, sampling=FAST) for name in ("simulator", "told"))
     assert simulated.agents[0].body == Body()
