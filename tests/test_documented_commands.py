@@ -96,6 +96,8 @@ NOT_RUN = {
 # programs that are only compiled, by their first line, with the reason
 SKETCHES = {
     "class LastFrame(Memory):  # from persist_cli.api.memory": "its imports are left out; docs/plugins.md runs all",
+    "# needs stable-baselines3": "learns for long; tests/environments learn shortly",
+    "# needs stable-baselines3, too": "see # needs stable-baselines3",
 }
 
 

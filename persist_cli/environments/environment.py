@@ -42,11 +42,16 @@ class Scenes(ABC):
         self.info, self.task = info, task
 
     @abstractmethod
-    def begin(self, number: int, draws: np.random.Generator) -> Attempt:
+    def begin(self, number: int, draws: np.random.Generator, options: Mapping[str, Any]) -> Attempt:
         """Begin an episode of an environment; equal draws give equal episodes.
 
+        Args:
+            number: of the environment.
+            draws: source of all that is random.
+            options: of ``reset``; empty for an episode that is drawn.
+
         Raises:
-            PersistError: when no start and goal can be found.
+            PersistError: when no start and goal can be found, or the options cannot be used.
         """
 
     @abstractmethod
@@ -81,9 +86,9 @@ class HouseEnv(gymnasium.Env[Observation, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode, drawn by the seed; options are not used."""
+        """Begin an episode, drawn by the seed; a true house takes a given one as options."""
         super().reset(seed=seed)
-        self._attempt = self.scenes.begin(0, self.np_random)
+        self._attempt = self.scenes.begin(0, self.np_random, options or {})
         return self.attempt.observation(), self.attempt.info()
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -130,16 +135,16 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode in each environment; options are not used.
+        """Begin an episode in each environment.
 
         Args:
             seed: one for each environment, or that of the first, after which they count up; ``None`` goes on drawing.
-            options: are not used.
+            options: those of each single environment.
         """
         for number, one in enumerate(environment_seeds(seed, self.num_envs)):
             if one is not None:
                 self._draws[number] = seeding.np_random(one)[0]
-        self._attempts = [self.scenes.begin(number, draws) for number, draws in enumerate(self._draws)]
+        self._attempts = [self.scenes.begin(number, draws, options or {}) for number, draws in enumerate(self._draws)]
         infos: dict[str, Any] = {}
         for number, attempt in enumerate(self._attempts):
             infos = self._add_info(infos, attempt.info(), number)
@@ -172,7 +177,7 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
             if ended[number]:
                 final = {"final_obs": attempt.observation(), "final_info": attempt.info()}
                 infos = self._add_info(infos, final, number)
-                self._attempts[number] = self.scenes.begin(number, self._draws[number])
+                self._attempts[number] = self.scenes.begin(number, self._draws[number], {})
             infos = self._add_info(infos, self._attempts[number].info(), number)
         return infos
 

@@ -102,8 +102,10 @@ class ImaginedScenes(Scenes):
         self._agents = [self.first] * count
         self._goals = [0] * count
 
-    def begin(self, number: int, draws: np.random.Generator) -> Attempt:
-        """Draw a start, a goal and the seed of the noise."""
+    def begin(self, number: int, draws: np.random.Generator, options: Mapping[str, Any]) -> Attempt:
+        """Draw a start, a goal and the seed of the noise; there are no options."""
+        if options:
+            raise DataError(f"options of reset ({', '.join(options)}): an imagined house has none; see its settings")
         start, goal = self._draw(draws)
         frame = self.starts[start]
         first = self.first

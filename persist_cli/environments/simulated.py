@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 import numpy as np
@@ -53,6 +53,34 @@ class SimulatedSettings(TaskSettings):
         return plan
 
 
+@dataclass(frozen=True)
+class Stand:
+    """Where an agent stands.
+
+    Args:
+        ground: place on the simulator's ground, metres.
+        heading: radians to the left, as the simulator counts them.
+    """
+
+    ground: tuple[float, float]
+    heading: float
+
+
+@dataclass(frozen=True)
+class GivenEpisode:
+    """An episode that is not drawn, such as one of a benchmark.
+
+    Args:
+        scene: seed of the simulator's scene.
+        start: where the agent starts.
+        goal: pose of the goal, whose view is the goal image.
+    """
+
+    scene: int
+    start: Stand
+    goal: Stand
+
+
 class SimulatedScenes(Scenes):
     """Houses of a simulator, one open for each environment.
 
@@ -76,11 +104,16 @@ class SimulatedScenes(Scenes):
         self.houses[0].open(self.seeds[0])
         super().__init__(self.houses[0].simulator.info, settings)
 
-    def begin(self, number: int, draws: np.random.Generator) -> Attempt:
-        """Draw a house, a start and a goal in it."""
+    def begin(self, number: int, draws: np.random.Generator, options: Mapping[str, Any]) -> Attempt:
+        """Draw a house, a start and a goal in it, or take those that ``options`` gives: see ``GivenEpisode``."""
         house = self.houses[number]
-        house.open(self.seeds[int(draws.integers(len(self.seeds)))])
-        return house.begin(draws)
+        if not options:
+            house.open(self.seeds[int(draws.integers(len(self.seeds)))])
+            return house.begin(*house.draw(draws))
+        named = {field.name: options[field.name] for field in fields(GivenEpisode) if field.name in options}
+        given = parse_settings(GivenEpisode, named, "options of reset")
+        house.open(given.scene)
+        return house.begin(given.start, given.goal)
 
     def walk(self, actions: Mapping[int, Sequence[str]]) -> dict[int, list[View]]:
         """Let the agents act, one after another."""
@@ -109,8 +142,8 @@ class OpenHouse:
         self.simulator.open_scene(seed)
         self._seed, self._grid = seed, FreeGrid(self.simulator)
 
-    def begin(self, draws: np.random.Generator) -> Attempt:
-        """Put the agent at a random start, with a goal that is as far away as the task says.
+    def draw(self, draws: np.random.Generator) -> tuple[Stand, Stand]:
+        """Draw a start, and a goal that is as far away as the task says.
 
         Raises:
             DataError: when the scene has no two such places.
@@ -119,15 +152,16 @@ class OpenHouse:
             start = random_start(self.simulator, draws)
             goal = self._draw_goal(start, draws)
             if goal is not None:
-                break
-        else:
-            low, high = self.task.goal_distance
-            scene = self.simulator.info.scene
-            raise DataError(f"{scene}: no start and goal that are {low:g} to {high:g} m apart; set goal_distance")
-        self._goal, self._distances = goal[0], self._grid.distances(goal[0])
-        shown = self._look_from(*goal)
-        view = self._look_from(start, float(draws.uniform(-math.pi, math.pi)))
-        info = self.simulator.info
+                return Stand(start, float(draws.uniform(-math.pi, math.pi))), goal
+        low, high = self.task.goal_distance
+        scene = self.simulator.info.scene
+        raise DataError(f"{scene}: no start and goal that are {low:g} to {high:g} m apart; set goal_distance")
+
+    def begin(self, start: Stand, goal: Stand) -> Attempt:
+        """Put the agent at a start, with the view at the goal in mind; ``DataError`` where one of them is not free."""
+        self._goal, self._distances = goal.ground, self._grid.distances(goal.ground)
+        shown = self._look_from(goal)
+        view, info = self._look_from(start), self.simulator.info
         seen = Goal(torch.from_numpy(shown.rgb), torch.from_numpy(shown.world_from_camera[:3, 3]), info.scene)
         return Attempt(view, seen, info.world_up, self.task)
 
@@ -135,7 +169,7 @@ class OpenHouse:
         """Do an action, and return what is seen after it."""
         return self._view(free=self.simulator.act(action))
 
-    def _draw_goal(self, start: Ground, draws: np.random.Generator) -> tuple[Ground, float] | None:
+    def _draw_goal(self, start: Ground, draws: np.random.Generator) -> Stand | None:
         """Draw a place and a heading with an open view; ``None`` when this start has none."""
         distances = self._grid.distances(start)
         places = [self._grid.place(cell) for cell in sorted(distances)]
@@ -143,11 +177,11 @@ class OpenHouse:
         for _ in range(TRIES if far else 0):
             place, heading = far[int(draws.integers(len(far)))], float(draws.uniform(-math.pi, math.pi))
             if clear_distance(self.simulator, place, heading, OPEN_VIEW, OPEN_VIEW):
-                return place, heading
+                return Stand(place, heading)
         return None
 
-    def _look_from(self, ground: Ground, heading: float) -> View:
-        self.simulator.place(ground, heading)
+    def _look_from(self, stand: Stand) -> View:
+        self.simulator.place(stand.ground, stand.heading)
         return self._view(free=True)
 
     def _view(self, free: bool) -> View:

@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import persist_cli.environments  # noqa: F401  registers them
+from persist_cli.environments.simulated import Stand
 from persist_cli.errors import PersistError
 from tests.support.miniworlds import make_world
 
@@ -54,9 +55,26 @@ def test_the_goal_shows_what_the_agent_sees_there():
         seen, info = env.reset(seed=seed)
         attempt, house = env.unwrapped.attempt, env.unwrapped.scenes.houses[0]
         place = attempt.goal.position.numpy()[[0, 2]]
-        views = (house._look_from(tuple(place), 2 * np.pi * turn / 720) for turn in range(720))
+        views = (house._look_from(Stand(tuple(place), 2 * np.pi * turn / 720)) for turn in range(720))
         assert min(np.abs(view.rgb.astype(int) - seen["goal"]).mean() for view in views) < 2
         assert 1.5 <= info["distance"] <= 8.0
+
+
+def test_an_episode_that_is_given_is_run_as_it_is():
+    env, other = make(), make()
+    env.reset(seed=2)
+    house, goal = env.unwrapped.scenes.houses[0], env.unwrapped.attempt.goal
+    (ground, heading), there = house.simulator.agent, house._goal
+    episode = {
+        "name": "a", "scene": house._seed, "start": {"ground": ground, "heading": heading},
+        "goal": {"ground": there, "heading": 0.0},
+    }  # fmt: skip
+    seen, info = other.reset(options=episode)
+    assert np.array_equal(seen["rgb"], env.unwrapped.attempt.now.rgb)
+    assert info["distance"] == env.unwrapped.attempt.now.left
+    assert np.array_equal(other.unwrapped.attempt.goal.position, goal.position)
+    with pytest.raises(PersistError, match="options of reset: goal is missing"):
+        other.reset(options={"scene": 3, "start": episode["start"]})
 
 
 def test_the_way_round_a_wall_is_longer_than_the_line_through_it():
