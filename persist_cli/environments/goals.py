@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -14,11 +14,13 @@ from torch import Tensor
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal
+from persist_cli.data.images import crop_resize
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.environments.task import TaskSettings
 from persist_cli.errors import DataError
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.navigation.routes import Distances, distances_to, holding
+from persist_cli.viewing.console import warn
 
 ROOM = 3.0  # metres of unknown ground around all that is known, over which an agent may walk too
 
@@ -69,16 +71,22 @@ class Goals:
     Args:
         positions: of the camera there, world metres.
         scene: name of their scene.
-        frames: whose images they show; ``None`` where the goals are places alone.
+        size: height and width of the agent's images.
+        frames: whose images they show, cropped and resized to that; ``None`` where the goals are places alone.
     """
 
     positions: Float[Tensor, "goal 3"]
     scene: str
+    size: tuple[int, int]
     frames: PosedFrames | None = None
 
     def goal(self, index: int) -> Goal:
         """Return one of the goals."""
-        rgb = None if self.frames is None else self.frames[index].rgb[0]
+        rgb = None
+        if self.frames is not None:
+            image = self.frames[index].rgb[0].numpy()
+            same = image.shape[:2] == self.size
+            rgb = torch.from_numpy(image if same else crop_resize(image.shape[:2], self.size).rgb(image))
         return Goal(rgb, self.positions[index].double(), self.scene)
 
 
@@ -101,12 +109,15 @@ def find_goals(wanted: str | Sequence[float], free: Goals, observe: str) -> Goal
     if isinstance(wanted, str) and wanted != "random":
         frames = PosedFrames(wanted)
         frames.check_scene(free.scene)
-        return Goals(frames.positions, free.scene, frames)
+        info, (height, width) = frames.info, free.size
+        if (info.height, info.width) != free.size:
+            warn(f"goal {wanted}: resized from {info.height}x{info.width} to {height}x{width} pixels")
+        return replace(free, positions=frames.positions, frames=frames)
     if observe == "image":
         raise DataError(f"goal {wanted!r}: a place has no image; give observe_goal='place', or a frame of a data set")
     if wanted == "random":
         return free
-    return Goals(torch.tensor([list(wanted)], dtype=torch.float64), free.scene)
+    return replace(free, positions=torch.tensor([list(wanted)], dtype=torch.float64))
 
 
 class KnownGround:

@@ -97,7 +97,7 @@ class ImaginedScenes(Scenes):
         if self.given is not None:
             memorize_frames(world, self.given)
         self.known = KnownGround(self._map(settings), body_of(info).radius, settings)
-        free = Goals(self.known.free_places(self.starts.positions), info.scene)
+        free = Goals(self.known.free_places(self.starts.positions), info.scene, (info.height, info.width))
         self.goals = find_goals(settings.goal, free, settings.observe_goal)
         self._agents = [self.first] * count
         self._goals = [0] * count

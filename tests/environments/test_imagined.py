@@ -11,6 +11,7 @@ import persist_cli.environments  # noqa: F401  registers them
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.errors import PersistError
 from persist_cli.rollout.open_world import open_world
+from tests.support.micro_runs import write_walks
 from tests.support.room_worlds import RoomWorld
 from tests.support.rooms import Room, walk
 
@@ -127,6 +128,13 @@ def test_random_goals_lie_on_free_ground_that_was_seen(settings):
         assert int(known.ground.at(known.ground.places(position))) == 1
         places.add(tuple(position.tolist()))
     assert len(places) > 1
+
+
+def test_a_goal_image_of_another_size_is_resized_and_said_so(settings, tmp_path, capsys):
+    env = make(settings, goal=f"{write_walks(tmp_path, size=64)}#0:0-9")
+    assert "resized from 64x64 to 32x32 pixels" in capsys.readouterr().err
+    seen, expected = (one.reset(seed=0)[0]["goal"].astype(int) for one in (env, make(settings)))
+    assert np.abs(seen - expected).mean() < 20
 
 
 def test_a_start_is_drawn_where_several_are_named(settings, walks):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import runpy
+import sys
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -16,6 +20,8 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecMonitor
 
 from persist_cli.environments.stable_baselines import BatchedVecEnv
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "ppo.py"
 
 TRUE = {"id": "persist/SimulatedHouse-v0", "scenes": "0:2", "split": "test"}
 
@@ -68,3 +74,15 @@ def test_environments_that_begin_anew_a_step_later_are_refused():
     make_world()
     with pytest.raises(PersistError, match="NEXT_STEP"):
         BatchedVecEnv(gymnasium.make_vec(num_envs=1, vectorization_mode="sync", **TRUE))
+
+
+@pytest.mark.parametrize("where", [[], ["--true"]])
+def test_the_example_learns_and_counts_the_goals_that_are_reached_in_truth(where, monkeypatch, capsys):
+    make_world()
+    monkeypatch.delenv("PERSIST_REFERENCE", raising=False)
+    few = ["--steps", "1", "--envs", "1", "--episodes", "1"]
+    monkeypatch.setattr(sys, "argv", ["ppo.py", *few, *where])
+    script = runpy.run_path(str(EXAMPLE))
+    script["LEARNING"]["n_steps"] = 4
+    script["main"]()
+    assert "goals reached in the true house: " in capsys.readouterr().out
