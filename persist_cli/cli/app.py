@@ -25,6 +25,7 @@ from persist_cli.cli.options import (
     JsonOption,
     MemoriesOption,
     NewPosesOption,
+    ReferenceArgument,
     ResampleOption,
     SamplerOption,
     SamplingOfOption,
@@ -273,9 +274,7 @@ def memorize(
 def rollout(
     start: Annotated[str, typer.Option(help="Where to start: DATA#trajectory:frame.")],
     out: Annotated[Path, typer.Option(help="Folder for videos, sheets, maps and poses.")],
-    checkpoint: Annotated[
-        Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
-    ] = None,
+    checkpoint: ReferenceArgument = None,
     actions: ActionsOption = None,
     step: StepOption = None,
     turn: TurnOption = None,

@@ -32,6 +32,15 @@ CheckpointsArgument = Annotated[
     list[Path] | None, typer.Argument(metavar="CHECKPOINT...", help="Runs or checkpoints; else the reference.")
 ]
 
+ReferenceArgument = Annotated[
+    Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
+]
+
+PlanSettingsOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="As in method.elites=0.1, policy.KEY=VALUE or cost.KEY=VALUE."),
+]
+
 StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
 
 SamplerOption = Annotated[

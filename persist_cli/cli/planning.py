@@ -13,6 +13,8 @@ from persist_cli.cli.options import (
     DtypeOption,
     GuidanceOption,
     JsonOption,
+    PlanSettingsOption,
+    ReferenceArgument,
     SamplerOption,
     SaveMemoryOption,
     StepOption,
@@ -48,9 +50,7 @@ def plan(
     start: Annotated[str, typer.Option(help="Where to start: DATA#trajectory:frame.")],
     goal: Annotated[str, typer.Option(help="An image, a frame DATA#trajectory:frame, or a place x,y on the map.")],
     out: Annotated[Path, typer.Option(help="Folder for plan.json, sheet.png, map.png and plan.mp4.")],
-    checkpoint: Annotated[
-        Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else the reference model.")
-    ] = None,
+    checkpoint: ReferenceArgument = None,
     memory: Annotated[Path | None, typer.Option(help="Memory file of the place.")] = None,
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
     method: Annotated[
@@ -67,9 +67,7 @@ def plan(
     actions: Annotated[str, typer.Option(help="Of cem, with commas; those that walk ahead or turn.")] = "",
     frames: Annotated[int | None, typer.Option(help="Budget: most imagined frames.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Budget: most seconds.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="As in method.elites=0.1, policy.KEY=VALUE or cost.KEY=VALUE.")
-    ] = None,
+    settings: PlanSettingsOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Candidates imagined together.")] = 20,
     body: Annotated[bool, typer.Option(help="Walls that are known stop the agent.")] = True,
     step: StepOption = None,

@@ -19,6 +19,7 @@ from persist_cli.io.files import written_aside
 PATH_COLORS = ("#d81b60", "#1e88e5", "#ffb300", "#004d40", "#8e24aa")
 UNSEEN = (0.94, 0.94, 0.95, 1.0)
 COST_COLORS = "viridis"  # of matplotlib: cheap is dark
+NO_COST = "#9e9e9e"  # where it is not finite
 MARGIN = 0.5  # metres around what is drawn
 AROUND = 2.0  # metres around candidates
 ABOVE_CAMERA = 0.1  # metres over the cameras at which the ceiling is cut away
@@ -116,18 +117,18 @@ def draw_candidates(
 
 def _draw_costs(figure: Any, axes: Any, places: Sequence[Array], costs: Sequence[float]) -> None:
     """Draw lines in colours of their costs, the dearest first, with the bar of the colours."""
-    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
     from matplotlib.collections import LineCollection
+    from matplotlib.colors import Normalize
 
-    order = sorted(range(len(costs)), key=lambda number: -costs[number] if np.isfinite(costs[number]) else -np.inf)
-    values = np.ma.masked_invalid([costs[number] for number in order])
-    colors = colormaps[COST_COLORS].with_extremes(bad="#9e9e9e")
-    lines = LineCollection([places[number] for number in order], cmap=colors, linewidths=1.4, zorder=2.5)
-    lines.set_array(values)
-    axes.add_collection(lines)
-    ends = np.stack([places[number][-1] for number in order])
-    axes.scatter(*ends.T, s=14, c=values, cmap=lines.cmap, norm=lines.norm, zorder=2.6)
-    figure.colorbar(lines, ax=axes, label="cost", shrink=0.8)
+    finite = [cost for cost in costs if np.isfinite(cost)]
+    scale = ScalarMappable(Normalize(min(finite, default=0.0), max(finite, default=1.0)), COST_COLORS)
+    order = sorted(range(len(costs)), key=lambda number: -costs[number])
+    colors = [scale.to_rgba(costs[number]) if np.isfinite(costs[number]) else NO_COST for number in order]
+    lines = [places[number] for number in order]
+    axes.add_collection(LineCollection(lines, colors=colors, linewidths=1.4, zorder=2.5))
+    axes.scatter(*np.stack([line[-1] for line in lines]).T, s=14, c=colors, zorder=2.6)
+    figure.colorbar(scale, ax=axes, label="cost", shrink=0.8)
 
 
 def _begin_figure(image: Array | None, extent: tuple[float, float, float, float] | None, size: Array) -> Any:

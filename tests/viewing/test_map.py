@@ -1,5 +1,6 @@
 """The map is seen from above, true to scale, and repeatable."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from PIL import Image
 
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import MapPoints
-from persist_cli.viewing.map import draw_map, paint
+from persist_cli.viewing.map import DrawnCandidate, draw_candidates, draw_map, paint
 from tests.support.room_views import room_walk, written_memory
 from tests.support.rooms import UP
 
@@ -93,3 +94,23 @@ def test_drawing_a_map_twice_gives_equal_files(tmp_path):
     for name in ("a.png", "b.png"):
         draw_map(memory.points(), UP, {}, tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def near_color(file, color):
+    """How many dots of a picture have about this colour."""
+    image = np.asarray(Image.open(file).convert("RGB")).astype(int)
+    return int((np.abs(image - np.array(color)).max(-1) < 12).sum())
+
+
+def test_candidates_are_drawn_in_colours_of_their_costs_under_the_chosen_one_and_the_goal(tmp_path):
+    paths = torch.eye(4, dtype=torch.float64).repeat(3, 4, 1, 1)
+    for path, axis, sign in zip(paths, (2, 0, 0), (1, 1, -1), strict=True):
+        path[:, axis, 3] = sign * torch.arange(4) * 0.25
+    candidates = [DrawnCandidate(path, cost) for path, cost in zip(paths, (0.1, 0.9, math.inf), strict=True)]
+    goal, no_points = torch.tensor([0.0, 0.0, 1.0]), points(((0, 0, 0), RED))
+    draw_candidates(no_points, UP, candidates, goal, tmp_path / "goal.png")
+    draw_candidates(no_points, UP, candidates[:2], None, tmp_path / "none.png")
+    magenta, yellow, grey, star = (216, 27, 96), (253, 231, 37), (158, 158, 158), (255, 179, 0)
+    assert all(near_color(tmp_path / "goal.png", color) > 20 for color in (magenta, yellow, grey, star))
+    assert near_color(tmp_path / "none.png", star) == 0
+    assert near_color(tmp_path / "none.png", grey) < near_color(tmp_path / "goal.png", grey)
