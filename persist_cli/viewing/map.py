@@ -123,8 +123,9 @@ def _draw_costs(figure: Any, axes: Any, places: Sequence[Array], costs: Sequence
 
     finite = [cost for cost in costs if np.isfinite(cost)]
     scale = ScalarMappable(Normalize(min(finite, default=0.0), max(finite, default=1.0)), COST_COLORS)
+    rgba = scale.to_rgba(np.nan_to_num(np.array(costs), posinf=0.0, neginf=0.0))
     order = sorted(range(len(costs)), key=lambda number: -costs[number])
-    colors = [scale.to_rgba(costs[number]) if np.isfinite(costs[number]) else NO_COST for number in order]
+    colors = [rgba[number] if np.isfinite(costs[number]) else NO_COST for number in order]
     lines = [places[number] for number in order]
     axes.add_collection(LineCollection(lines, colors=colors, linewidths=1.4, zorder=2.5))
     axes.scatter(*np.stack([line[-1] for line in lines]).T, s=14, c=colors, zorder=2.6)
