@@ -40,24 +40,26 @@ class EpisodeSearch:
 
     Args:
         bins: numbers of actions of the shortest ways.
-        each: most episodes of each bin, as many in sight and out of sight; a scene gives one of each at most.
+        each: most episodes of each bin, as many in sight and out of sight.
         walk_frames: most frames of the given walk.
         seed: seed of starts and goals.
+        per_scene: most episodes of each of these kinds in one scene.
     """
 
     bins: Sequence[int] = (8, 16, 32, 64)
     each: int = 16
     walk_frames: int = 48
     seed: int = 0
+    per_scene: int = 1
 
     def check(self) -> None:
         """Raise ``DataError`` for a bin, a number or a seed that cannot be."""
         if not self.bins or min(self.bins) < 1:
             raise DataError(f"--bins {','.join(map(str, self.bins))}: name numbers of actions above 0, as in 8,16")
-        if self.each < 1 or self.walk_frames < 1 or self.seed < 0:
+        if min(self.each, self.walk_frames, self.per_scene) < 1 or self.seed < 0:
             raise DataError(
-                f"{self.each} episodes of a kind with {self.walk_frames} frames and seed {self.seed}: the first two "
-                "must be at least 1, the seed not negative"
+                f"{self.each} episodes of a kind, {self.per_scene} in a scene, with {self.walk_frames} frames and seed "
+                f"{self.seed}: the first three must be at least 1, the seed not negative"
             )
 
     @property
@@ -73,11 +75,13 @@ def find_episodes(simulator: Simulator, scenes: Sequence[int], search: EpisodeSe
     """
     counts: Counter[Kind] = Counter()
     for scene in scenes:
-        wanted = [kind for kind in search.kinds if counts[kind] < search.each]
-        if not wanted:
+        if all(counts[kind] >= search.each for kind in search.kinds):
             return
-        found = SceneSearch(simulator, scene, search).find(wanted)
-        counts.update((episode.bin, episode.in_sight) for episode in found)
+        in_scene, found = SceneSearch(simulator, scene, search), list[Episode]()
+        for turn in range(search.per_scene):
+            new = in_scene.find([kind for kind in search.kinds if counts[kind] < search.each], turn)
+            counts.update((episode.bin, episode.in_sight) for episode in new)
+            found += new
         yield found
 
 
@@ -89,9 +93,16 @@ class SceneSearch:
         self.random = np.random.default_rng([search.seed, scene])
         simulator.open_scene(scene)
         self.grid = FreeGrid(simulator)
+        self.suffix = ""  # of the names of the episodes that are found now
 
-    def find(self, wanted: Sequence[Kind]) -> list[Episode]:
-        """Return an episode of each wanted kind that the scene has, shorter ways first."""
+    def find(self, wanted: Sequence[Kind], turn: int = 0) -> list[Episode]:
+        """Return an episode of each wanted kind that the scene has, shorter ways first.
+
+        Args:
+            wanted: the kinds.
+            turn: how often this scene was searched before; names say it.
+        """
+        self.suffix = f"-{turn}" if turn else ""
         found: dict[Kind, Episode] = {}
         for _ in range(STARTS):
             missing = [kind for kind in wanted if kind not in found]
@@ -154,7 +165,7 @@ class SceneSearch:
         if given is None:
             return None
         return Episode(
-            name=f"{self.scene}-{number}-{'in-sight' if sight else 'hidden'}", scene=self.scene,
+            name=f"{self.scene}-{number}-{'in-sight' if sight else 'hidden'}{self.suffix}", scene=self.scene,
             scene_name=self.simulator.info.scene, bin=number, in_sight=sight, goal_share=round(share, 4), start=start,
             goal=goal, actions=format_actions(actions), walk=given, seed=int(self.random.integers(2**31)),
             metres=round(actions.count("forward") * self.simulator.info.vocabulary["forward"].forward, 6),

@@ -155,6 +155,7 @@ def bench_episodes(
     size: Annotated[str, typer.Option(help="Image size HxW in pixels.")] = "64x64",
     bins: Annotated[str, typer.Option(help="Actions of the shortest ways, separated by commas.")] = "8,16,32,64",
     each: Annotated[int, typer.Option(min=1, help="Most of each bin, in sight and hidden.")] = 16,
+    per_scene: Annotated[int, typer.Option(min=1, help="Most of each of these in one scene.")] = 1,
     walk_frames: Annotated[int, typer.Option(min=1, help="Most posed images that are given.")] = 48,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts and goals.")] = 0,
     json: JsonOption = False,
@@ -167,7 +168,7 @@ def bench_episodes(
     from persist_cli.bench.make_episodes import run_episodes
     from persist_cli.simulators.collect import CollectPlan
 
-    search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed)
+    search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed, per_scene)
     run_episodes(CollectPlan(simulator, scenes, size=size, split=split), search, out, json)
 
 

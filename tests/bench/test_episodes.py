@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,14 @@ def test_a_seed_gives_the_same_episodes_again(small_world: MiniWorld, found: lis
     again = [episode for scene in find_episodes(small_world, [HOUSE], SEARCH) for episode in scene]
     assert again == found
     assert len(found) >= 2
+
+
+def test_a_scene_can_give_several_episodes_of_a_kind(small_world: MiniWorld, found: list[Episode]) -> None:
+    search = replace(SEARCH, bins=(8,), each=3, per_scene=2)
+    several = [episode for scene in find_episodes(small_world, [HOUSE], search) for episode in scene]
+    kinds = Counter((episode.bin, episode.in_sight) for episode in several)
+    assert max(kinds.values()) == 2
+    assert len({episode.name for episode in several}) == len({episode.start for episode in several}) == len(several)
 
 
 def test_the_shortest_way_of_an_episode_leads_to_the_goal_image(small_world: MiniWorld, found: list[Episode]) -> None:
