@@ -69,7 +69,9 @@ def plan(
     seconds: Annotated[float | None, typer.Option(help="Budget: most seconds.")] = None,
     settings: PlanSettingsOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Candidates imagined together.")] = 20,
-    body: Annotated[bool, typer.Option(help="Walls that are known stop the agent.")] = True,
+    body: Annotated[
+        bool | None, typer.Option("--body/--no-body", help="Known walls stop the agent; by default as in rollout.")
+    ] = None,
     step: StepOption = None,
     turn: TurnOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of candidates and sampling noise.")] = 0,

@@ -48,7 +48,8 @@ class PlanOptions:
     """The options of ``persist plan``; see its help.
 
     ``candidates``, ``rounds`` and ``horizon`` are ``None`` for the method's own, ``policy`` for ``random`` and ``cost``
-    for ``lpips``, or ``geodesic`` where the goal is a place. ``body`` says whether walls stop the agent.
+    for ``lpips``, or ``geodesic`` where the goal is a place. ``body`` says whether walls stop the
+    agent; ``None``: where the height of its camera is told, see ``tells_body``.
     """
 
     start: str
@@ -66,7 +67,7 @@ class PlanOptions:
     frames: int | None = None
     seconds: float | None = None
     batch: int = 20
-    body: bool = True
+    body: bool | None = None
     seed: int = 0
     settings: tuple[str, ...] = ()
     sampling: SamplingOverrides = field(default_factory=SamplingOverrides)
@@ -195,9 +196,8 @@ def open_model(checkpoint: Checkpoint, adapter: str | None, options: PlanOptions
 def make_plan(model: WorldModel, parts: PlanParts, options: PlanOptions) -> Planned:
     """Plan from the start frame, with a progress bar that shows each round's best cost."""
     agent, info = model.agents[0], parts.start.info
-    body = body_of(info)
-    ground = Surroundings(body, agent.now, info, agent.memory).map()
-    futures = WorldFutures(model, ground, body if options.body else None)
+    ground = Surroundings(body_of(info), agent.now, info, agent.memory).map()
+    futures = WorldFutures(model, ground, agent.body)
     judge = Judge(futures, parts.cost, parts.goal, ground, parts.over, parts.budget, options.batch)
     situation = Situation(parts.seen, info, parts.goal, ground)
     generator = torch.Generator().manual_seed(options.seed)
@@ -248,7 +248,7 @@ def describe(
         "policy": policy,
         "cost": {"name": parts.cost.name, "settings": dataclasses.asdict(parts.cost.settings), "over": options.over},
         "budget": dataclasses.asdict(parts.budget),
-        "body": options.body,
+        "body": model.agents[0].body is not None,
         "seed": options.seed,
         "sampling": dataclasses.asdict(model.sampling),
         "placement": dataclasses.asdict(options.placement),
