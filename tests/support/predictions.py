@@ -71,4 +71,4 @@ def cache_random(cache: Path, name: str, shapes: Mapping[str, tuple[int, ...]]) 
         if key.startswith("head") or key.endswith("var"):
             tensor.abs_()
     write_tensors(cache / "weights" / name / "model.safetensors", tensors)
-    write_json(cache / "weights" / name / "weight.json", {"name": name})
+    write_json(cache / "weights" / name / "weight.json", {"name": name, "sha256": "0" * 64})
