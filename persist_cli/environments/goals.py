@@ -116,6 +116,11 @@ def find_goals(wanted: str | Sequence[float], free: Goals, observe: str) -> Goal
     if observe == "image":
         raise DataError(f"goal {wanted!r}: a place has no image; give observe_goal='place', or a frame of a data set")
     if wanted == "random":
+        if not len(free.positions):
+            raise DataError(
+                "goal 'random': no free ground is known; name frames of a data set, or give collide=True where the "
+                "camera is some 1.25 m above the floor"
+            )
         return free
     return replace(free, positions=torch.tensor([list(wanted)], dtype=torch.float64))
 

@@ -23,7 +23,7 @@ from persist_cli.environments.goals import Goals, KnownGround, PosedFrames, find
 from persist_cli.environments.task import Attempt, TaskSettings, View
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.io.settings import parse_settings
-from persist_cli.navigation.ground_mapper import GroundMapper, body_of
+from persist_cli.navigation.ground_mapper import GroundMapper, body_of, tells_body
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.world_model import Agent, WorldModel
@@ -46,7 +46,8 @@ class ImaginedSettings(TaskSettings):
         adapter: name of a memory adapter, by default the checkpoint's own; ``stage1`` for none.
         memory: a file of ``persist memorize``, or frames of a data set to make one of; ``None`` for an empty memory.
         write: whether what is imagined is written into the memory, for the rest of the episode.
-        collide: whether the agent is stopped by what it saw, remembers or imagined; else it walks through walls.
+        collide: whether the agent is stopped by what it saw, remembers or imagined, or walks through walls; ``None``
+            stops it where the data tell how high its camera is, as a simulator's do.
         sampling: steps, sampler and guidance in place of the checkpoint's own.
         step: metres of an action, in place of the data set's own.
         turn: degrees of an action.
@@ -58,7 +59,7 @@ class ImaginedSettings(TaskSettings):
     adapter: str | None = None
     memory: str | None = None
     write: bool = True
-    collide: bool = True
+    collide: bool | None = None
     sampling: SamplingOverrides = field(default_factory=SamplingOverrides)
     step: float | None = None
     turn: float | None = None
@@ -155,7 +156,12 @@ class ImaginedScenes(Scenes):
         return [View(rgb.numpy(), depth.numpy(), pose.double().numpy(), m, was) for rgb, depth, pose, m, was in rows]
 
     def _map(self, settings: ImaginedSettings) -> GroundMap:
-        """What is known of the ground: from the memory or the frames that it was made of, and the start frames."""
+        """What is known of the ground: from the memory or the frames that it was made of, and the start frames.
+
+        Nothing is known where the height of the camera is not, since the floor itself could seem to be in the way.
+        """
+        if self.first.body is None and not tells_body(self.info):
+            return GroundMap.empty(self.info.world_up)
         body = body_of(self.info)
         mapper = GroundMapper(self.info.world_up, body)
         for frames in filter(None, [self.given, self.starts]):

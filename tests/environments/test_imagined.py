@@ -119,7 +119,7 @@ def is_alike(batch: object, number: int, alone: dict[str, np.ndarray]) -> bool:
 
 
 def test_random_goals_lie_on_free_ground_that_was_seen(settings):
-    env = make(settings, goal="random", observe_goal="place")
+    env = make(settings, goal="random", observe_goal="place", collide=True)
     known = env.unwrapped.scenes.known
     places = set()
     for seed in range(5):
@@ -157,6 +157,7 @@ def test_settings_that_do_not_go_together_are_one_line(settings, walks, tmp_path
         ({"memory": f"{walks}#1:0-6"}, "is of scene 'room-1', and the start of 'room-0'"),
         ({"goal": [0.0, 1.3, 0.0]}, "a place has no image; give observe_goal='place'"),
         ({"goal": str(picture)}, "an image does not say where it was taken"),
+        ({"goal": "random", "observe_goal": "place"}, "no free ground is known"),  # the room tells no height
         ({"adapter": "stage1"}, "without a memory adapter it cannot read"),
         ({"start": str(capture), "memory": None, "goal": str(capture)}, "have no motion of their own"),
         ({"memry": "m"}, "unknown key 'memry', did you mean 'memory'"),
