@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 from persist_cli.api.actions import Action
+
+LOOK_AHEAD: Final = 2  # steps
 
 
 def follow_waypoints(
@@ -13,8 +16,8 @@ def follow_waypoints(
 ) -> tuple[str, ...]:
     """Return at least one and at most ``horizon`` actions that lead along waypoints.
 
-    The agent looks at the first waypoint that is at least a step away, turns until it is within half a turn of its
-    heading, and walks. It ends within half a step of the last one.
+    The agent looks at the first waypoint that is at least two steps away, turns until it is within half a turn of its
+    heading, and walks. Nearer ones would let it turn to and fro. It ends within half a step of the last one.
 
     Args:
         waypoints: metres ahead and to the left of where the agent is now.
@@ -26,7 +29,7 @@ def follow_waypoints(
     target, names = 0, list[str]()
     while len(names) < horizon:
         distances = [math.dist((x, y), waypoint) for waypoint in waypoints]
-        while target < len(waypoints) - 1 and distances[target] < ahead.forward:
+        while target < len(waypoints) - 1 and distances[target] < LOOK_AHEAD * ahead.forward:
             target += 1
         if target == len(waypoints) - 1 and distances[target] <= ahead.forward / 2 and names:
             break
