@@ -275,10 +275,11 @@ def show(planned: Planned, record: dict[str, Any], out: Path) -> None:
     plan: Plan = planned.plan
     title = f"the best {len(rows)} of {len(plan.candidates)} candidates"
     print_table(title, ["rank", "cost", "true cost", "round", "blocked", "actions"], rows)
+    rounds = "1 round" if plan.rounds == 1 else f"{plan.rounds} rounds"
     say(f"chosen: {format_actions(plan.actions) or 'stay here'}")
     say(
         f"{len(plan.candidates)} videos, {plan.frames} imagined frames in {plan.seconds:.1f} s "
-        f"({plan.rounds} rounds{', ended by the budget' if plan.exhausted else ''}), "
+        f"({rounds}{', ended by the budget' if plan.exhausted else ''}), "
         f"{planned.futures.model.sampling.words}; written to {out}"
     )
     unknown = record["truth"]["unknown"]
