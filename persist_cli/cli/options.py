@@ -131,8 +131,8 @@ BodyOption = Annotated[
     bool | None,
     typer.Option(
         "--body/--no-body",
-        help="Stop at what is in the way of --actions, or go through walls; by default stop where the data tell how "
-        "high the camera is, as a simulator's do.",
+        help="Stop at what is in the way, or go through walls; by default stop where the data tell how high the camera "
+        "is, as a simulator's do.",
     ),
 ]
 

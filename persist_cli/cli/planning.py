@@ -9,6 +9,7 @@ import typer
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
+    BodyOption,
     ContextNoiseOption,
     DtypeOption,
     GuidanceOption,
@@ -69,9 +70,7 @@ def plan(
     seconds: Annotated[float | None, typer.Option(help="Budget: most seconds.")] = None,
     settings: PlanSettingsOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Candidates imagined together.")] = 20,
-    body: Annotated[
-        bool | None, typer.Option("--body/--no-body", help="Known walls stop the agent; by default as in rollout.")
-    ] = None,
+    body: BodyOption = None,
     step: StepOption = None,
     turn: TurnOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of candidates and sampling noise.")] = 0,
