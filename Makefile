@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo demo-train table1 table1-reference ablations gain-curve planning test test-slow lint bench docs clean
+.PHONY: demo demo-train table1 table1-reference ablations gain-curve planning learning test test-slow lint bench docs clean
 
 demo: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.demo runs/demo
@@ -26,6 +26,9 @@ gain-curve: $(STAMP)
 
 planning: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.planning runs/planning
+
+learning: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.reproduce.learning runs/learning --policy runs/policy
 
 # two processes of one thread each take about half the time of one, and each file stays in one process
 test: $(STAMP) lint
