@@ -111,12 +111,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def cache_lpips(cache: Path) -> None:
+    """Cache random weights of LPIPS."""
+    cache_random(cache, "lpips-alex", tensor_shapes(ALEX))
+
+
 # what a page may take as given, by the word for it
 GIVEN: dict[str, Callable[[Path], object]] = {
     "captures/kitchen": lambda path: write_sequence(path, 48, (48, 64)),  # twice around, so that clips return
     "DATA": write_walks,
     "DIR": lambda path: write_text_encoder(write_twin("5b-i2v", path)),
-    "weights fetch lpips-alex\n": lambda path: cache_random(path.parent / "cache", "lpips-alex", tensor_shapes(ALEX)),
+    "weights fetch lpips-alex\npersist": lambda path: cache_lpips(path.parent / "cache"),
 }
 
 
