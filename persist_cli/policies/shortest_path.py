@@ -203,7 +203,7 @@ class Walker:
 
     def _best_turns(self, distances: Distances, place: Place, heading: float) -> list[str] | None:
         """The turns towards the straight way whose first steps lead nearest to the target; ``None`` if none is free."""
-        options = list(self._options())
+        options = list(self.options())
         angles = [heading + self._turned(turns) for turns in options]
         ways = torch.stack([direction(angle) for angle in angles]) * self.ahead.forward
         steps = torch.arange(1, LOOK_AHEAD + 1, dtype=torch.float64)
@@ -216,7 +216,7 @@ class Walker:
         cost, number = torch.where(free, metres + effort, math.inf).amin(0).min(0)
         return options[int(number)] if math.isfinite(float(cost)) else None
 
-    def _options(self) -> Iterator[list[str]]:
+    def options(self) -> Iterator[list[str]]:
         """All turns on the spot that lead to different headings, the shortest first."""
         yield []
         whole = 360 if len(self.turns) == 1 else 180
@@ -228,7 +228,7 @@ class Walker:
 
     def _turns_by(self, degrees: float) -> list[str]:
         """The turns that come nearest to an angle."""
-        return min(self._options(), key=lambda turns: abs(wrapped(self._turned(turns) - degrees)))
+        return min(self.options(), key=lambda turns: abs(wrapped(self._turned(turns) - degrees)))
 
     def _turned(self, turns: list[str]) -> float:
         """Degrees to the left of some turns of one kind."""
