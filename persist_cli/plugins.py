@@ -45,6 +45,7 @@ KINDS: Final = {
     "importer": PluginKind("persist.importers", "persist_cli.api.importer:Importer", ()),
     "policy": PluginKind("persist.policies", "persist_cli.api.policy:Policy", ("settings",)),
     "cost": PluginKind("persist.costs", "persist_cli.api.cost:Cost", ("settings",)),
+    "scene model": PluginKind("persist.scene_models", "persist_cli.api.scene_model:SceneModel", ("settings",)),
 }
 
 OWN: Final = ("persist_cli", "persist_backbones", "persist_memory")  # packages whose errors are bugs of ours

@@ -124,6 +124,12 @@ class Memory(ABC):
         """
         self.write(observations if self.reads_depth else observations.without_depth())
 
+    def foresee(self, cameras: Sequence[Cameras]) -> None:
+        """Make ready to be read by camera paths; a scene imagines here what they will see and nobody has seen.
+
+        A rollout calls it before each clip. Reading alone changes no memory. By default it does nothing.
+        """
+
     @abstractmethod
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """Return the tokens that matter most to a path of cameras, the most relevant first, as an unbatched sample.

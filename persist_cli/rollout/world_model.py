@@ -294,7 +294,9 @@ class WorldModel:
             if memory is None:
                 continue
             readers = [number for number, agent in enumerate(agents) if agent.memory is memory]
-            batch = memory.read_batch([paths[number] for number in readers], self.backbone.token_budget)
+            wanted = [paths[number] for number in readers]
+            memory.foresee(wanted)
+            batch = memory.read_batch(wanted, self.backbone.token_budget)
             for number, sample in zip(readers, batch, strict=True):
                 tokens[number] = sample
                 agents[number].reads.append((self.backbone.count_tokens(sample, paths[number]), sample.bytes))

@@ -1,0 +1,64 @@
+"""Edits of a scene by hand: boxes that are removed, painted, moved or copied, and things that are put in."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Metres = Annotated[float, Field(allow_inf_nan=False)]
+Point = tuple[Metres, Metres, Metres]
+Shade = Annotated[int, Field(ge=0, le=255)]
+Colour = tuple[Shade, Shade, Shade]
+
+
+class _Edit(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Remove(_Edit):
+    """Take away what is in a box; what stood behind it is then seen, and imagined where it was never seen."""
+
+    edit: Literal["remove"] = "remove"
+    low: Point
+    high: Point
+
+
+class Paint(_Edit):
+    """Give all that is in a box one colour."""
+
+    edit: Literal["paint"] = "paint"
+    low: Point
+    high: Point
+    color: Colour
+
+
+class Insert(_Edit):
+    """Put a thing of a class at a place: a box of cells whose lowest face has its middle there."""
+
+    edit: Literal["insert"] = "insert"
+    kind: str
+    at: Point
+    size: Point | None = None
+    color: Colour | None = None
+
+
+class Move(_Edit):
+    """Move what is in a box by a vector in metres; where it was is treated as by ``Remove``."""
+
+    edit: Literal["move"] = "move"
+    low: Point
+    high: Point
+    by: Point
+
+
+class Copy(_Edit):
+    """Put what is in a box at a second place too, a vector in metres away."""
+
+    edit: Literal["copy"] = "copy"
+    low: Point
+    high: Point
+    by: Point
+
+
+Edit = Annotated[Remove | Paint | Insert | Move | Copy, Field(discriminator="edit")]
