@@ -124,7 +124,7 @@ class Memory(ABC):
         """
         self.write(observations if self.reads_depth else observations.without_depth())
 
-    def foresee(self, cameras: Sequence[Cameras]) -> None:
+    def foresee(self, cameras: Sequence[Cameras]) -> None:  # noqa: B027  # most memories imagine nothing
         """Make ready to be read by camera paths; a scene imagines here what they will see and nobody has seen.
 
         A rollout calls it before each clip. Reading alone changes no memory. By default it does nothing.
