@@ -24,12 +24,23 @@ class Scene(Memory):
 
     A cell's origin is a ``CellOrigin``. Of two the higher one stays: an imagined cell gives way to an observed one, and
     both to an edit. What changes by ``act`` counts as imagined.
+
+    The tokens that ``read`` returns are points of surfaces; the features of one are the class of its cell, one-hot in
+    the order of the palette and then zeros up to the encoder's channels.
     """
 
     @property
     @abstractmethod
     def cells(self) -> CellGrid:
         """All cells, in the smallest box that holds the known ones; shall not be written to."""
+
+    @abstractmethod
+    def add(self, cells: CellGrid) -> None:
+        """Add the known cells of a grid, such as those of a simulator's own geometry, by the rule of origins.
+
+        Raises:
+            DataError: when their size, palette or axes are not those of this scene; then nothing is added.
+        """
 
     @abstractmethod
     def complete(self, region: Box | None = None, seed: int = 0) -> int:
