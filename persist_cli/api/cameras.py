@@ -54,6 +54,10 @@ class Cameras:
         """Return these cameras in the frame of the camera ``reference``, a world_from_camera in metres."""
         return replace(self, world_from_camera=invert_rigid(reference) @ self.world_from_camera)
 
+    def at(self, poses: Float[Tensor, "frame 4 4"]) -> Cameras:
+        """Return cameras like this one, which has a frame axis of one, at other poses."""
+        return replace(self, world_from_camera=poses, intrinsics=self.intrinsics.expand(len(poses), 3, 3))
+
     def resized(self, height: int, width: int) -> Cameras:
         """Return cameras with these views at another image size in pixels; intrinsics scale with it."""
         scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cost import Futures
-from persist_cli.api.ground import Body, Cover, GroundMap
+from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import DataError
-from persist_cli.navigation.ways import way_is_free
+from persist_cli.rollout.surroundings import FixedSurroundings, whole_walks
 from persist_cli.rollout.world_model import WorldModel
 
 Over = Literal["last", "best"]  # which frame of a candidate is judged: its last, or the one of least cost
@@ -119,7 +119,7 @@ class WorldFutures:
         """Return RGB and depth of the frames to judge, of ways that take equally many clips."""
         branches = self.model.branches(len(poses))
         length, agents = branches.backbone.frames_per_clip - 1, branches.agents
-        paths = [cameras_at(agent.now.cameras, way) for agent, way in zip(agents, poses, strict=True)]
+        paths = [agent.now.cameras.at(way) for agent, way in zip(agents, poses, strict=True)]
         interactions = [interactions_of(names, agents[0].info.vocabulary) for names in candidates]
         lead = (max(map(len, candidates)) - 1) // length * length
         before, rest = [path[:lead] for path in paths], [path[lead:] for path in paths]
@@ -201,33 +201,8 @@ def walk_all(
         ground: what is known to be free.
         body: of the agent; ``None`` to go through walls.
     """
-    world_up = torch.tensor(info.world_up, dtype=torch.float64)
-    poses = [[camera.world_from_camera[0].double()] for _ in candidates]
-    free: list[list[bool]] = [[] for _ in candidates]
-    for step in range(max(map(len, candidates), default=0)):
-        moving = [number for number, names in enumerate(candidates) if len(names) > step]
-        ends = [info.vocabulary.move(poses[number][-1], candidates[number][step], world_up) for number in moving]
-        starts = torch.stack([poses[number][-1] for number in moving])
-        allowed = ways_are_free(starts, torch.stack(ends), ground, body)
-        for number, end, way in zip(moving, ends, allowed, strict=True):
-            poses[number].append(end if way else poses[number][-1])
-            free[number].append(way)
-    return [
-        Walk(torch.stack(path)[1:], torch.tensor(ways, dtype=torch.bool))
-        for path, ways in zip(poses, free, strict=True)
-    ]
-
-
-def ways_are_free(
-    starts: Float[Tensor, "way 4 4"], ends: Float[Tensor, "way 4 4"], ground: GroundMap, body: Body | None
-) -> list[bool]:
-    """Return for each move whether its way is not known to be occupied; a move on the spot always is free."""
-    if body is None:
-        return [True] * len(starts)
-    first, last = (ground.places(poses[:, :3, 3]) for poses in (starts, ends))
-    blocked = way_is_free(ground, first, last, body.radius) == Cover.OCCUPIED
-    moves = (last - first).norm(dim=-1) > 1e-6
-    return [not stopped for stopped in (blocked & moves).tolist()]
+    surroundings = None if body is None else FixedSurroundings(body, ground)
+    return [Walk(walk.path, walk.verdicts) for walk in whole_walks(camera, info, candidates, surroundings)]
 
 
 def free_actions(names: Actions, walk: Walk) -> tuple[str, ...]:
@@ -247,11 +222,6 @@ def frame_numbers(walk: Walk, count: int, over: Over) -> Int64[Tensor, " frame"]
     if over == "last":
         return numbers[-1:].clamp_max(1)
     return torch.cat([numbers, numbers[-1:].repeat(count - len(numbers))])
-
-
-def cameras_at(camera: Cameras, poses: Float[Tensor, "frame 4 4"]) -> Cameras:
-    """Return cameras like this one, which has a frame axis of one, at other poses."""
-    return Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
 
 
 def padded(

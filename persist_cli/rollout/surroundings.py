@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +18,36 @@ from persist_cli.navigation.ground_mapper import GroundMapper
 from persist_cli.navigation.ways import way_is_free
 
 Pose = Float[Tensor, "4 4"]
+
+
+class KnownSurroundings(Protocol):
+    """What says where a body can go."""
+
+    @property
+    def body(self) -> Body:
+        """The body."""
+        ...
+
+    def map(self) -> GroundMap:
+        """Return the map of the ground as it is known now."""
+        ...
+
+
+@dataclass(frozen=True)
+class FixedSurroundings:
+    """Surroundings of which nothing more is learned, as for candidates that are only compared.
+
+    Args:
+        body: of the agent.
+        ground: what is known.
+    """
+
+    body: Body
+    ground: GroundMap
+
+    def map(self) -> GroundMap:
+        """Return the map."""
+        return self.ground
 
 
 class Surroundings:
@@ -71,7 +102,7 @@ class Surroundings:
         return None
 
 
-def blocked(surroundings: Sequence[Surroundings], starts: Sequence[Pose], ends: Sequence[Pose]) -> list[bool]:
+def blocked(surroundings: Sequence[KnownSurroundings], starts: Sequence[Pose], ends: Sequence[Pose]) -> list[bool]:
     """Return for each agent whether something is in its way between two poses; what is unknown counts as free."""
     verdicts = [False] * len(starts)
     maps = [one.map() for one in surroundings]
@@ -96,7 +127,7 @@ class Walk:
 
     info: TrajectoryInfo
     camera: Cameras
-    surroundings: Surroundings | None
+    surroundings: KnownSurroundings | None
 
     def __post_init__(self) -> None:
         self.names: list[str] = []
@@ -112,8 +143,13 @@ class Walk:
     @property
     def cameras(self) -> Cameras:
         """The cameras after the actions that are free."""
-        poses, first = torch.stack(self.poses), self.camera
-        return Cameras(poses, first.intrinsics.expand(len(poses), 3, 3), first.height, first.width)
+        return self.camera.at(torch.stack(self.poses))
+
+    @property
+    def path(self) -> Float[Tensor, "action 4 4"]:
+        """The pose after each action, float64; a blocked one leaves it as it was."""
+        start = self.camera.world_from_camera[0].double()
+        return torch.stack([start, *self.poses])[self.verdicts.cumsum(0)]
 
     @property
     def moves(self) -> list[str]:
@@ -164,6 +200,24 @@ def plan_walks(walks: Sequence[Walk], actions: Sequence[Sequence[str]], most: in
             walks[n].take(name, end, is_free)
         if not going:
             return
+
+
+def whole_walks(
+    camera: Cameras, info: TrajectoryInfo, actions: Sequence[Sequence[str]], surroundings: KnownSurroundings | None
+) -> list[Walk]:
+    """Return walks that begin at one camera and take all of their actions.
+
+    Args:
+        camera: with a frame axis of one.
+        info: up axis and vocabulary.
+        actions: names in the vocabulary, for each walk; it may have none.
+        surroundings: what all of them know of the ground; ``None`` to go through walls.
+    """
+    walks = [Walk(info, camera, surroundings) for _ in actions]
+    longest = max(map(len, actions), default=0)
+    if longest:
+        plan_walks(walks, actions, longest)
+    return walks
 
 
 def _free(walks: Sequence[Walk], names: Sequence[str], ends: Sequence[Pose]) -> list[bool]:

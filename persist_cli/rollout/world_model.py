@@ -180,19 +180,19 @@ class WorldModel:
         for number, (agent, walk) in enumerate(zip(self.agents, walks, strict=True)):
             now, seen = agent.now, imagined.get(number, agent.now[:0])
             if number in imagined:
-                seen = self.stopped(walk, seen) if check_again else agent.notice(seen)
+                seen = self.stopped(agent, walk, seen) if check_again else agent.notice(seen)
                 self.take(agent, seen)
             results.append(StepResult(walk.frames(now, seen), walk.verdicts))
         return results
 
-    def stopped(self, walk: Walk, seen: Observations) -> Observations:
+    def stopped(self, agent: Agent, walk: Walk, seen: Observations) -> Observations:
         """Return the frames of a clip up to the first action that they show to be blocked, and cut the walk there.
 
         What is returned counts for later actions.
         """
-        if walk.surroundings is None:
+        if walk.surroundings is None or agent.surroundings is None:
             return seen
-        stop = walk.surroundings.first_blocked(seen)
+        stop = agent.surroundings.first_blocked(seen)
         if stop is None:
             return seen
         walk.cut(stop)
@@ -313,7 +313,7 @@ def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str])
     """
     world_up = torch.tensor(info.world_up, dtype=torch.float64)
     poses = info.vocabulary.follow(camera.world_from_camera[0], actions, world_up)
-    return Cameras(poses, camera.intrinsics.expand(len(poses), 3, 3), camera.height, camera.width)
+    return camera.at(poses)
 
 
 def clip_seed(seed: int, clip: int) -> int:

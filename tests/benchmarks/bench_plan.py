@@ -36,7 +36,7 @@ from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.io.files import write_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.navigation.ground_mapper import body_of
-from persist_cli.planning.futures import WorldFutures, cameras_at
+from persist_cli.planning.futures import WorldFutures
 from persist_cli.planning.planners import draw
 from persist_cli.planning.true_futures import true_futures
 from persist_cli.plugins import make_cost
@@ -156,7 +156,7 @@ def stage_times(one: Decision, cost: Cost) -> list[dict[str, Any]]:
     begun, branches = timed(lambda: model.branches(len(one.candidates)))
     walking, imagined = timed(lambda: futures.imagine(one.candidates, "last", sees=False))
     agent, backbone = model.agents[0], model.backbone
-    ways = [cameras_at(agent.now.cameras, walk.poses) for walk in imagined.walks]
+    ways = [agent.now.cameras.at(walk.poses) for walk in imagined.walks]
     none = [(None,) * len(way) for way in ways]
     reading, clips = timed(lambda: branches.recall(range(len(ways)), ways, none))
     last = [len(way) for way in ways]
