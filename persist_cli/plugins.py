@@ -219,6 +219,13 @@ def make_simulator(name: str, settings: dict[str, Any]) -> Simulator:
     return _make("simulator", name, settings)  # type: ignore[no-any-return]
 
 
+def check_simulator(name: str) -> None:
+    """Raise ``PluginError`` when the simulator of a name cannot be used before something is installed."""
+    needs = load_plugin("simulator", name).missing()
+    if needs:
+        raise PluginError(f"simulator {name!r} {needs}")
+
+
 def make_importer(name: str) -> Importer:
     """Make the importer of a name."""
     return load_plugin("importer", name)()  # type: ignore[no-any-return]

@@ -27,13 +27,13 @@ from persist_cli.bench.true_scene import observations_of
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone
 from persist_cli.data.held_out import was_trained_on
-from persist_cli.errors import DataError, PluginError
+from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
 from persist_cli.io.files import check_folder, write_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.navigation.ways import way_is_free
-from persist_cli.plugins import load_plugin, make_simulator
+from persist_cli.plugins import check_simulator, make_simulator
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say
@@ -117,9 +117,7 @@ def run_collisions(path: Path | None, plan: CollisionPlan, out: Path, as_json: b
     """
     plan.placement.device()
     plan.scenes.check()
-    needs = load_plugin("simulator", plan.scenes.simulator).missing()
-    if needs:
-        raise PluginError(f"simulator {plan.scenes.simulator!r} {needs}")
+    check_simulator(plan.scenes.simulator)
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapters = chosen_adapters(plan, checkpoint)
     sampling = checkpoint.sampling_with(plan.sampling)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from persist_cli.bench.episodes import Episode, EpisodeSet
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
-from persist_cli.errors import DataError, PluginError
+from persist_cli.errors import DataError
 from persist_cli.io.files import check_folder
-from persist_cli.plugins import load_plugin, make_simulator
+from persist_cli.plugins import check_simulator, make_simulator
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 
@@ -23,9 +23,7 @@ def draw_episodes(scenes: CollectPlan, search: EpisodeSearch) -> EpisodeSet:
     """
     scenes.check()
     search.check()
-    needs = load_plugin("simulator", scenes.simulator).missing()
-    if needs:
-        raise PluginError(f"simulator {scenes.simulator!r} {needs}")
+    check_simulator(scenes.simulator)
     simulator = make_simulator(scenes.simulator, scenes.agent_settings(lambda wanted: wanted.low))
     seeds, episodes = scenes.generator_seeds, list[Episode]()
     with progress() as bar:

@@ -24,12 +24,12 @@ from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_ope
 from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThreshold, stop_threshold
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter
-from persist_cli.errors import DataError, PersistError, PluginError, hint
+from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.plugins import load_plugin, make_cost, make_simulator
+from persist_cli.plugins import check_simulator, make_cost, make_simulator
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.simulators.collect import CollectPlan
@@ -273,9 +273,7 @@ def open_simulator(episodes: EpisodeSet) -> Simulator:
     Raises:
         PluginError: when it is not installed.
     """
-    needs = load_plugin("simulator", episodes.simulator).missing()
-    if needs:
-        raise PluginError(f"simulator {episodes.simulator!r} {needs}")
+    check_simulator(episodes.simulator)
     return make_simulator(episodes.simulator, episodes.settings)
 
 

@@ -14,9 +14,9 @@ from persist_cli.api.policy import Goal
 from persist_cli.api.simulator import Simulator
 from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
 from persist_cli.environments.task import Attempt, TaskSettings, View
-from persist_cli.errors import DataError, PluginError
+from persist_cli.errors import DataError
 from persist_cli.io.settings import parse_settings
-from persist_cli.plugins import load_plugin, make_simulator
+from persist_cli.plugins import check_simulator, make_simulator
 from persist_cli.simulators.collect import CollectPlan, random_start
 from persist_cli.simulators.free_grid import Cell, FreeGrid, Ground, clear_distance
 
@@ -94,9 +94,7 @@ class SimulatedScenes(Scenes):
 
     def __init__(self, settings: SimulatedSettings, count: int = 1) -> None:
         plan = settings.plan()
-        needs = load_plugin("simulator", settings.simulator).missing()
-        if needs:
-            raise PluginError(f"simulator {settings.simulator!r} {needs}")
+        check_simulator(settings.simulator)
         height, width = plan.image_size
         agent = {"height": height, "width": width} | settings.settings
         self.houses = [OpenHouse(make_simulator(settings.simulator, agent), settings) for _ in range(count)]

@@ -28,9 +28,9 @@ import numpy as np
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.data.store import write_trajectory
-from persist_cli.errors import DataError, PluginError
+from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
-from persist_cli.plugins import load_plugin, make_settings, make_simulator, plugin_errors
+from persist_cli.plugins import check_simulator, make_settings, make_simulator, plugin_errors
 from persist_cli.simulators.free_grid import clear_distance
 from persist_cli.simulators.policies import POLICIES, walk
 from persist_cli.simulators.ranges import Range
@@ -175,9 +175,7 @@ def run_collect(plan: CollectPlan, out: Path, workers: int, json: bool) -> None:
         PersistError: for a plan that cannot be used, a folder of another plan, or a worker that died.
     """
     plan.check()
-    needs = load_plugin("simulator", plan.simulator).missing()
-    if needs:
-        raise PluginError(f"simulator {plan.simulator!r} {needs}")
+    check_simulator(plan.simulator)
     claim_folder(plan, out)
     paths = {seed: out / f"house-{seed:06d}.parquet" for seed in plan.generator_seeds}
     missing = {seed: path for seed, path in paths.items() if not path.exists()}
