@@ -8,8 +8,7 @@ from typing import Any, Final
 
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.rows import PlanningRow
-from persist_cli.errors import PersistError
-from persist_cli.evaluate.journal import first_difference
+from persist_cli.evaluate.journal import check_same
 from persist_cli.io.files import read_json, remove_leftovers, write_json
 
 IDENTITY: Final = "plan.json"
@@ -40,12 +39,8 @@ class PlanningJournal:
 
     def check(self, identity: dict[str, Any]) -> None:
         """Raise ``PersistError`` when the folder holds another benchmark than this one."""
-        earlier = read_json(self.parts / IDENTITY) if self.begun else identity
-        if earlier != identity:
-            raise PersistError(
-                f"{self.out}: holds another benchmark ({first_difference(earlier, identity)}); choose another --out or "
-                "delete it"
-            )
+        if self.begun:
+            check_same(read_json(self.parts / IDENTITY), identity, f"{self.out}: holds another benchmark")
         remove_leftovers(self.parts)
 
     def begin(self, identity: dict[str, Any], episodes: EpisodeSet) -> None:

@@ -83,12 +83,8 @@ class Journal:
 
     def check(self, plan: dict[str, Any]) -> None:
         """Raise ``PersistError`` when the folder holds another evaluation than this one."""
-        earlier_plan = read_json(self.folder / PLAN) if self.begun else plan
-        if earlier_plan != plan:
-            raise PersistError(
-                f"{self.folder.parent}: holds another evaluation ({first_difference(earlier_plan, plan)}); "
-                "choose another --out or delete it"
-            )
+        if self.begun:
+            check_same(read_json(self.folder / PLAN), plan, f"{self.folder.parent}: holds another evaluation")
         remove_leftovers(self.folder)
 
     def begin(self, plan: dict[str, Any], cases: Sequence[Case]) -> None:
@@ -159,6 +155,18 @@ class Processes:
     def wait(self) -> None:
         """Wait until every process is here."""
         self.state.wait_for_everyone()
+
+
+def check_same(earlier: Any, now: Any, refusal: str) -> None:
+    """Raise ``PersistError`` when a folder was begun with other values than those of now.
+
+    Args:
+        earlier: JSON values that the folder holds.
+        now: JSON values.
+        refusal: the beginning of the error's line.
+    """
+    if earlier != now:
+        raise PersistError(f"{refusal} ({first_difference(earlier, now)}); choose another --out or delete it")
 
 
 def first_difference(earlier: Any, new: Any, where: str = "") -> str:
