@@ -279,8 +279,7 @@ def memory_verdicts(walk: TrueWalk, factory: MemoryFactory) -> list[Cover]:
         memory.memorize(walk.frames[written : attempt.frame + 1])
         written = attempt.frame + 1
         mapper = GroundMapper(walk.info.world_up, body)
-        eye = float(walk.frames.cameras.centers[attempt.frame].double() @ mapper.axes[2])
-        mapper.add_points(memory.points(), eye - body.camera_height)
+        mapper.add_points(memory.points(), mapper.floor_under(walk.frames.cameras.centers[attempt.frame]))
         verdicts.append(verdict(walk, attempt, mapper, body))
     return verdicts
 

@@ -11,8 +11,6 @@ import torch
 
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.cost import Cost
-from persist_cli.api.ground import Body
-from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.api.simulator import Simulator
@@ -23,9 +21,7 @@ from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.planning.futures import FutureModel, SimulatorFutures, WorldFutures
 from persist_cli.planning.judge import Budget, Judge
 from persist_cli.planning.planners import Cem, CemSettings, Planner, Rank, RankSettings
-from persist_cli.rollout.world_model import Agent, WorldModel
-
-MOST_SEEDS = 2**31  # seeds of the sampling noise are below it
+from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
 DECISIONS = 100_000  # more than an episode has, so that no two decisions of all episodes share a seed
 
@@ -109,7 +105,7 @@ class Navigator:
         self.world = make_world(parts, walk, self.seen, self.info, self.seed)
         memory = self.world.agents[0].memory if self.world else None
         if memory is not None:
-            self._add_points(memory, body)
+            self.ground.add_points(memory.points(), self.ground.floor_under(self.seen.cameras.centers[0]))
         elif not row.imagines:
             self.ground.add(walk)
         self.ground.add(self.seen)
@@ -183,11 +179,6 @@ class Navigator:
         budget = Budget(settings.frames, settings.seconds)
         return Judge(model, cost, self.goal, situation.ground, settings.over, budget)
 
-    def _add_points(self, memory: Memory, body: Body) -> None:
-        """Add what a memory knows of the ground, whose floor lies below the present camera."""
-        height = float((self.ground.axes @ self.seen.cameras.centers[0].double())[2])
-        self.ground.add_points(memory.points(), height - body.camera_height)
-
 
 def told_goal(goal: Goal, row: PlanningRow) -> Goal:
     """Return of a goal what a row is told: the image or the place."""
@@ -201,7 +192,7 @@ def make_world(
     if parts.backbone is None:
         return None
     memory = None if parts.factory is None else parts.factory.empty(info)
-    agent = Agent(memory, seed % MOST_SEEDS)
+    agent = Agent(memory, seed % SEEDS)
     if len(walk):
         agent.memorize(walk, parts.backbone.device)
     world = WorldModel(parts.backbone, [agent], parts.sampling)

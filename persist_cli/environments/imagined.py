@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras
@@ -26,13 +25,11 @@ from persist_cli.io.settings import parse_settings
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of, tells_body
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 from persist_cli.rollout.open_world import assemble_world
-from persist_cli.rollout.world_model import Agent, WorldModel
+from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
 NAME: Final = "persist/ImaginedHouse-v0"
 
 TRIES: Final = 100  # starts that are drawn before it is said that no goal is far enough
-
-SEEDS: Final = 2**31  # of an agent's noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,8 +166,7 @@ class ImaginedScenes(Scenes):
                 for piece in source.pieces():
                     mapper.add(piece)
         if settings.memory_file is not None and self.first.memory is not None:
-            height = self.starts.positions @ torch.tensor(self.info.world_up, dtype=torch.float64)
-            mapper.add_points(self.first.memory.points(), float(height.mean()) - body.camera_height)
+            mapper.add_points(self.first.memory.points(), mapper.floor_under(self.starts.positions.mean(0)))
         return mapper.map()
 
 

@@ -19,8 +19,7 @@ from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.learn.places import PracticePlace
-
-MOST_SEEDS = 2**31
+from persist_cli.rollout.world_model import SEEDS
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ def practise(
     """
     for first in range(0, settings.walks, settings.batch):
         numbers = range(first, min(first + settings.batch, settings.walks))
-        walkers = [Walker(place.info, policies, views, settings, seed * MOST_SEEDS + number) for number in numbers]
+        walkers = [Walker(place.info, policies, views, settings, seed * SEEDS + number) for number in numbers]
         place.begin([walker.seen for walker in walkers], [walker.sampling_seed for walker in walkers])
         while not all(walker.is_done for walker in walkers):
             ways = [walker.decide(place.ground(number)) for number, walker in enumerate(walkers)]
@@ -116,7 +115,7 @@ class Walker:
         self.policy, self.explorer = policies
         self.random = np.random.default_rng(seed)
         self.generator = torch.Generator().manual_seed(int(self.random.integers(2**62)))
-        self.sampling_seed = int(self.random.integers(MOST_SEEDS))
+        self.sampling_seed = int(self.random.integers(SEEDS))
         start = int(self.random.integers(len(views)))
         self.seen = views[[start]]
         self.actions: list[str] = []

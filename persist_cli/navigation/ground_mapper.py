@@ -158,6 +158,10 @@ class GroundMapper:
         front = place + (self.body.radius + self.spacing) * ahead
         self._count(Vote.OBSERVED_OCCUPIED, self._squares(front + across * aside))
 
+    def floor_under(self, camera: Float[Tensor, " 3"]) -> float:
+        """Return the height of the floor along up under a camera's position in world metres."""
+        return float(self.axes[2] @ camera.cpu().double()) - self.body.camera_height
+
     def map(self) -> GroundMap:
         """Return what is known now."""
         if self._map is None:

@@ -66,8 +66,7 @@ class Surroundings:
         self.body, self._waiting = body, [start]
         self._mapper = GroundMapper(info.world_up, body)
         if memory is not None:
-            eye = float(start.cameras.centers[0].cpu().double() @ self._mapper.axes[2])
-            self._mapper.add_points(memory.points(), eye - body.camera_height)
+            self._mapper.add_points(memory.points(), self._mapper.floor_under(start.cameras.centers[0]))
 
     def see(self, frames: Observations) -> None:
         """Add frames, observed or imagined."""

@@ -11,6 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -25,6 +26,8 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
 from persist_cli.rollout.surroundings import Surroundings, Walk, plan_walks
+
+SEEDS: Final = 2**31  # of the sampling noise of an agent
 
 
 def unchanged(seen: Observations) -> Observations:
