@@ -15,27 +15,26 @@ from typing import Any, Final
 import yaml
 
 from persist_cli.api.checkpoint import PLAIN, find_checkpoint
-from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.episodes import Episode, read_episodes
 from persist_cli.bench.run_episode import LoopSettings
-from persist_cli.checkpoints.load import adapter_memory, load_backbone
-from persist_cli.data.clips import check_size
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
 from persist_cli.learn.evaluation import evaluate_policy, mean_figures
 from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
 from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
-from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.sources import common_reference, find_sources
-from persist_cli.planning.true_futures import simulator_settings
-from persist_cli.plugins import make_policy, make_simulator
+from persist_cli.planning.true_futures import open_again
+from persist_cli.plugins import make_policy
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
+from persist_cli.rollout.camera_path import RolloutPlan
+from persist_cli.rollout.open_world import assemble_world
 from persist_cli.train.finetune import FinetunePlan, run_finetune
-from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say
+from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 from persist_cli.viewing.curve import Curve, draw_curves
 
 PLAN: Final = "plan.json"
@@ -194,11 +193,9 @@ def episodes_of(file: Path, info: TrajectoryInfo) -> list[Episode]:
 
 def open_simulator(plan: LearnPlan, info: TrajectoryInfo) -> Simulator:
     """Return the simulator of the views with their scene open."""
-    name, scene = info.source.get("simulator"), info.source.get("house")
-    if not isinstance(name, str) or not isinstance(scene, int):
+    simulator = open_again(info)
+    if simulator is None:
         raise DataError(f"{' '.join(plan.views)}: of no simulator; leave --episodes and --inside {SIMULATOR} out")
-    simulator = make_simulator(name, simulator_settings(name, info))
-    simulator.open_scene(scene)
     return simulator
 
 
@@ -210,18 +207,14 @@ def open_place(learning: Learning) -> PracticePlace:
         return TruePlace(learning.simulator, info)
     checkpoint = find_checkpoint(plan.checkpoint)
     adapter = checkpoint.chosen_adapter(plan.adapter)
-    with busy("loading the model"):
-        backbone = load_backbone(checkpoint, adapter=adapter)
-    check_size(info, backbone.image_size, plan.views[0])
-    sampling = checkpoint.sampling_with(plan.sampling)
-    backbone.check_sampling(sampling)
-    backbone.eval()
-    memory = None
-    if adapter is not None:
-        memory = MemoryFactory.of(adapter_memory(checkpoint, adapter), backbone.device).empty(info)
-        memory.memorize(learning.views.to(backbone.device))
+    rollout = RolloutPlan(
+        start=plan.views[0], actions=(), follow=False, frames=0, memory=None, adapter=plan.adapter, write=True,
+        seed=plan.seed, sampling=plan.sampling, placement=InferenceOptions(),
+    )  # fmt: skip
+    world = assemble_world(checkpoint, adapter, rollout, info)
+    world.agents[0].memorize(learning.views, world.backbone.device)
     origin = {"model": checkpoint.fingerprint, "adapter": adapter or PLAIN}
-    return ImaginedPlace(backbone, memory, sampling, info, origin)
+    return ImaginedPlace(world.backbone, world.agents[0].memory, world.sampling, info, origin)
 
 
 def walk(learning: Learning, place: PracticePlace, number: int) -> None:

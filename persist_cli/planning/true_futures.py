@@ -25,15 +25,25 @@ def true_futures(now: Observations, info: TrajectoryInfo) -> tuple[SimulatorFutu
         now: the frame.
         info: of its trajectory.
     """
-    name, scene = info.source.get("simulator"), info.source.get("house")
-    if not isinstance(name, str) or not isinstance(scene, int):
-        return None, "the data is no simulator's"
     try:
-        simulator = make_simulator(name, simulator_settings(name, info))
-        simulator.open_scene(scene)
-        return placed(simulator, now)
+        simulator = open_again(info)
+        return (None, "the data is no simulator's") if simulator is None else placed(simulator, now)
     except PersistError as error:
         return None, str(error)
+
+
+def open_again(info: TrajectoryInfo) -> Simulator | None:
+    """Return the simulator of a trajectory with its scene open, ``None`` where the data is no simulator's.
+
+    Raises:
+        PersistError: when that simulator is not here, or does not know the settings.
+    """
+    name, scene = info.source.get("simulator"), info.source.get("house")
+    if not isinstance(name, str) or not isinstance(scene, int):
+        return None
+    simulator = make_simulator(name, simulator_settings(name, info))
+    simulator.open_scene(scene)
+    return simulator
 
 
 def simulator_settings(name: str, info: TrajectoryInfo) -> dict[str, Any]:

@@ -70,10 +70,11 @@ def main(arguments: Sequence[str]) -> None:
     if not episodes.is_file():
         run_line(f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {plan.houses} --out {episodes}")
     run_line(f"collect miniworld --out {plan.out / 'views'} --scenes {plan.scenes} --frames {plan.views} --split test")
-    for scene in sorted({episode.scene_name for episode in read_episodes(episodes).episodes}):
+    scenes = sorted(read_episodes(episodes).scenes)
+    for scene in scenes:
         for memory in plan.memories:
             learn(plan, scene, memory)
-        write_results(plan)
+        write_results(plan, scenes)
     say(f"written to {plan.out / 'learning.md'}")
 
 
@@ -95,20 +96,13 @@ def folder_of(plan: Plan, scene: str, memory: str) -> Path:
     return plan.out / "learned" / memory / scene.replace("/", "-")
 
 
-def write_results(plan: Plan) -> None:
+def write_results(plan: Plan, scenes: Sequence[str]) -> None:
     """Write ``learning.json`` and ``learning.md`` from the houses in which every memory has learned."""
-    scenes = [path.name for path in sorted((plan.out / "learned" / plan.memories[0]).glob("*"))]
-    done = [
-        scene
-        for scene in scenes
-        if all((plan.out / "learned" / memory / scene / RESULTS).is_file() for memory in plan.memories)
-    ]
+    files = {memory: [folder_of(plan, scene, memory) / RESULTS for scene in scenes] for memory in plan.memories}
+    done = [number for number in range(len(scenes)) if all(own[number].is_file() for own in files.values())]
     if not done:
         return
-    rows = {
-        memory: [read_json(plan.out / "learned" / memory / scene / RESULTS) for scene in done]
-        for memory in plan.memories
-    }
+    rows = {memory: [read_json(own[number]) for number in done] for memory, own in files.items()}
     results = {"houses": len(done), "rounds": plan.rounds, "memories": summarise(rows, plan.rounds)}
     write_json(plan.out / "learning.json", results)
     write_text(plan.out / "learning.md", table(results))
