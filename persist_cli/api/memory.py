@@ -17,6 +17,7 @@ from torch import Tensor
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.observations import Observations, Origin, origins_like
+from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import write_tensors
@@ -70,7 +71,7 @@ class MapPoints:
         positions: world metres, float64.
         colors: uint8 RGB, 0…255.
         spread: side in metres of the square that is drawn for each point.
-        origins: the ``Origin`` of each point; without it all are observed.
+        origins: the ``Origin`` of each point, or its ``CellOrigin``; without it all are observed.
         rise: metres of height that each point stands for, half of them below it; infinite where heights are unknown.
     """
 
@@ -173,6 +174,19 @@ class Memory(ABC):
     def merge(self, other: Memory) -> None:
         """Add the content of another memory, of one kind and reference; ``CheckpointError`` when they do not match."""
         raise CheckpointError(f"a memory of kind {self.name!r} cannot be merged")
+
+    def edit(self, edits: Sequence[Edit], seed: int = 0) -> EditOutcome:
+        """Change what is stored by hand, all edits or none; by default a memory cannot be edited.
+
+        Args:
+            edits: the edits, which are done one after the other.
+            seed: of what is imagined where a thing was that is taken away.
+
+        Raises:
+            CheckpointError: when a memory of this kind cannot be edited.
+            DataError: when an edit cannot be done; then nothing changes.
+        """
+        raise CheckpointError(f"a memory of kind {self.name!r} cannot be edited; those of kind scene and voxel can")
 
     def clear(self) -> None:
         """Empty the memory."""

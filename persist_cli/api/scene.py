@@ -16,7 +16,7 @@ from persist_cli.api.actions import Action
 from persist_cli.api.cells import Box, CellGrid
 from persist_cli.api.ground import Body
 from persist_cli.api.memory import Memory
-from persist_cli.api.scene_edits import Edit
+from persist_cli.api.scene_edits import Edit, EditOutcome
 
 
 class Scene(Memory):
@@ -71,14 +71,13 @@ class Scene(Memory):
         """
 
     @abstractmethod
-    def edit(self, edits: Sequence[Edit], seed: int = 0) -> int:
+    def edit(self, edits: Sequence[Edit], seed: int = 0) -> EditOutcome:
         """Change cells by hand, all edits or none; changed cells count as edited.
 
-        What a removed thing hid is known where it was seen, and else completed with ``seed``.
-
-        Returns:
-            The number of cells that changed.
+        What a removed thing hid is known where it was seen, and else completed with ``seed``, or by what is around it
+        where the scene has no model.
 
         Raises:
-            DataError: when a box lies outside of the scene, or a class is unknown; then nothing changes.
+            DataError: when a box lies outside of the scene, a class is unknown, or something is put where something is;
+                then nothing changes.
         """

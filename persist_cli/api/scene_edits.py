@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -41,6 +42,7 @@ class Insert(_Edit):
     at: Point
     size: Point | None = None
     color: Colour | None = None
+    overwrite: bool = False  # take the place of what is there, where it would else be an error
 
 
 class Move(_Edit):
@@ -50,6 +52,7 @@ class Move(_Edit):
     low: Point
     high: Point
     by: Point
+    overwrite: bool = False
 
 
 class Copy(_Edit):
@@ -59,6 +62,22 @@ class Copy(_Edit):
     low: Point
     high: Point
     by: Point
+    overwrite: bool = False
 
 
 Edit = Annotated[Remove | Paint | Insert | Move | Copy, Field(discriminator="edit")]
+
+
+@dataclass(frozen=True)
+class EditOutcome:
+    """What became of some edits.
+
+    Args:
+        changed: cells that hold another thing or have another colour now, the uncovered ones too.
+        uncovered: cells that were never seen, behind or below what was taken away, and hold something or nothing now.
+        filled_by: what says what the uncovered cells hold: a model that imagines, or their surroundings.
+    """
+
+    changed: int
+    uncovered: int = 0
+    filled_by: Literal["model", "surroundings"] = "surroundings"
