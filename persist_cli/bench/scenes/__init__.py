@@ -1,0 +1,1 @@
+"""How good imagined scenes are, measured in houses whose cells are known."""

@@ -1,0 +1,171 @@
+"""Rows of the benchmark: ways to say what is in the cells that an image does not show."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from persist_cli.api.cells import FREE, OUTSIDE, CellGrid
+from persist_cli.api.memory import Memory
+from persist_cli.api.scene import Scene
+from persist_cli.bench.scenes.training_houses import House, class_frequencies, nearest_houses, region_of_match
+from persist_cli.bench.scenes.views import View, filled, same_form
+from persist_cli.errors import PersistError
+from persist_cli.memorize.factory import MemoryFactory
+
+
+class Completion(ABC):
+    """Fills the unknown cells around a view."""
+
+    name: ClassVar[str]
+    definition: ClassVar[str]
+    random: ClassVar[bool] = False  # whether another seed gives another completion
+
+    def prepare(self, views: Sequence[View]) -> None:  # noqa: B027  # most have nothing to prepare
+        """Look at all views before the first is completed."""
+
+    @abstractmethod
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return the view's region with its known cells as they are.
+
+        Args:
+            view: an image and what is known after it; its truth must not be read, but by the row ``truth``.
+            number: of the view among those that ``prepare`` was given.
+            seed: of random completions.
+        """
+
+
+class Truth(Completion):
+    """The true cells: the ceiling."""
+
+    name = "truth"
+    definition = "the true cells, the ceiling"
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return the true cells where nothing is known."""
+        return filled(view.known, view.truth.classes)
+
+
+class Empty(Completion):
+    """Nothing anywhere."""
+
+    name = "empty"
+    definition = "every unknown cell is free"
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return free cells where nothing is known."""
+        return filled(view.known, torch.full_like(view.known.classes, FREE))
+
+
+class Outside(Completion):
+    """No room anywhere."""
+
+    name = "outside"
+    definition = "every unknown cell is outside"
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return cells outside where nothing is known."""
+        return filled(view.known, torch.full_like(view.known.classes, OUTSIDE))
+
+
+class Prior(Completion):
+    """The most frequent class of each cell around cameras of the training.
+
+    Args:
+        houses: of the training.
+    """
+
+    name = "class prior"
+    definition = (
+        "the most frequent class of each cell around 8 cameras of each training house; cells are counted in the "
+        "camera's place, the house turned by quarter turns so that the camera looks along the first ground axis"
+    )
+
+    def __init__(self, houses: Sequence[House]) -> None:
+        self.houses = houses
+        self.classes: dict[tuple[int, int, int, int], UInt8[Tensor, "first second level"]] = {}
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return the most frequent classes."""
+        key = (*view.region.shape, view.region.corner[2])
+        if key not in self.classes:
+            frequencies = class_frequencies(self.houses, view.region, view.truth.form)
+            self.classes[key] = frequencies.argmax(-1).to(torch.uint8)
+        return filled(view.known, view.region.back(self.classes[key]))
+
+
+class NearestHouse(Completion):
+    """The training house that agrees best with what is known.
+
+    Args:
+        houses: of the training.
+    """
+
+    name = "nearest house"
+    definition = (
+        "the training house in which most known cells agree on being free or not, over four turns and all shifts by "
+        "whole cells; beyond it all is outside"
+    )
+
+    def __init__(self, houses: Sequence[House]) -> None:
+        self.houses = houses
+
+    def prepare(self, views: Sequence[View]) -> None:
+        """Find the house of each view."""
+        self.matches = nearest_houses(views, self.houses)
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return what is in the house at that place."""
+        return filled(view.known, region_of_match(self.matches[number], self.houses, view.region))
+
+
+class SceneCompletion(Completion):
+    """A scene with a model, to which the image is written as a user would.
+
+    Args:
+        factory: of scenes with the model.
+    """
+
+    name = "model"
+    definition = "the scene model, from the image with its depth and the cells that it shows"
+    random = True
+
+    def __init__(self, factory: MemoryFactory) -> None:
+        self.factory = factory
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return what the scene imagines in the region.
+
+        Raises:
+            DataError: when its classes are not those of the data.
+        """
+        scene = seen_scene(self.factory, view)
+        scene.complete(view.region.box(view.truth), seed)
+        return same_form(view.region.of(scene.cells), view.truth.form, "the scene model")
+
+
+def seen_scene(factory: MemoryFactory, view: View) -> Scene:
+    """Return a scene that holds one image.
+
+    Raises:
+        PersistError: when the memory is no scene.
+    """
+    scene = as_scene(factory.empty(view.info))
+    scene.memorize(view.frame.to(factory.device))
+    return scene
+
+
+def as_scene(memory: Memory) -> Scene:
+    """Return a memory that is a scene.
+
+    Raises:
+        PersistError: when it is none.
+    """
+    if not isinstance(memory, Scene):
+        raise PersistError(f"memory {memory.name!r} is no scene: it imagines nothing; take --memory scene")
+    return memory
