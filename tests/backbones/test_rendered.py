@@ -132,6 +132,15 @@ def test_a_fresh_adapter_predicts_from_noise_what_it_renders_and_nearly_leaves_w
     assert (clean - bare).abs().max() < 0.1 * (memory.latents - bare).abs().max()
 
 
+def test_a_fresh_adapter_trusts_drawn_colours_less_the_larger_their_error_and_depth_as_before():
+    clips = random_clips()
+    sure, unsure = (with_adapter(micro(), form="rendered", **WIDE, color_error=error) for error in (0.05, 1.0))
+    bare, _ = clean_of(sure, clips, None, 300)
+    sure, unsure = (clean_of(backbone, clips, wall(), 300)[0] - bare for backbone in (sure, unsure))
+    assert unsure[:, :, :4].abs().mean() < 0.6 * sure[:, :, :4].abs().mean()
+    assert torch.equal(unsure[:, :, 4:], sure[:, :, 4:])
+
+
 def test_latents_that_are_kept_stand_for_the_tokens_they_were_rendered_from():
     backbone, clips, tokens = with_adapter(micro(), form="rendered"), random_clips(), random_tokens(2, 60)
     shaken(backbone)

@@ -4,7 +4,7 @@ Known from ViewCrafter (2409.02048), See3D (2412.06699), TrajectoryCrafter (2503
 memory shows in each target view is drawn as an RGB-D image, holes are filled, and the clip of these images goes through
 the video model's own frozen VAE. Its latents and the mask of what was drawn are further input channels of the
 transformer. Here they also correct the prediction at each latent pixel, and ``projected`` attention brings in what is
-not drawn.
+not drawn. Where a memory tells classes, as a scene does, the first surfaces along each ray are given too (``peeling``).
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from torch import Tensor, nn
 from persist_backbones.adapters.base import Adapter, Encode, NoiseLevel, PreparedMemory, VideoShape
 from persist_backbones.adapters.canvas import CanvasHead
 from persist_backbones.adapters.memory_block import AttentionSettings
+from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
 from persist_backbones.adapters.projected import ProjectedAdapter, ProjectedMemory, ProjectedSettings, image_places
-from persist_backbones.adapters.splat import hide_covered, rasterize, splat
+from persist_backbones.adapters.splat import Splats, coarser, hide_covered, rasterize, splat
 from persist_backbones.noise_levels import add_level
 from persist_backbones.tensors import fold_frames, fold_patches, push_pull, zero_init
 from persist_cli.api.cameras import Cameras
@@ -33,7 +34,6 @@ from persist_cli.api.observations import Origin
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 
-ERROR = 0.05  # variance of rendered latents about the true ones, where those of the codec have about 1
 SPARSE = 0.125  # share of a latent pixel at which a fresh gate is half open: holes between points are filled well
 
 
@@ -49,6 +49,16 @@ class RenderedSettings(AttentionSettings):
         head_layers: number of those layers that look at neighbouring latent pixels.
         attention_tokens: tokens that ``projected`` attention reads of those that no view shows; 0 leaves attention out
             where there are no learned tokens either.
+        color_error: variance of the rendered latents of colour about the true ones, where those of the codec have about
+            1; the larger it is, the less a fresh adapter trusts drawn colours. Cells of one colour each have about 1.
+        depth_error: the same of the latents of depth.
+        layers: surfaces along each ray, one behind the other, that the model is also given with class, colour, depth
+            and origin; 0 for the rendered views alone.
+        layer_gap: metres from a surface to where the next one begins.
+        layer_scale: pixels of the layers along the edge of a latent pixel.
+        layer_width: channels to which the layers of a pixel are reduced.
+        classes: number of classes, one-hot in the features of the tokens, that layers tell; 0 for none.
+        class_channels: channels of the embedding of a class.
     """
 
     form: Literal["rendered"] = "rendered"
@@ -59,6 +69,14 @@ class RenderedSettings(AttentionSettings):
     head_width: PositiveInt = 96
     head_layers: PositiveInt = 2
     attention_tokens: NonNegativeInt = 256
+    color_error: PositiveFloat = 0.05
+    depth_error: PositiveFloat = 0.05
+    layers: NonNegativeInt = 0
+    layer_gap: PositiveFloat = 0.3
+    layer_scale: PositiveInt = 2
+    layer_width: PositiveInt = 16
+    classes: NonNegativeInt = 0
+    class_channels: PositiveInt = 32
 
 
 class Views(NamedTuple):
@@ -70,12 +88,14 @@ class Views(NamedTuple):
         covered: the share of a pixel that shows what was observed, and the share that shows what was imagined; both
             are 0 in holes.
         shown: for each token whether a view shows it.
+        splats: the pixels of the drawing that each token covers, hidden or not.
     """
 
     rgb: UInt8[Tensor, "batch frame height width 3"]
     depth: Float[Tensor, "batch frame height width"]
     covered: Float[Tensor, "batch frame origin height width"]
     shown: Bool[Tensor, "batch token"]
+    splats: Splats
 
 
 def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSettings) -> Views:
@@ -108,7 +128,7 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSetti
     pictures, observed, covered = sums.split([4, 1, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     origins = torch.cat([observed, covered - observed], dim=1).unflatten(0, shape[:2])
-    return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown)
+    return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown, drawn_pixels)
 
 
 def tokens_not_shown(tokens: MemoryTokens, shown: Bool[Tensor, "batch token"], cameras: Cameras, most: int) -> Tensor:
@@ -142,22 +162,23 @@ class RenderedHead(CanvasHead):
 
     Let r be the latents of the rendered views and x the clean latents as predicted. The new ones are x + g (r − x), and
     a correction is added to the prediction. A fresh head corrects nothing, and its gate g is open where points cover a
-    latent pixel, if only sparsely: g = 1 / (1 + SNR · ``ERROR``) is the weight of r in the mean of two measurements of
-    x, one by the noisy latents, with errors of variance 1 / SNR, and one by the rendered views, with errors of variance
-    ``ERROR``.
+    latent pixel, if only sparsely: g = 1 / (1 + SNR · error) is the weight of r in the mean of two measurements of
+    x, one by the noisy latents, with errors of variance 1 / SNR, and one by the rendered views, whose errors have the
+    variance of the settings ``color_error`` and ``depth_error``.
 
     Args:
-        drawn: channels of latents and mask of the rendered views.
+        drawn: channels of latents, mask and layers of the rendered views.
         video: sizes of the video model.
-        width: hidden channels.
-        layers: number of convolutions of 3×3 before the last.
+        settings: sizes of the head, and the errors of rendered latents.
     """
 
-    def __init__(self, drawn: int, video: VideoShape, width: int, layers: int) -> None:
+    def __init__(self, drawn: int, video: VideoShape, settings: RenderedSettings) -> None:
+        width = settings.head_width
         super().__init__(drawn, video.inputs, video.outputs, video.time_channels, width)
-        self.more = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(layers - 1))
+        self.more = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(settings.head_layers - 1))
         self.gate = nn.Conv2d(width, video.outputs, 3, padding=1)
         zero_init(self.gate)
+        self.errors = settings.color_error, settings.depth_error
 
     def hidden(self, predicted: Tensor, inputs: Tensor, canvas: Tensor, time: Tensor) -> Tensor:
         """Return what the last layers take, frames on the batch axis."""
@@ -175,7 +196,8 @@ class RenderedHead(CanvasHead):
         color, _, depth, _ = inputs[:, :, : 2 * predicted.shape[2]].chunk(4, dim=2)
         clean = level.clean(predicted, torch.cat([color, depth], dim=2))
         snr = (level.signal / level.noise).square()
-        doubt = (SPARSE / memory.share.clamp_min(1e-3)).square() + snr * ERROR
+        errors = torch.cat([snr.new_full((predicted.shape[2] // 2, 1, 1), error) for error in self.errors])
+        doubt = (SPARSE / memory.share.clamp_min(1e-3)).square() + snr * errors
         opened = torch.sigmoid(gate - doubt.log()) * (memory.share > 0)
         moved: Tensor = level.moved(predicted, opened * (memory.latents - clean)) + correction
         return moved
@@ -188,7 +210,7 @@ class PreparedRendering(PreparedMemory):
     Args:
         latents: latents of the rendered views.
         share: share of the pixels of a latent pixel that are covered.
-        seen: latents and mask, embedded for the head.
+        seen: latents, mask and layers, embedded for the head.
         blank: what the head sees where nothing is rendered.
         attention: the tokens that no view shows, ``None`` without attention.
     """
@@ -214,8 +236,8 @@ class PreparedRendering(PreparedMemory):
 class RenderedAdapter(Adapter[PreparedRendering]):
     """The form that renders tokens into the views and encodes them by the frozen codec, once for all denoising steps.
 
-    Latents and mask are embedded like the model's own input, without a bias and starting at zero, and added to the
-    video tokens before the first transformer block; after the last one a head corrects the prediction by them. The
+    Latents, mask and layers are embedded like the model's own input, without a bias and starting at zero, and added to
+    the video tokens before the first transformer block; after the last one a head corrects the prediction by them. The
     mask has for each latent pixel and frame the shares of its pixels that show what was observed, and what was
     imagined. Video tokens of which no pixel is covered stay as they are, as do latent frames without a token to attend
     to: a clip whose views show nothing equals that of stage 1 to the bit, before and after training, unless the adapter
@@ -228,9 +250,15 @@ class RenderedAdapter(Adapter[PreparedRendering]):
     def __init__(self, channels: int, settings: RenderedSettings, video: VideoShape) -> None:
         super().__init__(channels, settings, video)
         drawn = video.outputs + 2 * video.temporal
+        self.layers: LayerEmbedding | None = None
+        if settings.layers:
+            _check_layers(settings, channels, video.spatial)
+            sizes = settings.layers, settings.classes, settings.class_channels, settings.layer_width
+            self.layers = LayerEmbedding(*sizes)
+            drawn += settings.layer_width * video.temporal * settings.layer_scale**2
         self.patches = nn.Linear(drawn * video.token_frames * video.patch**2, video.channels, bias=False)
         zero_init(self.patches)
-        self.head = RenderedHead(drawn, video, settings.head_width, settings.head_layers)
+        self.head = RenderedHead(drawn, video, settings)
         self.register_parameter("learned", None)  # learned tokens are those of attention
         shared = {field.name: getattr(settings, field.name) for field in dataclasses.fields(AttentionSettings)}
         attention = ProjectedSettings(**shared | {"form": "projected", "noise": 0.0})
@@ -243,7 +271,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         return nn.ModuleDict() if self.attention is None else self.attention.blocks
 
     def render(self, tokens: MemoryTokens, cameras: Cameras, encode: Encode) -> MemoryTokens:
-        """Return latents and mask of the rendered views, float16, with the tokens for attention."""
+        """Return latents, mask and layers of the rendered views, float16, with the tokens for attention."""
         if tokens.rendered is not None:
             return tokens
         settings, spatial = self.settings, self.video.spatial
@@ -251,15 +279,39 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         shares = F.avg_pool2d(views.covered.flatten(0, 1), spatial).unflatten(0, views.covered.shape[:2])
         mask = fold_frames(shares, self.video.temporal)
         latents = encode(views.rgb, views.depth) * mask.any(dim=2, keepdim=True)
+        drawn = [latents, mask.to(latents), *self.peeled(tokens, views)]
         numbers = tokens_not_shown(tokens, views.shown, cameras, settings.attention_tokens)
         rest = {name: _chosen(part, numbers.clamp_min(0)) for name, part in tokens.tensors().items()}
-        rest |= {"mask": numbers >= 0, "rendered": torch.cat([latents, mask.to(latents)], dim=2).half()}
+        rest |= {"mask": numbers >= 0, "rendered": torch.cat(drawn, dim=2).half()}
         return MemoryTokens(**rest)
+
+    def peeled(self, tokens: MemoryTokens, views: Views) -> list[Float[Tensor, "batch frame folded height width"]]:
+        """Return the layers of the views folded to the size of latents, none where the adapter has none."""
+        settings, video = self.settings, self.video
+        if not settings.layers:
+            return []
+        batch, frames, height, width = views.depth.shape
+        size = (height * settings.layer_scale // video.spatial, width * settings.layer_scale // video.spatial)
+        splats = coarser(views.splats, (height * settings.supersampling, width * settings.supersampling), size)
+        surfaces = peel(tokens, splats, (batch, frames, *size), settings.layers, settings.layer_gap, settings.classes)
+        folded = F.pixel_unshuffle(surfaces.flatten(2, 3), settings.layer_scale)
+        return [fold_frames(folded, video.temporal)]
+
+    def embedded(self, surfaces: Float[Tensor, "batch frame folded height width"]) -> list[Tensor]:
+        """Return the embedding of folded layers, channels in the place of layers and values, none without layers."""
+        if self.layers is None:
+            return []
+        settings = self.settings
+        split = (self.video.temporal, settings.layers, VALUES, settings.layer_scale**2)
+        pixels = surfaces.unflatten(2, split).permute(0, 1, 2, 5, 6, 7, 3, 4)
+        drawn = self.layers(pixels.flatten(0, 5)).unflatten(0, pixels.shape[:6])
+        return [drawn.permute(0, 1, 2, 3, 6, 4, 5).flatten(2, 4)]
 
     def rendering(self) -> Mapping[str, Any]:
         """Return the settings that ``render`` depends on."""
         settings = self.settings
-        names = ("token_size", "splat_pixels", "supersampling", "attention_tokens")
+        names = ["token_size", "splat_pixels", "supersampling", "attention_tokens"]
+        names += ["layers", "layer_gap", "layer_scale", "classes"] if settings.layers else []
         return {name: getattr(settings, name) for name in names}
 
     def noisy(
@@ -267,17 +319,25 @@ class RenderedAdapter(Adapter[PreparedRendering]):
     ) -> MemoryTokens:
         """Return rendered tokens with noise of a level on their latents, where they cover anything, and features."""
         assert tokens.rendered is not None
-        latents, mask = tokens.rendered.split([self.video.outputs, 2 * self.video.temporal], dim=2)
+        latents, mask, surfaces = self.split(tokens.rendered)
         noisy = add_level(latents, level, generators) * mask.any(dim=2, keepdim=True)
         tokens = super().noisy(tokens, level, generators)
-        return dataclasses.replace(tokens, rendered=torch.cat([noisy, mask], dim=2))
+        drawn = torch.cat([part.float() for part in (noisy, mask, surfaces)], dim=2)  # autocast joins no float16
+        return dataclasses.replace(tokens, rendered=drawn.to(latents.dtype))
+
+    def split(self, rendered: Float[Tensor, "batch frame channel height width"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return latents, mask and folded layers of what ``render`` returned."""
+        shown = self.video.outputs + 2 * self.video.temporal
+        latents, mask = rendered[:, :, :shown].split([self.video.outputs, 2 * self.video.temporal], dim=2)
+        return latents, mask, rendered[:, :, shown:]
 
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedRendering:
         """Embed what ``render`` returned."""
         assert tokens.rendered is not None
         video, weights = self.video, self.patches.weight
-        drawn = fold_frames(tokens.rendered.to(weights.dtype), 1, video.token_frames)
-        latents, mask = drawn.split([video.outputs, 2 * video.temporal], dim=2)
+        latents, mask, surfaces = self.split(fold_frames(tokens.rendered.float(), 1, video.token_frames))
+        latents, mask = latents.to(weights.dtype), mask.to(weights.dtype)
+        drawn = torch.cat([latents, mask, *self.embedded(surfaces)], dim=2)
         covered = fold_patches(mask, video.patch, video.token_frames).any(dim=-1)
         return PreparedRendering(
             tokens=self.patches(fold_patches(drawn, video.patch, video.token_frames)),
@@ -318,6 +378,14 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         mask = memory.mask.reshape(batch, frames // token_frames, 1, height // side, width // side)
         mask = mask.repeat_interleave(token_frames, 1).repeat_interleave(side, -2).repeat_interleave(side, -1)
         return torch.where(mask, moved, predicted)
+
+
+def _check_layers(settings: RenderedSettings, channels: int, spatial: int) -> None:
+    """Raise ``CheckpointError`` unless tokens have so many classes and latent pixels can be divided so."""
+    if settings.classes > channels:
+        raise CheckpointError(f"adapter: classes is {settings.classes}, but a token has {channels} channels")
+    if spatial % settings.layer_scale:
+        raise CheckpointError(f"adapter: layer_scale is {settings.layer_scale}; it must divide {spatial} pixels")
 
 
 def _chosen(part: Shaped[Tensor, "batch token *rest"], numbers: Int64[Tensor, "batch chosen"]) -> Tensor:

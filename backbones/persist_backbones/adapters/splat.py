@@ -70,6 +70,20 @@ def splat(
     return result
 
 
+def coarser(splats: Splats, size: tuple[int, int], coarse: tuple[int, int]) -> Splats:
+    """Return the same splats in pixels of a coarser size, of which the finer is a multiple.
+
+    Args:
+        splats: the pixels that tokens cover.
+        size: height and width of all frames.
+        coarse: the smaller height and width.
+    """
+    (height, width), (rows, columns) = size, coarse
+    frame, place = splats.pixel // (height * width), splats.pixel % (height * width)
+    row, column = place // width * rows // height, place % width * columns // width
+    return Splats((frame * rows + row) * columns + column, splats.token, splats.depth)
+
+
 def rasterize(
     positions: Float[Tensor, "batch token 3"],
     mask: Bool[Tensor, "batch token"],

@@ -78,7 +78,9 @@ class AdaptedBackbone(Backbone):
         adapter = self.adapter
         if adapter is None:
             return NO_MEMORY
-        tokens = clips.tokens or MemoryTokens.stack([MemoryTokens.empty(adapter.channels)] * len(clips.seeds))
+        tokens = clips.tokens
+        if tokens is None:
+            tokens = MemoryTokens.stack([MemoryTokens.empty(adapter.channels)] * len(clips.seeds))
         if tokens.features.shape[-1] != adapter.channels:
             raise CheckpointError(
                 f"the memory gives features of {tokens.features.shape[-1]} channels, adapter {self.adapter_name!r} was "
