@@ -187,6 +187,9 @@ class DataSettings:
             frame to the next; after 100 frames it is ten times as much. The newest frame has its true pose.
         pose_drift_degrees: the same for rotation about each axis, in degrees.
         depth_noise: standard deviation of the error of written depth as a share of it, smooth over the image.
+        detour: of a policy's samples (stage policy): a later frame is a goal only where the walk came to it in at most
+            so many times the frames of the direct way, which turns to it, goes straight and turns to its heading; with
+            ``null`` every later frame may be one.
     """
 
     path: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
@@ -205,6 +208,7 @@ class DataSettings:
     pose_drift: Amount = 0.0
     pose_drift_degrees: Amount = 0.0
     depth_noise: Amount = 0.0
+    detour: Annotated[float, Field(ge=1, allow_inf_nan=False)] | None = None
 
 
 @dataclass(frozen=True)
@@ -411,6 +415,8 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")
     if recipe.data.own_writes and recipe.stage == "codec":
         problems.append("data.own_writes is for stages 1 and 2; leave it out")
+    if recipe.data.detour is not None and recipe.stage != "policy":
+        problems.append("data.detour is for stage policy only; leave it out")
     if training.frozen_precision == "bf16" and training.precision == "no":
         problems.append("training.frozen_precision bf16 needs training.precision bf16")
     if training.batch % training.accumulation:
@@ -422,7 +428,7 @@ def _of_a_policy(recipe: Recipe) -> list[str]:
     """Describe what a recipe of a policy lacks, or has that means nothing to it."""
     if (recipe.stage == "policy") != (recipe.policy is not None):
         return ["stage policy needs policy, as in policy: {name: nomad}; the other stages do not take it"]
-    data, allowed = recipe.data, DataSettings(recipe.data.path, mirror=recipe.data.mirror)
+    data, allowed = recipe.data, DataSettings(recipe.data.path, mirror=recipe.data.mirror, detour=recipe.data.detour)
     wrong = ["backbone"] if recipe.backbone != BackboneConfig() else []
     wrong += [f"data.{key}" for key, value in vars(allowed).items() if getattr(data, key) != value]
     wrong += [f"training.{key}" for key in OF_A_BACKBONE if getattr(recipe.training, key) not in (False, "no")]

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
+from torch.nn import functional
 from torch.utils.data import Dataset
 
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.policy_network import PolicySample, SampleForm
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError
+
+MOST_DRAWS: Final = 1000  # of a moment, before it is said that hardly any leads somewhere directly
+
+ROUNDING: Final = 1e-3  # metres, radians and frames that rounded poses may be wrong by
 
 
 @dataclass(frozen=True)
@@ -50,13 +58,17 @@ class PolicySampleDataset(Dataset[PolicySample]):
         form: what belongs to a sample.
         seed: seed of the draws.
         mirror: share of the samples in which left and right are exchanged.
+        detour: later frames that the trajectory came to in more than so many times the frames of the direct way are no
+            goals; see ``GroundPath.direct_frames``. ``None`` for any later frame.
 
     Raises:
         DataError: when no trajectory is long enough, or images are not all of one size.
     """
 
-    def __init__(self, folders: Sequence[Path], form: SampleForm, seed: int, mirror: float = 0.0) -> None:
-        self.form, self.seed, self.mirror = form, seed, mirror
+    def __init__(
+        self, folders: Sequence[Path], form: SampleForm, seed: int, mirror: float = 0.0, detour: float | None = None
+    ) -> None:
+        self.form, self.seed, self.mirror, self.detour = form, seed, mirror, detour
         store = [file for folder in folders for file in Store(folder)]
         needed = form.waypoints * form.spacing + 1
         self.files = [file for file in store if len(file) >= needed]
@@ -66,7 +78,7 @@ class PolicySampleDataset(Dataset[PolicySample]):
                 f"{where}: {form.waypoints} waypoints need {needed} frames, the longest trajectory has {longest}"
             )
         _check_sizes(self.files)
-        self.paths: dict[int, tuple[Tensor, Tensor]] = {}  # places and headings of trajectories, as they are read
+        self.paths: dict[int, GroundPath] = {}  # of trajectories, as they are read
 
     def __getitem__(self, number: int) -> PolicySample:
         return self.read(self.choose(number))
@@ -74,16 +86,35 @@ class PolicySampleDataset(Dataset[PolicySample]):
     def choose(self, number: int) -> SampleFrames:
         """The frame numbers of sample ``number``."""
         random, form = np.random.default_rng((self.seed, number)), self.form
-        file = int(random.integers(len(self.files)))
-        length = len(self.files[file])
-        present = int(random.integers(length - form.waypoints * form.spacing))
-        steps = int(random.integers(1, min(form.farthest, (length - 1 - present) // form.spacing) + 1))
-        goal_file, goal = file, present + steps * form.spacing
+        file, present, goal = self._moment(random)
+        goal_file = file
         if random.random() < form.negatives and len(self.files) > 1:
             goal_file = (file + int(random.integers(1, len(self.files)))) % len(self.files)
             goal = int(random.integers(len(self.files[goal_file])))
         mirrored = bool(random.random() < self.mirror)
         return SampleFrames(file, present, goal_file, goal, mirrored, int(random.integers(2**31)))
+
+    def _moment(self, random: np.random.Generator) -> tuple[int, int, int]:
+        """Draw the number of a trajectory, that of its present frame, and that of a later frame to be the goal."""
+        for _ in range(MOST_DRAWS):
+            file = int(random.integers(len(self.files)))
+            present = int(random.integers(len(self.files[file]) - self.form.waypoints * self.form.spacing))
+            goals = self._goals(file, present)
+            if len(goals):
+                return file, present, int(goals[int(random.integers(len(goals)))])
+        raise DataError(
+            f"{self.files[0].path.parent}: {MOST_DRAWS} moments drawn, and none leads to a later frame within "
+            f"{self.detour:g} times the frames of the direct way; raise data.detour"
+        )
+
+    def _goals(self, file: int, present: int) -> Int64[Tensor, " goal"]:
+        """The numbers of the later frames of a trajectory that may be the goal."""
+        spacing, last = self.form.spacing, len(self.files[file]) - 1
+        goals = torch.arange(present + spacing, min(last, present + self.form.farthest * spacing) + 1, spacing)
+        if self.detour is None:
+            return goals
+        direct = self._path(file).direct_frames(present, goals)
+        return goals[goals - present <= self.detour * direct + ROUNDING]
 
     def read(self, choice: SampleFrames) -> PolicySample:
         """The sample with these frame numbers."""
@@ -103,17 +134,57 @@ class PolicySampleDataset(Dataset[PolicySample]):
 
     def _waypoints(self, choice: SampleFrames) -> Float[Tensor, "waypoint 2"]:
         """Metres ahead and to the left of the present camera, float32."""
-        if choice.file not in self.paths:
-            self.paths[choice.file] = ground_path(self.files[choice.file])
-        places, headings = self.paths[choice.file]
-        first = choice.present + self.form.spacing
-        later = places[first : first + self.form.waypoints * self.form.spacing : self.form.spacing]
-        return local_places(later, places[choice.present], headings[choice.present]).float()
+        path, first = self._path(choice.file), choice.present + self.form.spacing
+        later = path.places[first : first + self.form.waypoints * self.form.spacing : self.form.spacing]
+        return local_places(later, path.places[choice.present], path.headings[choice.present]).float()
+
+    def _path(self, number: int) -> GroundPath:
+        """The path of a trajectory, which is read once."""
+        if number not in self.paths:
+            file = self.files[number]
+            self.paths[number] = GroundPath(*ground_places(file.poses(), file.info.world_up))
+        return self.paths[number]
 
 
-def ground_path(file: TrajectoryFile) -> tuple[Float[Tensor, "frame 2"], Float[Tensor, "frame 2"]]:
-    """The places of a trajectory's cameras on the ground axes in metres, and their headings as unit vectors there."""
-    return ground_places(file.poses(), file.info.world_up)
+@dataclass(frozen=True)
+class GroundPath:
+    """Where the cameras of a trajectory are on the ground.
+
+    Args:
+        places: metres on the ground axes, float64.
+        headings: unit vectors there, float64.
+    """
+
+    places: Float[Tensor, "frame 2"]
+    headings: Float[Tensor, "frame 2"]
+
+    def direct_frames(self, start: int, ends: Int64[Tensor, " end"]) -> Float[Tensor, " end"]:
+        """Return how many frames the direct way takes from one frame to others, if nothing is in between.
+
+        That is to turn to the place, to go straight there, and to turn to the heading, each at the greatest speed of
+        this path. For an agent that steps and turns by fixed amounts it is the number of its actions.
+        """
+        way = self.places[ends] - self.places[start]
+        metres, ahead = way.norm(dim=-1), functional.normalize(way, dim=-1)
+        before, after = self.headings[start].expand_as(ahead), self.headings[ends]
+        ahead = torch.where(metres[:, None] > ROUNDING, ahead, before)  # there is no way to turn to
+        step, turn = self._speeds
+        frames: Tensor = metres / step + (_angles(before, ahead) + _angles(ahead, after)) / turn
+        return frames
+
+    @cached_property
+    def _speeds(self) -> tuple[float, float]:
+        """The most metres and radians from one frame to the next; infinite where it never goes, or never turns."""
+        metres = (self.places[1:] - self.places[:-1]).norm(dim=-1).max()
+        radians = _angles(self.headings[:-1], self.headings[1:]).max()
+        step, turn = (float(speed) if speed > ROUNDING else math.inf for speed in (metres, radians))
+        return step, turn
+
+
+def _angles(first: Float[Tensor, "row 2"], second: Float[Tensor, "row 2"]) -> Float[Tensor, " row"]:
+    """The angle between unit vectors in radians, 0…π."""
+    across = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    return torch.atan2(across.abs(), (first * second).sum(-1))
 
 
 def ground_places(
@@ -122,7 +193,7 @@ def ground_places(
     """The places of cameras on the ground axes in metres, and their headings as unit vectors there, float64."""
     ground = ground_axes(world_up)[:2]
     headings = poses[:, :3, 2].double() @ ground.T
-    return poses[:, :3, 3].double() @ ground.T, torch.nn.functional.normalize(headings, dim=-1)
+    return poses[:, :3, 3].double() @ ground.T, functional.normalize(headings, dim=-1)
 
 
 def local_places(

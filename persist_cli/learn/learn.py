@@ -41,6 +41,7 @@ PLAN: Final = "plan.json"
 RESULTS: Final = "learn.json"
 CURVE: Final = "success.png"
 FIGURES: Final = ("success", "reached", "spl", "soft_spl", "collisions_per_action", "end_metres")
+DETOUR: Final = 2.0  # times the direct way; what a walk came to by a longer one is no goal in hindsight
 MODEL, SIMULATOR = "model", "simulator"  # where a policy may practise
 
 
@@ -242,7 +243,7 @@ def train(learning: Learning, number: int) -> None:
     plan = learning.plan
     recipe = {
         "stage": "policy", "description": f"round {number} of a policy that practises", "base": str(before.folder),
-        "policy": {"name": before.policy, "settings": before.settings},
+        "policy": {"name": before.policy, "settings": before.settings}, "data": {"detour": DETOUR},
         "training": {"steps": plan.steps, "seed": plan.seed, "precision": "no", "learning_rate": 1e-4, "warmup": 20,
                      "batch": 64, "ema": 0.99},
     }  # fmt: skip

@@ -2,7 +2,7 @@
 
 Practice has no teacher. Whatever a walk reached serves as its goal afterwards (hindsight relabelling): training draws
 the goal of a sample from the later frames of the same walk, so that also a walk that missed its goal shows a way to
-somewhere.
+somewhere. What it only came to by wandering about is left out: such a way is not worth repeating.
 """
 
 from __future__ import annotations

@@ -32,7 +32,8 @@ class PolicyTrainer(TrainingLoop[PolicyNetwork]):
     def __init__(self, recipe: Recipe, network: PolicyNetwork, accelerator: Accelerator) -> None:
         super().__init__(recipe, accelerator)
         folders = [data_folder(path) for path in recipe.data.path]
-        samples = PolicySampleDataset(folders, network.sample_form, recipe.training.seed, recipe.data.mirror)
+        data, form = recipe.data, network.sample_form
+        samples = PolicySampleDataset(folders, form, recipe.training.seed, data.mirror, data.detour)
         self.dataset = samples
         self.scenes = TrainingScenes(frozenset(trained_scene(file.info) for file in samples.files))
         self.prepare(network, network.trained_parameters())

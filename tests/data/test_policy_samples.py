@@ -11,7 +11,7 @@ import torch
 
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.policy_network import SampleForm
-from persist_cli.data.policy_samples import PolicySampleDataset, ground_places, local_places
+from persist_cli.data.policy_samples import GroundPath, PolicySampleDataset, ground_places, local_places
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from tests.support.rooms import UP, Room, look
@@ -24,6 +24,17 @@ def write_straight(folder: Path, yaw: float = 0.0, name: str = "straight", frame
     ahead = look((0.0, 0.0, 0.0), yaw, 0.0)[:3, 2]
     poses = [look(tuple(np.array([0.0, 1.3, 0.5]) + 0.05 * frame * ahead), yaw, 0.0) for frame in range(frames)]
     return Room(8, 8).write(folder / f"{name}.parquet", np.stack(poses)).parent
+
+
+def write_actions(folder: Path, actions: str) -> Path:
+    """Write a walk of 25 cm steps (f) and turns of 15 degrees to the left or right (l, r)."""
+    place, yaw = np.array([0.0, 1.3, 1.5]), 0.0
+    poses = [look(tuple(place), yaw, 0.0)]
+    for action in actions:
+        place = place + 0.25 * poses[-1][:3, 2] * (action == "f")
+        yaw += {"l": 15.0, "r": -15.0, "f": 0.0}[action]
+        poses.append(look(tuple(place), yaw, 0.0))
+    return Room(8, 8).write(folder / "walk.parquet", np.stack(poses)).parent
 
 
 def test_a_straight_walk_has_straight_waypoints(tmp_path):
@@ -75,6 +86,30 @@ def test_frames_before_the_first_are_the_first_again(walks):
     choice = dataclasses.replace(samples.choose(0), present=2, goal_file=0, file=0, goal=6, mirrored=False)
     rgb = Store(walks)[0].read([0, 0, 2]).observations.rgb
     assert torch.equal(samples.read(choice).seen, rgb)
+
+
+def test_the_direct_way_of_an_agent_has_as_many_frames_as_it_takes_actions(tmp_path):
+    file = Store(write_actions(tmp_path, "lllffffrr" + "lr" * 3))[0]
+    path = GroundPath(*ground_places(file.poses(), UP))
+    direct = path.direct_frames(0, torch.tensor([3, 7, 9, 15]))
+    assert direct.tolist() == pytest.approx([3, 7, 9, 9], abs=1e-3)  # at the end it only turned to and fro
+
+
+def test_what_a_walk_only_came_to_by_wandering_is_no_goal(tmp_path):
+    folder = write_actions(tmp_path, "ffffff" + "lr" * 6 + "ffffff")
+    any_way, direct = (PolicySampleDataset([folder], FORM, 0, detour=detour) for detour in (None, 1.5))
+    pairs, kept = (
+        {(choice.present, choice.goal) for choice in map(samples.choose, range(800))} for samples in (any_way, direct)
+    )
+    assert kept < pairs
+    assert {(6, 10), (0, 12)} <= pairs - kept  # to and fro where it is, and on a way that is as long as two
+    assert {(0, 6), (0, 8)} <= kept
+
+
+def test_data_in_which_nothing_is_reached_directly_is_refused_in_one_line(tmp_path):
+    folder = write_actions(tmp_path, "lr" * 12)
+    with pytest.raises(DataError, match=r"1000 moments drawn, and none leads .* within 2 times .*; raise data.detour"):
+        PolicySampleDataset([folder], dataclasses.replace(FORM, negatives=0.0), 0, detour=2.0).choose(0)
 
 
 def test_a_mirrored_sample_has_left_and_right_exchanged(walks):

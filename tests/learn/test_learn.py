@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
+import yaml
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
@@ -86,6 +87,8 @@ def test_a_round_leaves_walks_that_say_where_they_were_walked_and_a_policy_that_
 
 
 def test_a_learning_that_was_stopped_ends_as_one_that_was_not(learn, tmp_path):
+    recipe = yaml.safe_load((tmp_path / "out/round-01/policy/recipe.yaml").read_text())
+    assert recipe["data"]["detour"] == 2
     for rounds, out in (("2", "whole"), ("1", "halves"), ("2", "halves")):
         assert learn(out, "--rounds", rounds).code == 0
     whole, halves = (find_policy(tmp_path / out / "round-02/policy").fingerprint for out in ("whole", "halves"))

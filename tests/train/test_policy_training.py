@@ -77,6 +77,7 @@ def test_the_weights_of_the_small_policy_are_below_10_megabytes_in_half_precisio
         ("policy.name=random", "policy 'random' has no network to train"),
         ("policy.settings.token=8", "did you mean 'tokens'"),
         ("data.own_writes=0.5", "stage policy takes no data.own_writes; leave them out"),
+        ("data.detour=0.5", "data.detour must be a number of at least 1"),
         ("training.compile=true", "stage policy takes no training.compile"),
         ("stage=1", "stage policy needs policy"),
         ("base=runs/nothing", "runs/nothing: no trained policy there"),
