@@ -116,6 +116,7 @@ def learn(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Of the training, as in training.learning_rate=3e-5.")
     ] = None,
+    body: BodyOption = None,
     episodes: Annotated[
         Path | None, typer.Option(help="Episodes (`persist bench episodes`) to evaluate with in the true house.")
     ] = None,
@@ -142,7 +143,7 @@ def learn(
         views=tuple(views), policy=policy, inside=inside, checkpoint=checkpoint, adapter=adapter, rounds=rounds,
         practice=PracticeSettings(walks, actions, execute, explore, batch), steps=training_steps,
         training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body,
     )  # fmt: skip
     run_learn(plan, out, json)
 

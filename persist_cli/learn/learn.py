@@ -63,6 +63,8 @@ class LearnPlan:
         loop: how they are run.
         sampling: of the world model.
         seed: of all that is random.
+        body: whether walls stop the agent inside the model; ``None``: where the height of its camera is told, see
+            ``tells_body``.
     """
 
     views: tuple[str, ...]
@@ -78,6 +80,7 @@ class LearnPlan:
     loop: LoopSettings
     sampling: SamplingOverrides
     seed: int
+    body: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,10 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     check_folder(out)
     if plan.inside not in (MODEL, SIMULATOR):
         raise PersistError(f"--inside {plan.inside!r}: a policy practises inside the {MODEL} or the {SIMULATOR}")
+    if plan.inside == SIMULATOR and plan.body is False:
+        raise PersistError(
+            f"--no-body: nobody goes through the walls of the true house; leave out --inside {SIMULATOR}"
+        )
     begin = packaged_policy() if plan.policy is None else find_policy(Path(plan.policy))
     sources = find_sources(list(plan.views))
     common_reference(sources)
@@ -210,12 +217,12 @@ def open_place(learning: Learning) -> PracticePlace:
     adapter = checkpoint.chosen_adapter(plan.adapter)
     rollout = RolloutPlan(
         start=plan.views[0], actions=(), follow=False, frames=0, memory=None, adapter=plan.adapter, write=True,
-        seed=plan.seed, sampling=plan.sampling, placement=InferenceOptions(),
+        seed=plan.seed, sampling=plan.sampling, placement=InferenceOptions(), body=plan.body,
     )  # fmt: skip
     world = assemble_world(checkpoint, adapter, rollout, info)
     world.agents[0].memorize(learning.views, world.backbone.device)
     origin = {"model": checkpoint.fingerprint, "adapter": adapter or PLAIN}
-    return ImaginedPlace(world.backbone, world.agents[0].memory, world.sampling, info, origin)
+    return ImaginedPlace(world, info, origin)
 
 
 def walk(learning: Learning, place: PracticePlace, number: int) -> None:

@@ -7,9 +7,7 @@ from typing import Any, Protocol
 
 import torch
 
-from persist_cli.api.backbone import Backbone, Sampling
-from persist_cli.api.ground import Body, GroundMap
-from persist_cli.api.memory import Memory
+from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.true_scene import observations_of
@@ -41,30 +39,19 @@ class ImaginedPlace:
     """The world model; every walk begins with the memory of the given views, and writes into a copy of its own.
 
     Args:
-        backbone: with its adapter, if any.
-        memory: of the given views; ``None`` without an adapter.
-        sampling: of the world model.
+        world: its one agent has the memory of the given views, if any, and the body of every agent that walks here.
         info: of the given views.
         origin: says which model and memory these are.
     """
 
-    def __init__(
-        self,
-        backbone: Backbone,
-        memory: Memory | None,
-        sampling: Sampling,
-        info: TrajectoryInfo,
-        origin: dict[str, Any],
-    ) -> None:
-        self.backbone, self.memory, self.sampling, self.info, self.origin = backbone, memory, sampling, info, origin
-        self.body: Body = body_of(info)
-        self.world = WorldModel(backbone, [], sampling)
+    def __init__(self, world: WorldModel, info: TrajectoryInfo, origin: dict[str, Any]) -> None:
+        self.world, self.first, self.info, self.origin = world, world.agents[0], info, origin
 
     def begin(self, starts: Sequence[Observations], seeds: Sequence[int]) -> None:
         """Begin walks; see ``PracticePlace``."""
-        shared = self.memory is not None
-        agents = [Agent(self.memory, seed, shared=shared, body=self.body) for seed in seeds]
-        self.world = WorldModel(self.backbone, agents, self.sampling)
+        memory, body = self.first.memory, self.first.body
+        agents = [Agent(memory, seed, shared=memory is not None, body=body) for seed in seeds]
+        self.world = WorldModel(self.world.backbone, agents, self.world.sampling)
         self.world.reset(starts, [self.info] * len(starts))
 
     @torch.no_grad()
@@ -73,10 +60,9 @@ class ImaginedPlace:
         return self.world.step(ways)
 
     def ground(self, number: int) -> GroundMap:
-        """Return the map of the memory's points and of what the walk imagined."""
+        """Return the map of the memory's points and of what the walk imagined; without a body nothing is known."""
         surroundings = self.world.agents[number].surroundings
-        assert surroundings is not None  # agents here have bodies
-        return surroundings.map()
+        return GroundMap.empty(self.info.world_up) if surroundings is None else surroundings.map()
 
 
 class TruePlace:

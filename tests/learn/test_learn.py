@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
-
 import yaml
+
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import SamplingOverrides
+from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.store import Store
+from persist_cli.learn.learn import LearnPlan, open_place, prepare
 from persist_cli.learn.places import ImaginedPlace
 from persist_cli.learn.practice import PracticeSettings, PracticeWalk, practise
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import make_policy
 from persist_cli.policies.trained import find_policy
+from persist_cli.rollout.world_model import Agent, WorldModel
 from tests.conftest import CommandResult
 
 SETTINGS = PracticeSettings(walks=3, actions=6, execute=3, explore=0.5, batch=2)
@@ -47,7 +51,7 @@ def place(walks, voxel) -> ImaginedPlace:
     backbone, info = load_backbone(checkpoint, adapter="voxel").eval(), Store(walks)[0].info
     memory = MemoryFactory.of(adapter_memory(checkpoint, "voxel")).empty(info)
     memory.memorize(Store(walks)[0].read(range(12)).observations)
-    return ImaginedPlace(backbone, memory, checkpoint.sampling_with(ONE), info, {})
+    return ImaginedPlace(WorldModel(backbone, [Agent(memory)], checkpoint.sampling_with(ONE)), info, {})
 
 
 def walks_of(place: ImaginedPlace, views, seed: int) -> list[PracticeWalk]:
@@ -67,12 +71,13 @@ def test_a_walk_begins_at_a_given_view_and_each_frame_follows_from_its_action(pl
 
 
 def test_practice_follows_from_its_seed_and_does_not_change_the_memory(place, walks):
-    views, before = Store(walks)[0].read(range(12)).observations, place.memory.tensors()
+    memory = place.first.memory
+    views, before = Store(walks)[0].read(range(12)).observations, memory.tensors()
     first, again, other = (walks_of(place, views, seed) for seed in (1, 1, 2))
     assert [walk.actions for walk in first] == [walk.actions for walk in again]
     assert all(a.seen.rgb.equal(b.seen.rgb) for a, b in zip(first, again, strict=True))
     assert [walk.actions for walk in first] != [walk.actions for walk in other]
-    assert all(tensor.equal(before[name]) for name, tensor in place.memory.tensors().items())
+    assert all(tensor.equal(before[name]) for name, tensor in memory.tensors().items())
 
 
 def test_a_round_leaves_walks_that_say_where_they_were_walked_and_a_policy_that_learned(learn, policy_run, tmp_path):
@@ -82,13 +87,33 @@ def test_a_round_leaves_walks_that_say_where_they_were_walked_and_a_policy_that_
     assert files[0].info.source["practice"]["adapter"] == "voxel"
     results = json.loads((tmp_path / "out/learn.json").read_text())
     assert results["rounds"][1]["walked"] == 30
+    recipe = yaml.safe_load((tmp_path / "out/round-01/policy/recipe.yaml").read_text())
+    assert recipe["data"]["detour"] == 2
     before, after = (find_policy(run).load().parameters() for run in (policy_run, tmp_path / "out/round-01/policy"))
     assert not all(a.equal(b) for a, b in zip(before, after, strict=True))
 
 
+def test_without_a_known_camera_height_nothing_stops_a_walk_unless_it_is_asked_for(walks, voxel, policy_run, tmp_path):
+    plan = LearnPlan(
+        views=(f"{walks}#0:0-12",), policy=str(policy_run), inside="model", checkpoint=voxel, adapter=None, rounds=1,
+        practice=PracticeSettings(), steps=1, training=(), episodes=None, loop=LoopSettings(), sampling=ONE, seed=0,
+    )  # fmt: skip
+    for body in (None, True):
+        learning = prepare(replace(plan, body=body), tmp_path / str(body))
+        place = open_place(learning)
+        place.begin([learning.views[:1]], [0])
+        free = place.act([["forward"] * 16])[0].free
+        assert free.all() == (body is None)
+
+
+def test_nobody_goes_through_the_walls_of_the_true_house(learn, tmp_path):
+    result = learn("out", "--inside", "simulator", "--no-body")
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert "--no-body: nobody goes through the walls of the true house; leave out --inside simulator" in result.err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_learning_that_was_stopped_ends_as_one_that_was_not(learn, tmp_path):
-    recipe = yaml.safe_load((tmp_path / "out/round-01/policy/recipe.yaml").read_text())
-    assert recipe["data"]["detour"] == 2
     for rounds, out in (("2", "whole"), ("1", "halves"), ("2", "halves")):
         assert learn(out, "--rounds", rounds).code == 0
     whole, halves = (find_policy(tmp_path / out / "round-02/policy").fingerprint for out in ("whole", "halves"))
