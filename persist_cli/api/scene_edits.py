@@ -35,11 +35,15 @@ class Paint(_Edit):
 
 
 class Insert(_Edit):
-    """Put a thing of a class at a place: a box of cells whose lowest face has its middle there."""
+    """Put a thing of a class at a place: a box of cells whose lowest face has its middle there.
+
+    Where a coordinate is ``None``, which only the height may be, it stands on what is there already. Without a size or
+    colour it gets that of the scene's own things of this class, or a usual one.
+    """
 
     edit: Literal["insert"] = "insert"
     kind: str
-    at: Point
+    at: tuple[Metres | None, Metres | None, Metres | None]
     size: Point | None = None
     color: Colour | None = None
     overwrite: bool = False  # take the place of what is there, where it would else be an error

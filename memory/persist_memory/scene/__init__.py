@@ -1,0 +1,1 @@
+"""The memory of cells that also imagines, evolves and is edited."""

@@ -1,0 +1,187 @@
+"""Edits of cells by hand leave no hole, and change nothing but what they are asked to."""
+
+import pytest
+import torch
+
+from persist_cli.api.cell_things import find_things, floor_level, structure
+from persist_cli.api.cells import FREE, SOLID, CellGrid, CellOrigin
+from persist_cli.api.scene_edits import Copy, Edit, Insert, Move, Paint, Remove
+from persist_cli.errors import DataError
+from persist_memory.scene.editing import apply_edits, changes, edit_grid
+from persist_memory.scene.surroundings import guess
+from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, TABLE, TABLE_CELLS, WALL, cell_room
+
+EVERYWHERE = {"low": (-9.0, -9.0, -9.0), "high": (9.0, 9.0, 9.0)}
+
+
+def box_of(grid: CellGrid, name: str) -> dict[str, tuple[float, float, float]]:
+    box = next(thing.box for thing in find_things(grid) if thing.name == name)
+    return {"low": box.low, "high": box.high}
+
+
+def edited(grid: CellGrid, *edits: Edit) -> CellGrid:
+    return edit_grid(grid, edits)[0]
+
+
+def test_things_are_listed_apart_from_floor_and_walls_with_their_boxes():
+    things = find_things(cell_room((-2, -10, 0)))
+    assert [thing.name for thing in things] == ["table#1", "box#1"]
+    assert things[0].box.low == pytest.approx((0.375, 0.125, 0.375))  # z runs against the second ground axis
+    assert things[0].box.high == pytest.approx((0.875, 0.875, 1.125))
+    assert things[0].color == COLORS[TABLE]
+
+
+def test_a_removed_thing_leaves_free_space_on_a_floor_that_goes_on():
+    grid = cell_room()
+    gone = edited(grid, Remove(**box_of(grid, "table#1")))
+    assert bool((gone.classes[TABLE_CELLS] == FREE).all())
+    assert bool((gone.origins[TABLE_CELLS] == CellOrigin.EDITED).all())
+    assert bool((gone.classes[1:-1, 1:-1, 0] == FLOOR).all())
+    assert int(changes(grid, gone).sum()) == 2 * 3 * 3
+
+
+def test_the_floor_under_a_removed_thing_gets_the_class_and_colour_of_the_floor_around():
+    grid = cell_room()
+    grid.classes[4:6, 6:9, 0] = TABLE
+    grid.colors[4:6, 6:9, 0] = torch.tensor(COLORS[TABLE], dtype=torch.uint8)
+    gone = edited(grid, Remove(**box_of(grid, "table#1")))
+    assert bool((gone.classes[1:-1, 1:-1, 0] == FLOOR).all())
+    assert bool((gone.colors[1:-1, 1:-1, 0] == torch.tensor(COLORS[FLOOR], dtype=torch.uint8)).all())
+
+
+def test_a_box_around_a_thing_and_the_wall_behind_takes_the_thing_alone():
+    gone = edited(cell_room(), Remove(low=(0.3, -0.2, -0.9), high=(0.9, 1.0, 2.0)))
+    assert not bool((gone.classes == TABLE).any())
+    assert bool((gone.classes[:, 0] == WALL).all())
+
+
+def test_a_box_that_holds_a_wall_alone_opens_it_down_to_the_floor():
+    grid = cell_room()
+    opened = edited(grid, Remove(low=(0.4, 0.0, 2.3), high=(0.9, 2.0, 2.7)))
+    assert bool((opened.classes[5, 0, 1:9] == FREE).all())
+    assert int(opened.classes[5, 0, 0]) == FLOOR
+    assert int(changes(grid, opened).sum()) == 2 * 9
+
+
+def test_a_wall_that_a_thing_hid_goes_on_behind_it_and_never_is_a_hole():
+    grid = cell_room()
+    grid.classes[4:8, 1:3, 1:6] = BOX  # a cabinet at the wall, of which only the outside was seen
+    grid.origins[5:7, 1, 1:5], grid.origins[4:8, 0, 0:6], grid.origins[4:8, 1:3, 0] = 0, 0, 0
+    gone, outcome = edit_grid(grid, [Remove(**box_of(grid, "box#1"))])
+    assert bool((gone.classes[4:8, 0, 1:6] == WALL).all())
+    assert bool((gone.classes[4:8, 1:3, 1:6] == FREE).all())
+    assert bool((gone.classes[4:8, 1:3, 0] == FLOOR).all())
+    assert bool(gone.known[1:-1, 1:-1].all())
+    assert outcome.uncovered > 0
+    assert outcome.filled_by == "surroundings"
+
+
+def test_what_a_model_imagines_behind_a_removed_thing_stays():
+    grid = cell_room()
+    grid.origins[4:6, 9:12, 1:4] = 0
+
+    def imagine(cells: CellGrid, unknown: torch.Tensor) -> CellGrid:
+        filled = cells.copy()
+        filled.classes[unknown], filled.origins[unknown] = BOX, CellOrigin.IMAGINED
+        return filled
+
+    gone, outcome = edit_grid(grid, [Remove(**box_of(grid, "table#1"))], imagine)
+    assert bool((gone.classes[4:6, 9:12, 1:4] == BOX).all())
+    assert outcome.filled_by == "model"
+
+
+def test_things_of_no_known_class_are_removed_and_walls_stay():
+    grid = cell_room()
+    grid.classes[grid.solid] = SOLID
+    assert floor_level(grid) == 0
+    assert bool(structure(grid)[0, 3, 4])
+    assert not bool(structure(grid)[TABLE_CELLS].any())
+    gone = edited(grid, Remove(low=(0.3, 0.0, -0.9), high=(0.9, 1.0, 2.0)))
+    assert not bool(gone.solid[TABLE_CELLS].any())
+    assert bool(gone.solid[:, :, 0].all())
+
+
+def test_paint_gives_all_in_a_box_one_colour_and_changes_no_class():
+    grid = cell_room()
+    painted = edited(grid, Paint(**box_of(grid, "box#1"), color=(1, 2, 3)))
+    assert painted.colors[BOX_CELLS].flatten().tolist() == [1, 2, 3]
+    assert torch.equal(painted.classes, grid.classes)
+    assert int(changes(grid, painted).sum()) == 1
+
+
+def test_a_thing_is_moved_with_its_colour_and_the_same_way_back_restores_the_room():
+    grid = cell_room()
+    moved = edited(grid, Move(**box_of(grid, "table#1"), by=(1.0, 0.0, -0.5)))
+    assert bool((moved.classes[8:10, 8:11, 1:4] == TABLE).all())
+    assert int((moved.classes == TABLE).sum()) == 18
+    back = edited(moved, Move(**box_of(moved, "table#1"), by=(-1.0, 0.0, 0.5)))
+    assert not bool(changes(grid, back).any())
+
+
+def test_a_copy_stands_at_both_places():
+    grid = cell_room()
+    copied = edited(grid, Copy(**box_of(grid, "box#1"), by=(0.0, 0.0, -1.0)))
+    assert [thing.name for thing in find_things(copied)] == ["table#1", "box#1", "box#2"]
+
+
+def test_an_inserted_thing_rests_on_what_is_below_and_is_as_large_as_the_scenes_own():
+    grid = cell_room()
+    at = next(thing.middle for thing in find_things(grid) if thing.name == "table#1")
+    room = edited(grid, Insert(kind="box", at=(at[0], None, at[2])), Insert(kind="table", at=(2.0, None, 1.0)))
+    boxes = [thing for thing in find_things(room) if thing.kind == "box"]
+    assert max(thing.box.low[1] for thing in boxes) == pytest.approx(0.875)
+    assert all(len(thing.cells) == 1 for thing in boxes)
+    assert [len(thing.cells) for thing in find_things(room) if thing.kind == "table"] == [18, 18]
+
+
+def test_an_inserted_thing_stands_at_the_height_and_has_the_size_and_colour_that_are_asked_for():
+    room = edited(cell_room(), Insert(kind="box", at=(2.0, 1.0, 1.0), size=(0.5, 0.25, 0.75), color=(9, 8, 7)))
+    new = max((thing for thing in find_things(room) if thing.kind == "box"), key=lambda thing: thing.box.low[1])
+    size = [high - low for low, high in zip(new.box.low, new.box.high, strict=True)]
+    assert size == pytest.approx([0.5, 0.25, 0.75])
+    assert new.box.low[1] == pytest.approx(1.125)
+    assert new.color == (9, 8, 7)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (Remove(low=(50, 0, 0), high=(51, 1, 1)), "lies outside of the scene, which reaches from -0.625,-0.125,"),
+        (Remove(low=(2, 1, 1), high=(2.5, 1.5, 1.5)), "holds free or unknown space alone"),
+        (Remove(low=(1.5, 0, 1), high=(2, 0.1, 1.5)), "holds floor or ceiling alone"),
+        (Paint(low=(2, 1, 1), high=(2.5, 1.5, 1.5), color=(1, 2, 3)), "holds nothing that has a colour"),
+        (Insert(kind="tabel", at=(2, None, 1)), "no class 'tabel'; did you mean 'table'?"),
+        (Insert(kind="free", at=(2, None, 1)), "no class 'free'"),
+        (Insert(kind="box", at=(None, 1, 1)), "the height alone can be left open"),
+        (Insert(kind="box", at=(40, None, 1)), "reach out of the scene"),
+        (Insert(kind="box", at=(0.5, 0.0, 0.75)), "hold table; take another place, or let it replace them"),
+        (Move(**box_of(cell_room(), "table#1"), by=(50, 0, 0)), "reach out of the scene"),
+        (Move(**box_of(cell_room(), "table#1"), by=(0.1, 0, 0)), "less than half a cell of 0.25 m"),
+        (Copy(**box_of(cell_room(), "table#1"), by=(0.25, 0, 0)), "9 cells that hold table"),
+    ],
+)
+def test_an_edit_that_cannot_be_done_says_which_and_why_and_changes_nothing(edit, words):
+    grid = cell_room()
+    fine = Paint(**EVERYWHERE, color=(0, 0, 0))
+    with pytest.raises(DataError, match=rf"^edit 2 \({edit.edit}\): ") as error:
+        apply_edits(grid, [fine, edit])
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not bool(changes(cell_room(), grid).any())
+
+
+def test_overwriting_takes_the_place_of_what_is_there():
+    grid = cell_room()
+    room = edited(grid, Insert(kind="box", at=(0.5, 0.0, 0.75), size=(0.25, 0.25, 0.25), overwrite=True))
+    assert int((room.classes == BOX).sum()) == 2
+    assert int((room.classes == TABLE).sum()) == 17
+
+
+def test_the_surroundings_guess_every_cell_and_close_walls_but_not_doorways():
+    grid = cell_room()
+    grid.classes[6:8, 0, 8:11] = 6  # a doorway: its cells above are of class door
+    grid.origins[6:8, 0, 1:8], grid.origins[3:5, 0, 1:8] = 0, 0
+    guessed = guess(grid)
+    assert bool(guessed.known.all())
+    assert bool((guessed.classes[6:8, 0, 1:8] == FREE).all())
+    assert bool((guessed.classes[3:5, 0, 1:8] == WALL).all())
