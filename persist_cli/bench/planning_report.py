@@ -9,14 +9,12 @@ from typing import Any, Final
 
 from persist_cli.bench.plan_bench import LOOPS
 from persist_cli.bench.planning_pictures import EpisodePictures
+from persist_cli.bench.planning_results import COLUMNS
 from persist_cli.bench.planning_tables import (
-    amount,
-    cell,
     columns_of,
     counted,
     difference_columns,
     difference_rows,
-    heading,
     loop_columns,
     success_rows,
 )
@@ -62,7 +60,7 @@ def section(table: Mapping[str, Any], results: Mapping[str, Any]) -> dict[str, A
         "counted": counted(table),
         "parts": [loop_table(table, results, loop) for loop in LOOPS if columns_of(table, loop_columns(loop))],
         "differences": difference_rows(table),
-        "difference_heads": [heading(name) for name in difference_columns(table)],
+        "difference_heads": [COLUMNS[name].heading for name in difference_columns(table)],
     }
 
 
@@ -72,23 +70,18 @@ def loop_table(table: Mapping[str, Any], results: Mapping[str, Any], loop: str) 
     definitions = {row["name"]: row["definition"] for row in results["rows"]}
     return {
         "title": f"{loop.capitalize()} loop",
-        "columns": [{"heading": heading(name), "definition": results["columns"][name]["definition"]} for name in names],
+        "columns": [
+            {"heading": COLUMNS[name].heading, "definition": results["columns"][name]["definition"]} for name in names
+        ],
         "rows": [
             {
                 "name": row,
                 "definition": definitions[row],
-                "cells": [parts_of(figures.get(name), name) for name in names],
+                "cells": [COLUMNS[name].parts(figures.get(name)) for name in names],
             }
             for row, figures in table["rows"].items()
         ],
     }
-
-
-def parts_of(figure: Mapping[str, Any] | None, name: str) -> dict[str, str]:
-    """Return the text of a figure and of its interval, empty where it has none."""
-    has_interval = figure is not None and figure["low"] is not None
-    interval = f"[{amount(figure['low'], name)}, {amount(figure['high'], name)}]" if figure and has_interval else ""
-    return {"text": cell(figure, name, interval=False), "interval": interval}
 
 
 def facts(environment: Mapping[str, Any]) -> list[tuple[str, str]]:

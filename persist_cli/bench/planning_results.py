@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from persist_cli.bench.episodes import Episode
+from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.navigation_metrics import SUCCESS_METRES
 from persist_cli.bench.plan_bench import PlanningBench
 from persist_cli.bench.rows import NO_MEMORY, SIMULATOR, PlanningRow
@@ -23,44 +24,36 @@ VERSION: Final = 1
 
 
 @dataclass(frozen=True)
-class Column:
-    """A figure of the tables.
+class Column(FigureColumn):
+    """A figure of the tables, of one of the loops.
 
     Args:
-        title: in the head of its column.
         loop: that it is measured in.
-        better: ``higher``, ``lower``, or ``None`` where neither is.
-        percent: whether it is a share, shown in per cent.
-        definition: what it says, as a sentence without a full stop.
     """
 
-    title: str
     loop: Literal["closed", "open"]
-    better: Literal["higher", "lower"] | None
-    percent: bool
-    definition: str
 
 
 COLUMNS: Final = {
     "success": Column(
-        "success", "closed", "higher", True, f"the agent stopped within {SUCCESS_METRES:g} m (geodesic) of the goal"
+        "success", "higher", True, f"the agent stopped within {SUCCESS_METRES:g} m (geodesic) of the goal", "closed"
     ),
-    "spl": Column("SPL", "closed", "higher", True, "S · l / max(l, p): S success, l shortest way, p its way, metres"),
-    "soft_spl": Column("SoftSPL", "closed", "higher", True, "max(0, 1 − d / l) · l / max(l, p): d metres left"),
-    "reached": Column("reached", "closed", "higher", True, f"it was within {SUCCESS_METRES:g} m at any time"),
-    "end_metres": Column("metres left", "closed", "lower", False, "geodesic metres to the goal at the end"),
-    "collisions": Column("collisions", "closed", "lower", False, "actions that the scene refused, an episode"),
-    "collisions_per_action": Column("collisions/action", "closed", "lower", True, "these by all actions"),
-    "actions": Column("actions", "closed", None, False, "actions an episode, refused ones included"),
-    "decisions": Column("decisions", "closed", None, False, "plans an episode"),
-    "frames_per_decision": Column("frames/decision", "closed", None, False, "frames imagined for a plan"),
-    "seconds_per_decision": Column("s/decision", "closed", "lower", False, "seconds that a plan took"),
-    "ate": Column("ATE", "open", "lower", False, "root mean square of metres to the shortest way, pose by pose"),
-    "rpe": Column("RPE", "open", "lower", False, "the same of translations from one pose to the next, metres"),
-    "sim": Column("SIM", "open", "higher", False, "100 · cos(f(v), f(g)): v true view at the plan's end, g goal image"),
-    "lpips": Column("LPIPS", "open", "lower", False, "LPIPS-Alex of v and g"),
-    "open_collisions": Column("open collisions", "open", "lower", False, "actions of the plan that the scene refused"),
-    "open_seconds": Column("s/plan", "open", "lower", False, "seconds that the plan took"),
+    "spl": Column("SPL", "higher", True, "S · l / max(l, p): S success, l shortest way, p its way, metres", "closed"),
+    "soft_spl": Column("SoftSPL", "higher", True, "max(0, 1 − d / l) · l / max(l, p): d metres left", "closed"),
+    "reached": Column("reached", "higher", True, f"it was within {SUCCESS_METRES:g} m at any time", "closed"),
+    "end_metres": Column("metres left", "lower", False, "geodesic metres to the goal at the end", "closed"),
+    "collisions": Column("collisions", "lower", False, "actions that the scene refused, an episode", "closed"),
+    "collisions_per_action": Column("collisions/action", "lower", True, "these by all actions", "closed"),
+    "actions": Column("actions", None, False, "actions an episode, refused ones included", "closed"),
+    "decisions": Column("decisions", None, False, "plans an episode", "closed"),
+    "frames_per_decision": Column("frames/decision", None, False, "frames imagined for a plan", "closed"),
+    "seconds_per_decision": Column("s/decision", "lower", False, "seconds that a plan took", "closed"),
+    "ate": Column("ATE", "lower", False, "root mean square of metres to the shortest way, pose by pose", "open"),
+    "rpe": Column("RPE", "lower", False, "the same of translations from one pose to the next, metres", "open"),
+    "sim": Column("SIM", "higher", False, "100 · cos(f(v), f(g)): v true view at the plan's end, g goal image", "open"),
+    "lpips": Column("LPIPS", "lower", False, "LPIPS-Alex of v and g", "open"),
+    "open_collisions": Column("open collisions", "lower", False, "actions of the plan that the scene refused", "open"),
+    "open_seconds": Column("s/plan", "lower", False, "seconds that the plan took", "open"),
 }  # fmt: skip
 
 

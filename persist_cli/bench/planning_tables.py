@@ -5,58 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from persist_cli.bench.figure_text import markdown_table
 from persist_cli.bench.plan_bench import LOOPS
 from persist_cli.bench.planning_results import COLUMNS
 from persist_cli.viewing.console import print_table, say
 
 SHORT: Final = ("success", "spl", "soft_spl", "reached", "collisions", "seconds_per_decision", "ate", "rpe", "sim")
 
-MISSING: Final = "n/a"
-
-
-def cell(figure: Mapping[str, Any] | None, name: str, interval: bool = True) -> str:
-    """Return the text of a figure, with its interval where it has one."""
-    if figure is None or figure["mean"] is None:
-        return MISSING
-    text = amount(figure["mean"], name)
-    if not interval or figure["low"] is None:
-        return text
-    return f"{text} [{amount(figure['low'], name)}, {amount(figure['high'], name)}]"
-
-
-def gap(difference: Mapping[str, Any] | None, name: str) -> str:
-    """Return the text of a paired difference, starred where its interval leaves zero out."""
-    if difference is None or difference["mean"] is None:
-        return MISSING
-    text = amount(difference["mean"], name, sign=True)
-    if difference["low"] is None:
-        return text
-    star = "*" * (difference["low"] > 0 or difference["high"] < 0)
-    return f"{text}{star} [{amount(difference['low'], name, True)}, {amount(difference['high'], name, True)}]"
-
-
-def amount(value: float, name: str, sign: bool = False) -> str:
-    """Return a number as the column shows it."""
-    if COLUMNS[name].percent:
-        return f"{100 * value:{'+' * sign}.0f} %"
-    return f"{value:{'+' * sign}.2f}" if abs(value) < 10 else f"{value:{'+' * sign}.1f}"
-
-
-def heading(name: str) -> str:
-    """Return the head of a column, with an arrow to what is better."""
-    arrow = {"higher": " ↑", "lower": " ↓", None: ""}[COLUMNS[name].better]
-    return f"{COLUMNS[name].title}{arrow}"
-
 
 def columns_of(table: Mapping[str, Any], names: Sequence[str]) -> list[str]:
     """Return those of some columns that a row of the table has."""
     return [name for name in names if any(name in row for row in table["rows"].values())]
-
-
-def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def counted(table: Mapping[str, Any]) -> str:
@@ -74,13 +33,27 @@ def group_text(table: Mapping[str, Any]) -> str:
     parts = [f"## {table['name']} ({counted(table)})"]
     for loop in LOOPS:
         names = columns_of(table, loop_columns(loop))
-        rows = [[row, *(cell(figures.get(name), name) for name in names)] for row, figures in table["rows"].items()]
+        rows = [
+            [row, *(COLUMNS[name].cell(figures.get(name)) for name in names)] for row, figures in table["rows"].items()
+        ]
         if names:
-            parts.append(markdown_table([f"row ({loop} loop)", *map(heading, names)], rows))
+            parts.append(markdown_table([f"row ({loop} loop)", *(COLUMNS[name].heading for name in names)], rows))
     differences = difference_rows(table)
     if differences:
-        parts.append(markdown_table(["difference", *map(heading, difference_columns(table))], differences))
+        parts.append(
+            markdown_table(["difference", *(COLUMNS[name].heading for name in difference_columns(table))], differences)
+        )
     return "\n\n".join(parts)
+
+
+def row_cells(table: Mapping[str, Any], names: Sequence[str]) -> list[list[str]]:
+    """Return the name and the figures of each row."""
+    return [[row, *(COLUMNS[name].cell(figures.get(name)) for name in names)] for row, figures in table["rows"].items()]
+
+
+def headings(names: Sequence[str]) -> list[str]:
+    """Return the heads of some columns."""
+    return [COLUMNS[name].heading for name in names]
 
 
 def difference_columns(table: Mapping[str, Any]) -> list[str]:
@@ -95,7 +68,7 @@ def difference_rows(table: Mapping[str, Any]) -> list[list[str]]:
         others = dict.fromkeys(other for figure in figures.values() for other in figure["differences"])
         for other in others:
             gaps = [figures.get(name, {}).get("differences", {}).get(other) for name in difference_columns(table)]
-            texts = [gap(value, name) for value, name in zip(gaps, difference_columns(table), strict=True)]
+            texts = [COLUMNS[name].gap(value) for value, name in zip(gaps, difference_columns(table), strict=True)]
             rows.append([f"{row} − {other}", *texts])
     return rows
 
@@ -105,7 +78,7 @@ def success_rows(results: Mapping[str, Any], name: str = "success") -> tuple[lis
     kinds = [table for table in results["tables"] if table["bin"] is not None and table["in_sight"] is not None]
     heads = [f"{table['bin']} {'in sight' if table['in_sight'] else 'hidden'}" for table in kinds]
     rows = [
-        [row["name"], *(cell(table["rows"][row["name"]].get(name), name, interval=False) for table in kinds)]
+        [row["name"], *(COLUMNS[name].cell(table["rows"][row["name"]].get(name), interval=False) for table in kinds)]
         for row in results["rows"]
     ]
     return ["row", *heads], rows
@@ -136,8 +109,8 @@ def print_results(results: Mapping[str, Any]) -> None:
     """Print the table over all episodes, and success by kind of goal."""
     table = results["tables"][0]
     names = columns_of(table, SHORT)
-    rows = [[row, *(cell(figures.get(name), name) for name in names)] for row, figures in table["rows"].items()]
-    print_table(f"Plans, {counted(table)}", ["row", *map(heading, names)], rows)
+    rows = [[row, *(COLUMNS[name].cell(figures.get(name)) for name in names)] for row, figures in table["rows"].items()]
+    print_table(f"Plans, {counted(table)}", ["row", *(COLUMNS[name].heading for name in names)], rows)
     if "closed" in results["settings"]["loops"]:
         print_table("Success by actions of the shortest way", *success_rows(results))
     for line in results["settings"]["stop"]:
