@@ -9,11 +9,12 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
-from persist_cli.api.cells import CellGrid
+from persist_cli.api.cells import SOLID, CellGrid
 from persist_cli.api.geometry import camera_rays
 
 KEPT_SHARE = 0.8  # of the rays: as soon as fewer go on, the others are dropped
 ALONG = 1e-12  # cells: a ray that moves less along an axis moves along it by as much
+SHEETS = ("floor", "ceiling")  # classes whose surface is the middle plane of their cells
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,11 @@ class Surfaces:
 
 
 def first_surfaces(
-    grid: CellGrid, cameras: Cameras, layers: int = 1, opaque: Bool[Tensor, "first second level"] | None = None
+    grid: CellGrid,
+    cameras: Cameras,
+    layers: int = 1,
+    opaque: Bool[Tensor, "first second level"] | None = None,
+    sheets: Bool[Tensor, "first second level"] | None = None,
 ) -> Surfaces:
     """Return the first surfaces along the ray of every pixel.
 
@@ -57,20 +62,43 @@ def first_surfaces(
         layers: most surfaces of a ray.
         opaque: which cells can be seen; by default ``grid.solid``, so that unknown cells are clear. Cells of
             one class beside each other are one thing.
+        sheets: cells whose surface is the middle plane of their level, as ``sheet_cells`` finds them; without it all
+            surfaces are the faces of cells.
     """
     things = torch.where(grid.solid if opaque is None else opaque, grid.classes.long() + 1, 0)
-    start, direction = _rays_in_cells(grid, cameras)
-    depth, cells = trace(things, start, direction, layers)
+    start, direction = _rays_in_cells(grid, cameras.to(things.device))
+    depth, cells = trace(things, start, direction, layers, sheets)
     size = layers, len(cameras), cameras.height, cameras.width
     return Surfaces(depth.reshape(size), cells.reshape(size))
+
+
+def sheet_cells(grid: CellGrid, floor: int) -> Bool[Tensor, "first second level"]:
+    """Return which cells are a thin floor or ceiling in the middle of the cell, as those of houses are.
+
+    They are known by their class. A solid cell without a known class is one where nothing stands on it at the height of
+    the floor.
+
+    Args:
+        grid: the cells.
+        floor: number of the floor's level.
+    """
+    solid = grid.solid
+    named = [number for number, name in enumerate(grid.form.palette) if name in SHEETS]
+    sheets = torch.isin(grid.classes, grid.classes.new_tensor(named)) & solid
+    level = floor - grid.corner[2]
+    if 0 <= level < grid.shape[2]:
+        below = solid[:, :, level] & (grid.classes[:, :, level] == SOLID)
+        sheets[:, :, level] |= below if level + 1 == grid.shape[2] else below & ~solid[:, :, level + 1]
+    return sheets
 
 
 def _rays_in_cells(
     grid: CellGrid, cameras: Cameras
 ) -> tuple[Float[Tensor, "3 frame*height*width"], Float[Tensor, "3 frame*height*width"]]:
     """Return starts and directions of all rays; cell n of the grid reaches from n to n + 1, and 1 is a metre of z."""
-    cells_from_world = grid.axes / grid.form.size
-    centers = cameras.centers.double() @ cells_from_world.T + 0.5 - torch.tensor(grid.corner, dtype=torch.float64)
+    cells_from_world = grid.axes.to(cameras.centers.device) / grid.form.size
+    centers = cameras.centers.double() @ cells_from_world.T + 0.5
+    centers = centers - centers.new_tensor(grid.corner)
     rays = torch.einsum("fij,fhwj->fhwi", cameras.world_from_camera.double()[:, :3, :3], camera_rays(cameras))
     starts = centers[:, None, None].expand_as(rays)
     return starts.reshape(-1, 3).T.contiguous(), (rays.reshape(-1, 3) @ cells_from_world.T).T.contiguous()
@@ -81,6 +109,7 @@ def trace(
     start: Float[Tensor, "3 ray"],
     direction: Float[Tensor, "3 ray"],
     layers: int,
+    sheets: Bool[Tensor, "first second level"] | None = None,
 ) -> tuple[Float[Tensor, "layer ray"], Int64[Tensor, "layer ray"]]:
     """Return how many directions long each ray is up to its surfaces, and the cells there; infinity and -1 for none.
 
@@ -89,22 +118,26 @@ def trace(
         start: where rays begin; cell n reaches from n to n + 1.
         direction: their directions in cells.
         layers: most surfaces of a ray.
+        sheets: cells whose surface is their middle plane across the last axis; above and below it they are clear.
     """
     count = start.shape[1]
-    depth = torch.full((layers, count), torch.inf, dtype=torch.float64)
-    cells = torch.full((layers, count), -1, dtype=torch.int64)
+    depth = start.new_full((layers, count), torch.inf)
+    cells = torch.full((layers, count), -1, dtype=torch.int64, device=start.device)
     if 0 in things.shape:
         return depth, cells
     clear_border = torch.nn.functional.pad(things, (1, 1, 1, 1, 1, 1))  # where rays end that leave
-    flat, numbers = clear_border.flatten(), torch.arange(things.numel()).reshape(things.shape)
+    flat, numbers = clear_border.flatten(), torch.arange(things.numel(), device=start.device).reshape(things.shape)
     numbers = torch.nn.functional.pad(numbers, (1, 1, 1, 1, 1, 1), value=-1).flatten()
+    thin = None if sheets is None else torch.nn.functional.pad(sheets, (1, 1, 1, 1, 1, 1)).flatten()
     walk = _Walk.begin(clear_border, start, direction)
     before, found = flat[walk.place] * (walk.now <= 0), torch.zeros_like(walk.ray)
     while len(walk.ray):
-        thing = flat[walk.place]
+        thing, at = flat[walk.place], walk.now
+        if thin is not None:
+            thing, at = walk.across(thin[walk.place], thing)
         new = ((thing != before) & (thing > 0)).nonzero()[:, 0]
         layer, ray = found[new], walk.ray[new]
-        depth[layer, ray], cells[layer, ray] = walk.now[new], numbers[walk.place[new]]
+        depth[layer, ray], cells[layer, ray] = at[new], numbers[walk.place[new]]
         found[new] += 1
         going = walk.advance(found < layers)
         before = thing
@@ -138,7 +171,8 @@ class _Walk:
     @staticmethod
     def begin(bordered: Tensor, start: Float[Tensor, "3 ray"], direction: Float[Tensor, "3 ray"]) -> _Walk:
         """Return the rays that come through the grid inside of a border of one cell, each in its first cell."""
-        shape, strides = torch.tensor(bordered.shape)[:, None] - 2, torch.tensor(bordered.stride())[:, None]
+        shape, strides = (torch.tensor(x, device=start.device)[:, None] for x in (bordered.shape, bordered.stride()))
+        shape = shape - 2
         direction = torch.where(direction.abs() < ALONG, ALONG, direction)
         ends = torch.stack([-start, shape - start]) / direction
         enter, leave = ends.amin(0).amax(0).clamp(min=0), ends.amax(0).amin(0)
@@ -157,6 +191,17 @@ class _Walk:
         self.place = self.place + self.step.gather(0, axis)[0] * going
         self.upcoming = self.upcoming.scatter_add(0, axis, self.period.gather(0, axis))
         return going
+
+    def across(self, sheet: Bool[Tensor, " ray"], thing: Int64[Tensor, " ray"]) -> tuple[Tensor, Tensor]:
+        """Return what is in the cells, where sheets are clear unless crossed, and how long rays are when they meet it.
+
+        Args:
+            sheet: whether a cell is one.
+            thing: what is in each cell.
+        """
+        middle = self.upcoming[2] - self.period[2] / 2
+        missed = sheet & ((middle < self.now) | (middle > self.upcoming.amin(0)))
+        return torch.where(missed, 0, thing), torch.where(sheet, middle, self.now)
 
     def kept(self, rays: Bool[Tensor, " ray"]) -> _Walk:
         """Return some of the rays."""

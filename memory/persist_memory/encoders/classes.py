@@ -1,11 +1,11 @@
-"""The features of a scene's cells: their class and which surface along the ray they are; images are not read."""
+"""The features of a scene's cells: their classes; images are not read."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, UInt8
 from pydantic import PositiveInt
 from torch import Tensor
 
@@ -19,23 +19,21 @@ class ClassesSettings:
 
     Args:
         classes: largest number of classes; the palette of a scene may be shorter.
-        layers: largest number of surfaces along a ray.
     """
 
     classes: PositiveInt = 32
-    layers: PositiveInt = 4
 
 
 class Classes(Encoder):
-    """One-hot features: first the class of a cell, then the layer of the surface, 0 for the nearest along its ray."""
+    """One-hot features of classes, in the order of the scene's palette."""
 
     settings_type = ClassesSettings
     settings: ClassesSettings
 
     @property
     def channels(self) -> int:
-        """The number of classes and layers."""
-        return self.settings.classes + self.settings.layers
+        """The number of classes."""
+        return self.settings.classes
 
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
         """Raise ``CheckpointError``, since images have no classes."""
@@ -44,17 +42,6 @@ class Classes(Encoder):
             "take another encoder, such as patches, or the memory scene"
         )
 
-    def features(
-        self, classes: UInt8[Tensor, " token"], layers: Int64[Tensor, " token"]
-    ) -> Float[Tensor, "token channel"]:
-        """Return the features of surfaces.
-
-        Args:
-            classes: class of each surface's cell.
-            layers: which surface along its ray it is, from 0.
-        """
-        features = torch.zeros(len(classes), self.channels, device=classes.device)
-        rows = torch.arange(len(classes), device=classes.device)
-        features[rows, classes.long()] = 1.0
-        features[rows, self.settings.classes + layers] = 1.0
-        return features
+    def features(self, classes: UInt8[Tensor, " token"]) -> Float[Tensor, "token channel"]:
+        """Return the features of cells of these classes."""
+        return torch.nn.functional.one_hot(classes.long(), self.channels).float()
