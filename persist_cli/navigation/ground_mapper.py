@@ -129,7 +129,7 @@ class GroundMapper:
         if points.rise > self.body.height or not bool(near.any()):
             return
         places, bottom, origins = positions[near, :2], bottom[near], points.origins.cpu()[near]
-        blocking, observed = bottom > self.body.step_over, origins == Origin.OBSERVED
+        blocking, observed = bottom > self.body.step_over, origins >= Origin.OBSERVED
         for chosen, vote in (
             (blocking & observed, Vote.REMEMBERED_OCCUPIED),
             (~blocking & observed, Vote.REMEMBERED_FREE),

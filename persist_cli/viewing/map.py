@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.api.cells import CellOrigin
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import MapPoints
-from persist_cli.api.observations import Origin
 from persist_cli.io.files import written_aside
 
 PATH_COLORS = ("#d81b60", "#1e88e5", "#ffb300", "#004d40", "#8e24aa")
@@ -27,6 +27,7 @@ DOTS_ACROSS = 5  # dots along the side of the square that stands for a point
 MOST_DOTS = 900  # dots along the longer side of the picture
 STRIPE = 6  # dots from one stripe of what is imagined to the next
 PALE = (0.85, 0.45)  # share of white in its stripes and between them
+EDITED_COLOR = "#d81b60"  # of the stripes on what was edited, which run the other way
 LONG_SIDE = 8.0  # inches
 ARROW = 0.06  # length as a share of the long side
 Array = np.ndarray[Any, Any]
@@ -43,31 +44,65 @@ def draw_map(
 
     Args:
         points: points of a memory; without any the picture shows the paths alone. The legend says when some of them
-            are imagined.
+            are imagined or edited.
         world_up: unit vector that points up in the world.
         paths: world_from_camera of each path, by the name that the legend shows, or in order without names.
         out: path of the PNG file.
         stops: world_from_camera of where a camera was stopped by something in its way, drawn as crosses.
     """
-    from matplotlib.patches import Patch
 
+    _draw_maps({"": points}, world_up, paths, out, stops)
+
+
+def draw_before_and_after(
+    before: MapPoints,
+    after: MapPoints,
+    world_up: Sequence[float],
+    paths: Mapping[str, Float[Tensor, "frame 4 4"]],
+    out: Path,
+) -> None:
+    """Write a PNG of two maps of one place side by side; arguments as of ``draw_map``."""
+    _draw_maps({"before": before, "after": after}, world_up, paths, out)
+
+
+def _draw_maps(
+    maps: Mapping[str, MapPoints],
+    world_up: Sequence[float],
+    paths: Mapping[str, Float[Tensor, "frame 4 4"]] | Sequence[Float[Tensor, "frame 4 4"]],
+    out: Path,
+    stops: Float[Tensor, "stop 4 4"] | None = None,
+) -> None:
+    """Write a PNG with maps of one place side by side, by their titles."""
     ground = ground_axes(world_up)
     named = dict(paths) if isinstance(paths, Mapping) else {str(number): path for number, path in enumerate(paths)}
     lines = {name: path.detach().cpu().double() for name, path in named.items() if len(path)}
     places = {name: (path[:, :3, 3] @ ground.T).numpy() for name, path in lines.items()}
-    image, extent = paint(points, ground, _ceiling(places))
-    low, high = _limits(extent, places)
-    figure, axes = _begin_figure(image, extent, high - low)
-    for number, (name, place) in enumerate(places.items()):
-        look = _arrow(lines[name], ground, max(high - low))
-        _draw_path(axes, place[:, :2], look, PATH_COLORS[number % len(PATH_COLORS)], name)
-    if stops is not None and len(stops):
-        _draw_stops(axes, (stops[:, :3, 3].detach().cpu().double() @ ground.T).numpy())
-    handles = axes.get_legend_handles_labels()[0] if isinstance(paths, Mapping) else []
-    if _imagined(points).any():
-        handles.append(Patch(facecolor="#b8b8b8", edgecolor="white", hatch="////", label="imagined"))
-    _finish_axes(axes, low, high, handles)
+    painted = [paint(points, ground, _ceiling(places)) for points in maps.values()]
+    corners = [_limits(extent, places) for _, extent in painted]
+    low, high = np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)
+    figure, panels = _begin_figure(painted, high - low)
+    for axes, (title, points) in zip(panels, maps.items(), strict=True):
+        for number, (name, place) in enumerate(places.items()):
+            look = _arrow(lines[name], ground, max(high - low))
+            _draw_path(axes, place[:, :2], look, PATH_COLORS[number % len(PATH_COLORS)], name)
+        if stops is not None and len(stops):
+            _draw_stops(axes, (stops[:, :3, 3].detach().cpu().double() @ ground.T).numpy())
+        handles = axes.get_legend_handles_labels()[0] if isinstance(paths, Mapping) else []
+        _finish_axes(axes, low, high, handles + _origin_handles(points))
+        axes.set_title(title)
     _save(figure, out)
+
+
+def _origin_handles(points: MapPoints) -> list[Any]:
+    """Return what a legend says of points that were not observed."""
+    from matplotlib.patches import Patch
+
+    handles = []
+    if _of_origin(points, CellOrigin.IMAGINED).any():
+        handles.append(Patch(facecolor="#b8b8b8", edgecolor="white", hatch="////", label="imagined"))
+    if _of_origin(points, CellOrigin.EDITED).any():
+        handles.append(Patch(facecolor="#b8b8b8", edgecolor=EDITED_COLOR, hatch="\\\\\\\\", label="edited"))
+    return handles
 
 
 @dataclass(frozen=True)
@@ -105,7 +140,7 @@ def draw_candidates(
     image, extent = paint(points, ground, _ceiling(places))
     target = {} if goal is None else {"goal": (goal.cpu().double()[None] @ ground.T).numpy()}
     low, high = _limits(None, places | target, AROUND)
-    figure, axes = _begin_figure(image, extent, high - low)
+    figure, [axes] = _begin_figure([(image, extent)], high - low)
     ends = [_arrow(path, ground, max(high - low)) for path in paths]
     _draw_costs(figure, axes, [place[:, :2] for place in places.values()], [one.cost for one in candidates])
     _draw_path(axes, places["0"][:, :2], ends[0], PATH_COLORS[0], "chosen")
@@ -132,20 +167,24 @@ def _draw_costs(figure: Any, axes: Any, places: Sequence[Array], costs: Sequence
     figure.colorbar(scale, ax=axes, label="cost", shrink=0.8)
 
 
-def _begin_figure(image: Array | None, extent: tuple[float, float, float, float] | None, size: Array) -> Any:
-    """Return a figure and its axes with the picture of a map, for so many metres across and up."""
+def _begin_figure(
+    painted: Sequence[tuple[Array | None, tuple[float, float, float, float] | None]], size: Array
+) -> tuple[Any, list[Any]]:
+    """Return a figure and its axes, each with the picture of a map, for so many metres across and up."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     width, height = size
     scale = LONG_SIDE / max(width, height)
-    figure = Figure(figsize=(max(3.2, width * scale + 1.0), max(2.6, height * scale + 0.8)), layout="constrained")
+    across = max(3.2, width * scale + 1.0)
+    figure = Figure(figsize=(across * len(painted), max(2.6, height * scale + 0.8)), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_facecolor(UNSEEN)
-    if image is not None:
-        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
-    return figure, axes
+    panels = list(figure.subplots(1, len(painted), squeeze=False)[0])
+    for axes, (image, extent) in zip(panels, painted, strict=True):
+        axes.set_facecolor(UNSEEN)
+        if image is not None:
+            axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
+    return figure, panels
 
 
 def _arrow(path: Float[Tensor, "frame 4 4"], ground: Float[Tensor, "3 3"], side: float) -> Array:
@@ -165,7 +204,8 @@ def paint(
 ) -> tuple[Array | None, tuple[float, float, float, float] | None]:
     """Return the picture of some points, each square in the colour of the highest point under the ceiling.
 
-    Observed points are drawn over imagined ones, and what is imagined is pale with stripes.
+    Observed points are drawn over imagined ones. What is imagined is pale with stripes, and what is edited has coloured
+    stripes.
 
     Args:
         points: points to draw.
@@ -185,23 +225,27 @@ def paint(
     visible = heights <= ceiling
     if not visible.any():
         visible[:] = True
-    imagined = _imagined(points)[visible]
-    order = np.lexsort((heights[visible], ~imagined))
+    origins = points.origins.cpu().numpy()[visible]
+    order = np.lexsort((heights[visible], origins != CellOrigin.IMAGINED))
     colors = points.colors.cpu().numpy()[visible] / 255.0
-    image, extent = _stamp(places[visible][order, :2], np.column_stack([colors, imagined])[order], points.spread)
+    image, extent = _stamp(places[visible][order, :2], np.column_stack([colors, origins])[order], points.spread)
     return _hatched(image), extent
 
 
-def _imagined(points: MapPoints) -> Array:
-    return (points.origins == Origin.IMAGINED).cpu().numpy()
+def _of_origin(points: MapPoints, origin: CellOrigin) -> Array:
+    return (points.origins == origin).cpu().numpy()
 
 
 def _hatched(image: Array) -> Array:
-    """Return RGBA of an image with a fifth channel, whose dots are imagined where that is 1."""
+    """Return RGBA of an image whose fifth channel is the origin of each dot."""
+    from matplotlib.colors import to_rgb
+
     rows, columns = np.indices(image.shape[:2])
-    stripe = np.where((rows + columns) % STRIPE < STRIPE / 2, *PALE)
-    share = (image[..., 4] * stripe)[..., None]
-    return np.concatenate([image[..., :3] * (1 - share) + share, image[..., 3:4]], axis=-1)
+    pale = np.where((rows + columns) % STRIPE < STRIPE / 2, *PALE) * (image[..., 4] == CellOrigin.IMAGINED)
+    edited = ((columns - rows) % STRIPE < STRIPE / 3) & (image[..., 4] == CellOrigin.EDITED)
+    colors = image[..., :3] * (1 - pale[..., None]) + pale[..., None]
+    colors[edited] = to_rgb(EDITED_COLOR)
+    return np.concatenate([colors, image[..., 3:4]], axis=-1)
 
 
 def _stamp(places: Array, values: Array, spread: float) -> tuple[Array, tuple[float, float, float, float]]:

@@ -8,9 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
+from persist_cli.api.cells import CellOrigin
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import MapPoints
-from persist_cli.viewing.map import DrawnCandidate, draw_candidates, draw_map, paint
+from persist_cli.viewing.map import DrawnCandidate, draw_before_and_after, draw_candidates, draw_map, paint
 from tests.support.room_views import room_walk, written_memory
 from tests.support.rooms import UP
 
@@ -55,6 +56,23 @@ def test_what_is_imagined_is_pale_and_striped_and_never_hides_what_was_observed(
     image, _ = paint(mixed, ground_axes(UP), None)
     drawn = {tuple(color) for color in image[image[..., 3] > 0][:, :3].round(2)}
     assert drawn == {(1.0, 0.0, 0.0), (0.85, 0.85, 1.0), (0.45, 0.45, 1.0)}
+
+
+def test_what_is_edited_keeps_its_colour_between_coloured_stripes():
+    cells = points(((0, 0.0, 0), GREEN), ((3, 0, 0), BLUE))
+    cells = replace(cells, origins=torch.tensor([CellOrigin.EDITED, CellOrigin.OBSERVED], dtype=torch.uint8))
+    image, _ = paint(cells, ground_axes(UP), None)
+    drawn = {tuple(color) for color in image[image[..., 3] > 0][:, :3].round(2)}
+    assert drawn == {(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.85, 0.11, 0.38)}
+
+
+def test_two_maps_of_a_place_are_drawn_side_by_side_at_one_scale(tmp_path):
+    before, after = points(((0, 0, 0), RED), ((3, 0, 0), BLUE)), points(((0, 0, 0), RED))
+    draw_before_and_after(before, after, UP, {}, tmp_path / "pair.png")
+    draw_map(before, UP, {}, tmp_path / "one.png")
+    pair, one = Image.open(tmp_path / "pair.png"), Image.open(tmp_path / "one.png")
+    assert pair.width == pytest.approx(2 * one.width, abs=2)
+    assert pair.height == one.height
 
 
 def test_a_map_without_imagined_points_looks_as_before_and_has_no_legend_for_them(tmp_path):
