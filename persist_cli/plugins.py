@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from persist_cli.api.memory import FrameOfReference, Memory
     from persist_cli.api.policy import Policy
     from persist_cli.api.policy_network import PolicyNetwork
+    from persist_cli.api.scene_model import SceneModel
     from persist_cli.api.simulator import Simulator
 
 
@@ -251,6 +252,11 @@ def network_type(policy: str) -> type[PolicyNetwork]:
 def make_cost(name: str, settings: dict[str, Any]) -> Cost:
     """Make the cost of a name with plain settings."""
     return _make("cost", name, settings)  # type: ignore[no-any-return]
+
+
+def make_scene_model(name: str, settings: dict[str, Any]) -> SceneModel:
+    """Make the model of scenes of a name with plain settings and fresh weights."""
+    return _make("scene model", name, settings)  # type: ignore[no-any-return]
 
 
 def make_settings(kind: str, name: str, settings: dict[str, Any]) -> Any:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 CARD: Final = "persist.json"
 POLICY_CARD: Final = "policy.json"  # of a trained policy, which is no world model
+SCENE_CARD: Final = "scene.json"  # of a trained model of scenes, which is none either
 WEIGHTS: Final = ".safetensors"
 VERSION: Final = 1
 STEP: Final = "step-"  # start of the names of the folders of a run's checkpoints
@@ -291,6 +292,8 @@ def read_card(folder: Path) -> dict[str, Any]:
     path = folder / CARD
     if (folder / POLICY_CARD).is_file() and not path.is_file():
         raise CheckpointError(f"{run_folder(folder)}: a trained policy, no world model; name it as --policy")
+    if (folder / SCENE_CARD).is_file() and not path.is_file():
+        raise CheckpointError(f"{run_folder(folder)}: a model of scenes, no world model; a memory 'scene' takes it")
     check_sums(folder, lambda name: not name.endswith(WEIGHTS))
     card = read_json(path)
     if not isinstance(card, dict) or card.get("format") != "persist-checkpoint":
@@ -363,7 +366,7 @@ def _model_folders(place: Path) -> list[Path]:
 
 def _own_folder(place: Path) -> Path | None:
     """Return the folder with the card of the place itself, which may be the ``step-…`` folder around it."""
-    cards = (CARD, POLICY_CARD)  # the latter is refused when it is read
+    cards = (CARD, POLICY_CARD, SCENE_CARD)  # the latter two are refused when they are read
     return next(
         (folder for folder in (place, place / "model") if any((folder / card).is_file() for card in cards)), None
     )

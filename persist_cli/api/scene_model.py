@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from pathlib import Path
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int64, UInt8
 from torch import Tensor, nn
 
 from persist_cli.api.cells import CellForm
-from persist_cli.api.stages import ParameterGroup
+from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.io.settings import NoSettings
 
 
@@ -115,7 +115,7 @@ class SceneModel(nn.Module, ABC):
         """The windows that it knows."""
 
     @abstractmethod
-    def forward(self, samples: SceneSamples, stage: str) -> dict[str, Tensor]:
+    def forward(self, samples: SceneSamples, stage: Stage) -> dict[str, Tensor]:
         """Return scalar tensors of one training step by name; ``"loss"`` is minimised, the others are logged.
 
         Args:
@@ -137,20 +137,23 @@ class SceneModel(nn.Module, ABC):
         """
 
     @abstractmethod
-    def trained_parameters(self, stage: str) -> dict[str, nn.Parameter]:
-        """Return the parameters that a stage trains, by name."""
+    def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
+        """Freeze all parameters that the stage does not train, and return the others by name."""
+
+    def finish_stage(self, stage: Stage, batches: Iterable[SceneSamples]) -> None:
+        """Measure on some batches what training does not learn, such as a scale; nothing by default."""
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """Return every parameter in exactly one group, in the order of a table for people."""
         return [ParameterGroup("scene", dict(self.named_parameters()))]
 
     @abstractmethod
-    def save(self, folder: Path) -> None:
-        """Write the weights into an existing folder, as safetensors and JSON files only."""
+    def save(self, folder: Path, stage: Stage) -> None:
+        """Write what the stages up to this one trained into an existing folder, as safetensors and JSON files only."""
 
     @abstractmethod
-    def load(self, folder: Path) -> None:
-        """Load the weights that ``save`` wrote; the model may be on the meta device.
+    def load(self, folder: Path, stage: Stage) -> None:
+        """Load what ``save`` wrote for a stage; the model may be on the meta device, whose other parts stay there.
 
         Raises:
             CheckpointError: when a file is missing or corrupt, or a tensor has another shape.

@@ -1,4 +1,4 @@
-"""The stages of training a backbone and their options: parameter groups, memory savings and LoRA."""
+"""The stages of training and their options: parameter groups, memory savings and LoRA."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import torch
 from pydantic import Field
 from torch import nn
 
-Stage = Literal["codec", "1", "2", "policy"]  # the last trains a policy, the others a backbone
+Stage = Literal["codec", "1", "2", "policy", "scene-codec", "scene"]  # of a backbone, a policy, a model of scenes
 STAGES: tuple[Stage, ...] = ("codec", "1", "2")  # of a backbone
+SCENE_STAGES: tuple[Stage, ...] = ("scene-codec", "scene")  # of a model of scenes
 
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Some of a backbone's parameters under a name for people.
+    """Some of a model's parameters under a name for people.
 
     Args:
         name: name of the group, as in tables.
-        parameters: parameters by their names in the backbone.
+        parameters: parameters by their names in the model.
         new: whether they are initialised at random although others are pretrained.
     """
 

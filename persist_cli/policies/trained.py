@@ -5,23 +5,22 @@ A run's folder stands for its newest checkpoint, and the packaged policy for its
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import POLICY_CARD, TrainingScenes, run_folder, step_folders
+from persist_cli.api.checkpoint import POLICY_CARD, TrainingScenes
+from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.errors import CheckpointError
-from persist_cli.io.files import bundled_folder, file_sha256, read_json, write_json
+from persist_cli.io.files import bundled_folder
 from persist_cli.io.settings import parse_settings
 from persist_cli.io.sha256sums import check_sums, write_sums
 from persist_cli.plugins import network_type
 
-FORMAT: Final = "persist-policy"
-VERSION: Final = 1
 PACKAGED: Final = "policy"  # the folder of the policy that comes with the package
 TRAIN: Final = "persist finetune houses-64-policy --data DATA --out runs/policy"
+POLICY: Final = CardKind(POLICY_CARD, "persist-policy", "policy", "trained policy", TRAIN)
 
 
 @dataclass(frozen=True)
@@ -89,11 +88,7 @@ def write_policy_card(folder: Path, policy: str, settings: dict[str, Any], scene
         settings: plain settings of its network.
         scenes: the scenes that it was trained on, where they are known.
     """
-    hashes = "".join(file_sha256(path) for path in sorted(folder.glob("*.safetensors")))
-    fingerprint = hashlib.sha256(hashes.encode()).hexdigest()
-    card: dict[str, Any] = {"format": FORMAT, "version": VERSION, "policy": policy, "fingerprint": fingerprint}
-    lineage = {} if scenes is None else {"training_scenes": scenes.to_json()}
-    write_json(folder / POLICY_CARD, card | {"settings": settings} | lineage)
+    write_card(POLICY, folder, policy, settings, scenes)
 
 
 def find_policy(path: Path) -> TrainedPolicy:
@@ -102,25 +97,15 @@ def find_policy(path: Path) -> TrainedPolicy:
     Raises:
         CheckpointError: when there is none, or its card is damaged.
     """
-    folder = _policy_folder(path)
-    if folder is None:
-        raise CheckpointError(f"{path}: no trained policy there (no {POLICY_CARD}); train one: {TRAIN}")
-    card = read_json(folder / POLICY_CARD)
-    if not isinstance(card, dict) or card.get("format") != FORMAT or card.get("version") != VERSION:
-        raise CheckpointError(f"{folder / POLICY_CARD}: not the card of a trained policy of version {VERSION}")
-    scenes = card.get("training_scenes")
-    try:
-        return TrainedPolicy(
-            folder, run_folder(folder).name, str(card["policy"]), dict(card["settings"]), str(card["fingerprint"]),
-            None if scenes is None else TrainingScenes.from_json(scenes),
-        )  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{folder / POLICY_CARD}: the card is damaged ({error})") from error
+    card = find_card(POLICY, path)
+    return TrainedPolicy(
+        card.folder, card.name, card.plugin, card.settings, card.fingerprint, card.training_scenes
+    )  # fmt: skip
 
 
 def is_policy(path: Path) -> bool:
     """Whether a run or folder is that of a trained policy."""
-    return _policy_folder(path) is not None
+    return card_folder(POLICY, path) is not None
 
 
 def packaged_policy() -> TrainedPolicy:
@@ -133,9 +118,3 @@ def packaged_policy() -> TrainedPolicy:
     if not (folder / POLICY_CARD).is_file():
         raise CheckpointError(f"no trained policy comes with this installation; train one and give its folder: {TRAIN}")
     return find_policy(folder)
-
-
-def _policy_folder(path: Path) -> Path | None:
-    steps = step_folders(path)
-    places = (path, path / "model", *([steps[-1] / "model"] if steps else []))
-    return next((place for place in places if (place / POLICY_CARD).is_file()), None)

@@ -6,10 +6,8 @@ import contextlib
 import json
 from pathlib import Path
 
-from persist_cli.api.checkpoint import CARD, POLICY_CARD, STEP, find_checkpoint
+from persist_cli.api.checkpoint import CARD, POLICY_CARD, SCENE_CARD, STEP, find_checkpoint
 from persist_cli.io.files import read_json
-
-POLICIES = (POLICY_CARD, f"model/{POLICY_CARD}", f"{STEP}*/model/{POLICY_CARD}")  # of a folder, a checkpoint, a run
 
 RESULTS = {  # files that name what a folder is
     "rollout.json": "a rollout: look at sheet.png and the videos in it; rollout.json has its figures",
@@ -27,9 +25,11 @@ def describe_other(path: Path) -> str | None:
         return None
     if path.is_file():
         return _describe_memory(path)
-    policy = next((card for pattern in POLICIES for card in sorted(path.glob(pattern), reverse=True)), None)
-    if policy is not None:
-        return _describe_policy(path, policy)
+    for name, describe in ((POLICY_CARD, _describe_policy), (SCENE_CARD, _describe_scene_model)):
+        patterns = (name, f"model/{name}", f"{STEP}*/model/{name}")  # of a folder, a checkpoint, a run
+        cards = [card for pattern in patterns for card in sorted(path.glob(pattern), reverse=True)]
+        if cards:
+            return describe(path, cards[0])
     if (path / CARD).is_file() or any(path.glob(f"{STEP}*/model")):
         return _describe_checkpoint(path)
     return next((text.format(path=path) for name, text in RESULTS.items() if (path / name).is_file()), None)
@@ -40,6 +40,10 @@ def _describe_policy(path: Path, card: Path) -> str:
         f"a trained policy of {read_json(card).get('policy')!r}, {card.parent}; "
         f"`persist plan --method rank --policy {path}` ranks what it proposes"
     )
+
+
+def _describe_scene_model(path: Path, card: Path) -> str:
+    return f"a trained model of scenes, {card.parent}; a memory `scene` imagines with it: memory.settings.model={path}"
 
 
 def _describe_memory(path: Path) -> str | None:

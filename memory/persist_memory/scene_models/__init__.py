@@ -1,0 +1,1 @@
+"""Models that imagine scenes: they fill windows of cells."""

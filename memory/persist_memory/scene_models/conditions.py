@@ -1,0 +1,190 @@
+"""What the transformer is told: the given cells, the view with its rays, and the action."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from persist_cli.api.cells import COMMON, SOLID
+from persist_cli.api.scene_model import Given, SceneSamples
+from persist_memory.scene_models.codec import (
+    COLORS,
+    cells_of_a_token,
+    channels_first,
+    convolution,
+    every_cell,
+    unfold,
+)
+from persist_memory.scene_models.settings import SceneDiffusionSettings
+
+WAVES = 6  # octaves of sines of a coordinate
+PIXEL = 14  # channels of a pixel: colour, nearness, whether it has depth, origin, direction and point of its ray
+
+
+class GivenCells(nn.Module):
+    """Embeds what is given of the cells of each token.
+
+    Args:
+        settings: sizes of windows and transformer.
+    """
+
+    def __init__(self, settings: SceneDiffusionSettings) -> None:
+        super().__init__()
+        self.settings, self.axes = settings, len(settings.divided)
+        levels = settings.shape[2] if self.axes == 2 else 1
+        kinds, width, edge = len(settings.palette), settings.transformer.width, cells_of_a_token(settings)
+        self.contents = nn.Embedding(1 + 2 * kinds, settings.codec.embedding)  # nothing, each class, each past class
+        kind = convolution(self.axes)
+        self.patches = nn.Sequential(
+            kind(levels * (settings.codec.embedding + COLORS), width, edge, edge),
+            nn.SiLU(),
+            kind(width, width, 3, padding=1),
+        )
+
+    def forward(self, samples: SceneSamples) -> Float[Tensor, "batch token channel"]:
+        """Return an embedding of each token's cells."""
+        kinds, given = len(self.settings.palette), samples.given.int()
+        contents = (1 + samples.classes.int() + kinds * (given == Given.PAST)) * (given != Given.NOTHING)
+        told = (given != Given.NOTHING)[..., None]
+        embedded = self.contents(contents)
+        cells = torch.cat([embedded, samples.colors.to(embedded.dtype) / 255 * told], dim=-1)
+        tokens: Tensor = self.patches(channels_first(cells, self.axes)).flatten(2).transpose(1, 2)
+        return tokens
+
+
+class ViewTokens(nn.Module):
+    """Makes tokens of patches of the view, each with its rays in the window's coordinates.
+
+    Args:
+        settings: sizes of windows, view and transformer.
+    """
+
+    def __init__(self, settings: SceneDiffusionSettings) -> None:
+        super().__init__()
+        patch, width = settings.transformer.view_patch, settings.transformer.width
+        self.patch, self.settings = patch, settings
+        self.patches = nn.Conv2d(PIXEL, width, patch, patch)
+        self.places = nn.Linear(3 * 2 * WAVES, width)
+        self.mixed = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.nothing = nn.Parameter(torch.zeros(width))
+
+    def forward(
+        self, samples: SceneSamples, noise: Float[Tensor, "batch 3 height width"] | None, share: float
+    ) -> Float[Tensor, "batch token channel"]:
+        """Return tokens, row by row.
+
+        Args:
+            samples: their views, depths, poses and intrinsics are read.
+            noise: normal noise of the colours, ``None`` for none.
+            share: of the noise in the colours.
+        """
+        rgb = samples.rgb.permute(0, 3, 1, 2).float() / 127.5 - 1
+        rgb = rgb if noise is None else (1 - share) * rgb + share * noise
+        has_depth = (samples.depth > 0)[:, None].float()
+        origins, directions = self.rays(samples)
+        points = (origins + directions * samples.depth.float()[:, None] / self.unit) * has_depth
+        near = has_depth / (1 + samples.depth.float()[:, None])
+        pixels = torch.cat([rgb, near, has_depth, origins.expand_as(points), directions, points], dim=1)
+        patches = self.patches(pixels).flatten(2).transpose(1, 2)
+        pool = nn.functional.avg_pool2d
+        places = pool(points, self.patch) / pool(has_depth, self.patch).clamp_min(1e-6)
+        tokens = patches + self.places(sines(places.flatten(2).transpose(1, 2).clamp(-2, 2)))
+        mixed: Tensor = tokens + self.mixed(tokens)
+        return mixed
+
+    def without(self, tokens: Tensor, dropped: Bool[Tensor, " batch"]) -> Float[Tensor, "batch token channel"]:
+        """Return tokens that are the same for all places where a sample's view is dropped."""
+        return torch.where(dropped[:, None, None].to(tokens.device), self.nothing, tokens)
+
+    @property
+    def unit(self) -> float:
+        """The metres from the middle of the window to the end of its longest side, which coordinates are given in."""
+        return max(self.settings.shape) * self.settings.cell / 2
+
+    def rays(self, samples: SceneSamples) -> tuple[Float[Tensor, "batch 3 1 1"], Float[Tensor, "batch 3 height width"]]:
+        """Return origins and directions of the rays; a point is origin + direction × depth / unit."""
+        height, width = samples.depth.shape[-2:]
+        poses, lens = samples.window_from_camera.float(), samples.intrinsics.float()
+        middle = (poses.new_tensor(self.settings.shape) - 1) * self.settings.cell / 2
+        rows = torch.arange(height, device=poses.device) + 0.5
+        columns = torch.arange(width, device=poses.device) + 0.5
+        v = ((rows - lens[:, 1, 2, None]) / lens[:, 1, 1, None])[:, :, None].expand(-1, -1, width)
+        u = ((columns - lens[:, 0, 2, None]) / lens[:, 0, 0, None])[:, None].expand(-1, height, -1)
+        directions = torch.einsum("bij,bjhw->bihw", poses[:, :3, :3], torch.stack([u, v, torch.ones_like(u)], dim=1))
+        return ((poses[:, :3, 3] - middle) / self.unit)[..., None, None], directions
+
+
+class ActionEmbedding(nn.Module):
+    """Embeds the action, what is carried, and the pose of the camera, as one vector a sample.
+
+    Args:
+        settings: actions, palette and width.
+    """
+
+    def __init__(self, settings: SceneDiffusionSettings) -> None:
+        super().__init__()
+        width = settings.transformer.width
+        self.settings = settings
+        self.actions = nn.Embedding(1 + len(settings.actions), width)
+        self.carried = nn.Embedding(len(settings.palette), width)
+        self.rest = nn.Linear(COLORS + 9 + 3 * 2 * WAVES, width)
+        self.mixed = nn.Sequential(nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, samples: SceneSamples, origins: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch channel"]:
+        """Return the embeddings.
+
+        Args:
+            samples: their actions, carried things and poses are read.
+            origins: places of the cameras in the window's coordinates.
+        """
+        turned = samples.window_from_camera[:, :3, :3].float().flatten(1)
+        rest = torch.cat([samples.carried_color.float() / 255, turned, sines(origins)], dim=1)
+        told = self.actions(samples.action) + self.carried(samples.carried) + self.rest(rest)
+        mixed: Tensor = self.mixed(told)
+        return mixed
+
+
+def sines(coordinates: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch wave"]:
+    """Return sines and cosines of coordinates, -1…1 along the window, in octaves."""
+    octaves = math.pi / 2 * 2.0 ** torch.arange(WAVES, device=coordinates.device)
+    angles = (coordinates[..., None] * octaves).flatten(-2)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def settled(samples: SceneSamples) -> Bool[Tensor, "batch first second level"]:
+    """Return which cells are given and keep class and colour: of ``SOLID`` ones the class is still to be seen."""
+    return content(samples) & (samples.classes != SOLID)
+
+
+def content(samples: SceneSamples) -> Bool[Tensor, "batch first second level"]:
+    """Return which cells are given and keep what they hold."""
+    return samples.given == Given.CONTENT
+
+
+def known_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Bool[Tensor, "batch token"]:
+    """Return which tokens have settled cells only."""
+    kept = settled(samples) if len(settings.palette) > len(COMMON) else content(samples)
+    return every_cell(kept, len(settings.divided), cells_of_a_token(settings)).flatten(1)
+
+
+def draw_levels(settings: SceneDiffusionSettings, generators: list[torch.Generator]) -> Float[Tensor, "batch token"]:
+    """Draw logit-normal noise levels: in half of the samples one for all tokens, else one for each region."""
+    edge, tokens = settings.transformer.region, settings.tokens
+    regions = [-(-length // edge) for length in tokens]
+    levels = []
+    for generator in generators:
+        drawn = torch.randn(*regions, generator=generator).sigmoid()
+        whole = torch.rand((), generator=generator) < 0.5
+        drawn = drawn.flatten()[:1].expand(math.prod(regions)).reshape(regions) if whole else drawn
+        blocks = drawn[None, None].expand(1, edge ** len(regions), *regions)
+        levels.append(unfold(blocks, edge)[0, 0][tuple(slice(length) for length in tokens)].flatten())
+    return torch.stack(levels)
+
+
+def coordinates_of_tokens(settings: SceneDiffusionSettings) -> Int[Tensor, "token axis"]:
+    """Return row and column (and level) of each token."""
+    steps = [torch.arange(length) for length in settings.tokens]
+    return torch.stack(torch.meshgrid(*steps, indexing="ij"), dim=-1).flatten(0, -2)

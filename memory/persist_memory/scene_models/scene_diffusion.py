@@ -1,0 +1,289 @@
+"""The model of scenes: a codec from cells to latents, and a diffusion transformer that fills windows of them.
+
+Training follows PERSIST (arXiv 2603.03482): rectified flow on velocities, with noise levels of their own for regions,
+so that known places are clean where others are noise. Sampling takes Euler steps. The prediction is decoded after a
+step, given cells are written into it, it is snapped to classes and encoded again.
+
+diffusers has such blocks and Euler steps too, but importing them takes several seconds, and a scene imagines at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor, nn
+
+from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID
+from persist_cli.api.scene_model import SceneForm, SceneModel, SceneSamples
+from persist_cli.api.stages import SCENE_STAGES, ParameterGroup, Stage
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import load_exactly, read_tensors, write_tensors
+from persist_memory.scene_models.codec import SceneCodec, fold, unfold
+from persist_memory.scene_models.conditions import (
+    ActionEmbedding,
+    GivenCells,
+    ViewTokens,
+    content,
+    draw_levels,
+    known_tokens,
+)
+from persist_memory.scene_models.settings import SceneDiffusionSettings
+from persist_memory.scene_models.transformer import SceneTransformer
+
+CODEC, REST = "codec", ("given", "view", "action", "transformer")  # parts of the model, which the stages train
+FILES = {"scene-codec": "codec.safetensors", "scene": "transformer.safetensors"}
+STRUCTURE = (*COMMON, "floor", "ceiling", "wall", "door")  # all other classes are things
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the transformer is told, embedded once for all steps.
+
+    Args:
+        given: of the cells of each token.
+        view: tokens of the view.
+        action: of action and camera.
+    """
+
+    given: Float[Tensor, "batch token channel"]
+    view: Float[Tensor, "batch view channel"]
+    action: Float[Tensor, "batch channel"]
+
+
+class SceneDiffusion(SceneModel):
+    """Fills windows of cells by diffusion in the latents of a codec."""
+
+    settings_type = SceneDiffusionSettings
+    settings: SceneDiffusionSettings
+    weights: Tensor
+
+    def __init__(self, settings: SceneDiffusionSettings) -> None:
+        super().__init__(settings)
+        self.codec = SceneCodec(settings)
+        self.given, self.view = GivenCells(settings), ViewTokens(settings)
+        self.action, self.transformer = ActionEmbedding(settings), SceneTransformer(settings)
+        rare = [1.0 if name in STRUCTURE else settings.codec.furniture_weight for name in settings.palette]
+        self.register_buffer("weights", torch.tensor(rare), persistent=False)
+
+    @property
+    def form(self) -> SceneForm:
+        """The windows of the settings."""
+        return self.settings.form
+
+    def forward(self, samples: SceneSamples, stage: Stage) -> dict[str, Tensor]:
+        """Return the losses of the codec, or of the transformer on the codec's latents."""
+        generators = generators_of(samples)
+        return self._code(samples, generators) if stage == "scene-codec" else self._diffuse(samples, generators)
+
+    def _code(self, samples: SceneSamples, generators: list[torch.Generator]) -> dict[str, Tensor]:
+        """The loss of the codec, each part a mean over cells."""
+        classes, colors = truth(samples)
+        mean, logarithm = (part.float() for part in self.codec.posterior(classes, colors))
+        drawn = mean + (0.5 * logarithm).exp() * noise_like(mean, generators)
+        spread = drawn.detach().flatten(2).std(2)[(...,) + (None,) * self.codec.axes]
+        share = self.settings.codec.noise
+        noisy = (1 - share) * drawn + share * spread * noise_like(mean, generators)
+        logits, predicted = self.codec.read_off(noisy)
+        errors = F.cross_entropy(logits.flatten(0, 3), classes.flatten().long(), reduction="none")
+        weights = self.weights[classes.flatten().int()]
+        cross_entropy = (weights * errors).sum() / weights.sum()
+        solid = is_solid(classes)
+        color_error = ((predicted - colors / 255).abs().mean(-1) * solid).sum() / solid.sum().clamp_min(1)
+        divergence = 0.5 * (mean**2 + logarithm.exp() - 1 - logarithm).sum() / classes.numel()
+        own = self.settings.codec
+        loss = cross_entropy + own.color_weight * color_error + own.kl_weight * divergence
+        wrong = ((logits.detach().argmax(-1) != classes) & solid).sum() / solid.sum().clamp_min(1)
+        return {
+            "loss": loss, "cross_entropy": cross_entropy, "color_error": color_error, "divergence": divergence,
+            "wrong_solid": wrong,
+        }  # fmt: skip
+
+    def _diffuse(self, samples: SceneSamples, generators: list[torch.Generator]) -> dict[str, Tensor]:
+        """The squared error of the velocities of all tokens that are not known."""
+        with torch.no_grad():
+            latents = self.codec.encode(*truth(samples)).float()
+        known = known_tokens(samples, self.settings)
+        levels = draw_levels(self.settings, generators).to(known.device).masked_fill(known, 0.0)
+        noise = noise_like(latents, generators)
+        dropped = torch.cat([torch.rand(1, generator=generator) for generator in generators])
+        told = self.tell(samples, generators, dropped < self.settings.transformer.drop_view)
+        noisy = self._mix(latents, noise, levels, known)
+        velocity = self.transformer(noisy, levels, told.given, told.view, told.action).float()
+        errors = self._tokens(velocity - (noise - latents)).square().mean(-1)
+        unknown = (~known).float()
+        loss = (errors * unknown).sum() / unknown.sum().clamp_min(1)
+        return {"loss": loss, "known_tokens": known.float().mean()}
+
+    def tell(self, samples: SceneSamples, generators: list[torch.Generator], dropped: Bool[Tensor, " batch"]) -> Told:
+        """Return the embedded conditions.
+
+        Args:
+            samples: the conditions.
+            generators: of the samples' noise, in training and in sampling alike.
+            dropped: whose view is left out.
+        """
+        share = self.settings.transformer.condition_noise
+        colors = torch.empty(len(samples.rgb), 3, *samples.depth.shape[-2:], device=samples.rgb.device)
+        view = self.view(samples, noise_like(colors, generators), share)
+        action = self.action(samples, self.view.rays(samples)[0][:, :, 0, 0])
+        return Told(self.given(samples), self.view.without(view, dropped), action)
+
+    @torch.no_grad()
+    def sample(
+        self, samples: SceneSamples, steps: int
+    ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
+        """Return classes and colours of all cells; see ``SceneModel.sample``."""
+        generators, own = generators_of(samples), self.settings.sampling
+        known = known_tokens(samples, self.settings)
+        held = clean = self.codec.encode(*start(samples))  # what known tokens hold
+        rest = noise = noise_like(clean, generators)
+        told, fixed = self._tell_guided(samples, generators), self._places(known.float()).bool()
+        for step, (level, following) in enumerate(pairwise(noise_levels(steps, own.shift)), start=1):
+            of_tokens = torch.full(known.shape, level, device=known.device).masked_fill(known, 0.0)
+            latents = self._mix(held.where(fixed, clean), noise.where(fixed, rest), of_tokens, known)
+            velocity = self._velocity(latents, of_tokens, told)
+            clean, rest = latents - level * velocity, latents + (1 - level) * velocity
+            if own.snap_every and step % own.snap_every == 0 and following <= own.snap_below:
+                held = clean = self.codec.encode(*self._snapped(held.where(fixed, clean), samples))
+        return self._snapped(held.where(fixed, clean), samples)
+
+    def _velocity(self, latents: Tensor, levels: Tensor, told: tuple[Told, Told | None]) -> Tensor:
+        """The velocities, away from those without a view where guidance is on."""
+        seen, unseen = told
+        velocity: Tensor = self.transformer(latents, levels, seen.given, seen.view, seen.action).float()
+        if unseen is None:
+            return velocity
+        plain: Tensor = self.transformer(latents, levels, unseen.given, unseen.view, unseen.action).float()
+        return plain + self.settings.sampling.guidance * (velocity - plain)
+
+    def _tell_guided(self, samples: SceneSamples, generators: list[torch.Generator]) -> tuple[Told, Told | None]:
+        """The conditions, and those without a view where guidance is on."""
+        everyone = torch.ones(len(samples.given), dtype=torch.bool)
+        seen = self.tell(samples, generators, ~everyone)
+        if self.settings.sampling.guidance == 1:
+            return seen, None
+        return seen, Told(seen.given, self.view.without(seen.view, everyone), seen.action)
+
+    def _mix(
+        self,
+        clean: Float[Tensor, "batch channel *latent"],
+        noise: Float[Tensor, "batch channel *latent"],
+        levels: Float[Tensor, "batch token"],
+        known: Bool[Tensor, "batch token"],
+    ) -> Float[Tensor, "batch channel *latent"]:
+        """Latents at noise levels, known ones with the noise of conditions."""
+        share = self._places(levels.masked_fill(known, self.settings.transformer.condition_noise))
+        return (1 - share) * clean + share * noise
+
+    def _places(self, of_tokens: Float[Tensor, "batch token"]) -> Float[Tensor, "batch 1 *latent"]:
+        """A value of each token as one of each latent."""
+        patch, tokens = self.settings.transformer.patch, self.settings.tokens
+        values = of_tokens.unflatten(1, tokens)[:, None]
+        return unfold(values.expand(-1, patch ** len(tokens), *[-1] * len(tokens)), patch)
+
+    def _tokens(self, latents: Float[Tensor, "batch channel *latent"]) -> Float[Tensor, "batch token folded"]:
+        return fold(latents, self.settings.transformer.patch).flatten(2).transpose(1, 2)
+
+    def _snapped(
+        self, latents: Float[Tensor, "batch channel *latent"], samples: SceneSamples
+    ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
+        """Decode latents to the likeliest class of each cell, and write what is given into it."""
+        logits, colors = self.codec.decode(latents)
+        kept, named = content(samples), len(self.settings.palette) > len(COMMON)
+        if named:
+            logits[..., SOLID] = -torch.inf
+        classes = logits.argmax(-1).to(torch.uint8)
+        logits[..., [FREE, OUTSIDE]] = -torch.inf
+        told = samples.classes
+        if named:  # of a cell that is only known to be solid, the likeliest thing that it can be
+            told = torch.where(told == SOLID, logits.argmax(-1).to(torch.uint8), told)
+        classes = torch.where(kept, told, classes)
+        colors = (colors.clamp(0, 1) * 255).round().to(torch.uint8) * is_solid(classes)[..., None]
+        return classes, torch.where(kept[..., None], samples.colors, colors)
+
+    def finish_stage(self, stage: Stage, batches: Iterable[SceneSamples]) -> None:
+        """Measure the mean and deviation of the latents after the codec's stage."""
+        if stage == "scene-codec":
+            with torch.no_grad():
+                self.codec.measure([self.codec.posterior(*truth(batch))[0] for batch in batches])
+
+    def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
+        """Freeze all parameters that the stage does not train, and return the others by name."""
+        self.requires_grad_(False)
+        for name in (CODEC,) if stage == "scene-codec" else REST:
+            self.get_submodule(name).requires_grad_(True)
+        return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """Return the parameters by the parts of the model."""
+        return [
+            ParameterGroup(part, {f"{part}.{name}": value for name, value in module.named_parameters()})
+            for part, module in ((part, self.get_submodule(part)) for part in (CODEC, *REST))
+        ]
+
+    def save(self, folder: Path, stage: Stage) -> None:
+        """Write the codec, and after its stage the rest, each into a safetensors file."""
+        for trained in stages_to(stage):
+            write_tensors(folder / FILES[trained], self._tensors_of(trained))
+
+    def load(self, folder: Path, stage: Stage) -> None:
+        """Load the codec, and for the last stage the rest."""
+        for trained in stages_to(stage):
+            path = folder / FILES[trained]
+            load_exactly(self, read_tensors(path)[0], set(self._tensors_of(trained)), path)
+        if self.weights.is_meta:
+            self.weights = type(self)(self.settings).weights
+
+    def _tensors_of(self, stage: Stage) -> dict[str, Tensor]:
+        parts = (CODEC,) if stage == "scene-codec" else REST
+        return {name: tensor for name, tensor in self.state_dict().items() if name.partition(".")[0] in parts}
+
+
+def stages_to(stage: Stage) -> tuple[Stage, ...]:
+    """Return the stages up to this one."""
+    return SCENE_STAGES[: SCENE_STAGES.index(stage) + 1]
+
+
+def generators_of(samples: SceneSamples) -> list[torch.Generator]:
+    """Return a CPU generator for each sample, so that a sample does not depend on its batch or device."""
+    return [torch.Generator().manual_seed(int(seed)) for seed in samples.seeds]
+
+
+def noise_like(values: Tensor, generators: list[torch.Generator]) -> Tensor:
+    """Draw normal noise, each sample from its own generator, float32."""
+    drawn = [torch.randn(values.shape[1:], generator=generator) for generator in generators]
+    return torch.stack(drawn).to(values.device)
+
+
+def noise_levels(steps: int, shift: float) -> list[float]:
+    """Return the noise levels of so many Euler steps, from 1 to 0; a shift above 1 moves them up."""
+    even = [1 - step / steps for step in range(steps + 1)]
+    return [shift * level / (1 + (shift - 1) * level) for level in even]
+
+
+def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
+    """Return the true classes and colours.
+
+    Raises:
+        CheckpointError: when the samples have none.
+    """
+    if samples.true_classes is None or samples.true_colors is None:
+        raise CheckpointError("a model of scenes is trained on samples with true cells, these have none")
+    return samples.true_classes, samples.true_colors
+
+
+def start(samples: SceneSamples) -> tuple[Tensor, Tensor]:
+    """Return what is given, and free cells where nothing is: what sampling knows before its first step."""
+    kept = content(samples)
+    return samples.classes * kept, samples.colors * kept[..., None]
+
+
+def is_solid(classes: UInt8[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
+    """Return which classes are of something."""
+    return (classes != FREE) & (classes != OUTSIDE)

@@ -1,0 +1,112 @@
+"""Trained models of scenes on disk: a folder with a card, ``scene.json``, and the weights.
+
+A run's folder stands for its newest checkpoint, and the name ``scene`` for the model that comes with the package.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from persist_cli.api.checkpoint import SCENE_CARD, TrainingScenes
+from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
+from persist_cli.api.scene_model import SceneModel
+from persist_cli.api.stages import SCENE_STAGES, Stage
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import bundled_folder
+from persist_cli.io.sha256sums import check_sums, write_sums
+from persist_cli.plugins import make_scene_model
+
+PACKAGED: Final = "scene"  # names the model that comes with the package, and its folder
+TRAIN: Final = "persist finetune houses-64-scene --data DATA --out runs/scene base=CODEC_RUN"
+SCENE: Final = CardKind(SCENE_CARD, "persist-scene-model", "scene", "model of scenes", TRAIN)
+
+
+@dataclass(frozen=True)
+class TrainedSceneModel:
+    """A trained model of scenes on disk; its weights are not loaded yet.
+
+    Args:
+        folder: the folder of ``scene.json``.
+        name: the name of the run or folder, which tables show.
+        plugin: the name of its plugin.
+        settings: the plain settings of the model.
+        stage: the last stage that trained it; after ``scene-codec`` it cannot sample yet.
+        fingerprint: a hash of its weights.
+        training_scenes: the scenes that it was trained on; ``None`` where that is not known.
+    """
+
+    folder: Path
+    name: str
+    plugin: str
+    settings: dict[str, Any]
+    stage: Stage
+    fingerprint: str
+    training_scenes: TrainingScenes | None
+
+    def load(self) -> SceneModel:
+        """Return the model with its weights, ready to sample.
+
+        Raises:
+            CheckpointError: when it has only a codec, or a file is missing or damaged, or does not fit.
+        """
+        if self.stage != "scene":
+            raise CheckpointError(f"{self.folder}: the codec of a model of scenes alone; train the rest: {TRAIN}")
+        model = make_scene_model(self.plugin, self.settings)
+        self.load_into(model, "scene")
+        return model.eval()
+
+    def load_into(self, model: SceneModel, stage: Stage) -> None:
+        """Load the weights of the stages up to ``stage`` into a model of these settings.
+
+        Raises:
+            CheckpointError: when a file is missing or damaged, or does not fit.
+        """
+        check_sums(self.folder)
+        model.load(self.folder, stage)
+
+
+def save_scene_model(model: SceneModel, stage: Stage, folder: Path, scenes: TrainingScenes | None) -> None:
+    """Write a model's weights, a card and ``SHA256SUMS`` into an existing folder, which may hold other files.
+
+    Args:
+        model: the model, made by the registry.
+        stage: the stage that trained it.
+        folder: the folder.
+        scenes: the scenes that it was trained on, where they are known.
+    """
+    model.save(folder, stage)
+    write_scene_card(folder, model.name, asdict(model.settings), stage, scenes)
+    write_sums(folder)
+
+
+def write_scene_card(
+    folder: Path, plugin: str, settings: dict[str, Any], stage: Stage, scenes: TrainingScenes | None
+) -> None:
+    """Write the card that makes a folder with weights a trained model of scenes."""
+    write_card(SCENE, folder, plugin, settings, scenes, {"stage": stage})
+
+
+def find_scene_model(path: str | Path) -> TrainedSceneModel:
+    """Return the model in a folder, the newest one of a run, or the packaged one by its name.
+
+    Raises:
+        CheckpointError: when there is none, or its card is damaged.
+    """
+    if str(path) == PACKAGED and not Path(path).exists():
+        path = bundled_folder(PACKAGED)
+        if not (path / SCENE_CARD).is_file():
+            raise CheckpointError(f"no model of scenes comes with this installation; train one: {TRAIN}")
+    card = find_card(SCENE, Path(path))
+    stage = card.values.get("stage")
+    if stage not in SCENE_STAGES:
+        raise CheckpointError(f"{card.folder / SCENE_CARD}: its stage is {stage!r}; known: {', '.join(SCENE_STAGES)}")
+    return TrainedSceneModel(
+        card.folder, card.name, card.plugin, card.settings, stage, card.fingerprint, card.training_scenes
+    )  # fmt: skip
+
+
+def is_scene_model(path: Path) -> bool:
+    """Whether a run or folder is that of a trained model of scenes."""
+    return card_folder(SCENE, path) is not None

@@ -1,0 +1,207 @@
+"""The model of scenes on windows of random rooms: its codec, its diffusion, and what of a window it keeps."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from persist_cli.api.cells import FREE, SOLID
+from persist_cli.api.meta_device import without_weights
+from persist_cli.api.scene_model import Given, SceneSamples
+from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.io.settings import parse_settings
+from persist_cli.plugins import make_scene_model
+from persist_memory.scene_models.codec import fold, unfold
+from persist_memory.scene_models.conditions import draw_levels, known_tokens
+from persist_memory.scene_models.scene_diffusion import SceneDiffusion, generators_of, noise_levels
+from persist_memory.scene_models.settings import SceneDiffusionSettings
+from tests.support.micro_scenes import MICRO_SCENE, micro_model, micro_samples
+from tests.support.random_scenes import PALETTE
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return micro_samples(3)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return micro_model()
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_folding_places_into_channels_can_be_undone(axes):
+    values = torch.arange(2 * 3 * 4**axes).reshape(2, 3, *[4] * axes)
+    folded = fold(values, 2)
+    assert folded.shape == (2, 3 * 2**axes, *[2] * axes)
+    assert unfold(folded, 2).equal(values)
+
+
+def test_a_block_of_cells_becomes_the_channels_of_its_own_latent():
+    values = torch.zeros(1, 1, 4, 4)
+    values[..., 2:, :2] = 1.0
+    assert fold(values, 2)[0, :, 1, 0].equal(torch.ones(4))
+    assert fold(values, 2).sum() == 4
+
+
+@pytest.mark.parametrize("stage", ["scene-codec", "scene"])
+def test_a_loss_does_not_depend_on_how_samples_are_batched(model, samples, stage):
+    one_by_one = [model(SceneSamples.stack([sample]), stage)["loss"] for sample in micro_samples(3, stacked=False)]
+    if stage == "scene":  # all of these views leave every token to be imagined
+        assert torch.stack(one_by_one).mean().allclose(model(samples, stage)["loss"], atol=1e-5)
+    assert model(samples, stage)["loss"].equal(model(samples, stage)["loss"])
+
+
+def test_each_stage_trains_its_own_part_and_all_parts_are_named_once(model, samples):
+    codec, rest = (set(model.trained_parameters(stage)) for stage in ("scene-codec", "scene"))
+    assert not codec & rest
+    names = [name for group in model.parameter_groups() for name in group.parameters]
+    assert sorted(names) == sorted(codec | rest)
+    model(samples, "scene")["loss"].backward()
+    assert all(value.grad is None for name, value in model.named_parameters() if name in codec)
+
+
+def test_the_codec_learns_rooms_and_the_transformer_their_latents(samples):
+    model = micro_model()
+    for stage, steps in (("scene-codec", 35), ("scene", 35)):
+        optimizer = torch.optim.AdamW(model.trained_parameters(stage).values(), 1e-2)
+        losses = []
+        for number in range(steps):
+            batch = replace(samples, seeds=samples.seeds + 3 * number)
+            losses.append(model(batch, stage)["loss"])
+            losses[-1].backward()
+            optimizer.step()
+            optimizer.zero_grad()
+        model.finish_stage(stage, [samples])
+        assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
+    latents = model.codec.encode(samples.true_classes, samples.true_colors).detach()
+    assert latents.transpose(0, 1).flatten(1).std(1).allclose(torch.ones(latents.shape[1]), atol=1e-3)
+
+
+def test_given_cells_come_out_to_the_bit_and_solid_ones_as_something(model, samples):
+    given = samples.given.clone()
+    given[:, :8] = int(Given.CONTENT)  # as of a window beside one that is complete
+    told = torch.where((given > 0) & (samples.given == 0), samples.true_classes, samples.classes)
+    colors = torch.where((given > 0)[..., None], samples.true_colors, 0)
+    classes, painted = model.sample(replace(samples, given=given, classes=told, colors=colors), 2)
+    kept, named = given == Given.CONTENT, told != SOLID
+    assert classes[kept & named].equal(told[kept & named])
+    assert painted[kept].equal(colors[kept])
+    assert (classes[kept & ~named] > 2).all()
+    assert not (classes == SOLID).any()
+
+
+def test_a_sample_follows_from_its_seed_alone(model, samples):
+    first, again = (model.sample(samples, 2) for _ in range(2))
+    assert first[0].equal(again[0])
+    alone = model.sample(SceneSamples.stack(micro_samples(2, stacked=False)[1:]), 2)
+    assert (alone[0][0] == first[0][1]).float().mean() > 0.999  # kernels round differently in batches
+    others = model.sample(replace(samples, seeds=samples.seeds + 9), 2)
+    assert not others[0].equal(first[0])
+
+
+def test_what_is_past_may_change(model, samples):
+    past = torch.full_like(samples.given, int(Given.PAST))
+    classes, _ = model.sample(replace(samples, given=past, classes=samples.true_classes), 1)
+    assert not classes.equal(samples.true_classes)
+    assert not known_tokens(replace(samples, given=past), model.settings).any()
+
+
+def test_true_cells_are_not_read_when_sampling(model, samples):
+    blind = replace(samples, true_classes=None, true_colors=None)
+    assert model.sample(blind, 2)[0].equal(model.sample(samples, 2)[0])
+    with pytest.raises(CheckpointError, match="trained on samples with true cells"):
+        model(blind, "scene")
+
+
+def test_regions_have_noise_levels_of_their_own_in_half_of_the_samples(model):
+    generators = [torch.Generator().manual_seed(seed) for seed in range(200)]
+    levels = draw_levels(model.settings, generators)
+    assert ((levels >= 0) & (levels <= 1)).all()
+    whole = (levels == levels[:, :1]).all(1).float().mean()
+    assert 0.3 < whole < 0.7
+
+
+def test_a_token_is_known_when_all_its_cells_are_settled(model, samples):
+    given = torch.zeros_like(samples.given)
+    given[:, :4, :4] = int(Given.CONTENT)
+    free = replace(samples, given=given, classes=torch.full_like(samples.classes, FREE))
+    assert known_tokens(free, model.settings).sum(1).tolist() == [1, 1, 1]
+    assert not known_tokens(replace(free, classes=torch.full_like(given, SOLID)), model.settings).any()
+
+
+@pytest.mark.parametrize("shift", [1.0, 3.0])
+def test_noise_levels_fall_from_one_to_zero(shift):
+    levels = noise_levels(5, shift)
+    assert (levels[0], levels[-1]) == (1.0, 0.0)
+    assert levels == sorted(levels, reverse=True)
+
+
+def test_guidance_of_one_changes_nothing_and_more_changes_the_sample(samples):
+    guided = micro_model(sampling={"guidance": 3.0})
+    with torch.no_grad():
+        for parameter in guided.transformer.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+    plain = micro_model()
+    plain.load_state_dict(guided.state_dict())
+    assert not guided.sample(samples, 2)[0].equal(plain.sample(samples, 2)[0])
+
+
+def test_heights_are_folded_or_divided_by_configuration(samples):
+    cubes = micro_model(shape=[16, 16, 8], codec=MICRO_SCENE["codec"] | {"fold_levels": False})
+    assert cubes.settings.tokens == (4, 4, 2)
+    classes, _ = cubes.sample(micro_samples(1, cubes.form), 1)
+    assert classes.shape == (1, 16, 16, 8)
+    patches = micro_model(transformer=MICRO_SCENE["transformer"] | {"patch": 2})
+    assert patches.settings.tokens == (2, 2)
+    assert patches.sample(samples, 1)[0].shape == samples.given.shape
+
+
+def test_a_saved_model_is_loaded_to_the_bit_on_the_meta_device_too(model, samples, tmp_path):
+    model.save(tmp_path, "scene")
+    with without_weights():
+        loaded = make_scene_model("scene", asdict(model.settings))
+    loaded.load(tmp_path, "scene")
+    assert loaded.sample(samples, 2)[0].equal(model.sample(samples, 2)[0])
+    assert loaded(samples, "scene-codec")["loss"].equal(model(samples, "scene-codec")["loss"])
+
+
+def test_a_codec_alone_leaves_the_rest_as_it_was(model, tmp_path):
+    model.save(tmp_path, "scene-codec")
+    assert [path.name for path in tmp_path.iterdir()] == ["codec.safetensors"]
+    other = micro_model(seed=1)
+    before = other.transformer.places.clone()
+    other.load(tmp_path, "scene-codec")
+    assert other.codec.classes.weight.equal(model.codec.classes.weight)
+    assert other.transformer.places.equal(before)
+    with pytest.raises(CheckpointError, match=r"transformer.safetensors: no such file"):
+        other.load(tmp_path, "scene")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"palette": ["free", "floor", "wall"]}, "palette must begin with free, solid, outside"),
+        ({"palette": [*PALETTE, "box"]}, "name each class once"),
+        ({"shape": [18, 16, 8]}, "must be multiples of 4"),
+        ({"shape": [16, 16, 6], "codec": {"fold_levels": False}}, "must be multiples of 4"),
+        ({"image": [20, 16]}, "multiples of view_patch 8"),
+        ({"transformer": {"width": 32}}, "must be a multiple of twice the heads"),
+    ],
+)
+def test_sizes_that_do_not_go_together_are_refused(change, message):
+    with pytest.raises(RecipeError, match=message):
+        parse_settings(SceneDiffusionSettings, {"palette": PALETTE} | change, "scene")
+
+
+def test_the_levels_of_a_micro_window_are_seen_from_inside(samples):
+    model = micro_model()
+    origins, directions = model.view.rays(samples)
+    points = origins + directions * samples.depth[:, None] / model.view.unit
+    hits = points.permute(0, 2, 3, 1)[samples.depth > 0]
+    cells = (hits * model.view.unit / 0.25 + (torch.tensor(model.form.shape) - 1) / 2).round()
+    assert ((cells >= 0) & (cells < torch.tensor(model.form.shape))).all()
+    assert isinstance(model, SceneDiffusion)
+    assert len(generators_of(samples)) == 3
