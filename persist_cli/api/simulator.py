@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.observations import Frame, TrajectoryInfo
 
 
@@ -102,6 +103,18 @@ class Simulator(ABC):
     @abstractmethod
     def info(self) -> TrajectoryInfo:
         """The camera, up axis, vocabulary and source of the open scene."""
+
+    @property
+    def cell_form(self) -> CellForm | None:
+        """Size and classes of the cells that ``cells`` gives; ``None`` where this simulator knows no geometry."""
+        return None
+
+    def cells(self) -> CellGrid | None:
+        """Return the open scene as it is now in cells, all of them known; ``None`` without a ``cell_form``.
+
+        The box stays the same as long as the scene is open. What is returned shall not be written to.
+        """
+        return None
 
 
 def random_ground(simulator: Simulator, random: np.random.Generator, tries: int = 500) -> tuple[float, float] | None:

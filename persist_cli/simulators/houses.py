@@ -12,6 +12,7 @@ from functools import cached_property
 
 Ground = tuple[float, float]
 Colour = tuple[float, float, float]
+UP = (0.0, 1.0, 0.0)
 NORTH, EAST, SOUTH, WEST = range(4)
 WALL_HEIGHT = 2.74
 WALL_THICKNESS = 0.2

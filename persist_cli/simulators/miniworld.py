@@ -10,18 +10,19 @@ from typing import Any
 import numpy as np
 
 from persist_cli.api.actions import ActionVocabulary, walking_actions
+from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import AgentSettings, Simulator
 from persist_cli.errors import DataError
 from persist_cli.simulators.building import build_house
-from persist_cli.simulators.houses import Ground, House, Rectangle, Thing, is_clear
+from persist_cli.simulators.house_cells import FORM, structure_cells, with_things
+from persist_cli.simulators.houses import UP, Ground, House, Rectangle, Thing, is_clear
 from persist_cli.simulators.rendering import INSTALL, Renderer, is_installed
 
 GRAIN = 2.0**32  # positions are whole multiples of this part of a metre, so that going back is exact
 STRIDE = 0.1  # metres between the places that are checked along a step
 REACH = 1.5  # metres to a thing that can be picked up or toggled: nearer ones are below the image
 CARRIED_HEIGHT = 0.6  # metres above the floor
-UP = (0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,8 @@ class MiniWorld(Simulator):
         self._walkable: list[Rectangle] = []
         self._things: list[Thing] = []
         self._carried: Thing | None = None
+        self._structure: CellGrid | None = None  # cells of the open house without things
+        self._cells: tuple[list[Thing], CellGrid] | None = None  # with these things
         self._stale = True  # whether the renderer draws an earlier state of the house
         self._ground: Ground = (0.0, 0.0)
         self._start_heading, self._turned = 0.0, 0.0  # radians and degrees to the left
@@ -79,7 +82,7 @@ class MiniWorld(Simulator):
             return MiniWorld(settings)
         world = copy.copy(self)
         world.settings, world.vocabulary = settings, walking_actions(settings.step, settings.turn)
-        world._house, world._carried = None, None
+        world._house, world._carried, world._structure, world._cells = None, None, None, None
         return world
 
     @classmethod
@@ -105,6 +108,7 @@ class MiniWorld(Simulator):
         self._house = build_house(scene)
         self._walkable = self.house.walkable(self.settings.radius)
         self._things, self._carried, self._stale = self.house.things, None, True
+        self._structure, self._cells = None, None
 
     def place(self, ground: tuple[float, float], heading: float) -> None:
         """Put the agent at a free ground position with a heading in radians; it drops what it carries.
@@ -122,8 +126,7 @@ class MiniWorld(Simulator):
     def observe(self) -> Frame:
         """The image, depth and pose of the agent's camera now."""
         if self._stale:
-            carried = [self._carried_thing(self._ground, self._heading)] if self._carried is not None else []
-            self._renderer.load(self.house, [*self._things, *carried])
+            self._renderer.load(self.house, self._things_now())
             self._stale = False
         pose = self._world_from_camera()
         rgb, depth = self._renderer.render(pose[:3, 3].tolist(), pose[:3, 2].tolist(), self.settings.fov)
@@ -190,6 +193,20 @@ class MiniWorld(Simulator):
         )
 
     @property
+    def cell_form(self) -> CellForm:
+        """Cells of 0.25 m, with the kinds of walls and things as classes."""
+        return FORM
+
+    def cells(self) -> CellGrid:
+        """The cells of the open house as it is now, with what the agent carries in front of it."""
+        if self._structure is None:
+            self._structure = structure_cells(self.house)
+        things = self._things_now()
+        if self._cells is None or self._cells[0] != things:
+            self._cells = things, with_things(self._structure, things, self.house.light)
+        return self._cells[1]
+
+    @property
     def _heading(self) -> float:
         return self._start_heading + math.radians(self._turned)
 
@@ -222,6 +239,11 @@ class MiniWorld(Simulator):
         """Whether a carried thing touches neither walls nor other things."""
         between_walls = any(area.contains(carried.ground) for area in self.house.walkable(carried.radius))
         return between_walls and is_clear(carried.ground, carried.radius, things)
+
+    def _things_now(self) -> list[Thing]:
+        """All things of the house where they are, the carried one too."""
+        carried = [self._carried_thing(self._ground, self._heading)] if self._carried is not None else []
+        return [*self._things, *carried]
 
     def _carried_thing(self, ground: Ground, heading: float) -> Thing:
         """The carried thing in front of an agent at this place."""

@@ -59,24 +59,25 @@ class Panel:
 def house_panels(house: House, things: Iterable[Thing]) -> Iterator[Panel]:
     """Every panel of the house, with boxes and tables as they stand now."""
     for room in house.rooms:
-        yield from _shell(room, house.doors)
+        yield from shell_panels(room, house.doors)
         for picture in room.pictures:
-            yield from _picture(room.ground, picture)
+            yield from picture_panels(room.ground, picture)
     for door in house.doors:
-        yield from _doorway(door)
+        yield from doorway_panels(door)
     for thing in things:
         if not thing.is_mesh:
-            yield from _furniture(thing)
+            yield from furniture_panels(thing)
 
 
-def _shell(room: Room, doors: tuple[Door, ...]) -> Iterator[Panel]:
+def shell_panels(room: Room, doors: tuple[Door, ...]) -> Iterator[Panel]:
+    """Floor, ceiling and walls of a room, with the frames around its doorways."""
     yield _level(room.ground, 0.0, room.floor)
     if room.ceiling is not None:
         yield _level(room.ground, WALL_HEIGHT, room.ceiling, down=True)
     for wall, paint in enumerate(room.walls):
         start, end = room.ground.wall(wall)
         position = 0.0
-        for low, high, door in _openings(room.ground, wall, doors):
+        for low, high, door in openings(room.ground, wall, doors):
             yield _upright(start, end, (position, low), (0.0, WALL_HEIGHT), paint)
             yield _upright(start, end, (low, high), (door.height, WALL_HEIGHT), paint)
             yield from _trim(start, end, (low, high), door)
@@ -84,7 +85,7 @@ def _shell(room: Room, doors: tuple[Door, ...]) -> Iterator[Panel]:
         yield _upright(start, end, (position, math.dist(start, end)), (0.0, WALL_HEIGHT), paint)
 
 
-def _openings(ground: Rectangle, wall: int, doors: tuple[Door, ...]) -> list[tuple[float, float, Door]]:
+def openings(ground: Rectangle, wall: int, doors: tuple[Door, ...]) -> list[tuple[float, float, Door]]:
     """Where along the wall its doorways begin and end, left to right."""
     spans = ((door_span(ground, wall, door.passage), door) for door in doors)
     return sorted(((span[0], span[1], door) for span, door in spans if span), key=lambda opening: opening[0])
@@ -100,7 +101,7 @@ def _trim(start: Ground, end: Ground, span: tuple[float, float], door: Door) -> 
     yield _upright(start, end, (low, high), (door.height, top), door.paint)
 
 
-def _doorway(door: Door) -> Iterator[Panel]:
+def doorway_panels(door: Door) -> Iterator[Panel]:
     """Threshold, lintel and jambs between the two faces of a wall, out to the trim's faces."""
     out = FRAME_DEPTH
     passage = door.passage.grown(out, 0.0) if door.along_x else door.passage.grown(0.0, out)
@@ -111,7 +112,8 @@ def _doorway(door: Door) -> Iterator[Panel]:
         yield _upright(start, end, (0.0, math.dist(start, end)), (0.0, door.height), door.paint)
 
 
-def _picture(ground: Rectangle, picture: Picture) -> Iterator[Panel]:
+def picture_panels(ground: Rectangle, picture: Picture) -> Iterator[Panel]:
+    """A picture's front and its four edges."""
     wall_start, wall_end = ground.wall(picture.wall)
     start, end = _moved(wall_start, wall_end, PICTURE_DEPTH)
     span = picture.along - picture.width / 2, picture.along + picture.width / 2
@@ -127,7 +129,8 @@ def _picture(ground: Rectangle, picture: Picture) -> Iterator[Panel]:
         yield Panel(Paint().texture, picture.frame, corners, WHOLE)
 
 
-def _furniture(thing: Thing) -> Iterator[Panel]:
+def furniture_panels(thing: Thing) -> Iterator[Panel]:
+    """The faces of a box or a table as it stands now."""
     width, height, depth = thing.size
     if thing.shape == "box":
         yield from _block(thing, (0.0, 0.0), (width, height, depth), 0.0)
@@ -153,10 +156,10 @@ def _block(thing: Thing, middle: Ground, size: tuple[float, float, float], botto
         faces.append((side, size[0] if corner % 2 == 0 else size[2], y))
     for corners, across, along in faces:
         tiles = WHOLE * np.array([across, along]) / thing.paint.span
-        yield Panel(thing.paint.texture, thing.paint.tint, _placed(corners, thing), tiles)
+        yield Panel(thing.paint.texture, thing.paint.tint, placed(corners, thing), tiles)
 
 
-def _placed(corners: Points, thing: Thing) -> Points:
+def placed(corners: Points, thing: Thing) -> Points:
     """Points of the thing's own axes in the world."""
     cos, sin = math.cos(thing.heading), math.sin(thing.heading)
     x, y, z = corners.T

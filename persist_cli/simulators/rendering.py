@@ -227,7 +227,7 @@ class Renderer:
 
     def _draw_mesh(self, thing: Thing, number: int, shape: Mesh) -> None:
         gl = self._gl
-        scale = min(thing.size[1] / shape.height, thing.radius / shape.radius)
+        scale = mesh_scale(thing, shape)
         gl.glPushMatrix()
         gl.glTranslatef(thing.ground[0], thing.elevation, thing.ground[1])
         gl.glRotatef(math.degrees(thing.heading), 0.0, 1.0, 0.0)
@@ -239,11 +239,17 @@ class Renderer:
 @functools.cache
 def texture(name: str) -> Any:
     """The OpenGL number of one of MiniWorld's textures; ``portraits/7`` is the eighth portrait by name."""
+    return _upload(texture_file(name))
+
+
+@functools.cache
+def texture_file(name: str) -> Path:
+    """The image file of one of MiniWorld's textures."""
     folder = assets() / "textures"
     if name.startswith("portraits/"):
         portraits = sorted((folder / "portraits").glob("*.png"))
-        return _upload(portraits[int(name.removeprefix("portraits/")) % len(portraits)])
-    return _upload(folder / f"{name}.png")
+        return portraits[int(name.removeprefix("portraits/")) % len(portraits)]
+    return folder / f"{name}.png"
 
 
 @functools.cache
@@ -268,10 +274,16 @@ def _upload(path: Path) -> Any:
 
 
 @functools.cache
+def mesh_shape(name: str) -> Mesh:
+    """One of MiniWorld's meshes."""
+    return read_mesh(assets() / "meshes" / f"{name}.obj")
+
+
+@functools.cache
 def mesh(name: str) -> tuple[int, Mesh]:
     """The OpenGL display list of one of MiniWorld's meshes, in the file's units, and the mesh."""
     gl = _graphics()
-    shape = read_mesh(assets() / "meshes" / f"{name}.obj")
+    shape = mesh_shape(name)
     textures = [_upload(part.image) if part.image else texture("white_1") for part in shape.parts]
     number = gl.glGenLists(1)
     gl.glNewList(number, gl.GL_COMPILE)
@@ -279,6 +291,11 @@ def mesh(name: str) -> tuple[int, Mesh]:
         _draw_part(gl, part, image)
     gl.glEndList()
     return number, shape
+
+
+def mesh_scale(thing: Thing, shape: Mesh) -> float:
+    """Metres of a thing for one unit of its mesh's file."""
+    return min(thing.size[1] / shape.height, thing.radius / shape.radius)
 
 
 def _draw_part(gl: Any, part: MeshPart, image: Any) -> None:
