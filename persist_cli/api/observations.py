@@ -14,6 +14,7 @@ from torch import Tensor
 
 from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.cells import CellGrid
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Frame:
         world_from_camera: ``[4, 4]`` float64, OpenCV axes, metres.
         action: name of the agent's action that leads to the next frame; ``None`` at the last.
         timestamp: seconds since any fixed time.
+        cells: the scene as it is at this frame, where that is known; the same box in all frames.
     """
 
     rgb: np.ndarray[Any, Any]
@@ -33,6 +35,7 @@ class Frame:
     world_from_camera: np.ndarray[Any, Any]
     action: str | None = None
     timestamp: float = 0.0
+    cells: CellGrid | None = None
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import itertools
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,8 +21,10 @@ from torch import Tensor
 
 from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses
+from persist_cli.api.cells import CellGrid
 from persist_cli.api.observations import Frame, Observations, Trajectory, TrajectoryInfo
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
+from persist_cli.data.stored_cells import CellBox, encode_cells
 from persist_cli.errors import DataError, nearest_name
 from persist_cli.io.files import ASIDE, written_aside
 
@@ -41,6 +44,7 @@ COLUMNS = pa.schema(
         pa.field("timestamp", pa.float64()),
     ]
 )
+CELLS = pa.field("cells", pa.binary())  # an optional column
 
 
 class Store:
@@ -117,6 +121,32 @@ class TrajectoryFile:
         """
         return read_info(self._metadata.metadata, self.path)
 
+    @property
+    def has_cells(self) -> bool:
+        """Whether the scene's cells are stored with the frames."""
+        return self._cell_box is not None
+
+    def cells(self, frame: int) -> CellGrid:
+        """The scene's cells as they are at a frame, in the box that all frames of the trajectory have.
+
+        Raises:
+            DataError: naming the file, when it has no cells or no such frame, or something in it is damaged.
+        """
+        box = self._cell_box
+        if box is None:
+            raise DataError(
+                f"{self.path}: has no cells of its scene; `persist collect` writes them for simulators that know "
+                "their geometry"
+            )
+        (number,) = self.frame_numbers([frame])
+        groups = range(bisect.bisect_right(self._group_starts, number))
+        with _parquet_errors(self.path), self._open() as file:
+            parts = file.read_row_groups([*groups], columns=[CELLS.name], use_threads=False)[CELLS.name].to_pylist()
+        try:
+            return box.read(parts[: number + 1], self.info.world_up)
+        except ValueError as error:
+            raise DataError(f"{self.path}: the cells of frame {number} are damaged ({error})") from error
+
     def read(self, frames: slice | Sequence[int] = slice(None)) -> Trajectory:
         """Some frames as tensors; only the row groups that hold them are read.
 
@@ -189,6 +219,19 @@ class TrajectoryFile:
         return metadata
 
     @cached_property
+    def _cell_box(self) -> CellBox | None:
+        self.info  # noqa: B018  a damaged header is reported
+        values = json.loads(self._metadata.metadata[METADATA_KEY]).get("cells")
+        if values is None:
+            return None
+        if CELLS.name not in self._metadata.schema.to_arrow_schema().names:
+            raise DataError(f"{self.path}: its column {CELLS.name} is missing")
+        try:
+            return CellBox.from_json(values)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{self.path}: its header is damaged ({type(error).__name__}: {error})") from error
+
+    @cached_property
     def _group_starts(self) -> list[int]:
         """Number of the first frame of each row group."""
         sizes = [self._metadata.row_group(group).num_rows for group in range(self._metadata.num_row_groups)]
@@ -239,37 +282,55 @@ def write_trajectory(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) 
     Args:
         path: a ``.parquet`` file.
         info: camera, up axis, actions and provenance, which hold for every frame.
-        frames: in order; depth that is NaN, negative, infinite or beyond 65.535 m is stored as missing.
+        frames: in order; depth that is NaN, negative, infinite or beyond 65.535 m is stored as missing. Either all or
+            none have cells.
 
     Returns:
         The number of frames.
 
     Raises:
-        DataError: naming the frame whose shape or pose is wrong, for bad intrinsics, and when there is no frame.
+        DataError: naming the frame whose shape, pose or cells are wrong, for bad intrinsics, and when there is no
+            frame.
     """
     check_info(info, str(path))
+    frames = iter(frames)
+    start = next(frames, None)
+    if start is None:
+        raise DataError(f"{path}: a trajectory without frames")
+    form = schema(info, start.cells)
+    rows = _checked_rows(path, info, itertools.chain([start], frames))
     poses: list[Tensor] = []
-    rows: list[dict[str, Any]] = []
-    form = schema(info)
     with written_aside(path) as aside:
         with pq.ParquetWriter(aside, form, compression="none", use_dictionary=False, write_page_checksum=True) as out:
-            for number, frame in enumerate(frames):
-                _check_frame(frame, info, f"{path}: frame {number}")
-                poses.append(torch.from_numpy(np.asarray(frame.world_from_camera, dtype=np.float64)))
-                rows.append(_row(frame))
-                if len(rows) == FRAMES_PER_GROUP:
-                    out.write_table(pa.Table.from_pylist(rows, form))
-                    rows = []
-            if rows:
-                out.write_table(pa.Table.from_pylist(rows, form))
-        if not poses:
-            raise DataError(f"{path}: a trajectory without frames")
+            while group := list(itertools.islice(rows, FRAMES_PER_GROUP)):
+                out.write_table(pa.Table.from_pylist(group, form))
+                poses += [torch.tensor(row["world_from_camera"], dtype=torch.float64).reshape(4, 4) for row in group]
         check_poses(torch.stack(poses), str(path))
     return len(poses)
 
 
-def schema(info: TrajectoryInfo) -> pa.Schema:
-    """The columns with ``info`` as metadata, in a form that Hugging Face ``datasets`` shows as images."""
+def _checked_rows(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) -> Iterator[dict[str, Any]]:
+    """The row of each frame, once it is checked."""
+    before: CellGrid | None = None
+    box: CellBox | None = None
+    for number, frame in enumerate(frames):
+        where = f"{path}: frame {number}"
+        _check_frame(frame, info, where)
+        now = None if frame.cells is None else CellBox.of(frame.cells)
+        if number and now != box:
+            raise DataError(f"{where}: its cells are not in the box of those of frame 0")
+        box = now
+        yield _row(frame) | ({} if frame.cells is None else {CELLS.name: encode_cells(frame.cells, before)})
+        before = frame.cells
+
+
+def schema(info: TrajectoryInfo, cells: CellGrid | None = None) -> pa.Schema:
+    """The columns with ``info`` as metadata, in a form that Hugging Face ``datasets`` shows as images.
+
+    Args:
+        info: camera, up axis, actions and provenance.
+        cells: those of the first frame, where there are any; they get a column, and their box stands in the metadata.
+    """
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -281,8 +342,12 @@ def schema(info: TrajectoryInfo) -> pa.Schema:
         "vocabulary": info.vocabulary.to_json(),
         "source": info.source,
     }
+    columns = COLUMNS
+    if cells is not None:
+        header["cells"], columns = CellBox.of(cells).to_json(), COLUMNS.append(CELLS)
     header["crc32"] = _header_checksum(header)  # pages have checksums of Parquet's, the metadata has none
-    return COLUMNS.with_metadata({METADATA_KEY: json.dumps(header), b"huggingface": json.dumps(_hugging_face_info())})
+    features = _hugging_face_info(cells is not None)
+    return columns.with_metadata({METADATA_KEY: json.dumps(header), b"huggingface": json.dumps(features)})
 
 
 def read_info(metadata: dict[bytes, bytes] | None, path: Path) -> TrajectoryInfo:
@@ -342,7 +407,7 @@ def _parse_header(header: dict[str, Any]) -> TrajectoryInfo:
     )
 
 
-def _hugging_face_info() -> dict[str, Any]:
+def _hugging_face_info(cells: bool) -> dict[str, Any]:
     double = {"dtype": "float64", "_type": "Value"}
     features = {
         "rgb": {"_type": "Image"},
@@ -351,6 +416,8 @@ def _hugging_face_info() -> dict[str, Any]:
         "action": {"dtype": "string", "_type": "Value"},
         "timestamp": double,
     }
+    if cells:
+        features[CELLS.name] = {"dtype": "binary", "_type": "Value"}
     return {"info": {"features": features}}
 
 

@@ -184,5 +184,3 @@ def _numbers_of(ground: Rectangle) -> tuple[Array, Array]:
 def _to_bytes(colors: Array) -> Array:
     """Colours of 0 to 1 as uint8."""
     return np.asarray(np.rint(np.clip(colors, 0.0, 1.0) * 255).astype(np.uint8))
-
-

@@ -40,16 +40,18 @@ Policy = Callable[[Simulator, np.random.Generator, int], ActionStream]
 def walk(simulator: Simulator, policy: Policy, random: np.random.Generator, frames: int) -> Iterator[Frame]:
     """Let a policy walk from where the agent stands, and yield exactly ``frames`` observations.
 
-    Each frame holds the action taken at it, the last none; timestamps count one second an action.
+    Each frame holds the action taken at it, the last none, and the scene's cells where the simulator knows them;
+    timestamps count one second an action.
 
     Raises:
         DataError: when the world refuses every action of the policy.
     """
     actions = policy(simulator, random, frames - 1)
     for number in range(frames - 1):
-        frame = simulator.observe()
+        frame = replace(simulator.observe(), cells=simulator.cells())
         yield replace(frame, action=_next_allowed(simulator, actions, first=number == 0), timestamp=float(number))
-    yield replace(simulator.observe(), action=None, timestamp=float(frames - 1))
+    last = replace(simulator.observe(), cells=simulator.cells())
+    yield replace(last, action=None, timestamp=float(frames - 1))
 
 
 def explore(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from persist_cli.api.observations import Frame
 
@@ -41,7 +42,7 @@ class Look:
         return Look(light, (red, green, blue))
 
     def apply(self, rgb: Array) -> Array:
-        """The uint8 ``[height, width, 3]`` image in this light."""
+        """The uint8 ``[..., 3]`` colours in this light."""
         if self == Look():
             return rgb
         scaled = rgb.astype(np.float32) * (self.light * np.array(self.gains, np.float32))
@@ -95,6 +96,12 @@ def too_steep(depth: Array, intrinsics: Array) -> Array:
 
 
 def sensed(frame: Frame, look: Look, sensor: str, intrinsics: Array, random: np.random.Generator) -> Frame:
-    """The frame as a camera of this look and depth sensor records it; ``exact`` leaves depth as it is."""
+    """The frame as a camera of this look and depth sensor records it, its cells in this look too.
+
+    ``exact`` leaves depth as it is.
+    """
     depth = kinect_depth(frame.depth, intrinsics, random) if sensor == "kinect" else frame.depth
-    return replace(frame, rgb=look.apply(frame.rgb), depth=depth)
+    cells = frame.cells
+    if cells is not None and look != Look():
+        cells = replace(cells, colors=torch.from_numpy(look.apply(cells.colors.numpy())))
+    return replace(frame, rgb=look.apply(frame.rgb), depth=depth, cells=cells)

@@ -24,9 +24,9 @@ from persist_cli.simulators.panels import (
 )
 from persist_cli.simulators.rendering import AMBIENT, DIFFUSE, mesh_scale, mesh_shape, texture_file
 
-SPACING = 0.06  # metres between the points of a panel: four along the edge of a cell
+SPACING = 0.084  # metres between the points of a panel: three along the edge of a cell
 INWARD = 0.06  # metres from a surface to its points; pictures stand off their wall, and belong to it
-TEXELS = 32  # a side of the reduced textures: a tile is one to two metres wide, so a texel about a point's spacing
+TEXELS = 32  # a side of the reduced textures: a tile is one to two metres wide, so a texel is about a point's spacing
 PLANE = 0.01  # metres from a wall's plane within which points belong to it; frames of doorways are twice as far
 MESH_POINTS = 20_000  # of each mesh's surface
 

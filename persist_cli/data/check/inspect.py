@@ -42,6 +42,7 @@ class TrajectoryFigures:
         seconds: from the first to the last frame; 0 where frames have no times.
         actions: how often each is taken.
         unknown_actions: those that are taken, but are not in the trajectory's vocabulary.
+        cells: whether it holds the cells of its scene.
     """
 
     name: str
@@ -54,6 +55,7 @@ class TrajectoryFigures:
     seconds: float
     actions: dict[str, int]
     unknown_actions: list[str]
+    cells: bool = False
 
 
 def run_inspect(data: str, pairs: int, json: bool) -> None:
@@ -126,6 +128,7 @@ def trajectory_figures(file: TrajectoryFile, frames: slice | None = None) -> Tra
         seconds=float(times[-1] - times[0]),
         actions=taken,
         unknown_actions=[name for name in taken if name not in info.vocabulary.names],
+        cells=file.has_cells,
     )
 
 
@@ -141,6 +144,7 @@ def figures_table(figures: Sequence[TrajectoryFigures], effects: Mapping[str, st
         taken.update(one.actions)
     known = {name: f": {effect}" for name, effect in effects.items()}
     names = [*known, *(name for name in taken if name not in known)]
+    with_cells = sum(one.cells for one in figures)
     return [
         ("trajectories", str(len(figures))),
         ("scenes", str(len({one.scene for one in figures}))),
@@ -150,6 +154,7 @@ def figures_table(figures: Sequence[TrajectoryFigures], effects: Mapping[str, st
         ("metres travelled", _total([one.metres for one in figures], "{:.2f}".format)),
         ("degrees turned", _total([one.turned for one in figures], "{:.0f}".format)),
         ("seconds", _total([one.seconds for one in figures], "{:.1f}".format)),
+        *([("trajectories with the cells of their scene", str(with_cells))] if with_cells else []),
         *[(f"action {name}{known.get(name, ': not in the vocabulary')}", str(taken[name])) for name in names],
     ]
 
