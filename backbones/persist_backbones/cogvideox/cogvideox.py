@@ -20,6 +20,7 @@ from persist_backbones.cogvideox.adapted import AdaptedBackbone
 from persist_backbones.cogvideox.codec import Codec, frames_to_batch, to_uint8
 from persist_backbones.cogvideox.codec_start import start_as_components
 from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.cogvideox.cpu_attention import kernel_for_training
 from persist_backbones.cogvideox.diffusion import (
     SAMPLERS,
     SamplingSchedule,
@@ -160,7 +161,8 @@ class CogVideoX(AdaptedBackbone):
         # condition
         conditions = self.conditions(clips, timesteps, self.memory_condition(clips, generators), image_noise)
         # predict
-        predicted = self.predict(noisy.to(image.dtype), image, conditions)
+        with kernel_for_training(self.transformer.base, noisy):
+            predicted = self.predict(noisy.to(image.dtype), image, conditions)
         return NoisedPrediction(predicted, target, noisy, timesteps)
 
     @torch.no_grad()

@@ -1,0 +1,68 @@
+"""Attention in training on processors: other kernels, the same losses and gradients up to rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from persist_backbones.cogvideox import cpu_attention
+from persist_backbones.cogvideox.cogvideox import CogVideoX
+from tests.support.micro_model import micro, random_clips, shaken
+
+FUSED = "aten::_scaled_dot_product_flash_attention_for_cpu"
+
+
+def model() -> CogVideoX:
+    backbone = micro()
+    shaken(backbone)
+    return backbone
+
+
+def loss(backbone: CogVideoX, precision: torch.dtype) -> torch.Tensor:
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=precision == torch.bfloat16):
+        return backbone(random_clips(2), "1")["loss"]
+
+
+def uses_fused(run: Callable[[], object]) -> bool:
+    with profile(activities=[ProfilerActivity.CPU]) as recorded:
+        run()
+    return any(event.key == FUSED for event in recorded.key_averages())
+
+
+def test_a_training_step_in_bfloat16_attends_by_products() -> None:
+    assert not uses_fused(lambda: loss(model(), torch.bfloat16))
+
+
+def test_float32_and_steps_without_gradients_keep_the_fused_kernel() -> None:
+    assert uses_fused(lambda: loss(model(), torch.float32))
+    with torch.no_grad():
+        assert uses_fused(lambda: loss(model(), torch.bfloat16))
+
+
+def test_blocks_that_are_computed_again_keep_the_fused_kernel() -> None:
+    backbone = model()
+    backbone.transformer.base.enable_gradient_checkpointing()
+    assert uses_fused(lambda: loss(backbone.train(), torch.bfloat16).backward())
+
+
+def test_more_weights_than_fit_keep_the_fused_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cpu_attention, "MOST_WEIGHTS", 1)
+    assert uses_fused(lambda: loss(model(), torch.bfloat16))
+
+
+def test_losses_and_gradients_are_those_of_the_fused_kernel_up_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    by_products, fused = model(), model()
+    values = [loss(by_products, torch.bfloat16)]
+    monkeypatch.setattr(cpu_attention, "MOST_WEIGHTS", 1)
+    values.append(loss(fused, torch.bfloat16))
+    for value in values:
+        value.backward()
+    torch.testing.assert_close(values[0], values[1], rtol=0.01, atol=0.0)
+    one, two = (
+        torch.cat([part.grad.flatten() for part in it.parameters() if part.grad is not None])
+        for it in (by_products, fused)
+    )
+    assert float((one - two).norm()) < 0.02 * float(two.norm())
