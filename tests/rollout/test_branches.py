@@ -1,17 +1,13 @@
+import functools
 import json
 
 import pytest
 import torch
 
-from persist_cli.api.backbone import Sampling
-from persist_cli.api.memory import FrameOfReference
 from persist_cli.data.clips import interactions_of
-from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
-from persist_cli.plugins import make_encoder, make_memory
-from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_memory.grid.visibility import Views
-from tests.support.micro_model import micro, shaken
+from tests.support.micro_worlds import remembering_model, world_on_walk
 
 ACTIONS = (["left"] * 8, ["left"] * 4 + ["forward"] * 4, ["right"] * 8)
 
@@ -19,25 +15,13 @@ ACTIONS = (["left"] * 8, ["left"] * 4 + ["forward"] * 4, ["right"] * 8)
 @pytest.fixture(scope="module")
 def backbone():
     """A micro model with an adapter, all of whose parts have an effect."""
-    backbone = micro()
-    backbone.add_adapter("voxel", make_encoder("patches", {}).channels, {"width": 16, "heads": 2})
-    shaken(backbone)
-    return backbone
+    return remembering_model()
 
 
 @pytest.fixture
 def start(backbone, walks):
-    """Return a function that makes a world model at one frame of a walk, with a memory of the frames before it."""
-    walk = Store(walks)[0].read()
-
-    def begin(kind="voxel", **options):
-        memory = make_memory(kind, {}, make_encoder("patches", {}), FrameOfReference("room-0", walk.info.world_up))
-        memory.write(walk.observations[:8])
-        model = WorldModel(backbone, [Agent(memory, **options)], Sampling(2))
-        model.reset([walk.observations[8:9]], [walk.info])
-        return model
-
-    return begin
+    """A function that makes a world model at one frame of a walk, with a memory of the frames before it."""
+    return functools.partial(world_on_walk, backbone, walks)
 
 
 def alike(first, second):
