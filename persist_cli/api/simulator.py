@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -27,6 +28,23 @@ class AgentSettings:
     width: int = 64
     step: float = 0.25
     turn: float = 15.0
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Where an agent stands.
+
+    Args:
+        ground: place on the simulator's ground, metres.
+        heading: radians to the left, as the simulator counts them.
+    """
+
+    ground: tuple[float, float]
+    heading: float
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (*self.ground, self.heading))):
+            raise ValueError("a place and heading must be finite")
 
 
 class Simulator(ABC):

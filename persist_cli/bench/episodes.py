@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from persist_cli.api.simulator import Stand
 from persist_cli.errors import DataError
-from persist_cli.io.files import write_json
+from persist_cli.io.files import read_json, write_json
 from persist_cli.io.settings import plain_problems
 
 FORMAT: Final = "persist-episodes"
@@ -41,24 +40,6 @@ class EpisodePart(BaseModel):
     """A part of a file of episodes; unknown keys are ignored, so that files of a later persist can still be read."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class Stand(EpisodePart):
-    """Where an agent stands.
-
-    Args:
-        ground: place on the simulator's ground, metres.
-        heading: radians to the left, as the simulator counts them.
-    """
-
-    ground: tuple[float, float]
-    heading: float
-
-    @model_validator(mode="after")
-    def _is_finite(self) -> Stand:
-        if not all(map(math.isfinite, (*self.ground, self.heading))):
-            raise ValueError("a place and heading must be finite")
-        return self
 
 
 class GivenWalk(EpisodePart):
@@ -177,12 +158,7 @@ def read_episodes(path: Path) -> EpisodeSet:
     Raises:
         DataError: one line when it is missing, not JSON, no episodes, of another version, or damaged.
     """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file; `persist bench episodes --out {path}` writes it") from error
-    except (ValueError, OSError, RecursionError) as error:
-        raise DataError(f"{path}: not readable as JSON ({str(error).splitlines()[0]})") from error
+    value = read_json(path, DataError, f"no such file; `persist bench episodes --out {path}` writes it")
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise DataError(f"{path}: holds no episodes (no format {FORMAT!r} in it); `persist bench episodes` writes them")
     if value.get("version") != VERSION:

@@ -13,8 +13,8 @@ import torch
 from persist_cli.api.actions import format_actions
 from persist_cli.api.geometry import in_view
 from persist_cli.api.observations import Observations
-from persist_cli.api.simulator import Simulator, random_ground
-from persist_cli.bench.episodes import SIGHT_SHARE, Episode, GivenWalk, Stand
+from persist_cli.api.simulator import Simulator, Stand, random_ground
+from persist_cli.bench.episodes import SIGHT_SHARE, Episode, GivenWalk
 from persist_cli.bench.shortest_actions import ShortestActions
 from persist_cli.bench.true_scene import Geodesic, look_from, observations_of, stand
 from persist_cli.errors import DataError

@@ -14,8 +14,8 @@ from persist_cli.api.cost import Cost, Futures
 from persist_cli.api.ground import GroundMap, ground_axes
 from persist_cli.api.observations import Observations
 from persist_cli.api.policy import Goal
-from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, Stand
+from persist_cli.api.simulator import Simulator, Stand
+from persist_cli.bench.episodes import Episode
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.bench.navigation_metrics import SUCCESS_METRES
 from persist_cli.bench.true_scene import TrueScene, look_from, stand

@@ -12,8 +12,8 @@ import torch
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal
-from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, Stand
+from persist_cli.api.simulator import Simulator, Stand
+from persist_cli.bench.episodes import Episode
 from persist_cli.errors import DataError
 from persist_cli.simulators.free_grid import FINE, FreeGrid, Ground
 

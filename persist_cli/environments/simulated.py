@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from persist_cli.api.policy import Goal
-from persist_cli.api.simulator import Simulator
+from persist_cli.api.simulator import Simulator, Stand
 from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
 from persist_cli.environments.task import Attempt, TaskSettings, View
 from persist_cli.errors import DataError
@@ -51,19 +51,6 @@ class SimulatedSettings(TaskSettings):
         plan = CollectPlan(self.simulator, scenes, size=self.size, split=self.split)
         plan.check()
         return plan
-
-
-@dataclass(frozen=True)
-class Stand:
-    """Where an agent stands.
-
-    Args:
-        ground: place on the simulator's ground, metres.
-        heading: radians to the left, as the simulator counts them.
-    """
-
-    ground: tuple[float, float]
-    heading: float
 
 
 @dataclass(frozen=True)

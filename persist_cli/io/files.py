@@ -175,18 +175,23 @@ def reallocate(module: nn.Module) -> None:
         tensor.data = tensor.data.clone()
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, refusal: type[PersistError] = CheckpointError, missing: str = "no such file") -> Any:
     """The value of a JSON file.
 
+    Args:
+        path: the file.
+        refusal: the error that is raised.
+        missing: what it says of a file that is not there.
+
     Raises:
-        CheckpointError: one line when the file is missing or not JSON.
+        PersistError: of the kind ``refusal``, one line when the file is missing or not JSON.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise CheckpointError(f"{path}: no such file") from error
-    except (ValueError, OSError) as error:
-        raise CheckpointError(f"{path}: not readable as JSON ({error})") from error
+        raise refusal(f"{path}: {missing}") from error
+    except (ValueError, OSError, RecursionError) as error:
+        raise refusal(f"{path}: not readable as JSON ({str(error).splitlines()[0]})") from error
 
 
 def file_sha256(path: Path) -> str:

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import persist_cli.environments  # noqa: F401  registers them
-from persist_cli.environments.simulated import Stand
+from persist_cli.api.simulator import Stand
 from persist_cli.errors import PersistError
 from tests.support.miniworlds import make_world
 

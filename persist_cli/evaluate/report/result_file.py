@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, mo
 
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import LEAST_UNITS
+from persist_cli.io.files import read_json
 from persist_cli.io.settings import plain_problems
 
 FORMAT = "persist-evaluation"
@@ -290,12 +290,7 @@ def read_results(path: Path) -> EvalResults:
     file = path
     if path.is_dir():
         file = next((path / name for name in FILES if (path / name).is_file()), path / FILE)
-    try:
-        value = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError(f"{file}: no such file; `persist eval` writes it") from error
-    except (ValueError, OSError, RecursionError) as error:
-        raise DataError(f"{file}: not readable as JSON ({str(error).splitlines()[0]})") from error
+    value = read_json(file, DataError, "no such file; `persist eval` writes it")
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise DataError(f"{file}: not the results of `persist eval` (no format {FORMAT!r} in it)")
     if value.get("version") != VERSION:
