@@ -135,7 +135,7 @@ def trace(
         thing, at = flat[walk.place], walk.now
         if thin is not None:
             thing, at = walk.across(thin[walk.place], thing)
-        new = ((thing != before) & (thing > 0)).nonzero()[:, 0]
+        new = ((thing != before) & (thing > 0) & (found < layers)).nonzero()[:, 0]
         layer, ray = found[new], walk.ray[new]
         depth[layer, ray], cells[layer, ray] = at[new], numbers[walk.place[new]]
         found[new] += 1

@@ -117,6 +117,15 @@ class CellGrid:
         numbers = torch.stack(torch.meshgrid(*steps, indexing="ij"), dim=-1).double()
         return (numbers * self.form.size) @ self.axes
 
+    def columns(self) -> Float[Tensor, "first second 2"]:
+        """Return the middles of the columns of cells on the ground axes, metres, float64."""
+        device = self.classes.device
+        first, second = (
+            (torch.arange(count, device=device) + low).double() * self.form.size
+            for count, low in zip(self.shape[:2], self.corner[:2], strict=True)
+        )
+        return torch.stack(torch.meshgrid(first, second, indexing="ij"), dim=-1)
+
     def box(self, corner: tuple[int, int, int], shape: tuple[int, int, int]) -> CellGrid:
         """Return the cells of another box of the lattice, a copy; those outside of this one are unknown."""
         part = CellGrid.unknown(corner, shape, self.form, self.axes)

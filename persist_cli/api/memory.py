@@ -96,6 +96,7 @@ class Memory(ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
+    usual_encoder: ClassVar[str] = "patches"  # the encoder when nobody names one
     reads_depth: ClassVar[bool] = True  # where it is false, ``memorize`` hides all depth from ``write``
     name: str = ""  # set by the registry
 

@@ -7,16 +7,20 @@ for cameras is drawn from the cells, known and imagined alike, and imagined fram
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.actions import Action
 from persist_cli.api.cells import Box, CellGrid
+from persist_cli.api.encoder import Encoder
 from persist_cli.api.ground import Body
-from persist_cli.api.memory import Memory
+from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.api.scene_edits import Edit, EditOutcome
+from persist_cli.api.scene_model import SceneModel
+from persist_cli.errors import CheckpointError
 
 
 class Scene(Memory):
@@ -28,6 +32,44 @@ class Scene(Memory):
     The tokens that ``read`` returns are points of surfaces; the features of one are the class of its cell, one-hot in
     the order of the palette and then zeros up to the encoder's channels.
     """
+
+    usual_encoder: ClassVar[str] = "classes"
+
+    def __init__(self, settings: Any, encoder: Encoder, reference: FrameOfReference) -> None:
+        super().__init__(settings, encoder, reference)
+        self._open_model: Callable[[], SceneModel] | None = None
+
+    @property
+    def wanted_model(self) -> str | None:
+        """The name or path of the scene model that its settings ask for; whoever makes a scene gives it that model."""
+        return None
+
+    @property
+    def imagines(self) -> bool:
+        """Whether this scene has a model that imagines."""
+        return self._open_model is not None
+
+    def imagine_with(self, open_model: Callable[[], SceneModel] | None) -> None:
+        """Give this scene the model that imagines, or take it away.
+
+        Args:
+            open_model: returns the model, ready to sample; it is called when something is imagined first, and later
+                calls return the same model.
+        """
+        self._open_model = open_model
+
+    def model(self) -> SceneModel:
+        """Return the model that imagines.
+
+        Raises:
+            CheckpointError: when this scene has none, or it cannot be loaded.
+        """
+        if self._open_model is None:
+            raise CheckpointError(
+                f"memory {self.name!r}: no model that imagines; name a trained one by --model FOLDER, or "
+                "memory.model=FOLDER in its settings (`persist finetune houses-64-scene` trains one)"
+            )
+        return self._open_model()
 
     @property
     @abstractmethod
@@ -46,12 +88,14 @@ class Scene(Memory):
     def complete(self, region: Box | None = None, seed: int = 0) -> int:
         """Imagine the unknown cells of a region, given the known ones; known cells stay as they are to the bit.
 
+        But known solid cells of which no class is known get the class that the model sees in them.
+
         Args:
             region: what is completed; the surroundings of the newest observed camera without one.
             seed: another seed gives another completion; the same gives the same.
 
         Returns:
-            The number of cells that were unknown.
+            The number of cells that were unknown and are imagined now.
 
         Raises:
             CheckpointError: when this scene has no model that can imagine.

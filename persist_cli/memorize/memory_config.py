@@ -12,6 +12,7 @@ import yaml
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
+from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
 
 USUAL = "voxel"  # the memory when neither the user nor a checkpoint names one
@@ -49,8 +50,9 @@ def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]
     memories = set(_memory_names(reference).values()) if reference else set()
     if reference and memories and (plan.memory is None or plan.memory in memories):
         return adapter_of(reference, plan.memory)
-    settings = plugin_settings(plan.settings)
-    return MemoryConfig(plan.memory or USUAL, settings["memory"], plan.encoder or "patches", settings["encoder"]), None
+    settings, name = plugin_settings(plan.settings), plan.memory or USUAL
+    encoder = plan.encoder or load_plugin("memory", name).usual_encoder
+    return MemoryConfig(name, settings["memory"], encoder, settings["encoder"]), None
 
 
 def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig, str]:

@@ -1,0 +1,526 @@
+"""The memory ``scene``: a grid of cells that is written by depth, read by rays, completed, acted on and edited."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, Self
+
+import torch
+from jaxtyping import Bool, Float
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from persist_cli.api.actions import Action
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.cell_rays import first_surfaces, sheet_cells
+from persist_cli.api.cells import COMMON, SOLID, Box, CellForm, CellGrid, CellOrigin
+from persist_cli.api.encoder import Encoder
+from persist_cli.api.geometry import camera_rays
+from persist_cli.api.ground import Body, ground_axes
+from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
+from persist_cli.api.observations import Observations, Origin
+from persist_cli.api.reach import cells_in_reach
+from persist_cli.api.scene import Scene
+from persist_cli.api.scene_edits import Edit, EditOutcome
+from persist_cli.api.scene_model import Given
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import CheckpointError, DataError
+from persist_memory.batched_reads import distinct_cameras, same_size
+from persist_memory.encoders.classes import Classes
+from persist_memory.scene.cell_store import CellStore, check_cells
+from persist_memory.scene.editing import edit_grid
+from persist_memory.scene.fusion import votes_of
+from persist_memory.scene.imagination import Carried, Imagination, View, limited, windows_over
+from persist_memory.scene.interaction import Load, Reached, changed_cells, reached_box
+from persist_memory.validation import check_mergeable, check_observations
+
+FORESEEN_STRIDE = 4  # pixels from ray to ray that look for unknown cells
+
+VIEW: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {  # tensors of the newest observed frame
+    "view.rgb": (torch.uint8, (None, None, 3)),
+    "view.depth": (torch.float32, (None, None)),
+    "view.pose": (torch.float64, (4, 4)),
+    "view.intrinsics": (torch.float64, (3, 3)),
+}
+
+LOAD: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {  # tensors of the carried thing
+    "carried.cells": (torch.int32, (None, 3)),
+    "carried.classes": (torch.uint8, (None,)),
+    "carried.colors": (torch.uint8, (None, 3)),
+}
+
+
+@dataclass(frozen=True)
+class GridSceneSettings:
+    """The cells of a scene, how they are read, and what imagines the unknown ones.
+
+    Args:
+        size: edge of a cell in metres.
+        palette: names of the classes, the first three free, solid and outside; a scene model has its own.
+        floor: height of the floor in metres along up. The windows of a scene model begin there.
+        farthest: metres of depth beyond which what frames show is not believed.
+        layers: surfaces along each ray that a read returns, one behind the other.
+        stride: pixels from ray to ray of a read; it is larger where the first surfaces are more than the budget.
+        unknown: whether rays of a read go through cells of which nothing is known, or end there.
+        writes_imagined: whether frames that a video model imagined fill unknown cells; they are renderings of the
+            scene, so by default it takes nothing from them.
+        model: folder of the scene model that imagines unknown cells; none without one.
+        steps: denoising steps of the scene model.
+        seed: seed of what is imagined while an agent walks.
+        foresight: metres of depth up to which what an agent will see is imagined before it looks.
+        evolution: whether things are picked up, dropped and toggled by rules, or as the scene model says.
+        carries: metres along each axis of the largest thing that can be picked up.
+        toggles: classes of the things that can be toggled.
+    """
+
+    size: PositiveFloat = 0.25
+    palette: tuple[str, ...] = COMMON
+    floor: float = 0.0
+    farthest: PositiveFloat = 10.0
+    layers: PositiveInt = 2
+    stride: PositiveInt = 1
+    unknown: Literal["clear", "ends"] = "clear"
+    writes_imagined: bool = False
+    model: str | None = None
+    steps: PositiveInt = 10
+    seed: NonNegativeInt = 0
+    foresight: NonNegativeFloat = 8.0
+    evolution: Literal["rules", "model"] = "rules"
+    carries: PositiveFloat = 0.75
+    toggles: tuple[str, ...] = ("solid", "box")
+
+    def __post_init__(self) -> None:
+        if self.palette[: len(COMMON)] != COMMON or len(set(self.palette)) < len(self.palette):
+            raise ValueError(f"palette must begin with {', '.join(COMMON)} and name no class twice")
+        if len(self.palette) > 256:
+            raise ValueError(f"palette has {len(self.palette)} classes; a cell can have 256")
+
+
+class GridScene(Scene):
+    """A dense grid of cells that grows, with the votes of observed frames, the newest view and what is carried.
+
+    Frames with depth say which cells are free and which hold a surface, in which colour; see ``fusion``. What they say
+    does not depend on their order, and only the newest view does. An observed surface is ``solid`` until a model says
+    more; then its class is imagined, its place and colour are observed. Frames that were imagined change nothing unless
+    ``writes_imagined`` is set; then they fill unknown cells.
+
+    A read casts rays into the grid. The first surface along each ray comes first, then the next ones; in each layer
+    frame by frame and row by row; a ray without a surface gives no token. A token lies where its ray meets the surface.
+    """
+
+    settings_type = GridSceneSettings
+    settings: GridSceneSettings
+    encoder: Classes
+
+    def __init__(self, settings: GridSceneSettings, encoder: Encoder, reference: FrameOfReference) -> None:
+        super().__init__(settings, encoder, reference)
+        if not isinstance(encoder, Classes):
+            raise CheckpointError(
+                f"memory {self.name!r} has classes, no features of images; take the encoder classes, not {encoder.name}"
+            )
+        if len(settings.palette) > encoder.channels:
+            raise CheckpointError(
+                f"memory {self.name!r} has {len(settings.palette)} classes, the encoder {encoder.channels} channels; "
+                f"take encoder.classes={len(settings.palette)}"
+            )
+        self._form = CellForm(settings.size, tuple(settings.palette))
+        self._axes = ground_axes(reference.world_up)
+        self._view: View | None = None
+        self._load: Load | None = None
+        self._store = self._empty_store()
+        self._cells: CellGrid | None = None
+
+    @property
+    def cells(self) -> CellGrid:
+        """All cells, in the smallest box that holds the known ones; another object after each change."""
+        if self._cells is None:
+            self._cells = self._store.known()
+        return self._cells
+
+    @property
+    def wanted_model(self) -> str | None:
+        """The setting ``model``."""
+        return self.settings.model
+
+    @property
+    def floor(self) -> int:
+        """The number of the floor's level."""
+        return round(self.settings.floor / self.settings.size)
+
+    def write(self, observations: Observations) -> None:
+        """Fuse posed depth frames; pixels without depth say nothing.
+
+        Raises:
+            DataError: when a pose is not finite and rigid, or the scene would become too large; then nothing is
+                written.
+        """
+        check_observations(observations, f"memory {self.name!r}")
+        for origin, frames in observations.by_origin() if len(observations) else ():
+            if origin == Origin.IMAGINED and not self.settings.writes_imagined:
+                continue
+            votes = votes_of(frames, self._axes, self.settings.size, self.settings.farthest)
+            if not len(self._store.box.classes):
+                self._store = self._empty_store(frames.depth.device)
+            if origin == Origin.OBSERVED:
+                self._store.observe(votes)
+                self._view = View(frames.rgb[-1].clone(), frames.depth[-1].float().clone(), frames.cameras[-1])
+            else:
+                imagined = self._empty_store(frames.depth.device)
+                imagined.observe(votes)
+                self._fill(replace(imagined.box, origins=imagined.box.known.byte() * int(CellOrigin.IMAGINED)))
+            self._cells = None
+
+    def add(self, cells: CellGrid) -> None:
+        """Add the known cells of a grid, by the rule of origins; of equal origins the added one stays.
+
+        Raises:
+            DataError: when their size, palette or axes are not those of this scene, or the scene would become too
+                large; then nothing is added.
+        """
+        form = cells.form
+        if form != self._form:
+            raise DataError(
+                f"memory {self.name!r}: cells of {form.size:g} m and the classes {', '.join(form.palette)} do not fit "
+                f"this scene of {self._form.size:g} m and {', '.join(self._form.palette)}"
+            )
+        if not torch.allclose(cells.axes.cpu(), self._axes, atol=1e-6):
+            raise DataError(f"memory {self.name!r}: the axes of the cells are not those of this scene; up differs")
+        self._store.put(cells)
+        self._cells = None
+
+    def foresee(self, cameras: Sequence[Cameras]) -> None:
+        """Imagine what camera paths will see of unknown cells, up to ``foresight``, if this scene has a model.
+
+        Wherever a camera sees an unknown cell, all of the window around that camera is imagined. The same state, paths
+        and setting ``seed`` give the same.
+        """
+        if self.imagines and self.settings.foresight:
+            for path in cameras:
+                self._foresee(path.to("cpu"))
+
+    def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
+        """Return at most ``budget`` surfaces, the first along each ray first."""
+        return self.read_batch([cameras], budget)[0]
+
+    def read_batch(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
+        """Return for each camera path what ``read`` gives it; each distinct camera casts its rays once."""
+        paths = [path.to(self._store.box.classes.device) for path in cameras]
+        strides = {self._stride(path, budget) for path in paths}
+        if not same_size(paths) or len(strides) > 1:
+            return [self.read_batch([path], budget)[0] for path in paths]
+        distinct, groups = distinct_cameras(paths)
+        stride = strides.pop()
+        views = distinct.resized(max(1, distinct.height // stride), max(1, distinct.width // stride))
+        grid = self.cells
+        opaque = grid.solid if self.settings.unknown == "clear" else grid.solid | ~grid.known
+        surfaces = first_surfaces(grid, views, self.settings.layers, opaque, sheet_cells(grid, self.floor))
+        rays = torch.einsum("fij,fhwj->fhwi", views.world_from_camera.double()[:, :3, :3], camera_rays(views))
+        tokens = []
+        for group in groups:
+            depth, cells = surfaces.depth[:, group], surfaces.cells[:, group]
+            layer, frame, row, column = _seen(grid, cells).nonzero()[:budget].unbind(1)
+            camera = group[frame]
+            along = depth[layer, frame, row, column][:, None]
+            positions = views.centers[camera].double() + along * rays[camera, row, column]
+            tokens.append(self._tokens(grid, cells[layer, frame, row, column], positions))
+        return tokens
+
+    def complete(self, region: Box | None = None, seed: int = 0) -> int:
+        """Imagine the unknown cells of a region; see ``Scene.complete``.
+
+        Without a region it is the model's window around the newest observed camera. Of a larger region than a window
+        the parts nearest to that camera come first. Cells below the floor and above the windows stay unknown.
+
+        Raises:
+            CheckpointError: when this scene has no model, or the model knows other cells.
+            DataError: when there is neither a region nor an observed frame, or the scene would become too large.
+        """
+        imagination = self._imagination()
+        if region is None and self._view is None:
+            raise DataError(
+                f"memory {self.name!r}: nothing is observed yet; name a region to complete, or write a frame"
+            )
+        if self._view is None:
+            assert region is not None
+            middle = torch.tensor([region.low, region.high], dtype=torch.float64).mean(0)
+        else:
+            middle = self._view.camera.centers.cpu()
+        center = self._store.box.numbers(middle.to(self._store.box.classes.device)).tolist()
+        if region is None:
+            return self._imagine(imagination, imagination.around(center), seed)
+        picks = torch.tensor([region.low, region.high], dtype=torch.float64)
+        corners = torch.cartesian_prod(*picks.T.unbind(0)) @ self._axes.T / self.settings.size
+        low, high = corners.amin(0).round().long().tolist(), corners.amax(0).round().long().tolist()
+        windows = windows_over(low, [number + 1 for number in high], imagination.model.form, center)
+        return sum(self._imagine(imagination, (x, y, self.floor), seed, region) for x, y in windows)
+
+    def act(self, action: Action, world_from_camera: Float[Tensor, "4 4"], body: Body) -> bool:
+        """Let the scene evolve by an interaction; steps and turns change nothing and are always allowed.
+
+        Whether a step is blocked is decided where the agent's ground map is, from the points of this scene and from
+        what the agent saw: see ``Surroundings``.
+        """
+        if not action.interaction:
+            return True
+        pose = world_from_camera.cpu()
+        before = reached_box(self.cells, pose)
+        if self.settings.evolution == "model":
+            return self._act_by_model(action, pose, before)
+        reached = Reached(before.copy(), pose, body, self.settings.carries)
+        load = self._load
+        if action.name == "pick_up":
+            load = None if load is not None else reached.pick_up()
+            done = load is not None
+        elif action.name == "drop":
+            done, load = load is not None and reached.drop(load), None
+        else:
+            done = action.name == "toggle" and reached.toggle(self.settings.toggles)
+        if done:
+            self._load = load
+            self._change(reached.grid, before)
+        return done
+
+    def edit(self, edits: Sequence[Edit], seed: int = 0) -> EditOutcome:
+        """Change cells by hand; see ``Scene.edit``."""
+        before = self.cells.box(self.cells.corner, self.cells.shape)
+        imagine = None
+        if self.imagines:
+            imagination = self._imagination()
+
+            def imagine(grid: CellGrid, hidden: Bool[Tensor, "first second level"]) -> CellGrid:
+                return _imagined(imagination, grid, hidden, seed)
+
+        after, outcome = edit_grid(before, edits, imagine)
+        self._change(after, before)
+        return outcome
+
+    def copy(self) -> Self:
+        """Return a scene of the same cells, with the same model; changing one of the two does not change the other."""
+        copy = type(self)(self.settings, self.encoder, self.reference)
+        copy._store, copy._cells = self._store.copy(), self._cells
+        copy._view, copy._load, copy._open_model = self._view, self._load, self._open_model
+        return copy
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the known cells with their votes, in the order of their numbers, the newest view and the load."""
+        tensors = self._store.tensors()
+        if self._view is not None:
+            camera = self._view.camera
+            parts = (self._view.rgb, self._view.depth, camera.world_from_camera.double(), camera.intrinsics.double())
+            tensors |= dict(zip(VIEW, parts, strict=True))
+        if self._load is not None:
+            load = (self._load.cells.to(torch.int32), self._load.classes, self._load.colors)
+            tensors |= dict(zip(LOAD, load, strict=True))
+        return tensors
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Replace the content by what ``tensors()`` gave.
+
+        Raises:
+            CheckpointError: when they are not tensors of a scene with these classes; then it stays as it was.
+        """
+        where = f"memory {self.name!r}"
+        view, load = (_part(tensors, expected, where) for expected in (VIEW, LOAD))
+        cells = {name: tensor for name, tensor in tensors.items() if name not in VIEW and name not in LOAD}
+        store = self._empty_store(next(iter(cells.values())).device if cells else None)
+        if cells:
+            check_cells(cells, len(self._form.palette), where)
+            store.fill(cells)
+        self._store, self._cells, self._view, self._load = store, None, None, None
+        if view:
+            rgb, depth, pose, matrix = view
+            self._view = View(rgb, depth, Cameras(pose, matrix, depth.shape[0], depth.shape[1]))
+        if load:
+            self._load = Load(load[0].long(), load[1], load[2])
+
+    def merge(self, other: Memory) -> None:
+        """Add the cells of another scene: observed ones as if its frames had been written here.
+
+        Of other cells the higher origin stays, and of equal ones the own; so do the own view and what is carried here.
+
+        Raises:
+            CheckpointError: when the two differ in settings, such as the size of cells, or the place.
+        """
+        check_mergeable(self, other)
+        if not isinstance(other, GridScene):
+            return
+        try:
+            self._store.merge(other._store)
+        except DataError as error:
+            raise CheckpointError(str(error)) from error
+        self._view, self._load, self._cells = self._view or other._view, self._load or other._load, None
+
+    def points(self) -> MapPoints:
+        """Return the middles of solid cells in their colours, with their ``CellOrigin``."""
+        grid = self.cells
+        places = grid.solid.nonzero()
+        numbers = (places + places.new_tensor(grid.corner)).double()
+        at = tuple(places.T)
+        positions = (numbers * grid.form.size) @ grid.axes.to(numbers.device)
+        return MapPoints(positions, grid.colors[at], grid.form.size, grid.origins[at], grid.form.size)
+
+    def figures(self) -> MemoryFigures:
+        """Return the number of known cells, their bytes, the box around them, and how many were imagined."""
+        grid, tensors = self.cells, self.tensors()
+        size = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+        known = int(grid.known.sum())
+        if not known:
+            return MemoryFigures(0, size, None)
+        ends = torch.tensor([grid.corner, [a + b for a, b in zip(grid.corner, grid.shape, strict=True)]])
+        corners = torch.cartesian_prod(*(ends.double() - 0.5).T.unbind(0)) * grid.form.size @ self._axes
+        bounds = tuple(corners.amin(0).tolist()), tuple(corners.amax(0).tolist())
+        return MemoryFigures(known, size, bounds, int((grid.origins == CellOrigin.IMAGINED).sum()))
+
+    def resolution(self, cameras: Cameras, distance: float = 2.5) -> float:
+        """Return the edge of a cell."""
+        return self.settings.size
+
+    def _empty_store(self, device: torch.device | None = None) -> CellStore:
+        empty = CellGrid.unknown((0, 0, 0), (0, 0, 0), self._form, self._axes.to(device))
+        return CellStore(
+            replace(empty, **{name: getattr(empty, name).to(device) for name in ("classes", "colors", "origins")})
+        )
+
+    def _stride(self, path: Cameras, budget: int) -> int:
+        """The pixels from ray to ray with which the first surfaces of a path fit into a budget."""
+        stride = self.settings.stride
+        while len(path) * (path.height // stride) * (path.width // stride) > max(1, budget) and stride < path.height:
+            stride += 1
+        return stride
+
+    def _tokens(self, grid: CellGrid, cells: Tensor, positions: Float[Tensor, "token 3"]) -> MemoryTokens:
+        """The tokens of surfaces."""
+        origins = grid.origins.flatten()[cells].clamp_max(int(Origin.OBSERVED))  # an edit is a fact, as observed
+        features = self.encoder.features(grid.classes.flatten()[cells])
+        return MemoryTokens.of(features, positions, grid.colors.flatten(0, 2)[cells], origins)
+
+    def _imagination(self) -> Imagination:
+        """What imagines now, after a check that it knows such cells."""
+        load = self._load
+        carried = Carried(0, torch.zeros(3, dtype=torch.uint8)) if load is None else Carried(load.kind, load.color)
+        imagination = Imagination(self.model(), self.settings.steps, self._view, self.floor, carried)
+        imagination.check(self._store.box)
+        return imagination
+
+    def _imagine(
+        self, imagination: Imagination, corner: tuple[int, int, int], seed: int, region: Box | None = None
+    ) -> int:
+        """Imagine the unknown cells of a window, those in a region alone, and return how many."""
+        window = self._store.box.box(corner, imagination.model.form.shape)
+        chosen = ~window.known
+        if region is not None:
+            chosen &= region.contains(window.centers())
+        count = int(chosen.sum())
+        if count:
+            filled = limited(imagination.fill(window, seed), window, chosen)
+            self._store.reach(corner, [a + b for a, b in zip(corner, window.shape, strict=True)])
+            self._store.replace(filled, chosen)
+            self._store.name(filled, window.known & (window.classes == SOLID) & (filled.classes != SOLID))
+            self._cells = None
+        return count
+
+    def _foresee(self, path: Cameras) -> None:
+        """Imagine windows around the cameras of a path until none sees an unknown cell."""
+        imagination = self._imagination()
+        for number in range(len(path)):
+            camera = path[number : number + 1]
+            corner = imagination.around(self._store.box.numbers(camera.centers[0].to(self._axes.device)).tolist())
+            window = self._store.box.box(corner, imagination.model.form.shape)
+            if _sees_unknown(window, camera, self.settings.foresight, self.floor):
+                self._imagine(imagination, corner, self.settings.seed)
+
+    def _act_by_model(self, action: Action, pose: Float[Tensor, "4 4"], before: CellGrid) -> bool:
+        """Let the scene model say what becomes of the cells in reach; false when it changes nothing."""
+        imagination = self._imagination()
+        known = imagination.model.form.actions
+        if action.name not in known:
+            raise CheckpointError(f"the scene model knows the interactions {', '.join(known)}, not {action.name!r}")
+        center = before.numbers(pose[:3, 3]).tolist()
+        window = self._store.box.box(imagination.around(center), imagination.model.form.shape)
+        reach = cells_in_reach(window, pose) & window.known
+        given = torch.where(window.known, int(Given.CONTENT), 0) + reach * (int(Given.PAST) - int(Given.CONTENT))
+        action_number = 1 + known.index(action.name)
+        classes, colors = imagination.sample(window, given.to(torch.uint8), action_number, self.settings.seed)
+        differs = reach & ((classes != window.classes) | ((colors != window.colors).any(-1) & window.solid))
+        if not bool(differs.any()):
+            return False
+        after = window.copy()
+        after.classes[differs], after.colors[differs] = classes[differs], colors[differs]
+        after.origins[differs] = CellOrigin.IMAGINED
+        self._load = self._load_after(action.name, window, after)
+        self._change(after, window)
+        return True
+
+    def _load_after(self, action: str, before: CellGrid, after: CellGrid) -> Load | None:
+        """What is carried after the model changed cells: what it took away by ``pick_up``, nothing after ``drop``."""
+        if action == "drop":
+            return None
+        gone = (before.solid & ~after.solid).nonzero()
+        if action != "pick_up" or not len(gone) or self._load is not None:
+            return self._load
+        at = tuple(gone.T)
+        low, high = gone.amin(0), gone.amax(0)
+        middle = torch.stack([(low[0] + high[0]) // 2, (low[1] + high[1]) // 2, low[2]])
+        return Load(gone - middle, before.classes[at].clone(), before.colors[at].clone())
+
+    def _change(self, after: CellGrid, before: CellGrid) -> None:
+        """Overwrite the cells in which two grids of one box differ."""
+        self._store.replace(after, changed_cells(before, after))
+        self._cells = None
+
+    def _fill(self, cells: CellGrid) -> None:
+        """Take over the known cells of a grid where nothing is known."""
+        unknown = cells.known & ~self._store.box.box(cells.corner, cells.shape).known.to(cells.classes.device)
+        self._store.replace(cells, unknown)
+
+
+def _seen(grid: CellGrid, cells: Tensor) -> Bool[Tensor, "layer frame row column"]:
+    """Which surfaces are known: a ray that ends at an unknown cell sees nothing from there on."""
+    hit = cells >= 0
+    known = grid.known.flatten()[cells.clamp_min(0)] if grid.known.numel() else torch.zeros_like(hit)
+    ended = (hit & ~known).cumsum(0) > 0
+    return hit & ~ended
+
+
+def _sees_unknown(window: CellGrid, camera: Cameras, foresight: float, floor: int) -> bool:
+    """Whether a ray of a camera meets an unknown cell before any surface."""
+    views = camera.resized(max(1, camera.height // FORESEEN_STRIDE), max(1, camera.width // FORESEEN_STRIDE))
+    classes = torch.where(window.known, window.classes, len(window.form.palette)).to(torch.uint8)
+    marked = replace(window, classes=classes)  # unknown cells are a thing of their own
+    surfaces = first_surfaces(marked, views, 1, window.solid | ~window.known, sheet_cells(window, floor))
+    unknown = ~window.known.flatten()[surfaces.cells[0].clamp_min(0)]
+    return bool((unknown & surfaces.hit[0] & (surfaces.depth[0] < foresight)).any())
+
+
+def _imagined(
+    imagination: Imagination, grid: CellGrid, hidden: Bool[Tensor, "first second level"], seed: int
+) -> CellGrid:
+    """Return a grid with its hidden cells imagined, as far as the model's windows reach."""
+    places = hidden.nonzero() + torch.tensor(grid.corner)
+    low, high = places.amin(0).tolist(), (places.amax(0) + 1).tolist()
+    center = [(a + b) // 2 for a, b in zip(low, high, strict=True)]
+    result = grid.copy()
+    wanted = replace(grid, origins=hidden.byte())
+    for x, y in windows_over(low, high, imagination.model.form, center):
+        corner = (x, y, imagination.floor)
+        window = result.box(corner, imagination.model.form.shape)
+        chosen = ~window.known & wanted.box(corner, window.shape).known
+        if bool(chosen.any()):
+            result.put(limited(imagination.fill(window, seed), window, chosen | window.known))
+    return result
+
+
+def _part(
+    tensors: dict[str, Tensor], expected: dict[str, tuple[torch.dtype, tuple[int | None, ...]]], where: str
+) -> list[Tensor]:
+    """The tensors of a part of the state, all or none; ``CheckpointError`` when they are others."""
+    names = [name for name in expected if name in tensors]
+    if names and len(names) < len(expected):
+        raise CheckpointError(f"{where}: tensor {(set(expected) - set(names)).pop()!r} is missing")
+    for name in names:
+        (dtype, shape), tensor = expected[name], tensors[name]
+        fits = tensor.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, tensor.shape, strict=True))
+        if tensor.dtype != dtype or not fits or (tensor.is_floating_point() and not bool(tensor.isfinite().all())):
+            raise CheckpointError(f"{where}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}, or not finite")
+    return [tensors[name] for name in names]

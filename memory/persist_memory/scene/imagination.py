@@ -1,0 +1,204 @@
+"""Imagining the unknown cells of a grid by a scene model, window by window, the nearest first.
+
+A window lies at whole cells. What is known in it is given to the model, what an earlier window imagined too, so that
+neighbouring windows go on from each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.cells import SOLID, CellGrid, CellOrigin
+from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples
+from persist_cli.errors import CheckpointError
+
+Corner = tuple[int, int, int]
+SEEDS = 2**62  # seeds of windows are smaller
+MIXERS = (6364136223846793005, 3202034522624059733, 7046029254386353087, 1442695040888963407)
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame that tells the model how the place looks.
+
+    Args:
+        rgb: uint8 RGB.
+        depth: planar z in metres, 0 = missing.
+        camera: its camera, single, in the world.
+    """
+
+    rgb: UInt8[Tensor, "height width 3"]
+    depth: Float[Tensor, "height width"]
+    camera: Cameras
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What the agent carries.
+
+    Args:
+        kind: its class, 0 for nothing.
+        color: its mean RGB, uint8.
+    """
+
+    kind: int
+    color: UInt8[Tensor, " 3"]
+
+
+@dataclass(frozen=True)
+class Imagination:
+    """A scene model and what it is told beside the cells.
+
+    Args:
+        model: the model, ready to sample.
+        steps: its denoising steps.
+        view: the newest observed frame, ``None`` without one.
+        floor: number of the floor's level, with which windows begin.
+        carried: what the agent carries.
+    """
+
+    model: SceneModel
+    steps: int
+    view: View | None
+    floor: int
+    carried: Carried
+
+    def check(self, grid: CellGrid) -> None:
+        """Raise ``CheckpointError`` when the cells are not those that the model knows."""
+        form = self.model.form.cells
+        if grid.form.size != form.size:
+            raise CheckpointError(
+                f"the scene's cells are {grid.form.size:g} m wide, those of the model {form.size:g} m; "
+                f"make the scene with memory.size={form.size:g}"
+            )
+        if grid.form.palette != form.palette:
+            raise CheckpointError(
+                f"the scene has the classes {', '.join(grid.form.palette)}, the model knows {', '.join(form.palette)}; "
+                "make the scene with the model's own, as `persist memorize --memory scene --model` does"
+            )
+
+    def around(self, center: Sequence[int]) -> Corner:
+        """Return the corner of the window around a cell, from the floor up."""
+        first, second, _ = self.model.form.shape
+        return center[0] - first // 2, center[1] - second // 2, self.floor
+
+    def fill(self, window: CellGrid, seed: int) -> CellGrid:
+        """Return a window with all its unknown cells imagined, and with the class of what was solid and nothing more.
+
+        Args:
+            window: a box of the model's shape.
+            seed: seed of the draw; the window's place changes it.
+        """
+        given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING)).to(torch.uint8)
+        classes, colors = self.sample(window, given, 0, seed)
+        unknown, unnamed = ~window.known, window.known & (window.classes == SOLID)
+        filled = window.copy()
+        filled.classes[unknown | unnamed] = classes[unknown | unnamed]
+        filled.classes[unnamed & ~filled.solid] = SOLID
+        filled.origins[unknown] = CellOrigin.IMAGINED
+        filled.colors[unknown] = colors[unknown] * filled.solid[unknown][:, None]
+        return filled
+
+    def sample(
+        self, window: CellGrid, given: UInt8[Tensor, "first second level"], action: int, seed: int
+    ) -> tuple[UInt8[Tensor, "first second level"], UInt8[Tensor, "first second level 3"]]:
+        """Return classes and colours that the model draws for a window.
+
+        Args:
+            window: a box of the model's shape.
+            given: the ``Given`` of each cell.
+            action: 0 for none, or 1 + the number of an interaction that the model knows.
+            seed: seed of the draw; the window's place changes it.
+        """
+        known = given > Given.NOTHING
+        classes, colors = window.classes * known, window.colors * known[..., None]
+        rgb, depth, pose, matrix = self._seen(window)
+        number = torch.tensor(window_seed(seed, window.corner))
+        sample = SceneSamples(
+            given, classes, colors, rgb, depth, pose, matrix, torch.tensor(action), torch.tensor(self.carried.kind),
+            self.carried.color.cpu(), number,
+        )  # fmt: skip
+        device = next(self.model.parameters()).device
+        with torch.inference_mode():
+            drawn = self.model.sample(SceneSamples.stack([sample.to("cpu")]).to(device), self.steps)
+        here = window.classes.device
+        return drawn[0][0].to(here).clone(), drawn[1][0].to(here).clone()
+
+    def _seen(self, window: CellGrid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return RGB, depth, pose and intrinsics of the view, for a window; without a view in it all pixels are 0."""
+        height, width = self.model.form.image
+        rgb = torch.zeros(height, width, 3, dtype=torch.uint8)
+        depth, pose = torch.zeros(height, width), torch.eye(4)
+        matrix = torch.tensor([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1]])
+        if self.view is None:
+            return rgb, depth, pose, matrix
+        view = resized(self.view, height, width)
+        world_from_camera = view.camera.world_from_camera.double().cpu()
+        window_from_camera = torch.eye(4, dtype=torch.float64)
+        axes = window.axes.cpu()
+        window_from_camera[:3, :3] = axes @ world_from_camera[:3, :3]
+        corner = torch.tensor(window.corner, dtype=torch.float64)
+        window_from_camera[:3, 3] = axes @ world_from_camera[:3, 3] - corner * window.form.size
+        place = (window_from_camera[:3, 3] / window.form.size).round()
+        if bool(((place < 0) | (place >= place.new_tensor(window.shape)))[:2].any()):
+            return rgb, depth, pose, matrix  # far from here: it shows another place
+        return view.rgb.cpu(), view.depth.cpu(), window_from_camera.float(), view.camera.intrinsics.float().cpu()
+
+
+def resized(view: View, height: int, width: int) -> View:
+    """Return a view at another image size: colours as means, depths as those of the nearest pixel."""
+    if view.depth.shape == (height, width):
+        return view
+    rgb = view.rgb.movedim(-1, 0)[None].float()
+    rgb = torch.nn.functional.interpolate(rgb, (height, width), mode="bilinear", antialias=True, align_corners=False)
+    depth = torch.nn.functional.interpolate(view.depth[None, None], (height, width), mode="nearest-exact")[0, 0]
+    image = rgb[0].round().clamp(0, 255).to(torch.uint8).movedim(0, -1)
+    return View(image, depth, view.camera.resized(height, width))
+
+
+def window_seed(seed: int, corner: Corner) -> int:
+    """Return the seed of a window's draw, another one for each place, equal on all machines."""
+    mixed = 0
+    for value, mixer in zip((seed, *corner), MIXERS, strict=True):
+        mixed = ((mixed ^ (value % SEEDS)) * mixer + (mixed >> 29)) % SEEDS
+    return mixed
+
+
+def windows_over(
+    low: Sequence[int], high: Sequence[int], form: SceneForm, center: Sequence[int]
+) -> list[tuple[int, int]]:
+    """Return corners on the ground of windows that cover a piece of it together, the nearest to a cell first.
+
+    A piece that is no larger than a window gets one window around its middle. Else windows overlap by half, so that
+    each goes on from the one before.
+
+    Args:
+        low: first and second number of the lowest cell.
+        high: those after the highest.
+        form: the windows' shape.
+        center: numbers of the cell.
+    """
+    corners = []
+    for a, b, side in zip(low[:2], high[:2], form.shape[:2], strict=True):
+        count = 1 if b - a <= side else math.ceil((b - a - side) / (side // 2)) + 1
+        first = (a + b - side - (count - 1) * (side // 2)) // 2
+        corners.append([first + number * (side // 2) for number in range(count)])
+    places = [(x, y) for x in corners[0] for y in corners[1]]
+    half = [side // 2 for side in form.shape[:2]]
+    places.sort(key=lambda p: ((p[0] + half[0] - center[0]) ** 2 + (p[1] + half[1] - center[1]) ** 2, p))
+    return places
+
+
+def limited(filled: CellGrid, before: CellGrid, chosen: Bool[Tensor, "first second level"]) -> CellGrid:
+    """Return a filled window in which only chosen cells are new; other unknown ones stay unknown."""
+    dropped = ~before.known & ~chosen
+    origins = torch.where(dropped, 0, filled.origins)
+    classes = torch.where(dropped, 0, filled.classes)
+    return replace(filled, origins=origins, classes=classes, colors=filled.colors * ~dropped[..., None])

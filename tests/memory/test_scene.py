@@ -1,0 +1,247 @@
+"""A scene: depth frames become cells, and reads are rays into them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from persist_cli.api.cells import FREE, SOLID, CellOrigin
+from persist_cli.api.geometry import project
+from persist_cli.api.memory import FrameOfReference
+from persist_cli.api.observations import Origin
+from persist_cli.errors import CheckpointError, DataError, PersistError
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.plugins import make_encoder, make_memory
+from persist_memory.scene.grid_scene import GridScene
+from tests.support.cell_rooms import FORM, TABLE_CELLS, camera_at, cell_room
+from tests.support.room_views import observe, room_walk
+from tests.support.rooms import FURNITURE, ROOM, UP, look
+
+
+def scene(*parts, **settings) -> GridScene:
+    """A scene into which these frames were written one part after the other."""
+    memory = make_memory("scene", settings, make_encoder("classes", {}), FrameOfReference("room", UP))
+    assert isinstance(memory, GridScene)
+    for part in parts:
+        memory.write(part)
+    return memory
+
+
+def named_scene(**settings) -> GridScene:
+    """An empty scene with the classes of ``cell_room``."""
+    return scene(palette=list(FORM.palette), **settings)
+
+
+def without_view(tensors):
+    return {name: tensor for name, tensor in tensors.items() if not name.startswith("view.")}
+
+
+def same(first: GridScene, second: GridScene) -> bool:
+    mine, theirs = (without_view(one.tensors()) for one in (first, second))
+    return mine.keys() == theirs.keys() and all(torch.equal(mine[name], theirs[name]) for name in mine)
+
+
+def inside_room(centers, margin: float):
+    """Which places lie in the free space of the room, so many metres away from all walls and furniture."""
+    low, high = (torch.from_numpy(corner) for corner in ROOM)
+    free = ((centers > low + margin) & (centers < high - margin)).all(-1)
+    for corners in FURNITURE:
+        near, far = (torch.from_numpy(corner) for corner in corners)
+        free &= ~((centers > near - margin) & (centers < far + margin)).all(-1)
+    return free
+
+
+def test_cells_before_a_surface_are_free_and_those_of_the_surface_solid():
+    grid = scene(room_walk(12)).cells
+    centers = grid.centers()
+    free, within = inside_room(centers, 0.2), inside_room(centers, -0.2)
+    assert bool((grid.classes[grid.known & free] == FREE).all())
+    assert bool((grid.classes[grid.known & ~within] == SOLID).all())
+    assert int((grid.known & free).sum()) > 0.8 * int(free.sum())
+
+
+def test_a_grazing_look_over_the_floor_frees_none_of_its_cells():
+    grid = scene(observe([look((2.2, 1.3, 0.0), 90.0, -2.0)], 64, 64)).cells
+    floor = -grid.corner[2]
+    assert int((grid.solid[:, :, floor]).sum()) > 10
+    assert not bool((grid.known & ~grid.solid)[:, :, floor].any())
+
+
+def test_a_cell_has_the_mean_colour_of_its_pixels():
+    frame = observe([look((0.0, 1.3, 0.0), 0.0, 0.0)])
+    white = replace(frame, rgb=torch.full_like(frame.rgb, 200))
+    black = replace(frame, rgb=torch.full_like(frame.rgb, 101))
+    grid = scene(white, black).cells
+    assert set(grid.colors[grid.solid].flatten().tolist()) == {151}
+    assert int(grid.colors[~grid.solid].max()) == 0
+
+
+def test_neither_the_order_of_writing_nor_saving_changes_a_cell(tmp_path):
+    frames = room_walk(6)
+    memory = scene(frames)
+    assert same(memory, scene(frames[4:], frames[1:4], frames[:1]))
+    memory.save(tmp_path / "scene.safetensors")
+    loaded = load_memory(tmp_path / "scene.safetensors")
+    assert same(memory, loaded)
+    assert torch.equal(loaded.tensors()["view.rgb"], frames.rgb[-1])
+    parts = scene(frames[:3])
+    parts.merge(scene(frames[3:]))
+    assert same(memory, parts)
+
+
+def test_depth_that_is_missing_says_nothing_but_where_the_camera_is():
+    frame = observe([look((0.0, 1.3, 0.0), 0.0, 0.0)])
+    grid = scene(frame.without_depth()).cells
+    assert grid.shape == (1, 1, 1)
+    assert not bool(grid.solid.any())
+
+
+def test_imagined_frames_change_nothing_unless_it_is_wanted_and_then_no_known_cell():
+    frames = room_walk(8)
+    seen, rest = frames[:3], frames[3:].with_origin(Origin.IMAGINED)
+    before = scene(seen)
+    assert same(before, scene(seen, rest))
+    grown = scene(seen, rest, writes_imagined=True)
+    known = before.cells.known
+    assert bool((grown.cells.box(before.cells.corner, before.cells.shape).origins[known] == CellOrigin.OBSERVED).all())
+    assert grown.figures().imagined > 100
+    assert same(scene(frames), scene(seen, rest, frames[3:], writes_imagined=True))
+
+
+def test_a_read_returns_the_first_surfaces_of_all_rays_before_the_second_ones():
+    memory = named_scene()
+    memory.add(cell_room())
+    camera = camera_at(cell_room(), (1, 7, 2), (12, 7, 2), size=32)
+    tokens, first = memory.read(camera, 10_000), memory.read(camera, 1024)
+    assert len(first) == 1024 < len(tokens)
+    assert torch.equal(tokens.positions[:1024], first.positions)
+    pixels, depth = project(first.positions[None], camera)
+    numbers = torch.arange(1024)
+    expected = torch.stack([numbers % 32 + 0.5, numbers // 32 + 0.5], dim=1)
+    torch.testing.assert_close(pixels[0], expected.double())
+    assert bool((depth > 0).all())
+    table = first.features.argmax(1) == FORM.palette.index("table")
+    assert bool((first.colors[table] == torch.tensor([20, 160, 40])).all())
+    assert int(table.sum()) > 50
+
+
+def test_a_small_budget_casts_fewer_rays_and_no_camera_gets_more_tokens_than_it():
+    memory = scene(room_walk(6))
+    cameras = room_walk(3).cameras
+    tokens = memory.read(cameras, 500)
+    assert 100 < len(tokens) <= 500
+    pixels, _ = project(tokens.positions[-20:][None], cameras[2:])
+    assert bool(((pixels > 0) & (pixels < 64)).all(-1).any())
+    assert len(memory.read(cameras, 0)) == 0
+
+
+def test_reading_paths_together_gives_what_each_read_gives():
+    memory = scene(room_walk(6))
+    paths = [room_walk(6).cameras[:3], room_walk(6).cameras[1:5]]
+    for together, path in zip(memory.read_batch(paths, 20_000), paths, strict=True):
+        alone = memory.read(path, 20_000)
+        assert all(torch.equal(tensor, alone.tensors()[name]) for name, tensor in together.tensors().items())
+
+
+def test_an_empty_scene_has_no_token_and_no_bounds():
+    assert len(scene().read(room_walk(2).cameras, 100)) == 0
+    assert scene().figures().bounds is None
+    assert scene().tensors() == {}
+
+
+def test_rays_go_through_unknown_cells_or_end_there():
+    grid = cell_room()
+    grid.origins[TABLE_CELLS] = 0
+    camera = camera_at(grid, (1, 7, 2), (12, 7, 2), size=32)
+    clear, ends = named_scene(), named_scene(unknown="ends")
+    for memory in (clear, ends):
+        memory.add(grid)
+    assert len(clear.read(camera, 1024)) == 1024 > len(ends.read(camera, 1024)) > 100
+
+
+def test_given_cells_count_as_observed_and_one_frame_does_not_change_them():
+    memory = scene(palette=list(FORM.palette))
+    memory.add(cell_room())
+    before = memory.cells
+    memory.write(observe([look((0.5, 1.2, 1.0), 30.0)]))
+    after = memory.cells.box(before.corner, before.shape)
+    assert torch.equal(after.classes, before.classes)
+
+
+@pytest.mark.parametrize("change", [{"size": 0.5}, {"palette": ("free", "solid", "outside")}])
+def test_cells_of_another_size_or_palette_are_refused_in_one_line(change):
+    memory, grid = named_scene(), cell_room()
+    with pytest.raises(DataError, match="do not fit this scene"):
+        memory.add(replace(grid, form=replace(grid.form, **change)))
+    assert not bool(memory.cells.known.any())
+
+
+def test_scenes_of_other_cell_sizes_cannot_be_merged():
+    with pytest.raises(CheckpointError, match="settings"):
+        scene(size=0.25).merge(scene(size=0.5))
+
+
+def test_a_scene_too_large_is_refused_and_stays_as_it_was():
+    frames = room_walk(2)
+    memory = scene(frames[:1])
+    before = without_view(memory.tensors())
+    poses = frames.cameras.world_from_camera.clone()
+    poses[1, 0, 3] += 1e6
+    far = replace(frames, cameras=replace(frames.cameras, world_from_camera=poses))
+    with pytest.raises(DataError, match="take larger cells"):
+        memory.write(far[1:])
+    assert all(torch.equal(tensor, memory.tensors()[name]) for name, tensor in before.items())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "cause"),
+    [
+        ("classes", 9, "palette has 3 classes"),
+        ("origins", 7, "unknown origin 7"),
+        ("hits", -1, "fewer than no votes"),
+    ],
+)
+def test_a_scene_with_wrong_cells_is_refused_in_one_line_and_nothing_changes(name, value, cause):
+    memory = scene(room_walk(1))
+    tensors = {key: tensor.clone() for key, tensor in memory.tensors().items()}
+    tensors[name][0] = value
+    with pytest.raises(CheckpointError, match=cause):
+        memory.restore(tensors)
+    assert same(memory, scene(room_walk(1)))
+
+
+def test_a_scene_without_a_part_of_its_view_or_with_cells_out_of_order_is_refused():
+    tensors = scene(room_walk(1)).tensors()
+    with pytest.raises(CheckpointError, match=r"view\.pose"):
+        scene().restore({name: tensor for name, tensor in tensors.items() if name != "view.pose"})
+    with pytest.raises(CheckpointError, match="not in order"):
+        scene().restore(tensors | {"cells": tensors["cells"].flip(0)})
+
+
+def test_only_the_encoder_of_classes_fits_and_it_needs_a_channel_for_each_class():
+    with pytest.raises(CheckpointError, match="take the encoder classes"):
+        make_memory("scene", {}, make_encoder("patches", {}), FrameOfReference("room", UP))
+    with pytest.raises(CheckpointError, match=r"encoder\.classes=9"):
+        make_memory("scene", {"palette": list(FORM.palette)}, make_encoder("classes", {"classes": 4}),
+                    FrameOfReference("room", UP))  # fmt: skip
+    with pytest.raises(PersistError, match="palette must begin with"):
+        scene(palette=["wall"])
+
+
+def test_a_map_shows_solid_cells_with_their_origins():
+    memory = named_scene()
+    grid = cell_room()
+    grid.origins[TABLE_CELLS] = CellOrigin.EDITED
+    memory.add(grid)
+    points = memory.points()
+    assert len(points.positions) == int(grid.solid.sum())
+    assert set(points.origins.tolist()) == {CellOrigin.OBSERVED, CellOrigin.EDITED}
+    assert memory.figures().cells == grid.known.numel()
+
+
+def test_a_copy_is_independent():
+    memory = scene(room_walk(2))
+    copy = memory.copy()
+    copy.write(room_walk(6))
+    assert same(memory, scene(room_walk(2)))
+    assert not same(memory, copy)
