@@ -80,8 +80,18 @@ def success(walk: WalkRecord) -> float:
 
 
 def reached(walk: WalkRecord) -> float:
-    """Return 1 when the agent was within ``SUCCESS_METRES`` of the goal at any time, else 0."""
+    """Return oracle success: 1 when the agent was within ``SUCCESS_METRES`` of the goal at any time, else 0."""
     return float(min(walk.distances) <= SUCCESS_METRES)
+
+
+def wrong_stop(walk: WalkRecord) -> float:
+    """Return 1 when the agent stopped farther than ``SUCCESS_METRES`` from the goal, else 0."""
+    return float(walk.stopped and walk.distances[-1] > SUCCESS_METRES)
+
+
+def missed_stop(walk: WalkRecord) -> float:
+    """Return 1 when the agent never stopped, though it was within ``SUCCESS_METRES`` of the goal, else 0."""
+    return float(not walk.stopped and reached(walk) == 1)
 
 
 def spl(walk: WalkRecord, shortest: float) -> float:
@@ -110,6 +120,8 @@ def closed_loop_figures(walk: WalkRecord, shortest: float) -> dict[str, float]:
     return {
         "success": success(walk),
         "reached": reached(walk),
+        "wrong_stop": wrong_stop(walk),
+        "missed_stop": missed_stop(walk),
         "spl": spl(walk, shortest),
         "soft_spl": soft_spl(walk, shortest),
         "collisions": float(walk.collisions),

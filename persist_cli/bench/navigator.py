@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,13 +16,19 @@ from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.rows import PlanningRow
+from persist_cli.bench.stop_rules import view_costs
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
-from persist_cli.planning.futures import FutureModel, SimulatorFutures, WorldFutures
+from persist_cli.planning.approach import best_approach
+from persist_cli.planning.futures import FutureModel, Over, SimulatorFutures, WorldFutures
 from persist_cli.planning.judge import Budget, Judge
 from persist_cli.planning.planners import Cem, CemSettings, Planner, Rank, RankSettings
 from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
+
+APPROACH = 8  # actions of the ways that are compared before an agent stops
+
+MANY = 1_000_000  # actions after which nothing is left of a plan
 
 DECISIONS = 100_000  # more than an episode has, so that no two decisions of all episodes share a seed
 
@@ -37,6 +44,8 @@ class PlanSettings:
         frames: most imagined frames of a decision; ``None`` for no bound.
         seconds: most seconds of a decision, likewise.
         body: whether imagined moves over ground known to be occupied do not move.
+        keep: whether ``rank-N`` judges what is left of its last plan again.
+        approach: whether an agent that recognises the goal goes on to the best view before it stops.
     """
 
     horizon: int = 8
@@ -45,6 +54,8 @@ class PlanSettings:
     frames: int | None = None
     seconds: float | None = None
     body: bool = True
+    keep: bool = True
+    approach: bool = True
 
 
 @dataclass(frozen=True)
@@ -53,7 +64,7 @@ class RowParts:
 
     Args:
         policy: proposes; ``None`` for ``cem``.
-        cost: judges; ``None`` without imagination.
+        cost: judges what is imagined, or retrieves; ``None`` for rows that do neither.
         backbone: of the world model, with the row's adapter; ``None`` without one.
         factory: makes the memories that the adapter reads; ``None`` without one.
         sampling: of the world model.
@@ -97,20 +108,18 @@ class Navigator:
     ) -> None:
         self.row, self.parts, self.settings = row, parts, settings
         self.info, self.seed = scene.info, scene.episode.seed
-        self.goal = told_goal(scene.goal, row)
         self.seen = scene.look()
         walk = scene.walk() if row.walk else self.seen[:0]
+        self.goal = retrieved(scene.goal, walk, parts.cost) if row.retrieves else told_goal(scene.goal, row)
         body = body_of(self.info)
         self.ground = GroundMapper(self.info.world_up, body)
         self.world = make_world(parts, walk, self.seen, self.info, self.seed)
-        memory = self.world.agents[0].memory if self.world else None
-        if memory is not None:
-            self.ground.add_points(memory.points(), self.ground.floor_under(self.seen.cameras.centers[0]))
-        elif not row.imagines:
-            self.ground.add(walk)
+        self.ground.add(walk)
         self.ground.add(self.seen)
         self.body = body if settings.body else None
+        self.simulator = scene.simulator
         self.decisions = 0
+        self.least = math.inf  # cost of the best true view from which the agent approached the goal
         self.decide_once = self._decider(scene.simulator, horizon)
 
     def saw(self, frames: Observations, executed: int) -> None:
@@ -148,6 +157,30 @@ class Navigator:
             actions, frames = self.decide_once(situation, generator)
         return Decision(actions, frames, time.monotonic() - begun)
 
+    @property
+    def approaches(self) -> bool:
+        """Whether it goes on to the best view of a goal that it recognised; who does not imagine cannot."""
+        return self.row.imagines and self.row.goal == "image" and self.settings.approach
+
+    def approach(self) -> Decision:
+        """Return the way to the best view nearby of a goal that was recognised; without actions: stop here.
+
+        The agent stops where no imagined view is better than the present one, and where the last approach did not make
+        the true view better.
+        """
+        begun = time.monotonic()
+        situation = Situation(self.seen, self.info, self.goal, self.ground.map())
+        judge = self._judge(self._model(self.simulator, situation), situation, "best")
+        now = view_costs(judge.cost, self.seen[-1:], self.goal)[0]
+        if now >= self.least:
+            return Decision((), 0, time.monotonic() - begun)
+        self.least = now
+        if self.planner is not None:
+            self.planner.executed(MANY)
+        with torch.no_grad():
+            best = best_approach(judge, self.info.vocabulary, APPROACH)
+        return Decision(best.chosen if best.cost < now else (), judge.frames, time.monotonic() - begun)
+
     def _decider(
         self, simulator: Simulator, horizon: int
     ) -> Callable[[Situation, torch.Generator], tuple[tuple[str, ...], int]]:
@@ -172,17 +205,25 @@ class Navigator:
             return SimulatorFutures(simulator)
         return WorldFutures(self.world, situation.ground, self.body)
 
-    def _judge(self, model: FutureModel, situation: Situation) -> Judge:
+    def _judge(self, model: FutureModel, situation: Situation, over: Over | None = None) -> Judge:
         cost, settings = self.parts.cost, self.settings
         if cost is None:
             raise ValueError(f"row {self.row.name!r} imagines and has no cost")
         budget = Budget(settings.frames, settings.seconds)
-        return Judge(model, cost, self.goal, situation.ground, settings.over, budget)
+        return Judge(model, cost, self.goal, situation.ground, over or settings.over, budget)
 
 
 def told_goal(goal: Goal, row: PlanningRow) -> Goal:
     """Return of a goal what a row is told: the image or the place."""
     return Goal(goal.rgb, None, goal.scene) if row.goal == "image" else Goal(None, goal.position, goal.scene)
+
+
+def retrieved(goal: Goal, walk: Observations, cost: Cost | None) -> Goal:
+    """Return the place of the frame of a walk that is most like a goal's image, as the place of the goal."""
+    if cost is None:
+        raise ValueError("a row that retrieves the goal's place needs a cost")
+    costs = view_costs(cost, walk, goal)
+    return Goal(None, walk.cameras.centers[costs.index(min(costs))], goal.scene)
 
 
 def make_world(
@@ -206,7 +247,7 @@ def make_planner(row: PlanningRow, policy: Policy | None, settings: PlanSettings
         return Cem(CemSettings(horizon=horizon, candidates=row.candidates, rounds=settings.rounds))
     if policy is None:
         raise ValueError(f"row {row.name!r} ranks and has no policy")
-    return Rank(policy, RankSettings(horizon=horizon, candidates=row.candidates))
+    return Rank(policy, RankSettings(horizon=horizon, candidates=row.candidates, keep=settings.keep))
 
 
 def _first_proposal(

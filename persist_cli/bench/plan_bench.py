@@ -21,7 +21,7 @@ from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
 from persist_cli.bench.planning_journal import PlanningJournal
 from persist_cli.bench.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
 from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_open_loop
-from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThreshold, stop_threshold
+from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThresholds, stop_thresholds
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter
 from persist_cli.errors import DataError, PersistError, hint
@@ -136,7 +136,7 @@ class PlanningBench:
         cost: of the rows that imagine, by which agents that are shown an image stop.
         simulator: of the episodes.
         journal: keeps what was run.
-        threshold: at which such agents stop; ``None`` where the cost reads a place and none is needed.
+        thresholds: at which such agents stop; ``None`` where the cost reads a place and none is needed.
     """
 
     plan: BenchPlan
@@ -146,13 +146,15 @@ class PlanningBench:
     cost: Cost
     simulator: Simulator
     journal: PlanningJournal
-    threshold: StopThreshold | None
+    thresholds: StopThresholds | None
 
     def stop_rule(self, row: PlanningRow) -> StopRule:
         """Return the rule by which the agents of a row stop."""
-        if row.goal == "place" or self.threshold is None:
+        if row.goal == "place" or self.thresholds is None:
             return StopAtPlace()
-        return StopByCost(self.cost, self.threshold.value)
+        approaches = row.imagines and self.plan.planning.approach
+        chosen = self.thresholds.approach if approaches else self.thresholds.stop
+        return StopByCost(self.cost, chosen.value)
 
     def units(self, row: PlanningRow, processes: Processes) -> Iterator[Episode]:
         """Yield the episodes of a row that this process runs and the journal lacks."""
@@ -192,10 +194,10 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         check_model(checkpoint, rows, episodes)
     simulator = open_simulator(episodes)
     if processes.main:
-        find_threshold(plan, cost, rows, simulator, journal)
+        find_thresholds(plan, cost, rows, simulator, journal)
     processes.wait()  # the others find what the main process kept
-    threshold = find_threshold(plan, cost, rows, simulator, journal)
-    return PlanningBench(plan, checkpoint, episodes, rows, cost, simulator, journal, threshold)
+    thresholds = find_thresholds(plan, cost, rows, simulator, journal)
+    return PlanningBench(plan, checkpoint, episodes, rows, cost, simulator, journal, thresholds)
 
 
 def check_policies(rows: Sequence[PlanningRow], settings: PlanSettings) -> None:
@@ -277,20 +279,20 @@ def open_simulator(episodes: EpisodeSet) -> Simulator:
     return make_simulator(episodes.simulator, episodes.settings)
 
 
-def find_threshold(
+def find_thresholds(
     plan: BenchPlan, cost: Cost, rows: Sequence[PlanningRow], simulator: Simulator, journal: PlanningJournal
-) -> StopThreshold | None:
-    """Return the threshold at which agents that are shown an image stop; ``None`` where there are none."""
+) -> StopThresholds | None:
+    """Return the thresholds at which agents that are shown an image stop; ``None`` where there are none."""
     if cost.reads != "image" or all(row.goal == "place" for row in rows):
         return None
     if plan.stop_cost is not None:
-        return StopThreshold(plan.stop_cost, 0, 0)
+        return StopThresholds.given(plan.stop_cost)
     kept = journal.stop()
     if kept is None:
         with busy("choosing on validation houses when to stop"):
-            kept = asdict(stop_threshold(simulator, cost))
+            kept = asdict(stop_thresholds(simulator, cost))
         journal.keep_stop(kept)
-    return StopThreshold(**kept)
+    return StopThresholds.read(kept)
 
 
 def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict[str, Any]:
@@ -335,7 +337,10 @@ class RowLoader:
     def load(self, row: PlanningRow) -> RowParts:
         """Return the parts of a row; the backbone has its adapter until another row is loaded."""
         policy = open_policy(row.policy) if row.policy is not None else None
-        parts, checkpoint = RowParts(policy, self.bench.cost if row.imagines else None), self.bench.checkpoint
+        parts, checkpoint = (
+            RowParts(policy, self.bench.cost if row.imagines or row.retrieves else None),
+            self.bench.checkpoint,
+        )
         if checkpoint is None or not row.uses_world_model:
             return parts
         backbone, adapter = self.loader.load(checkpoint), adapter_of(checkpoint, row)

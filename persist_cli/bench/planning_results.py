@@ -40,7 +40,12 @@ COLUMNS: Final = {
     ),
     "spl": Column("SPL", "higher", True, "S · l / max(l, p): S success, l shortest way, p its way, metres", "closed"),
     "soft_spl": Column("SoftSPL", "higher", True, "max(0, 1 − d / l) · l / max(l, p): d metres left", "closed"),
-    "reached": Column("reached", "higher", True, f"it was within {SUCCESS_METRES:g} m at any time", "closed"),
+    "reached": Column(
+        "oracle success", "higher", True,
+        f"it was within {SUCCESS_METRES:g} m at any time, as if it were told when to stop", "closed",
+    ),
+    "wrong_stop": Column("wrong stop", "lower", True, "it stopped farther away than that", "closed"),
+    "missed_stop": Column("missed stop", "lower", True, "it was so near and never stopped", "closed"),
     "end_metres": Column("metres left", "lower", False, "geodesic metres to the goal at the end", "closed"),
     "collisions": Column("collisions", "lower", False, "actions that the scene refused, an episode", "closed"),
     "collisions_per_action": Column("collisions/action", "lower", True, "these by all actions", "closed"),
@@ -137,10 +142,8 @@ def settings_json(bench: PlanningBench) -> dict[str, Any]:
 def stop_words(bench: PlanningBench) -> list[str]:
     """Return sentences that say when agents stop."""
     words = [f"an agent that is told the goal's place stops within {AT_PLACE:g} m of it"]
-    if bench.threshold is not None and bench.threshold.episodes:
-        words.insert(0, bench.threshold.definition)
-    elif bench.threshold is not None:
-        words.insert(0, f"an agent that is shown the goal image stops when its view costs {bench.threshold.value:g}")
+    if bench.thresholds is not None:
+        words = [*bench.thresholds.definitions(bench.plan.planning.approach), *words]
     return [*words, "any agent stops when its plan is empty"]
 
 
@@ -148,6 +151,8 @@ def define(row: PlanningRow, bench: PlanningBench) -> str:
     """Return a few words that say what a row is."""
     given = "given the walk" if row.walk else "given nothing of the scene but its own frames"
     told = f"{'shown the goal image' if row.goal == 'image' else 'told the place of the goal'}, {given}"
+    if row.retrieves:
+        told = f"shown the goal image; takes for its place that of the frame most like it by {bench.cost.name}; {given}"
     if not row.imagines:
         return f"policy {row.policy!r} without imagination; {told}"
     model = "the simulator itself as the model" if row.memory == SIMULATOR else f"memory {row.memory!r}"

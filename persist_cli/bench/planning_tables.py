@@ -10,7 +10,19 @@ from persist_cli.bench.plan_bench import LOOPS
 from persist_cli.bench.planning_results import COLUMNS
 from persist_cli.viewing.console import print_table, say
 
-SHORT: Final = ("success", "spl", "soft_spl", "reached", "collisions", "seconds_per_decision", "ate", "rpe", "sim")
+SHORT: Final = (
+    "success",
+    "spl",
+    "soft_spl",
+    "reached",
+    "wrong_stop",
+    "missed_stop",
+    "collisions",
+    "seconds_per_decision",
+    "ate",
+    "rpe",
+    "sim",
+)
 
 
 def columns_of(table: Mapping[str, Any], names: Sequence[str]) -> list[str]:

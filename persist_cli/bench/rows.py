@@ -16,6 +16,12 @@ NO_MEMORY: Final = "none"
 
 POLICY: Final = "policy"  # the row of the policy that ``--policy`` names, without imagination
 
+POLICY_WALK: Final = "policy-walk"  # the same, given the walk, so that it knows as much ground as rows with a memory
+
+RETRIEVAL: Final = "shortest-path-retrieval"  # to the place of the given frame that is most like the goal image
+
+POLICIES: Final = (POLICY, POLICY_WALK)
+
 RANK = re.compile(r"rank-(?P<count>[1-9]\d*)")
 
 Planning = Literal["policy", "rank", "cem"]
@@ -33,6 +39,7 @@ class PlanningRow:
         goal: what it is told of the goal.
         walk: whether it is given the walk.
         candidates: that a round imagines; 0 without a model.
+        retrieves: whether the place that it is told is that of the given frame most like the goal image, by the cost.
     """
 
     name: str
@@ -42,6 +49,7 @@ class PlanningRow:
     goal: GoalKind
     walk: bool
     candidates: int = 0
+    retrieves: bool = False
 
     @property
     def imagines(self) -> bool:
@@ -64,6 +72,7 @@ ALONE: Final[dict[str, tuple[str, GoalKind | None, bool]]] = {
     "shortest-path": ("shortest-path", "place", True),
     "shortest-path-no-walk": ("shortest-path", "place", False),
     "shortest-path-image": ("shortest-path", "image", True),
+    RETRIEVAL: ("shortest-path", "place", True),
 }
 """Rows without imagination: the policy, what it is told of the goal (``None``: what the cost reads), and whether it is
 given the walk."""
@@ -74,6 +83,7 @@ PLANNED: Final = ("rank-8", "rank-16", "cem")
 def default_rows(policy: str | None, goal: GoalKind) -> tuple[str, ...]:
     """Return the names of the rows where none are named."""
     alone = [name for name, (_, told, _) in ALONE.items() if told in (None, "place", goal)]
+    alone = [name for name in alone if name != RETRIEVAL or goal == "image"]
     return (*alone, *([POLICY] if policy else []), *PLANNED)
 
 
@@ -82,7 +92,7 @@ class RowChoice:
     """What the rows are made of.
 
     Args:
-        names: of ``ALONE``, ``policy``, ``rank-N`` or ``cem``.
+        names: of ``ALONE``, of ``POLICIES``, ``rank-N`` or ``cem``.
         memories: of the world model, and ``simulator``; each makes a row of every ``rank-N`` and of ``cem``.
         policy: name or folder of the policy of ``policy`` and ``rank-N``; ``None`` where none is named, which ranks
             ``random``.
@@ -104,28 +114,29 @@ class RowChoice:
         """
         names, memories = list(dict.fromkeys(self.names)), list(dict.fromkeys(self.memories))
         for name in names:
-            if name not in (*ALONE, POLICY, "cem") and not RANK.fullmatch(name):
-                raise PersistError(f"unknown row {name!r}; {hint(name, [*ALONE, POLICY, *PLANNED])}")
-            if self.goal == "place" and ALONE.get(name, ("", "", False))[1] == "image":
+            if name not in (*ALONE, *POLICIES, "cem") and not RANK.fullmatch(name):
+                raise PersistError(f"unknown row {name!r}; {hint(name, [*ALONE, *POLICIES, *PLANNED])}")
+            if self.goal == "place" and (name == RETRIEVAL or ALONE.get(name, ("", "", False))[1] == "image"):
                 raise PersistError(f"row {name!r} is shown the goal image, and the cost reads a place; leave it out")
-        if POLICY in names and self.policy is None:
-            raise PersistError("the row 'policy' needs a policy; give --policy a name or the folder of a trained one")
+        alone = next((name for name in names if name in POLICIES), None)
+        if alone is not None and self.policy is None:
+            raise PersistError(f"the row {alone!r} needs a policy; give --policy a name or the folder of a trained one")
         rows = [row for name in names for row in self._rows_of(name, memories)]
         if not rows:
             raise PersistError("no row is left; name --rows such as random,rank-8 and --memories such as none,voxel")
         return rows
 
     def _rows_of(self, name: str, memories: Sequence[str]) -> Iterator[PlanningRow]:
-        if name == POLICY:
-            yield PlanningRow(name, "policy", self.policy, None, self.goal, False)
+        if name in POLICIES:
+            yield PlanningRow(name, "policy", self.policy, None, self.goal, name == POLICY_WALK)
         elif name in ALONE:
             policy, goal, walk = ALONE[name]
-            yield PlanningRow(name, "policy", policy, None, goal or self.goal, walk)
+            yield PlanningRow(name, "policy", policy, None, goal or self.goal, walk, retrieves=name == RETRIEVAL)
         else:
             ranked = RANK.fullmatch(name)
             count = int(ranked["count"]) if ranked else self.cem_candidates
             for memory in memories:
                 yield PlanningRow(
                     f"{name}, {memory}", "rank" if ranked else "cem", (self.policy or "random") if ranked else None,
-                    memory, self.goal, memory not in (NO_MEMORY, SIMULATOR), count,
+                    memory, self.goal, memory != NO_MEMORY, count,
                 )  # fmt: skip

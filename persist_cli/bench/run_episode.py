@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import torch
 
@@ -17,11 +18,13 @@ from persist_cli.bench.navigation_metrics import (
     relative_error,
     similarity,
 )
-from persist_cli.bench.navigator import Navigator
+from persist_cli.bench.navigator import Decision, Navigator
 from persist_cli.bench.stop_rules import StopRule
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.metrics.networks import missing_weights
 from persist_cli.metrics.src import ENCODERS, VideoFeatures
+
+OUT_OF_ACTIONS: Final = "out of actions"
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,11 @@ class Trace:
     frames: int = 0  # imagined
     seconds: float = 0.0  # of deciding
 
+    def add(self, decision: Decision) -> None:
+        """Count a decision."""
+        self.decisions += 1
+        self.frames, self.seconds = self.frames + decision.frames, self.seconds + decision.seconds
+
     def to_json(self, ended: str, figures: dict[str, float]) -> dict[str, Any]:
         """Return the trace with its figures as JSON values."""
         decisions = max(self.decisions, 1)
@@ -64,10 +72,76 @@ class Trace:
         }  # fmt: skip
 
 
+@dataclass
+class ClosedLoop:
+    """An agent that acts, looks and decides again, until it stops or has no actions left.
+
+    Args:
+        scene: with the agent at the start.
+        navigator: of an agent that was given what its row is given.
+        stop: rule of the row.
+        settings: of the loop.
+        trace: what happened so far.
+    """
+
+    scene: TrueScene
+    navigator: Navigator
+    stop: StopRule
+    settings: LoopSettings
+    trace: Trace
+
+    def run(self) -> str:
+        """Run it to its end, and return how it ended: ``stopped``, ``gave no action`` or ``out of actions``."""
+        recognised = self._recognises(self.navigator.seen[-1:])
+        while self.left:
+            if recognised and not self.navigator.approaches:
+                return "stopped"
+            decision = self.navigator.approach() if recognised else self.navigator.decide()
+            self.trace.add(decision)
+            if not decision.actions:
+                return "stopped" if recognised else "gave no action"
+            recognised = self._act(decision.actions, recognised)
+        return "stopped" if recognised else OUT_OF_ACTIONS
+
+    @property
+    def left(self) -> int:
+        """Number of actions that the agent still has."""
+        return math.ceil(self.settings.patience * self.scene.episode.bin) - len(self.trace.actions)
+
+    def _recognises(self, view: Observations) -> bool:
+        return self.stop.stops(view, self.navigator.goal, self.scene.info.world_up)
+
+    def _act(self, actions: Sequence[str], approaching: bool) -> bool:
+        """Do the first actions of a plan until the goal is recognised, or all of an approach; return whether it is."""
+        count = self.left if approaching else min(self.settings.execute, self.left)
+        frames, recognised = list[Observations](), False
+        for action in actions[:count]:
+            frames.append(self._do(action))
+            recognised = self._recognises(frames[-1])
+            if recognised and not approaching:
+                break
+        self.navigator.saw(Observations.concatenate(frames), len(frames))
+        return recognised
+
+    def _do(self, action: str) -> Observations:
+        """Do an action and return the frame after it; the agent notices when something is in the way."""
+        allowed, trace = self.scene.simulator.act(action), self.trace
+        if not allowed:
+            trace.refused.append(len(trace.actions))
+        trace.actions.append(action)
+        trace.places.append(self.scene.simulator.agent[0])
+        trace.distances.append(self.scene.distance)
+        frame = self.scene.look()
+        if not allowed:
+            self.navigator.collided(frame, action)
+        return frame
+
+
 def run_closed_loop(scene: TrueScene, navigator: Navigator, stop: StopRule, settings: LoopSettings) -> dict[str, Any]:
     """Let an agent act until it stops or has no actions left, and return what happened as JSON values.
 
-    After each action the agent looks. It stops when its stop rule says so, or when it decides to do nothing.
+    After each action the agent looks. Where its stop rule recognises the goal it stops, or first approaches the best
+    view of it; it also stops when it decides to do nothing.
 
     Args:
         scene: with the agent at the start.
@@ -76,35 +150,10 @@ def run_closed_loop(scene: TrueScene, navigator: Navigator, stop: StopRule, sett
         settings: of the loop.
     """
     trace = Trace([scene.distance], [scene.simulator.agent[0]])
-    most = math.ceil(settings.patience * scene.episode.bin)
-    ended = "stopped" if stop.stops(navigator.seen[-1:], navigator.goal, scene.info.world_up) else ""
-    while not ended and len(trace.actions) < most:
-        decision = navigator.decide()
-        trace.decisions += 1
-        trace.frames, trace.seconds = trace.frames + decision.frames, trace.seconds + decision.seconds
-        count = min(settings.execute, most - len(trace.actions))
-        ended = _act(scene, navigator, stop, trace, decision.actions[:count]) if decision.actions else "gave no action"
+    ended = ClosedLoop(scene, navigator, stop, settings, trace).run()
     metres = sum(math.dist(*pair) for pair in zip(trace.places, trace.places[1:], strict=False))
-    walk = WalkRecord(trace.distances, metres, len(trace.refused), bool(ended))
-    return trace.to_json(ended or "out of actions", closed_loop_figures(walk, scene.episode.metres))
-
-
-def _act(scene: TrueScene, navigator: Navigator, stop: StopRule, trace: Trace, actions: tuple[str, ...]) -> str:
-    """Do actions and look after each; return ``stopped`` when the agent stopped, else an empty text."""
-    frames = []
-    for action in actions:
-        if not (allowed := scene.simulator.act(action)):
-            trace.refused.append(len(trace.actions))
-        trace.actions.append(action)
-        trace.places.append(scene.simulator.agent[0])
-        trace.distances.append(scene.distance)
-        frames.append(scene.look())
-        if not allowed:
-            navigator.collided(frames[-1], action)
-        if stop.stops(frames[-1], navigator.goal, scene.info.world_up):
-            return "stopped"
-    navigator.saw(Observations.concatenate(frames), len(frames))
-    return ""
+    walk = WalkRecord(trace.distances, metres, len(trace.refused), ended != OUT_OF_ACTIONS)
+    return trace.to_json(ended, closed_loop_figures(walk, scene.episode.metres))
 
 
 def run_open_loop(scene: TrueScene, navigator: Navigator) -> dict[str, Any]:

@@ -1,11 +1,15 @@
-"""When an agent of the benchmark stops: at the goal's place, or when its view costs little enough."""
+"""When an agent of the benchmark stops: at the goal's place, or when its view costs little enough.
+
+What costs little from 1.4 m behind the goal looks as the goal does, only smaller, so that no threshold tells the two
+apart. Agents that imagine therefore take the threshold for having recognised the goal, and go to the best view nearby.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -23,6 +27,8 @@ from persist_cli.errors import PersistError
 from persist_cli.simulators.collect import FIRST_SEED
 
 AT_PLACE: Final = 0.5  # metres from the goal's place at which an agent that is told it stops
+
+APPROACH_METRES: Final = 1.5  # from the goal, from where an approach of some steps finds the best view
 
 VALIDATION_SEARCH: Final = EpisodeSearch(bins=(8, 16), each=12, walk_frames=24)
 
@@ -91,15 +97,13 @@ class Approach:
 
     Args:
         far: least cost of the views from farther than ``SUCCESS_METRES`` of the goal.
+        farther: least cost of those from farther than ``APPROACH_METRES``.
         near: cost of a view from beside the goal.
     """
 
     far: float
+    farther: float
     near: float
-
-    def succeeds(self, threshold: float) -> bool:
-        """Return whether an agent would stop at the near view and at none of the far ones."""
-        return self.near <= threshold < self.far
 
 
 @dataclass(frozen=True)
@@ -108,38 +112,85 @@ class StopThreshold:
 
     Args:
         value: the threshold.
-        successes: validation episodes in which the agent stops near the goal and not before.
-        episodes: all validation episodes.
+        metres: from the goal, beyond which a view that costs so little is a mistake.
+        successes: validation episodes in which the near view costs so little and no view from beyond ``metres`` does.
+        episodes: all validation episodes; 0 when the threshold was given.
     """
 
     value: float
+    metres: float
     successes: int
     episodes: int
 
     @property
-    def definition(self) -> str:
-        """A sentence that says how it was chosen."""
+    def chosen(self) -> str:
+        """Words that say how it was chosen."""
+        if not self.episodes:
+            return f"{self.value:.4g} (given)"
         return (
-            "an agent that is shown the goal image stops when the cost of its view is at most "
-            f"{self.value:.4g}: chosen in validation houses, where {self.successes} of {self.episodes} agents stop at "
-            f"a view {BESIDE[0]:g} to {BESIDE[1]:g} m and up to {TURNED:g}° beside the goal's pose, and at none of "
-            f"those from farther than {SUCCESS_METRES:g} m on the shortest way and on the given walk"
+            f"{self.value:.4g} (in {self.successes} of {self.episodes} validation episodes a view {BESIDE[0]:g} to "
+            f"{BESIDE[1]:g} m and up to {TURNED:g}° beside the goal's pose costs so little, and none from farther than "
+            f"{self.metres:g} m on the shortest way and on the given walk does)"
         )
 
 
-def choose_threshold(approaches: Sequence[Approach]) -> StopThreshold:
-    """Return the threshold at which most approaches succeed, the middle one of equals.
+@dataclass(frozen=True)
+class StopThresholds:
+    """Largest costs of the present view.
+
+    Args:
+        stop: at which an agent stops that does not imagine.
+        approach: at which an agent that imagines goes to the best view nearby, and stops there.
+    """
+
+    stop: StopThreshold
+    approach: StopThreshold
+
+    @staticmethod
+    def given(cost: float) -> StopThresholds:
+        """Return thresholds that the user gave."""
+        return StopThresholds(StopThreshold(cost, SUCCESS_METRES, 0, 0), StopThreshold(cost, APPROACH_METRES, 0, 0))
+
+    @staticmethod
+    def read(values: Mapping[str, Any]) -> StopThresholds:
+        """Return what ``dataclasses.asdict`` made JSON values of."""
+        return StopThresholds(StopThreshold(**values["stop"]), StopThreshold(**values["approach"]))
+
+    def definitions(self, approach: bool) -> list[str]:
+        """Return sentences without a full stop that say when agents stop which are shown an image.
+
+        Args:
+            approach: whether agents that imagine approach the best view first.
+        """
+        who = "an agent that is shown the goal image"
+        if not approach:
+            return [f"{who} stops when its view costs at most {self.stop.chosen}"]
+        return [
+            f"{who} and does not imagine stops when its view costs at most {self.stop.chosen}",
+            f"{who} and imagines goes to the best view it imagines nearby as soon as its view costs at most "
+            f"{self.approach.chosen}, and stops where none is better",
+        ]
+
+
+def choose_threshold(approaches: Sequence[Approach], metres: float = SUCCESS_METRES) -> StopThreshold:
+    """Return the threshold at which most near views cost little enough and no view from too far, the middle of equals.
+
+    Args:
+        approaches: of validation episodes.
+        metres: ``SUCCESS_METRES`` or ``APPROACH_METRES``, from where on a view is too far.
 
     Raises:
         PersistError: without approaches.
     """
     if not approaches:
         raise PersistError("no validation episode was found to choose when to stop; give --stop-cost")
-    costs = np.unique([approach.near for approach in approaches])
-    counts = np.array([sum(approach.succeeds(cost) for approach in approaches) for cost in costs])
+    near = np.array([approach.near for approach in approaches])
+    far = np.array([approach.far if metres == SUCCESS_METRES else approach.farther for approach in approaches])
+    costs = np.unique(near)
+    counts = np.array([((near <= cost) & (cost < far)).sum() for cost in costs])
     best = np.flatnonzero(counts == counts.max())
     chosen = best[len(best) // 2]
-    return StopThreshold(float(costs[chosen]), int(counts[chosen]), len(approaches))
+    return StopThreshold(float(costs[chosen]), metres, int(counts[chosen]), len(approaches))
 
 
 def approach(scene: TrueScene, cost: Cost) -> Approach | None:
@@ -149,12 +200,13 @@ def approach(scene: TrueScene, cost: Cost) -> Approach | None:
     shown = [scene.look_and_measure(), *scene.act_and_measure(vocabulary.parse(walk.actions) if walk.actions else ())]
     scene.back_to_start()
     way = [scene.look_and_measure(), *scene.act_and_measure(vocabulary.parse(scene.episode.actions))]
-    far = [view for view, metres in (*shown, *way) if metres > SUCCESS_METRES]
+    far = [(view, metres) for view, metres in (*shown, *way) if metres > SUCCESS_METRES]
     near = look_beside(scene)
     if near is None or not far:
         return None
-    *costs, last = view_costs(cost, Observations.concatenate([*far, near]), scene.goal)
-    return Approach(min(costs), last)
+    *costs, last = view_costs(cost, Observations.concatenate([*(view for view, _ in far), near]), scene.goal)
+    farther = [value for value, (_, metres) in zip(costs, far, strict=True) if metres > APPROACH_METRES]
+    return Approach(min(costs), min(farther, default=math.inf), last)
 
 
 def look_beside(scene: TrueScene) -> Observations | None:
@@ -177,11 +229,12 @@ def validation_episodes(simulator: Simulator) -> list[Episode]:
     return [episode for found in find_episodes(simulator, scenes, VALIDATION_SEARCH) for episode in found]
 
 
-def stop_threshold(simulator: Simulator, cost: Cost) -> StopThreshold:
-    """Choose the threshold of a cost in validation houses, in which the simulator is left.
+def stop_thresholds(simulator: Simulator, cost: Cost) -> StopThresholds:
+    """Choose the thresholds of a cost in validation houses, in which the simulator is left.
 
     Raises:
         PersistError: when these houses have no episodes, or a cost is NaN.
     """
-    approaches = [approach(TrueScene(simulator, episode), cost) for episode in validation_episodes(simulator)]
-    return choose_threshold([one for one in approaches if one is not None])
+    tried = [approach(TrueScene(simulator, episode), cost) for episode in validation_episodes(simulator)]
+    approaches = [one for one in tried if one is not None]
+    return StopThresholds(choose_threshold(approaches), choose_threshold(approaches, APPROACH_METRES))

@@ -231,6 +231,8 @@ def bench_plan(
     loops: Annotated[str, typer.Option(help="closed, open or both; open: up to 16 actions.")] = "closed,open",
     stop_cost: Annotated[float | None, typer.Option(help="Cost of a view to stop at; else chosen.")] = None,
     body: Annotated[bool, typer.Option(help="Imagined moves into known obstacles do not move.")] = True,
+    keep: Annotated[bool, typer.Option(help="rank-N: the rest of the last plan is a candidate again.")] = True,
+    approach: Annotated[bool, typer.Option(help="Go to the best imagined view of a goal in sight, then stop.")] = True,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
@@ -254,8 +256,9 @@ def bench_plan(
     plan = BenchPlan(
         EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each), checkpoint,
         split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
-        PlanSettings(horizon, over, rounds, frames, seconds, body), split_names(loops), LoopSettings(execute, patience),
-        stop_cost, SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory),
+        PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach), split_names(loops),
+        LoopSettings(execute, patience), stop_cost, SamplingOverrides(steps, sampler, guidance),
+        InferenceOptions.of(dtype, save_memory),
         allow_training_scenes,
     )  # fmt: skip
     run_plan_bench(plan, out, report, json)

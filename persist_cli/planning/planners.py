@@ -79,11 +79,14 @@ class RankSettings:
         horizon: most actions of a proposal.
         candidates: proposals of a round.
         rounds: rounds, each of new proposals.
+        keep: whether what is left of the last plan is one of the next plan's candidates, in place of a proposal. Else
+            an agent that plans again forgets a good way whenever the new proposals are worse.
     """
 
     horizon: PositiveInt = 8
     candidates: PositiveInt = 16
     rounds: PositiveInt = 1
+    keep: bool = False
 
 
 class Rank:
@@ -106,19 +109,24 @@ class Rank:
                 f"--horizon {policy.longest}"
             )
         self.policy, self.settings = policy, settings
+        self._last: tuple[str, ...] = ()  # what is left of the last plan
 
     def plan(self, situation: Situation, judge: Judge, generator: torch.Generator, on_round: OnRound = nothing) -> Plan:
         """Return the judged proposals; see ``Planner``."""
         horizon, count, number = self.settings.horizon, self.settings.candidates, 0
         while number < self.settings.rounds and not judge.exhausted:
             number += 1
-            proposals = self.policy.propose(situation, horizon, count, generator)
-            judge.judge(proposals, number)
+            kept = [self._last] if self._last and number == 1 else []
+            proposals = self.policy.propose(situation, horizon, max(count - len(kept), 1), generator)
+            judge.judge([*kept, *proposals][:count], number)
             on_round(number, least(judge))
-        return finished(judge, number)
+        plan = finished(judge, number)
+        self._last = plan.actions if self.settings.keep else ()
+        return plan
 
     def executed(self, count: int) -> None:
-        """Do nothing: each plan begins anew."""
+        """Drop the actions that were done from the plan that is kept."""
+        self._last = self._last[count:]
 
 
 @dataclass(frozen=True)

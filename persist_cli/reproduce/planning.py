@@ -3,9 +3,12 @@
 ``python -m persist_cli.reproduce.planning [OUT]`` runs them in order, each in a process of its own. Every command
 continues where it was stopped and repeats nothing that is done, so this may be stopped and started at any time.
 
-- Episodes are drawn once, so that all figures are of the same starts and goals.
-- The main table plans by the paper's cost. Rows of the simulator in place of the model show what the model costs.
-- The same memories are ranked by another cost of images, and by the way that is left. These show what the cost costs.
+- Episodes are drawn once, so that all figures are of the same starts and goals. They lie in other houses than those in
+  which the ways of planning were chosen (scenes 0:16).
+- The main table ranks ways over known ground by the paper's cost. Rows of the simulator in place of the model show what
+  the model costs, and rows without imagination what imagining is worth. Its first half comes first, with a report.
+- The same is ranked without what an agent keeps of its last plan, and without its approach: what do these two give?
+- The cross-entropy method, another cost of images, and the way that is left follow. They take most of the time.
 """
 
 from __future__ import annotations
@@ -26,11 +29,11 @@ WEIGHTS: Final = ("lpips-alex", "dinov2-s-derived")
 
 SAMPLING: Final = "--steps 1 --guidance 1"
 
-ALONE: Final = "random,straight,shortest-path,shortest-path-no-walk,shortest-path-image"
+ALONE: Final = "policy,policy-walk,shortest-path,shortest-path-image,shortest-path-retrieval"
 
-IMAGINING: Final = "rank-8,rank-16,cem"
+MEMORIES: Final = "simulator,voxel,none"
 
-MEMORIES: Final = "none,map2d,snapshots,voxel,simulator"
+LOOP: Final = "--horizon 16 --execute 8"
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class PlanningFigures:
     Args:
         out: folder of everything.
         checkpoint: the world model; ``reference`` is that of the package.
-        policy: a trained policy, whose proposals are ranked; ``None`` ranks random ones.
+        policy: proposes what is ranked; a name, or the folder of a trained one.
         scenes: held-out houses.
         each: most episodes of each bin, in sight and hidden.
         bins: actions of the shortest ways.
@@ -48,29 +51,32 @@ class PlanningFigures:
 
     out: Path
     checkpoint: str = "reference"
-    policy: str | None = None
-    scenes: str = "0:48"
-    each: int = 16
-    bins: str = "8,16,32,64"
+    policy: str = "routes"
+    scenes: str = "40:96"
+    each: int = 32
+    bins: str = "8,16"
 
 
 def commands(figures: PlanningFigures) -> Iterator[str]:
     """Yield the command lines in order."""
     home, model = shlex.quote(str(figures.out)), shlex.quote(figures.checkpoint)
-    policy = f" --policy {shlex.quote(figures.policy)}" if figures.policy else ""
-    alone = f"{ALONE},policy" if figures.policy else ALONE
-    plan = f"bench plan {model} --episodes {home}/episodes.json {SAMPLING}{policy}"
+    plan = f"bench plan {model} --episodes {home}/episodes.json {SAMPLING} --policy {shlex.quote(figures.policy)}"
     yield f"weights fetch {' '.join(WEIGHTS)}"
     if not (figures.out / "episodes.json").is_file():
         yield (
             f"bench episodes --scenes {figures.scenes} --bins {figures.bins} --each {figures.each} "
             f"--out {home}/episodes.json"
         )
+    for rows in (f"{ALONE},rank-16", f"{ALONE},rank-8,rank-16"):
+        yield f"{plan} {LOOP} --rows {rows} --memories {MEMORIES} {_to(home, 'lpips')}"
+    for choice in ("no-keep", "no-approach"):
+        yield f"{plan} {LOOP} --{choice} --loops closed --rows rank-16 --memories simulator,voxel {_to(home, choice)}"
     if not (figures.out / "collisions.json").is_file():
         yield f"bench collisions {model} {SAMPLING} --memories voxel,none --out {home}/collisions.json"
-    yield f"{plan} --rows {alone},{IMAGINING} --memories {MEMORIES} {_to(home, 'lpips')}"
-    yield f"{plan} --rows rank-16,cem --memories none,voxel,simulator --cost dino {_to(home, 'dino')}"
-    yield f"{plan} --rows rank-16,cem --memories none,voxel,simulator --cost geodesic {_to(home, 'geodesic')}"
+    closed = f"{plan} --loops closed"
+    yield f"{closed} --bins 16 --rows cem --memories {MEMORIES} {_to(home, 'cem')}"
+    yield f"{closed} {LOOP} --rows rank-16 --memories {MEMORIES} --cost dino {_to(home, 'dino')}"
+    yield f"{closed} {LOOP} --rows rank-16 --memories {MEMORIES} --cost geodesic {_to(home, 'geodesic')}"
 
 
 def _to(home: str, name: str) -> str:
@@ -82,10 +88,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.planning")
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/planning"), help="folder of everything")
     parser.add_argument("--checkpoint", default="reference", help="the world model; else that of the package")
-    parser.add_argument("--policy", help="a trained policy, whose proposals are ranked; else random ones")
-    parser.add_argument("--scenes", default="0:48", help="held-out houses")
-    parser.add_argument("--each", type=int, default=16, help="most episodes of each bin, in sight and hidden")
-    parser.add_argument("--bins", default="8,16,32,64", help="actions of the shortest ways")
+    parser.add_argument("--policy", default="routes", help="proposes what is ranked")
+    parser.add_argument("--scenes", default="40:96", help="held-out houses")
+    parser.add_argument("--each", type=int, default=32, help="most episodes of each bin, in sight and hidden")
+    parser.add_argument("--bins", default="8,16", help="actions of the shortest ways")
     options = parser.parse_args()
     try:
         figures = PlanningFigures(

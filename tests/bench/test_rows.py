@@ -17,9 +17,9 @@ def test_rows_that_imagine_come_with_each_memory_and_others_once() -> None:
     assert names == ["random", "rank-8, none", "rank-8, voxel", "cem, none", "cem, voxel"]
 
 
-def test_only_a_memory_is_given_the_walk() -> None:
+def test_a_memory_and_the_simulator_are_given_the_walk() -> None:
     rows = choice("rank-16", memories=("none", "voxel", "simulator")).rows()
-    assert [row.walk for row in rows] == [False, True, False]
+    assert [row.walk for row in rows] == [False, True, True]
     assert [row.uses_world_model for row in rows] == [True, True, False]
     assert {row.candidates for row in rows} == {16}
 
@@ -29,6 +29,19 @@ def test_the_classical_planner_is_told_the_place_whatever_the_others_see() -> No
     assert (place.goal, image.goal) == ("place", "image")
     assert place.walk
     assert image.walk
+
+
+def test_the_goals_place_can_be_retrieved_from_the_given_frames() -> None:
+    (row,) = choice("shortest-path-retrieval").rows()
+    assert (row.goal, row.retrieves, row.walk) == ("place", True, True)
+    assert "shortest-path-retrieval" not in default_rows(None, "place")
+
+
+def test_the_policy_alone_can_be_given_the_walk_too() -> None:
+    rows = choice("policy", "policy-walk", policy="straight").rows()
+    assert [row.walk for row in rows] == [False, True]
+    with pytest.raises(PersistError, match="row 'policy-walk' needs a policy"):
+        choice("policy-walk").rows()
 
 
 def test_a_named_policy_proposes_what_is_ranked_and_has_a_row() -> None:
@@ -49,6 +62,7 @@ def test_default_rows_can_be_made_whatever_the_cost_reads() -> None:
         (("randm",), None, "unknown row 'randm'; did you mean 'random'?"),
         (("rank-0",), None, "unknown row 'rank-0'"),
         (("policy",), None, "needs a policy; give --policy"),
+        (("shortest-path-retrieval",), "place", "is shown the goal image, and the cost reads a place"),
         (("shortest-path-image",), "place", "is shown the goal image, and the cost reads a place"),
         ((), None, "no row is left"),
     ],

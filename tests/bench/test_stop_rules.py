@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+
 import pytest
 import torch
 
@@ -10,9 +13,12 @@ from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal
 from persist_cli.bench.episodes import Episode
 from persist_cli.bench.stop_rules import (
+    APPROACH_METRES,
     Approach,
     StopAtPlace,
     StopByCost,
+    StopThreshold,
+    StopThresholds,
     approach,
     choose_threshold,
 )
@@ -34,9 +40,22 @@ class PixelCost(Cost):
 
 
 def test_the_threshold_is_one_at_which_most_agents_stop_near_and_only_there() -> None:
-    approaches = [Approach(far=5.0, near=1.0), Approach(far=4.0, near=2.0), Approach(far=1.5, near=9.0)]
+    approaches = [Approach(5.0, 9.9, near=1.0), Approach(4.0, 9.9, near=2.0), Approach(1.5, 9.9, near=9.0)]
     chosen = choose_threshold(approaches)
     assert (chosen.value, chosen.successes, chosen.episodes) == (2.0, 2, 3)
+    farther = choose_threshold(approaches, APPROACH_METRES)  # who still approaches may begin sooner
+    assert (farther.value, farther.successes, farther.metres) == (9.0, 3, APPROACH_METRES)
+
+
+def test_thresholds_are_kept_as_json_values_and_say_what_they_are() -> None:
+    chosen = StopThresholds(StopThreshold(0.25, 1.0, 22, 37), StopThreshold(0.5, 1.5, 30, 37))
+    assert StopThresholds.read(json.loads(json.dumps(asdict(chosen)))) == chosen
+    stop, approach = chosen.definitions(approach=True)
+    assert "does not imagine stops when its view costs at most 0.25 (in 22 of 37" in stop
+    assert "as soon as its view costs at most 0.5 (in 30 of 37" in approach
+    assert StopThresholds.given(0.25).definitions(approach=False) == [
+        "an agent that is shown the goal image stops when its view costs at most 0.25 (given)"
+    ]
 
 
 def test_without_validation_episodes_a_threshold_must_be_given() -> None:

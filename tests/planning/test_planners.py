@@ -77,6 +77,17 @@ def test_the_cross_entropy_method_finds_the_way_and_a_seed_gives_the_same_plan(j
     assert [one.actions for one in again.candidates] == [one.actions for one in plan.candidates]
 
 
+def test_what_is_left_of_a_plan_is_judged_again_beside_new_proposals(judge, situation):
+    planner = Rank(make_policy("random", {}), RankSettings(4, 5, keep=True))
+    first = planner.plan(situation, judge(), seeded())
+    planner.executed(1)
+    second = planner.plan(situation, judge(), seeded(1))
+    assert second.candidates[0].actions == first.actions[1:]
+    assert len(second.candidates) == 5
+    planner.executed(4)
+    assert len(planner.plan(situation, judge(), seeded(2)).candidates[0].actions) == 4  # nothing was left
+
+
 def test_later_rounds_draw_what_the_elites_did(judge, situation):
     plan = Cem(CemSettings(horizon=4, candidates=60, rounds=5, smoothing=0.1)).plan(situation, judge(), seeded())
     means = [

@@ -1,0 +1,37 @@
+"""The last steps to a goal that was recognised: straight ways ahead and to both sides, which a planner compares.
+
+For example a goal image is recognised from two metres behind the place where it was taken. Its view looks much the same
+from there, so no threshold of a cost tells near from far. But it costs less with every step towards that place, and
+more beyond it: the agent imagines some steps in several directions, and goes to the best view of all.
+"""
+
+from __future__ import annotations
+
+from persist_cli.api.actions import ActionVocabulary
+from persist_cli.planning.judge import Candidate, Judge
+from persist_cli.policies.simple import gait
+
+SIDES = 3  # turns to each side at most
+
+
+def straight_ways(vocabulary: ActionVocabulary, horizon: int) -> list[tuple[str, ...]]:
+    """Return ways of ``horizon`` actions: some turns to a side, none to ``SIDES``, and steps straight ahead.
+
+    Raises:
+        PersistError: when the vocabulary has no step ahead or no turn.
+    """
+    ahead, turns = gait(vocabulary)
+    starts = [(), *((turn.name,) * count for count in range(1, SIDES + 1) for turn in turns)]
+    ways = [(*start, *(ahead.name,) * (horizon - len(start)))[:horizon] for start in starts]
+    return list(dict.fromkeys(ways))
+
+
+def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> Candidate:
+    """Return the straight way that passes the best view, which ``Candidate.chosen`` leads to.
+
+    Args:
+        judge: judges every frame of a candidate (``over`` is ``best``).
+        vocabulary: of the agent.
+        horizon: actions of each way.
+    """
+    return min(judge.judge(straight_ways(vocabulary, horizon), 1), key=lambda candidate: candidate.cost)
