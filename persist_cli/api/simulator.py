@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -111,6 +112,10 @@ class Simulator(ABC):
     @abstractmethod
     def ahead(self, heading: float) -> tuple[float, float]:
         """Return the unit vector on the ground that a heading in radians points along."""
+
+    def movable(self) -> Sequence[tuple[float, float]]:
+        """Return the ground positions in metres of all things that lie about and can be picked up; by default none."""
+        return ()
 
     @property
     @abstractmethod

@@ -168,6 +168,10 @@ class MiniWorld(Simulator):
         between_walls = any(rectangle.contains(ground) for rectangle in self._walkable)
         return between_walls and is_clear(ground, self.settings.radius, self._things)
 
+    def movable(self) -> list[Ground]:
+        """Where things stand that can be picked up."""
+        return [thing.ground for thing in self._things if thing.movable]
+
     def ahead(self, heading: float) -> tuple[float, float]:
         """Unit ground direction of a heading."""
         return math.cos(heading), -math.sin(heading)

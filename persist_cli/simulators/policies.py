@@ -1,4 +1,4 @@
-"""Policies: how an agent walks through a scene, at random, to random goals, there and back, or round a loop."""
+"""Policies: how an agent walks through a scene: at random, to goals, there and back, round a loop, or to things."""
 
 from __future__ import annotations
 
@@ -32,6 +32,13 @@ PATIENCE = 4  # steps without getting nearer, after which it gives up a goal
 # of loop
 OUTWARD = 0.35  # of the actions that it goes away at least, before it asks how long the way back is
 SPARE = 6  # actions that it may have left when it is back
+
+# of interact
+BEFORE_THING = (0.7, 1.3)  # metres from a thing's middle at which it is acted on
+SIDES = 0.6  # metres of way beyond the nearest such place at which others are taken, too
+HANDY = 1.5  # metres of way to a thing that make it 1 / e as likely as one beside the agent
+TOGGLES = 0.4  # how often it toggles a thing before it picks it up
+CARRY = (0.5, 2.5)  # metres along the ground to the place where it puts a thing down
 
 ActionStream = Generator[str, bool, None]  # yields the next action, and is sent whether the world allowed it
 Policy = Callable[[Simulator, np.random.Generator, int], ActionStream]
@@ -130,8 +137,69 @@ def paths_without_copies(simulator: Simulator, random: np.random.Generator, coun
     yield from _paths(simulator, random, lambda turns: turns - int(math.copysign(whole, turns)) if turns else 0)
 
 
+def interact(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
+    """Walks to things that can be moved, toggles some of them, picks them up, and puts them down elsewhere.
+
+    Where nothing can be moved it walks as ``path`` does.
+    """
+    while True:
+        grid = FreeGrid(simulator)
+        chosen = _place_before_a_thing(simulator, grid, random)
+        if chosen is None:
+            yield from path(simulator, random, count)
+            return
+        place, thing = chosen
+        yield from go_to(simulator, grid, place)
+        yield from _turned(_turns_towards(simulator, thing))
+        if random.random() < TOGGLES:
+            yield "toggle"
+        if not (yield "pick_up"):
+            yield from _turned(int(random.choice([-1, 1])))
+            continue
+        yield from _carry(simulator, random)
+        yield "drop"
+
+
+def _carry(simulator: Simulator, random: np.random.Generator) -> ActionStream:
+    """Walk with a thing to a place not far from here, or as near to it as the thing gets."""
+    grid = FreeGrid(simulator)
+    away = grid.distances(simulator.agent[0])
+    places = [cell for cell, distance in sorted(away.items()) if CARRY[0] <= distance <= CARRY[1]]
+    if places:
+        yield from go_to(simulator, grid, grid.place(places[int(random.integers(len(places)))]))
+    yield from _turned(int(random.integers(-2, 3)))
+
+
+def _place_before_a_thing(
+    simulator: Simulator, grid: FreeGrid, random: np.random.Generator
+) -> tuple[Ground, Ground] | None:
+    """A reachable place near a thing that can be moved, and the thing's; near things are likelier."""
+    away = grid.distances(simulator.agent[0])
+    low, high = BEFORE_THING
+    sides = {thing: [cell for cell in sorted(away) if low <= math.dist(grid.place(cell), thing) <= high]
+             for thing in simulator.movable()}  # fmt: skip
+    things = [thing for thing, cells in sides.items() if cells]
+    if not things:
+        return None
+    ways = np.array([min(away[cell] for cell in sides[thing]) for thing in things])
+    likely = np.exp((ways.min() - ways) / HANDY)
+    number = int(random.choice(len(things), p=likely / likely.sum()))
+    thing = things[number]
+    near = [cell for cell in sides[thing] if away[cell] <= ways[number] + SIDES]
+    return grid.place(near[int(random.integers(len(near)))]), thing
+
+
+def _turns_towards(simulator: Simulator, place: Ground) -> int:
+    """Number of turns to the left (negative: right) after which the agent looks towards a place."""
+    _, turn = _gait(simulator)
+    (x, z), heading = simulator.agent
+    most = int(180 // turn)
+    headings = [(turns, simulator.ahead(heading + math.radians(turns * turn))) for turns in range(-most, most + 1)]
+    return max(headings, key=lambda one: one[1][0] * (place[0] - x) + one[1][1] * (place[1] - z))[0]
+
+
 POLICIES: dict[str, Policy] = {
-    "explore": explore, "path": path, "there-and-back": there_and_back, "loop": loop,
+    "explore": explore, "path": path, "there-and-back": there_and_back, "loop": loop, "interact": interact,
 }  # fmt: skip
 
 
