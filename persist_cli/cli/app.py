@@ -91,7 +91,7 @@ def collect(
     size: Annotated[str, typer.Option(help="Image size HxW in pixels.")] = "64x64",
     seed: Annotated[int, typer.Option(help="Seed of the paths through the scenes.")] = 0,
     split: Annotated[str, typer.Option(help="train, validation or test: they share no scene.")] = "train",
-    policy: Annotated[str, typer.Option(help="explore, path, there-and-back or loop.")] = "explore",
+    policy: Annotated[str, typer.Option(help="explore, path, loop, there-and-back or interact.")] = "explore",
     step: Annotated[str, typer.Option(help="Metres of a step; LOW:HIGH: drawn for each scene.")] = "0.25",
     turn: Annotated[str, typer.Option(help="Degrees of a turn.")] = "15",
     fov: Annotated[str | None, typer.Option(help="Degrees of view from top to bottom; 75 in miniworld.")] = None,

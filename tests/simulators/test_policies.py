@@ -22,6 +22,8 @@ from persist_cli.simulators.policies import POLICIES, walk
 from tests.support.miniworlds import make_world, put_somewhere
 
 MOVES = ("forward", "backward")
+HOUSE_OF_THINGS = 9001
+INTERACTIONS = ("pick_up", "drop", "toggle")
 
 
 def collect(world: MiniWorld, policy: str, scene: int, frames: int = 60, seed: int = 0) -> list[Frame]:
@@ -45,7 +47,7 @@ def test_a_walk_has_exactly_the_number_of_frames_of_its_plan(world: MiniWorld, p
 def test_every_recorded_action_was_done(world: MiniWorld, policy: str) -> None:
     for frame, following in pairwise(collect(world, policy, 6)):
         moved = not np.allclose(frame.world_from_camera, following.world_from_camera, atol=1e-9)
-        assert moved == (frame.action != "stay")
+        assert moved == (frame.action not in ("stay", *INTERACTIONS))
 
 
 @pytest.mark.parametrize("policy", sorted(POLICIES))
@@ -155,3 +157,29 @@ def test_a_walk_ends_with_an_error_where_the_agent_cannot_move(world: MiniWorld)
 
     with pytest.raises(DataError, match="miniworld/house-3: the agent cannot move"):
         list(walk(world, stubborn, np.random.default_rng(0), 3))
+
+
+def test_interactions_are_really_done_and_change_the_cells_before_the_agent(world: MiniWorld) -> None:
+    frames = collect(world, "interact", HOUSE_OF_THINGS, 96)
+    for frame, following in pairwise(frames):
+        assert frame.cells is not None
+        assert following.cells is not None
+        changed = (frame.cells.colors != following.cells.colors).any(dim=-1)
+        if frame.action in INTERACTIONS:
+            place = torch.from_numpy(frame.world_from_camera[:3, 3])
+            assert changed.any()
+            assert (frame.cells.centers()[changed] - place).norm(dim=-1).max() < 3.0
+
+
+def test_things_are_picked_up_and_put_down_elsewhere(world: MiniWorld) -> None:
+    actions = [frame.action for frame in collect(world, "interact", HOUSE_OF_THINGS, 96)]
+    handled = [action for action in actions if action in ("pick_up", "drop")]
+    assert handled[:4] == ["pick_up", "drop"] * 2
+    assert "forward" in actions[actions.index("pick_up") : actions.index("drop")]
+
+
+def test_where_nothing_can_be_moved_interact_walks_on(world: MiniWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(world, "movable", lambda: [])
+    frames = collect(world, "interact", HOUSE_OF_THINGS, 20)
+    assert len({frame.action for frame in frames} & {*MOVES, "left", "right"}) > 0
+    assert not {frame.action for frame in frames} & set(INTERACTIONS)
