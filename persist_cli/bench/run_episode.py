@@ -35,11 +35,17 @@ class LoopSettings:
         execute: actions that the closed loop does before it plans again.
         patience: most actions of the closed loop, as a multiple of those of the shortest way.
         open_longest: longest bin of the open loop, in actions.
+        max_actions: most actions of every closed loop, as the 500 or 1,000 of Habitat, in place of ``patience``.
     """
 
     execute: int = 4
     patience: float = 4.0
     open_longest: int = 16
+    max_actions: int | None = None
+
+    def most(self, shortest: int) -> int:
+        """Return the most actions of a closed loop whose shortest way has ``shortest`` actions."""
+        return math.ceil(self.patience * shortest) if self.max_actions is None else self.max_actions
 
 
 @dataclass
@@ -106,7 +112,7 @@ class ClosedLoop:
     @property
     def left(self) -> int:
         """Number of actions that the agent still has."""
-        return math.ceil(self.settings.patience * self.scene.episode.bin) - len(self.trace.actions)
+        return self.settings.most(self.scene.episode.bin) - len(self.trace.actions)
 
     def _recognises(self, view: Observations) -> bool:
         return self.stop.stops(view, self.navigator.goal, self.scene.info.world_up)

@@ -224,6 +224,7 @@ def bench_plan(
     horizon: Annotated[int, typer.Option(min=1, help="Actions that a plan looks ahead.")] = 8,
     execute: Annotated[int, typer.Option(min=1, help="Actions done before the next plan.")] = 4,
     patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
+    max_actions: Annotated[int | None, typer.Option(min=1, help="Most actions of every episode instead: 500.")] = None,
     candidates: Annotated[int, typer.Option(min=1, help="Of a round of cem.")] = 60,
     rounds: Annotated[int, typer.Option(min=1, help="Most rounds of cem.")] = 3,
     frames: Annotated[int | None, typer.Option(min=1, help="Most imagined frames of a decision.")] = None,
@@ -257,8 +258,7 @@ def bench_plan(
         EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each), checkpoint,
         split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
         PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach), split_names(loops),
-        LoopSettings(execute, patience), stop_cost, SamplingOverrides(steps, sampler, guidance),
-        InferenceOptions.of(dtype, save_memory),
-        allow_training_scenes,
+        LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
+        SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
     )  # fmt: skip
     run_plan_bench(plan, out, report, json)

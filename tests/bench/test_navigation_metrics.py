@@ -13,13 +13,16 @@ from persist_cli.bench.navigation_metrics import (
     WalkRecord,
     absolute_error,
     collision_rate,
+    missed_stop,
     reached,
     relative_error,
     similarity,
     soft_spl,
     spl,
     success,
+    wrong_stop,
 )
+from persist_cli.bench.run_episode import LoopSettings
 
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
@@ -103,3 +106,13 @@ def test_the_similarity_of_features_is_a_hundred_times_their_cosine() -> None:
 def test_errors_of_trajectories_are_those_of_evo(poses: str, true: str, ape: float, rpe: float) -> None:
     assert absolute_error(trajectory(poses), trajectory(true)) == pytest.approx(ape, rel=1e-12)
     assert relative_error(trajectory(poses), trajectory(true)) == pytest.approx(rpe, rel=1e-12)
+
+
+def test_a_stop_is_wrong_when_far_and_missed_when_the_agent_was_near_and_went_on() -> None:
+    far, passed = WalkRecord([3.0, 1.4], 1.6, 0, stopped=True), WalkRecord([3.0, 0.9, 1.4], 2.6, 0, stopped=False)
+    assert (success(far), wrong_stop(far), missed_stop(far), reached(far)) == (0, 1, 0, 0)
+    assert (success(passed), wrong_stop(passed), missed_stop(passed), reached(passed)) == (0, 0, 1, 1)
+
+
+def test_a_fixed_budget_of_actions_takes_the_place_of_patience() -> None:
+    assert (LoopSettings(patience=2.5).most(9), LoopSettings(max_actions=500).most(9)) == (23, 500)
