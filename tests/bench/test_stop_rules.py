@@ -6,10 +6,7 @@ import json
 from dataclasses import asdict
 
 import pytest
-import torch
 
-from persist_cli.api.cost import Cost, Futures
-from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal
 from persist_cli.bench.episodes import Episode
 from persist_cli.bench.stop_rules import (
@@ -25,18 +22,9 @@ from persist_cli.bench.stop_rules import (
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.errors import PersistError
 from persist_cli.simulators.miniworld import MiniWorld
+from tests.support.pixel_cost import PixelCost
 
 UP = (0.0, 1.0, 0.0)
-
-
-class PixelCost(Cost):
-    """The mean difference of pixels, which needs no weights."""
-
-    name = "pixels"
-
-    def measure(self, futures: Futures, goal: Goal, ground: GroundMap) -> torch.Tensor:
-        assert goal.rgb is not None
-        return (futures.rgb.double() - goal.rgb.double()).abs().mean((2, 3, 4))
 
 
 def test_the_threshold_is_one_at_which_most_agents_stop_near_and_only_there() -> None:

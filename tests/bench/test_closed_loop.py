@@ -1,0 +1,55 @@
+"""Agents in the true house: where they stop, and what they take the goal for."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from persist_cli.bench.episodes import Episode
+from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, retrieved
+from persist_cli.bench.rows import PlanningRow
+from persist_cli.bench.run_episode import LoopSettings, run_closed_loop
+from persist_cli.bench.stop_rules import StopByCost, view_costs
+from persist_cli.bench.true_scene import TrueScene
+from persist_cli.plugins import make_policy
+from persist_cli.simulators.miniworld import MiniWorld
+from tests.support.pixel_cost import PixelCost
+
+RANKED = PlanningRow("rank-2, simulator", "rank", "random", "simulator", "image", walk=False, candidates=2)
+ALONE = PlanningRow("policy", "policy", "random", None, "image", walk=False)
+COST = PixelCost(None)
+
+
+@pytest.fixture
+def scene(small_world: MiniWorld, found: list[Episode]) -> TrueScene:
+    """An episode whose goal is in sight from the start."""
+    return TrueScene(small_world, next(episode for episode in found if episode.in_sight))
+
+
+def recognise_at_once(scene: TrueScene, row: PlanningRow, settings: PlanSettings) -> dict[str, Any]:
+    """Run an agent that takes any view for one of the goal."""
+    scene.back_to_start()
+    navigator = Navigator(row, RowParts(make_policy("random", {}), COST), settings, scene, 8)
+    return run_closed_loop(scene, navigator, StopByCost(COST, math.inf), LoopSettings())
+
+
+def test_an_agent_that_imagines_goes_to_the_best_view_before_it_stops(scene: TrueScene) -> None:
+    before = view_costs(COST, scene.look(), scene.goal)[0]
+    record = recognise_at_once(scene, RANKED, PlanSettings())
+    assert (record["ended"], record["actions"] != "") == ("stopped", True)
+    assert view_costs(COST, scene.look(), scene.goal)[0] < before
+
+
+@pytest.mark.parametrize(("row", "approach"), [(RANKED, False), (ALONE, True)])
+def test_an_agent_that_does_not_approach_stops_at_once(scene: TrueScene, row: PlanningRow, approach: bool) -> None:
+    record = recognise_at_once(scene, row, PlanSettings(approach=approach))
+    assert (record["ended"], record["actions"], record["figures"]["decisions"]) == ("stopped", "", 0)
+
+
+def test_the_goals_place_is_that_of_the_given_frame_most_like_its_image(scene: TrueScene) -> None:
+    found = retrieved(scene.goal, scene.walk(), COST)
+    assert found.rgb is None
+    torch.testing.assert_close(found.position, scene.goal.position)  # the walk begins at the goal
