@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import IntEnum
 
 import torch
 from torch import Tensor
@@ -56,9 +57,9 @@ def with_origins(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return tensors | {ORIGINS: origins_like(next(iter(tensors.values())), Origin.OBSERVED)}
 
 
-def check_origins(tensors: Mapping[str, Tensor], where: str) -> None:
+def check_origins(tensors: Mapping[str, Tensor], where: str, known: type[IntEnum] = Origin) -> None:
     """Raise ``CheckpointError`` when a memory's tensors have an origin that this version does not know."""
-    unknown = set(tensors[ORIGINS].unique().tolist()) - set(Origin)
+    unknown = set(tensors[ORIGINS].unique().tolist()) - {int(origin) for origin in known}
     if unknown:
         raise CheckpointError(f"{where}: unknown origin {min(unknown)} of an item; a newer persist may know it")
 

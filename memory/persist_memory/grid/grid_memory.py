@@ -11,13 +11,16 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.cells import CellOrigin
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
 from persist_cli.api.observations import Observations, Origin, origins_like
+from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.detail import feature_across
+from persist_memory.grid.editing import MapPlace, edit_cells
 from persist_memory.grid.occlusion import with_enough_new, without_edges, without_known
 from persist_memory.grid.pooling import (
     GridSettings,
@@ -155,6 +158,18 @@ class GridMemory(Memory):
         if isinstance(other, GridMemory) and len(other.grid):
             self.grid.absorb(other.grid.keys, {name: other.grid.values(name) for name in other.grid.columns})
 
+    def edit(self, edits: Sequence[Edit], seed: int = 0) -> EditOutcome:
+        """Remove, paint, move or copy cells; where one is removed nothing is known any more, so no seed is needed.
+
+        An edit takes the cells whose middle lies in its box seen from above, and that the box touches in height.
+
+        Raises:
+            DataError: when an edit cannot be done; then the map stays as it was.
+        """
+        edited, outcome = edit_cells(self.tensors(), MapPlace(self.lattice, self.reference.world_up), edits)
+        self.restore(edited if len(edited.get("cells", ())) else {})
+        return outcome
+
     def points(self) -> MapPoints:
         """Return the cells' centres, in the colours of their nearest observations."""
         centers = self._in_world(self._centers(self.grid.keys))
@@ -183,7 +198,7 @@ class GridMemory(Memory):
         if len(self.grid) and not self.lattice.flat:
             cells = cells_in_view(self.grid, self.lattice, self.views(imagined.cameras.to(self.grid.device)))
             if self.settings.imagined == "merge":
-                cells = cells[self.grid.values(ORIGINS, cells) == Origin.OBSERVED]
+                cells = cells[self.grid.values(ORIGINS, cells) >= Origin.OBSERVED]
             centers = self._in_world(self._centers(self.grid.keys[cells])).to(imagined.depth.device)
             new = without_known(new, centers, self.lattice.across)
         return with_enough_new(imagined, new, self.settings.least_new) if self.settings.least_new else new
@@ -211,7 +226,7 @@ class GridMemory(Memory):
         centers = self._centers(self.grid.keys[cells])
         centers[:, 1] = self.heights(centers, cameras)
         colors, origins = unpack_colors(self.grid.values("colors", cells)), self.grid.values(ORIGINS, cells)
-        return MemoryTokens.of(features, self._in_world(centers), colors, origins)
+        return MemoryTokens.of(features, self._in_world(centers), colors, origins.clamp(max=Origin.OBSERVED))
 
     def _centers(self, keys: Tensor) -> Float[Tensor, "cell 3"]:
         """The cells' centres in the grid's axes, metres."""
@@ -226,7 +241,7 @@ class GridMemory(Memory):
         for name, column in self.grid.columns.items():
             expected[name] = column.dtype, (None, column.width) if column.width else (None,)
         check_tensors(tensors, expected, where)
-        check_origins(tensors, where)
+        check_origins(tensors, where, CellOrigin)
         if "counts" in tensors and bool((tensors["counts"] < 1).any()):
             raise CheckpointError(f"{where}: a cell without a pixel")
         cells = tensors["cells"].long()

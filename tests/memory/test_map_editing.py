@@ -1,0 +1,86 @@
+"""A voxel map is edited cell by cell; what is edited stays when frames are written afterwards."""
+
+import pytest
+import torch
+
+from persist_cli.api.cells import CellOrigin
+from persist_cli.api.memory import Memory
+from persist_cli.api.observations import Origin
+from persist_cli.api.scene_edits import Copy, Insert, Move, Paint, Remove
+from persist_cli.errors import CheckpointError, DataError
+from tests.support.room_views import empty_memory, room_walk, written_memory
+
+BOX = {"low": (0.6, 0.0, 0.4), "high": (1.4, 0.4, 1.1)}  # of one piece of furniture
+FINE = (0.25, 0.25, 0.25)
+
+
+@pytest.fixture
+def room() -> Memory:
+    return written_memory("voxel", room_walk(4), cell=FINE)
+
+
+def test_removed_cells_are_gone_and_no_others(room):
+    before = {tuple(place) for place in room.points().positions.tolist()}
+    outcome = room.edit([Remove(**BOX)])
+    after = {tuple(place) for place in room.points().positions.tolist()}
+    gone = before - after
+    assert after < before
+    assert outcome.changed == len(gone)
+    assert all(0.6 <= x <= 1.4 and -0.125 <= y <= 0.525 and 0.4 <= z <= 1.1 for x, y, z in gone)
+
+
+def test_a_tall_cell_is_taken_by_a_box_that_touches_it():
+    room = written_memory("voxel", room_walk(4))
+    tall = room.edit([Remove(**BOX)]).changed
+    assert tall > 0
+    assert written_memory("map2d", room_walk(4)).edit([Remove(**BOX)]).changed > 0
+
+
+def test_paint_shows_in_points_and_tokens_and_lasts_when_the_place_is_seen_again(room):
+    room.edit([Paint(**BOX, color=(1, 2, 3))])
+    room.write(room_walk(4))
+    points = room.points()
+    painted = (points.colors == torch.tensor([1, 2, 3], dtype=torch.uint8)).all(1)
+    assert int(painted.sum()) > 4
+    assert bool((points.origins[painted] == CellOrigin.EDITED).all())
+    tokens = room.read(room_walk(4).cameras, 4096)
+    assert bool((tokens.colors == torch.tensor([1, 2, 3], dtype=torch.uint8)).all(1).any())
+    assert int(tokens.origins.max()) == Origin.OBSERVED
+
+
+def test_moved_cells_take_features_and_colours_along_and_a_way_back_restores_them(room):
+    before = room.tensors()
+    room.edit([Move(**BOX, by=(0.0, 20.0, 0.0))])
+    there = {"low": (0.6, 20.0, 0.4), "high": (1.4, 20.4, 1.1)}
+    room.edit([Move(**there, by=(0.0, -20.0, 0.0))])
+    for name in ("cells", "features", "colors"):
+        assert torch.equal(room.tensors()[name], before[name])
+
+
+def test_a_copy_leaves_the_first_where_it_is(room):
+    before = room.figures().cells
+    outcome = room.edit([Copy(**BOX, by=(0.0, 20.0, 0.0))])
+    assert room.figures().cells == before + outcome.changed
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (Remove(low=(50, 0, 0), high=(51, 1, 1)), "holds the middle of no cell; these lie from"),
+        (Insert(kind="table", at=(0, 0, 0)), "a thing that was never seen has none"),
+        (Move(**BOX, by=(0.0, 0.1, 0.0)), "less than half a cell of 0.25 × 0.25 × 0.25 m"),
+        (Copy(**BOX, by=(0.25, 0.0, 0.0)), "cells that hold something; take another place"),
+        (Move(**BOX, by=(1e9, 0.0, 0.0)), "out of all that a map can hold"),
+    ],
+)
+def test_an_edit_of_a_map_that_cannot_be_done_changes_nothing(room, edit, words):
+    before = room.tensors()
+    with pytest.raises(DataError, match=r"^edit 2 ") as error:
+        room.edit([Paint(**BOX, color=(0, 0, 0)), edit])
+    assert words in str(error.value)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in room.tensors().items())
+
+
+def test_a_memory_that_cannot_be_edited_says_which_can():
+    with pytest.raises(CheckpointError, match="kind 'snapshots' cannot be edited; those of kind scene and voxel can"):
+        empty_memory("snapshots").edit([Remove(**BOX)])
