@@ -190,6 +190,8 @@ class DataSettings:
         detour: of a policy's samples (stage policy): a later frame is a goal only where the walk came to it in at most
             so many times the frames of the direct way, which turns to it, goes straight and turns to its heading; with
             ``null`` every later frame may be one.
+        true_cells: share of the clips whose memory, a scene, holds the data's own cells, all of them known, in the
+            place of what the context's frames show.
     """
 
     path: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
@@ -209,6 +211,7 @@ class DataSettings:
     pose_drift_degrees: Amount = 0.0
     depth_noise: Amount = 0.0
     detour: Annotated[float, Field(ge=1, allow_inf_nan=False)] | None = None
+    true_cells: Share = 0.0
 
 
 @dataclass(frozen=True)
@@ -399,7 +402,7 @@ def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
 
 def _contradictions(recipe: Recipe) -> list[str]:
     """Describe each group of settings that are valid alone but not together."""
-    training, problems = recipe.training, _of_a_policy(recipe)
+    training, problems = recipe.training, [*_of_a_policy(recipe), *_of_true_cells(recipe)]
     if training.cooldown > training.steps:
         problems.append(
             f"training.cooldown {training.cooldown} is more than training.steps {training.steps}; set both, as in "
@@ -422,6 +425,16 @@ def _contradictions(recipe: Recipe) -> list[str]:
     if training.batch % training.accumulation:
         problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
     return problems
+
+
+def _of_true_cells(recipe: Recipe) -> list[str]:
+    """Describe why a recipe cannot train on true cells, where it shall."""
+    data = recipe.data
+    if data.true_cells and recipe.stage != "2":
+        return ["data.true_cells is for stage 2 only; leave it out"]
+    if data.true_cells and (data.mirror or data.color_jitter):
+        return ["data.true_cells takes no data.mirror and no data.color_jitter, which change frames and no cells"]
+    return []
 
 
 def _of_a_policy(recipe: Recipe) -> list[str]:

@@ -96,7 +96,7 @@ ControlsOption = Annotated[
     str | None,
     typer.Option(
         "--controls",
-        help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, noisy, drifting.",
+        help="Of copy, nearest, warp, codec, truth, shuffled, emptied, oracle, true-cells, noisy, drifting.",
         show_default=DEFAULT_CONTROLS,
     ),
 ]

@@ -13,6 +13,7 @@ from torch.utils.data import BatchSampler, Dataset
 
 from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.backbone import Clip, Interactions
+from persist_cli.api.cells import CellGrid
 from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.augment import Augmentation, View
@@ -41,6 +42,7 @@ class ClipPlan:
         own_after: number of the first sample that may be chained.
         segments: number of segments of a chained sample, the clip included.
         noise: errors of the frames of contexts.
+        true_cells: share of the samples that come with the true cells of their scene in the place of a context.
     """
 
     frames: int
@@ -57,6 +59,7 @@ class ClipPlan:
     own_after: int = 0
     segments: int = 2
     noise: WritingNoise = NO_ERRORS
+    true_cells: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,7 @@ class ClipFrames:
         view: how images and cameras are changed; ``None`` for not at all.
         before: numbers of the frames of each segment before the clip; each ends where the next one begins.
         noise_seed: seed of the errors of the context's frames.
+        true_cells: whether the true cells of the scene stand in the place of the context.
     """
 
     file: TrajectoryFile
@@ -80,6 +84,7 @@ class ClipFrames:
     view: View | None = None
     before: tuple[range, ...] = ()
     noise_seed: int = 0
+    true_cells: bool = False
 
     def segments(self) -> tuple[ClipFrames, ...]:
         """The frame numbers of each segment before the clip, and of the clip, as samples of their own."""
@@ -99,6 +104,8 @@ class ClipSample:
         info: what holds for every frame of the trajectory.
         before: the segments before the clip, whose frames the model shall predict and write itself.
         remembered: tensors of a memory that stand for the context; ``None`` when there are none.
+        cells: the true cells of the scene at the sample's first frame, which stand for the context; ``None`` where the
+            context does, or when left unread.
     """
 
     clip: Clip
@@ -106,6 +113,7 @@ class ClipSample:
     info: TrajectoryInfo
     before: tuple[Clip, ...] = ()
     remembered: dict[str, Tensor] | None = None
+    cells: CellGrid | None = None
 
 
 class ClipDataset(Dataset[ClipSample]):
@@ -163,9 +171,12 @@ class ClipDataset(Dataset[ClipSample]):
         Args:
             choice: frame numbers, as ``choose`` gives them.
             images: false leaves the clips' images unread and gives their cameras only.
-            context: false leaves the context unread.
+            context: false leaves the context unread, and the cells that stand for it.
         """
         *before, clip = (self._clip(segment, images) for segment in choice.segments())
+        if choice.true_cells:
+            cells = choice.file.cells(choice.segments()[0].frames[0]) if context else None
+            return ClipSample(clip, None, choice.file.info, tuple(before), cells=cells)
         seen = choice.file.read(choice.context).observations if context and choice.context else None
         if seen is not None and choice.view is not None:
             seen = choice.view.observations(seen, choice.file.info.world_up)
@@ -194,7 +205,8 @@ class ClipDataset(Dataset[ClipSample]):
         view = plan.augmentation.draw(file.info, plan.image_size, random)
         noise_seed = int(random.integers(2**31)) if context and plan.noise else 0
         *before, clip = (frames[first : first + length + 1] for first in range(0, steps, length))
-        return ClipFrames(file, clip, context, 0, view, tuple(before), noise_seed)
+        true_cells = bool(plan.true_cells) and random.random() < plan.true_cells
+        return ClipFrames(file, clip, context, 0, view, tuple(before), noise_seed, true_cells)
 
     def _context_frames(self, file: TrajectoryFile, frames: range, random: np.random.Generator) -> list[int]:
         """The clip's first frame and a random choice of those before it, in order."""

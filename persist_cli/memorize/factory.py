@@ -12,7 +12,9 @@ from persist_cli.api.backbone import Clip
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.api.observations import TrajectoryInfo
+from persist_cli.api.scene import Scene
 from persist_cli.data.clips import ClipSample
+from persist_cli.errors import RecipeError
 from persist_cli.io.settings import parse_settings
 from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.plugins import load_plugin, make_encoder
@@ -63,12 +65,25 @@ class MemoryFactory:
 
 
 def memory_of(sample: ClipSample, factory: MemoryFactory) -> Memory:
-    """Return a memory of a sample's context, or the one that the sample remembers in its place."""
+    """Return a memory of a sample's context, or of what stands in its place: a kept memory, or true cells."""
     memory = factory.empty(sample.info)
     if sample.remembered is not None:
         memory.restore({name: tensor.to(factory.device) for name, tensor in sample.remembered.items()})
     elif sample.context is not None:
         memory.memorize(sample.context.to(factory.device))
+    elif sample.cells is not None:
+        as_scene(memory).add(sample.cells)
+    return memory
+
+
+def as_scene(memory: Memory) -> Scene:
+    """Return the memory, which must be a scene.
+
+    Raises:
+        RecipeError: one line when it is not, and so takes no cells.
+    """
+    if not isinstance(memory, Scene):
+        raise RecipeError(f"memory {memory.name!r} takes no true cells; use the memory scene, or data.true_cells=0")
     return memory
 
 
@@ -76,5 +91,6 @@ def with_memory(sample: ClipSample, factory: MemoryFactory | None, budget: int) 
     """Return a training clip with at most ``budget`` tokens of a memory of its context; none without a factory."""
     if factory is None:
         return sample.clip
-    tokens = memory_of(sample, factory).read(sample.clip.observations.cameras, budget).to(factory.device)
-    return replace(sample.clip, tokens=tokens)
+    memory, cameras = memory_of(sample, factory), sample.clip.observations.cameras
+    memory.foresee([cameras])
+    return replace(sample.clip, tokens=memory.read(cameras, budget).to(factory.device))

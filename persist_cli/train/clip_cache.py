@@ -104,7 +104,9 @@ class CacheKeys:
         elif self.repeats:
             latents = cache_key(clip | self.latents)
         if self.repeats and self.tokens is not None:
-            context = {"context": list(frames.context)} | ({"errors": frames.noise_seed} if frames.noise_seed else {})
+            context: dict[str, Any] = {"context": list(frames.context)}
+            context |= {"errors": frames.noise_seed} if frames.noise_seed else {}
+            context = {"cells": "true"} if frames.true_cells else context
             tokens = cache_key(clip | context | self.tokens)
             memory = cache_key(clip | {"frames": "memory"} | context | self.tokens)
         return ClipKeys(latents, tokens, memory)

@@ -90,7 +90,9 @@ class OwnWrites:
             clip = replace(clip, latents=ClipLatents(clip.latents.video, first.image))
         if chain.memory is None or self.encoder.factory is None:
             return clip
-        tokens = chain.memory.read(clip.observations.cameras, self.encoder.backbone.token_budget)
+        cameras = clip.observations.cameras
+        chain.memory.foresee([cameras])
+        tokens = chain.memory.read(cameras, self.encoder.backbone.token_budget)
         return replace(clip, tokens=tokens.to(self.encoder.factory.device))
 
     def _end(self, chain: Chain) -> CachedSample:

@@ -96,6 +96,7 @@ class Trainer(TrainingLoop[Backbone]):
             own_after=recipe.data.own_warmup * recipe.training.batch,
             segments=recipe.data.own_segments,
             noise=WritingNoise.of(recipe.data),
+            true_cells=recipe.data.true_cells if self.factory else 0.0,
         )
         return ClipDataset([data_folder(path) for path in recipe.data.path], plan)
 

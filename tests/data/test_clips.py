@@ -10,6 +10,7 @@ import torch
 from persist_cli.api.geometry import near_poses
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
 from persist_cli.errors import DataError, RecipeError
+from tests.support.cell_walks import CHANGE, cells_around, write_with_cells
 from tests.support.micro_runs import SIZE
 
 
@@ -116,3 +117,28 @@ def test_clips_that_cannot_be_drawn_are_reported_with_the_numbers(walks):
         ClipDataset([walks], plan(image_size=(64, 64)))
     with pytest.raises(RecipeError, match=r"cannot be shared by 3 processes .* give training.batch=6 training.acc"):
         DistributedBatches(0, 1, 8, 1, 0, 3)
+
+
+def test_true_cells_stand_in_the_place_of_a_context_and_are_those_of_the_first_frame(walks, tmp_path):
+    clips = ClipDataset([write_with_cells(walks, tmp_path / "cells")], plan(true_cells=1.0))
+    starts = []
+    for number in range(8):
+        choice, sample = clips.choose(number), clips[number]
+        assert sample.context is None
+        assert torch.equal(sample.cells.classes, cells_around(choice.file, choice.frames[0]).classes)
+        starts.append(choice.frames[0] >= CHANGE)
+    assert any(starts)
+    assert not all(starts)
+
+
+def test_true_cells_change_neither_the_choice_of_clips_nor_that_of_contexts(walks, tmp_path):
+    folder = write_with_cells(walks, tmp_path / "cells")
+    plain, mixed = (ClipDataset([folder], plan(true_cells=share)) for share in (0.0, 0.5))
+    choices = [(plain.choose(number), mixed.choose(number)) for number in range(20)]
+    assert all(one.frames == other.frames and one.context == other.context for one, other in choices)
+    assert {other.true_cells for _, other in choices} == {True, False}
+
+
+def test_true_cells_that_the_data_do_not_have_are_one_line(walks):
+    with pytest.raises(DataError, match="has no cells of its scene"):
+        ClipDataset([walks], plan(true_cells=1.0))[0]

@@ -11,6 +11,7 @@ from persist_cli.api.geometry import pose_differences, small_motions
 from persist_cli.data.store import Store
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
+from persist_cli.evaluate.rows.build_rows import no_cells
 from persist_cli.evaluate.rows.controls import NoisyWarp
 from persist_cli.evaluate.rows.interventions import (
     DRIFT_FRAMES,
@@ -19,8 +20,10 @@ from persist_cli.evaluate.rows.interventions import (
     NoisyPoses,
     Oracle,
     Shuffled,
+    TrueCells,
     one_scene,
 )
+from tests.support.cell_walks import cells_around, write_with_cells
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +50,19 @@ def test_the_oracle_holds_the_frames_of_the_clip_and_the_emptied_memory_none(cas
     clip = read_case(cases[0])
     assert torch.equal(Oracle().context(clip).rgb[-9:], clip.observations.rgb)
     assert Emptied().context(clip) is None
+
+
+def test_a_scene_of_true_cells_begins_with_those_of_the_clips_first_frame_and_no_frames(held_out, tmp_path):
+    folder = write_with_cells(held_out, tmp_path / "cells")
+    case = PROTOCOLS["revisit"].find(ClipSearch([folder], 0, 8, 8))[0]
+    clip = read_case(case)
+    assert TrueCells().context(clip) is None
+    assert torch.equal(TrueCells().cells(clip).classes, cells_around(case.file, case.start).classes)
+    assert no_cells([case]) is None
+
+
+def test_true_cells_need_data_that_have_some(cases):
+    assert no_cells(cases).startswith("needs the cells of every scene, which")
 
 
 def test_noisy_poses_have_errors_of_the_given_deviations(held_out):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from persist_cli.data.clips import ClipDataset, ClipPlan
+from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import MemoryConfig
+from tests.support.cell_walks import write_with_cells
 from tests.support.micro_runs import SIZE
 
 
@@ -35,3 +38,10 @@ def test_a_clip_has_tokens_only_when_its_memory_has_a_context(walks):
     factory = MemoryFactory.of(MemoryConfig("voxel"), torch.device("cpu"))
     nothing, something = (with_memory(sample, factory, 64).tokens for sample in (clips[5], with_context[5]))
     assert len(nothing) == 0 < len(something) <= 64
+
+
+def test_a_memory_that_is_no_scene_refuses_true_cells_in_one_line(walks, tmp_path):
+    folder = write_with_cells(walks, tmp_path / "cells")
+    clips = ClipDataset([folder], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE), true_cells=1.0))
+    with pytest.raises(RecipeError, match="memory 'voxel' takes no true cells; use the memory scene"):
+        with_memory(clips[0], MemoryFactory.of(MemoryConfig("voxel")), 64)

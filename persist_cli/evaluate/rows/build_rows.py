@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import PLAIN, Checkpoint
+from persist_cli.api.memory import Memory
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.evaluate.cases import Case
@@ -19,6 +20,7 @@ from persist_cli.evaluate.rows.interventions import (
     NoisyPoses,
     Oracle,
     Shuffled,
+    TrueCells,
     Unmodified,
     one_scene,
 )
@@ -35,6 +37,7 @@ INTERVENTIONS: dict[str, Callable[[RowConfig, Sequence[Case]], MemoryInterventio
     "shuffled": lambda config, cases: Shuffled(cases),
     "emptied": lambda config, cases: Emptied(),
     "oracle": lambda config, cases: Oracle(),
+    "true-cells": lambda config, cases: TrueCells(),
     "noisy": lambda config, cases: NoisyPoses(*config.noise),
     "drifting": lambda config, cases: DriftingPoses(*config.noise),
 }
@@ -46,9 +49,15 @@ def no_depth(cases: Sequence[Case]) -> str | None:
     return "needs depth, which the data does not have" if missing else None
 
 
+def no_cells(cases: Sequence[Case]) -> str | None:
+    """The reason why scenes cannot hold the true cells, ``None`` when the cases have cells."""
+    lacking = next((case for case in cases if not case.file.has_cells), None)
+    return None if lacking is None else f"needs the cells of every scene, which {lacking.file.path} does not have"
+
+
 NOISY_WARP = "warp of noisy poses"  # stands beside the controls of noisy memories, with the same errors
 
-OBSTACLES = {"shuffled": one_scene, "warp": no_depth}  # of controls that not all clips allow
+OBSTACLES = {"shuffled": one_scene, "warp": no_depth, "true-cells": no_cells}  # of controls that not all clips allow
 
 
 @dataclass(frozen=True)
@@ -184,19 +193,33 @@ def possible(cases: Sequence[Case]) -> None:
 def intervention_rows(
     models: Sequence[ModelRow], config: RowConfig, cases: Sequence[Case]
 ) -> Iterator[tuple[str, ModelRow]]:
-    """Name of the control and row, for each model that reads a memory and each intervention in it."""
+    """Name of the control and row, for each model that reads a memory and each intervention that is for this memory.
+
+    Raises:
+        PersistError: when the user named an intervention that is for none of the memories.
+    """
+    named = [(name, make(config, cases)) for name, make in INTERVENTIONS.items() if name in config.controls]
+    for name, intervention in named:
+        scenes_only = intervention.memories is not Memory
+        if scenes_only and config.named and not any(takes(row, intervention) for row in models):
+            raise PersistError(f"the control {name!r} needs a scene among --memories; leave it out of --controls")
     for row in models:
-        if row.adapter in (None, NO_MEMORY):
-            continue
-        for name, make_intervention in INTERVENTIONS.items():
-            if name in config.controls:
-                intervention = make_intervention(config, cases)
-                row_memory = replace(row.row_memory, intervention=intervention)
-                row_name = f"{row.name}, {intervention.name}"
-                changed = ModelRow(row_name, row.checkpoint, row.adapter, row.sampling, row_memory)
-                changed.own_sampling = row.own_sampling
-                changed.group = f"{row.group}, {intervention.name}"
-                yield name, changed
+        yield from ((name, changed_by(row, made)) for name, made in named if takes(row, made))
+
+
+def takes(row: ModelRow, intervention: MemoryIntervention) -> bool:
+    """Whether a row reads a memory, of those that an intervention is for."""
+    factory = row.row_memory.factory
+    return factory is not None and row.adapter != NO_MEMORY and issubclass(factory.kind, intervention.memories)
+
+
+def changed_by(row: ModelRow, intervention: MemoryIntervention) -> ModelRow:
+    """The same row with an intervention in its memory."""
+    row_memory = replace(row.row_memory, intervention=intervention)
+    changed = ModelRow(f"{row.name}, {intervention.name}", row.checkpoint, row.adapter, row.sampling, row_memory)
+    changed.own_sampling = row.own_sampling
+    changed.group = f"{row.group}, {intervention.name}"
+    return changed
 
 
 def untrained_rows(

@@ -14,8 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, invert_rigid
+from persist_cli.api.cells import CellGrid
 from persist_cli.api.geometry import small_motions
+from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
+from persist_cli.api.scene import Scene
 from persist_cli.evaluate.cases import Case, CaseFrames, read_case
 
 Disturb = Callable[[Observations], Observations]
@@ -28,14 +31,15 @@ DRIFT_FRAMES = 32  # after which drifting poses are off by their standard deviat
 class MemoryIntervention(ABC):
     """A rule for what is written into a row's memory.
 
-    ``writes`` says whether the model's own output may follow, ``holds`` what the memory holds before, and ``poses``
-    whether its poses are true.
+    ``writes`` says whether the model's own output may follow, ``holds`` what the memory holds before, ``poses``
+    whether its poses are true, and ``memories`` which memories it is for.
     """
 
     name: ClassVar[str]
     holds: ClassVar[str] = "true frames"
     poses: ClassVar[str] = "true"
     writes: ClassVar[bool] = False
+    memories: ClassVar[type] = Memory  # a class of memories
 
     @property
     @abstractmethod
@@ -45,6 +49,10 @@ class MemoryIntervention(ABC):
     @abstractmethod
     def context(self, clip: CaseFrames) -> Observations | None:
         """The frames that a clip's memory is made of before the clip begins; ``None`` for none."""
+
+    def cells(self, clip: CaseFrames) -> CellGrid | None:
+        """The cells that a clip's memory, a scene, begins with; ``None``, the default, for none."""
+        return None
 
     def disturb(self, seen: Observations, draws: torch.Generator) -> Observations:
         """Change frames on their way into the memory; by default they stay as they are."""
@@ -90,6 +98,23 @@ class Oracle(MemoryIntervention):
         """The frames before the clip and those of the clip."""
         earlier = [] if clip.context is None else [clip.context]
         return Observations.concatenate([*earlier, clip.observations])
+
+
+class TrueCells(MemoryIntervention):
+    """A scene whose cells are those of the data, all of them known."""
+
+    name = "true cells"
+    holds = "the true cells of the scene"
+    definition = "its scene is the data's own grid of cells, all of them known: what a perfect scene would give"
+    memories = Scene
+
+    def context(self, clip: CaseFrames) -> Observations | None:
+        """Always ``None``: the cells hold all there is."""
+        return None
+
+    def cells(self, clip: CaseFrames) -> CellGrid:
+        """The cells at the clip's first frame."""
+        return clip.case.file.cells(clip.case.start)
 
 
 class Shuffled(MemoryIntervention):

@@ -20,7 +20,7 @@ from persist_cli.checkpoints.load import load_adapter
 from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.rows.interventions import MemoryIntervention, Unmodified
 from persist_cli.evaluate.rows.row import Row
-from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.memorize.factory import MemoryFactory, as_scene
 from persist_cli.rollout.world_model import Agent, WorldModel
 
 NO_MEMORY = "none"  # name of the memory that never gives a token, so that no intervention can change anything
@@ -154,4 +154,7 @@ class ModelRow(Row):
         context = self.row_memory.intervention.context(clip)
         if context is not None:
             memory.memorize(disturb(context))
+        cells = self.row_memory.intervention.cells(clip)
+        if cells is not None:
+            as_scene(memory).add(cells)
         return memory
