@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 MISSING: Final = "n/a"
@@ -18,12 +18,14 @@ class FigureColumn:
         better: ``higher``, ``lower``, or ``None`` where neither is.
         percent: whether it is a share, shown in per cent.
         definition: what it says, as a sentence without a full stop.
+        digits: of a share behind the point.
     """
 
     title: str
     better: Literal["higher", "lower"] | None
     percent: bool
     definition: str
+    digits: int = field(default=0, kw_only=True)
 
     @property
     def heading(self) -> str:
@@ -34,7 +36,7 @@ class FigureColumn:
     def amount(self, value: float, sign: bool = False) -> str:
         """Return a number as the column shows it."""
         if self.percent:
-            return f"{100 * value:{'+' * sign}.0f} %"
+            return f"{100 * value:{'+' * sign}.{self.digits}f} %"
         return f"{value:{'+' * sign}.2f}" if abs(value) < 10 else f"{value:{'+' * sign}.1f}"
 
     def cell(self, figure: Mapping[str, Any] | None, interval: bool = True) -> str:

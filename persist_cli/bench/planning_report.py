@@ -15,6 +15,7 @@ from persist_cli.bench.planning_tables import (
     counted,
     difference_columns,
     difference_rows,
+    headings,
     loop_columns,
     success_rows,
 )
@@ -60,7 +61,7 @@ def section(table: Mapping[str, Any], results: Mapping[str, Any]) -> dict[str, A
         "counted": counted(table),
         "parts": [loop_table(table, results, loop) for loop in LOOPS if columns_of(table, loop_columns(loop))],
         "differences": difference_rows(table),
-        "difference_heads": [COLUMNS[name].heading for name in difference_columns(table)],
+        "difference_heads": headings(difference_columns(table)),
     }
 
 
@@ -71,7 +72,8 @@ def loop_table(table: Mapping[str, Any], results: Mapping[str, Any], loop: str) 
     return {
         "title": f"{loop.capitalize()} loop",
         "columns": [
-            {"heading": COLUMNS[name].heading, "definition": results["columns"][name]["definition"]} for name in names
+            {"heading": head, "definition": results["columns"][name]["definition"]}
+            for name, head in zip(names, headings(names), strict=True)
         ],
         "rows": [
             {

@@ -45,16 +45,11 @@ def group_text(table: Mapping[str, Any]) -> str:
     parts = [f"## {table['name']} ({counted(table)})"]
     for loop in LOOPS:
         names = columns_of(table, loop_columns(loop))
-        rows = [
-            [row, *(COLUMNS[name].cell(figures.get(name)) for name in names)] for row, figures in table["rows"].items()
-        ]
         if names:
-            parts.append(markdown_table([f"row ({loop} loop)", *(COLUMNS[name].heading for name in names)], rows))
+            parts.append(markdown_table([f"row ({loop} loop)", *headings(names)], row_cells(table, names)))
     differences = difference_rows(table)
     if differences:
-        parts.append(
-            markdown_table(["difference", *(COLUMNS[name].heading for name in difference_columns(table))], differences)
-        )
+        parts.append(markdown_table(["difference", *headings(difference_columns(table))], differences))
     return "\n\n".join(parts)
 
 
@@ -121,8 +116,7 @@ def print_results(results: Mapping[str, Any]) -> None:
     """Print the table over all episodes, and success by kind of goal."""
     table = results["tables"][0]
     names = columns_of(table, SHORT)
-    rows = [[row, *(COLUMNS[name].cell(figures.get(name)) for name in names)] for row, figures in table["rows"].items()]
-    print_table(f"Plans, {counted(table)}", ["row", *(COLUMNS[name].heading for name in names)], rows)
+    print_table(f"Plans, {counted(table)}", ["row", *headings(names)], row_cells(table, names))
     if "closed" in results["settings"]["loops"]:
         print_table("Success by actions of the shortest way", *success_rows(results))
     for line in results["settings"]["stop"]:

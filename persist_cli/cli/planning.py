@@ -30,7 +30,7 @@ from persist_cli.errors import PersistError
 PLAN_MEMORIES = "none,voxel,simulator"
 
 planning_app = typer.Typer()
-bench_app = typer.Typer(no_args_is_help=True, help="Measure plans and collisions against the simulator.")
+bench_app = typer.Typer(no_args_is_help=True, help="Measure plans, collisions and imagined scenes in held-out houses.")
 planning_app.add_typer(bench_app, name="bench")
 
 
@@ -262,3 +262,49 @@ def bench_plan(
         SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
     )  # fmt: skip
     run_plan_bench(plan, out, report, json)
+
+
+@bench_app.command("scene")
+def bench_scene(
+    data: Annotated[str, typer.Option(help="Test houses with cells, as `persist collect miniworld` writes them.")],
+    model: Annotated[str | None, typer.Argument(help="A scene model; without one only the other rows.")] = None,
+    train: Annotated[Path | None, typer.Option(help="Training houses, for the rows that look them up.")] = None,
+    parts: Annotated[str, typer.Option(help="Of completion, walk, speed, return, edits.")] = "completion",
+    images: Annotated[int, typer.Option(min=1, help="Most images, each of another house.")] = 32,
+    seeds: Annotated[int, typer.Option(min=1, help="Completions, and walks, of each image.")] = 3,
+    radius: Annotated[float, typer.Option(min=0.5, help="Metres around the camera that are measured.")] = 5.0,
+    houses: Annotated[int, typer.Option(min=1, help="Most training houses that are read.")] = 500,
+    steps: Annotated[int, typer.Option(min=1, help="Actions of a walk.")] = 1000,
+    walks: Annotated[int, typer.Option(min=1, help="Most images to walk from.")] = 4,
+    checkpoint: Annotated[Path | None, typer.Option(help="World model that draws scenes: return, edits.")] = None,
+    memories: Annotated[str, typer.Option(help="Its adapters that go there and back, with commas.")] = "scene",
+    return_steps: Annotated[int, typer.Option(min=1, help="Frames of a way out, and of the way back.")] = 64,
+    edits: Annotated[int, typer.Option(min=1, help="Random edits.")] = 100,
+    denoising_steps: Annotated[int | None, typer.Option(min=1, help="Of the frames; the checkpoint's.")] = None,
+    sampler: SamplerOption = None,
+    guidance: GuidanceOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", help="Of the scenes: memory.KEY=VALUE.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the choice of images and edits.")] = 0,
+    allow_training_scenes: TrainingScenesOption = False,
+    out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-scene"),
+    json: JsonOption = False,
+) -> None:
+    """Compare the scenes that a model imagines from one image with true houses, and with guesses without a model.
+
+    persist bench scene runs/scene --data runs/test-houses --train runs/houses --out runs/bench-scene
+    """
+    from persist_cli.bench.scenes.run_scene_bench import run_scene_bench
+    from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBenchPlan
+
+    rendering = None
+    if checkpoint is not None:
+        sampling = SamplingOverrides(denoising_steps, sampler, guidance)
+        placement = InferenceOptions.of(dtype, save_memory)
+        rendering = RenderingPlan(checkpoint, split_names(memories), return_steps, sampling, placement)
+    plan = SceneBenchPlan(
+        model, data, train, split_names(parts), images, seeds, radius, houses, steps, walks, rendering, edits,
+        tuple(settings or ()), seed, allow_training_scenes,
+    )  # fmt: skip
+    run_scene_bench(plan, out, json)

@@ -1,16 +1,23 @@
-"""A house of cells with two rooms and a doorway between them, and cameras in it."""
+"""A house of cells with two rooms and a doorway between them, cameras in it, and data sets of such houses."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from persist_cli.api.actions import walking_actions
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.cell_rays import first_surfaces
 from persist_cli.api.cells import COMMON, FREE, CellForm, CellGrid
 from persist_cli.api.ground import ground_axes
-from persist_cli.api.observations import Observations
+from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.bench.scenes.views import Region, View, near_camera, true_region
+from persist_cli.data.store import write_trajectory
 from tests.support.rooms import Room, look
 
 UP = (0.0, 1.0, 0.0)
@@ -52,7 +59,7 @@ def view_of(grid: CellGrid, known: Bool[Tensor, "first second level"], radius: f
     frame = Observations(torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(*size), cameras)
     truth = true_region(grid, region)
     near = near_camera(truth, pose[:3, 3], radius)
-    return View("house:0", "house", room.info, frame, region, region.of(seen), truth, near)
+    return View("house:0", "house", room.info, frame, region, region.of(seen), truth, near, grid)
 
 
 def known_room(grid: CellGrid) -> Bool[Tensor, "first second level"]:
@@ -60,3 +67,37 @@ def known_room(grid: CellGrid) -> Bool[Tensor, "first second level"]:
     known = torch.zeros(grid.shape, dtype=torch.bool)
     known[:16] = True
     return known
+
+
+def write_cell_houses(folder: Path, doorways: Sequence[int], size: int = 32, frames: int = 20) -> Path:
+    """Write a data set of houses with doorways at some places, in which an agent looks around in the first room.
+
+    Args:
+        folder: the folder to make.
+        doorways: first column of the doorway of each house.
+        size: pixels of the side of a frame.
+        frames: of each house.
+    """
+    folder.mkdir(parents=True)
+    matrix = np.array([[size / 2, 0, size / 2], [0, size / 2, size / 2], [0, 0, 1.0]])
+    for number, start in enumerate(doorways):
+        grid = two_rooms(slice(start, start + 4))
+        grid.colors[grid.solid] = torch.tensor([120, 110, 100], dtype=torch.uint8)
+        info = TrajectoryInfo(
+            f"cells/{folder.name}-{start}", matrix, size, size, UP, walking_actions(), {"simulator": "cells"}
+        )
+        turned = info.vocabulary.follow(camera_in(grid), ["left"] * (frames - 1), torch.tensor(UP).double())
+        poses = torch.cat([camera_in(grid)[None], turned])
+        cameras = Cameras(poses, torch.from_numpy(matrix).expand(frames, 3, 3), size, size)
+        write_trajectory(folder / f"house-{number}.parquet", info, seen_cells(grid, cameras))
+    return folder
+
+
+def seen_cells(grid: CellGrid, cameras: Cameras) -> Iterator[Frame]:
+    """The frames that cameras see of a grid, with all of its cells."""
+    surfaces = first_surfaces(grid, cameras)
+    depth = torch.where(surfaces.hit[0], surfaces.depth[0], 0.0).float().numpy()
+    colors = surfaces.colors(grid)[0].numpy()
+    for number, pose in enumerate(cameras.world_from_camera.numpy()):
+        action = "left" if number + 1 < len(cameras) else None
+        yield Frame(colors[number], depth[number], pose, action, number / 10, grid)

@@ -53,9 +53,9 @@ def is_occupied(classes: Tensor) -> Tensor:
     return (classes != FREE) & (classes != OUTSIDE)
 
 
-def things(palette: Sequence[str]) -> list[int]:
+def things(classes: int) -> range:
     """Return the numbers of the classes that stand for something known: all but the first three."""
-    return list(range(3, len(palette)))
+    return range(3, classes)
 
 
 def class_iou(counts: Counts | Numbers, row: int) -> Numbers:

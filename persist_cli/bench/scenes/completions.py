@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -11,8 +12,9 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from persist_cli.api.cells import FREE, OUTSIDE, CellGrid
-from persist_cli.api.memory import Memory
+from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
+from persist_cli.api.scene_model import SceneModel
 from persist_cli.bench.scenes.training_houses import House, class_frequencies, nearest_houses, region_of_match
 from persist_cli.bench.scenes.views import View, filled, same_form
 from persist_cli.errors import PersistError
@@ -128,44 +130,49 @@ class SceneCompletion(Completion):
     """A scene with a model, to which the image is written as a user would.
 
     Args:
-        factory: of scenes with the model.
+        scenes: with the model.
     """
 
     name = "model"
     definition = "the scene model, from the image with its depth and the cells that it shows"
     random = True
 
-    def __init__(self, factory: MemoryFactory) -> None:
-        self.factory = factory
+    def __init__(self, scenes: Scenes) -> None:
+        self.scenes = scenes
 
     def complete(self, view: View, number: int, seed: int) -> CellGrid:
-        """Return what the scene imagines in the region.
-
-        Raises:
-            DataError: when its classes are not those of the data.
-        """
-        scene = seen_scene(self.factory, view)
+        """Return what the scene imagines in the region."""
+        scene = self.scenes.after(view)
         scene.complete(view.region.box(view.truth), seed)
         return same_form(view.region.of(scene.cells), view.truth.form, "the scene model")
 
 
-def seen_scene(factory: MemoryFactory, view: View) -> Scene:
-    """Return a scene that holds one image.
+@dataclass(frozen=True)
+class Scenes:
+    """Makes the scenes of the benchmark.
 
-    Raises:
-        PersistError: when the memory is no scene.
+    Args:
+        factory: of memories that are scenes.
+        model: imagines their unknown cells; ``None`` for none.
     """
-    scene = as_scene(factory.empty(view.info))
-    scene.memorize(view.frame.to(factory.device))
-    return scene
 
+    factory: MemoryFactory
+    model: SceneModel | None
 
-def as_scene(memory: Memory) -> Scene:
-    """Return a memory that is a scene.
+    def empty(self, info: TrajectoryInfo) -> Scene:
+        """Return an empty scene in the world of a trajectory.
 
-    Raises:
-        PersistError: when it is none.
-    """
-    if not isinstance(memory, Scene):
-        raise PersistError(f"memory {memory.name!r} is no scene: it imagines nothing; take --memory scene")
-    return memory
+        Raises:
+            PersistError: when the memory is no scene.
+        """
+        memory, model = self.factory.empty(info), self.model
+        if not isinstance(memory, Scene):
+            raise PersistError(f"memory {memory.name!r} is no scene: it imagines nothing; take the memory 'scene'")
+        memory.imagine_with(None if model is None else lambda: model)
+        return memory
+
+    def after(self, view: View) -> Scene:
+        """Return a scene that holds one image."""
+        scene = self.empty(view.info)
+        scene.memorize(view.frame.to(self.factory.device))
+        return scene

@@ -6,17 +6,19 @@ least a square metre of ground on either side. A room is closed when its free ce
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool
+import torch
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from persist_cli.api.cells import FREE, OUTSIDE, CellGrid
+from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellGrid
 from persist_cli.api.ground import Body
 
 DOOR, WALL = "door", "wall"
@@ -98,11 +100,12 @@ def imagined_doors(grid: CellGrid, known: Bool[Tensor, "first second level"]) ->
             yield Door((low[0], low[1]), (high[0], high[1]))
 
 
-def agent_places(grid: CellGrid, body: Body) -> Mask:
-    """Return where the middle of an agent may be, in squares of a fifth of a cell.
+def clearance(grid: CellGrid, body: Body) -> NDArray[np.float64]:
+    """Return metres to the nearest ground that cannot be walked on, in squares of a fifth of a cell; 0 on such ground.
 
     A column can be walked on where all cells whose middle is between what is stepped over and the agent's height are
-    known to be free, and something lies below them.
+    known to be free, and something lies below them. The floor is where the height along up is 0, as in the cells of
+    simulators.
     """
     heights = (np.arange(grid.shape[2]) + grid.corner[2]) * grid.form.size
     body_levels = (heights > body.step_over) & (heights < body.height)
@@ -110,9 +113,34 @@ def agent_places(grid: CellGrid, body: Body) -> Mask:
     free = (grid.known & (grid.classes == FREE)).numpy()
     ground = free[..., body_levels].all(2) & grid.solid.numpy()[..., floor_levels].any(2)
     fine = ground.repeat(FINER, 0).repeat(FINER, 1)
-    side = grid.form.size / FINER
-    away: Mask = (ndimage.distance_transform_edt(np.pad(fine, 1))[1:-1, 1:-1] - 0.5) * side >= body.radius - 1e-9
-    return away
+    away: NDArray[np.float64] = ndimage.distance_transform_edt(np.pad(fine, 1))[1:-1, 1:-1]
+    return np.maximum(away - 0.5, 0.0) * (grid.form.size / FINER)
+
+
+def agent_places(grid: CellGrid, body: Body) -> Mask:
+    """Return where the middle of an agent may be, in squares as of ``clearance``."""
+    places: Mask = clearance(grid, body) >= body.radius - 1e-9
+    return places
+
+
+def may_step(grid: CellGrid, body: Body, start: Float[Tensor, " 3"], end: Float[Tensor, " 3"]) -> bool:
+    """Return whether an agent can go from a place to one nearby, both in world metres.
+
+    It can where it fits, or stands less near to what is in the way than before.
+    """
+    reach = math.ceil((body.radius + 1.0) / grid.form.size)
+    first, second, _ = grid.numbers(end).tolist()
+    around = grid.box((first - reach, second - reach, grid.corner[2]), (2 * reach + 1, 2 * reach + 1, grid.shape[2]))
+    metres = clearance(around, body)
+    before, after = (metres[_square(around, place)] for place in (start, end))
+    return bool(after >= body.radius - 1e-9 or after > before)
+
+
+def _square(grid: CellGrid, place: Float[Tensor, " 3"]) -> tuple[int, int]:
+    """Return the square of ``clearance`` in which a place lies."""
+    cells = (grid.axes @ place.double())[:2] / grid.form.size + 0.5 - torch.tensor(grid.corner[:2])
+    first, second = (cells * FINER).floor().long().tolist()
+    return first, second
 
 
 def judge_door(standing: Mask, door: Door, size: float) -> tuple[bool, bool]:
@@ -157,7 +185,7 @@ class BorderCounts:
 
     Args:
         open: faces between a free cell and one that is outside, side by side.
-        closed: faces between a free cell and a wall, or what is above a doorway.
+        closed: faces between a free cell and a wall, what is above a doorway, or something that was seen.
     """
 
     open: int
@@ -175,7 +203,7 @@ def count_borders(grid: CellGrid, known: Bool[Tensor, "first second level"]) -> 
     """
     numbers = np.arange(grid.shape[2]) + grid.corner[2]
     levels = (numbers > 0) & (numbers < numbers.max(initial=0))
-    names = [grid.form.palette.index(name) for name in (WALL, DOOR) if name in grid.form.palette]
+    names = [SOLID, *(grid.form.palette.index(name) for name in (WALL, DOOR) if name in grid.form.palette)]
     classes, there = grid.classes.numpy()[..., levels], grid.known.numpy()[..., levels]
     free, outside = there & (classes == FREE), there & (classes == OUTSIDE)
     wall, new = there & np.isin(classes, names), ~known.numpy()[..., levels]

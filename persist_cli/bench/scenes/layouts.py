@@ -1,7 +1,9 @@
 """How different the houses are that are imagined from one image, and how like true ones: diversity of layouts.
 
 Precision and recall are those of Kynkäänniemi et al. (2019): a layout is precise when it lies within the distance of a
-true layout to its k-th nearest true neighbour, and a true one is recalled when it lies so near to an imagined one.
+true layout to its k-th nearest true neighbour, and a true one is recalled when it lies so near to an imagined one. One
+true layout that is far from all others makes many imagined ones precise, so the share of true layouts that have an
+imagined one so near stands beside: coverage (Naeem et al. 2020).
 """
 
 from __future__ import annotations
@@ -57,17 +59,19 @@ def distinct(samples: UInt8[Tensor, "seed first second level"], mask: Bool[Tenso
 
 def precision_recall(
     imagined: Float[Tensor, "imagined feature"], true: Float[Tensor, "true feature"], k: int = NEIGHBOUR
-) -> tuple[float, float]:
-    """Return the share of imagined layouts that lie among the true ones, and of true ones among the imagined.
+) -> tuple[float, float, float]:
+    """Return the share of imagined layouts among the true ones, of true ones among the imagined, and of those covered.
 
     NaN where there are not more than ``k`` of either.
     """
     if min(len(imagined), len(true)) <= k:
-        return float("nan"), float("nan")
+        return float("nan"), float("nan"), float("nan")
     between = torch.cdist(imagined.double(), true.double())
+    precise = between <= _kth_neighbour(true, k)[None]
     return (
-        float((between <= _kth_neighbour(true, k)[None]).any(1).float().mean()),
+        float(precise.any(1).float().mean()),
         float((between <= _kth_neighbour(imagined, k)[:, None]).any(0).float().mean()),
+        float(precise.any(0).float().mean()),
     )
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from persist_cli.api.cells import FREE, OUTSIDE, Box, CellForm, CellGrid
+from persist_cli.api.cells import OUTSIDE, Box, CellForm, CellGrid
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.errors import DataError
 
@@ -80,6 +80,7 @@ class View:
         known: the region's cells after the image was written into an empty scene.
         truth: the region's true cells, every one known.
         near: which cells of the region are measured when they are not known.
+        house: all true cells of the house.
     """
 
     name: str
@@ -90,6 +91,7 @@ class View:
     known: CellGrid
     truth: CellGrid
     near: Bool[Tensor, "first second level"]
+    house: CellGrid
 
     @property
     def unseen(self) -> Bool[Tensor, "first second level"]:
@@ -138,6 +140,15 @@ def filled(known: CellGrid, classes: UInt8[Tensor, "first second level"]) -> Cel
     return result
 
 
-def with_free(grid: CellGrid) -> UInt8[Tensor, "first second level"]:
-    """Return the classes of a grid, free where nothing is known."""
-    return torch.where(grid.known, grid.classes, FREE)
+def sampled(
+    view: View, classes: UInt8[Tensor, "first second level"], known: Bool[Tensor, "first second level"]
+) -> CellGrid:
+    """Return a view's region with the classes of a sample, observed where the image shows the cell.
+
+    Args:
+        view: an image.
+        classes: of all cells; those of observed ones say what a model sees in them.
+        known: which cells the sample has.
+    """
+    origins = torch.where(view.known.known, view.known.origins, known.to(torch.uint8))
+    return replace(view.known, classes=classes, origins=origins)

@@ -30,7 +30,7 @@ def test_what_is_true_has_an_intersection_over_union_of_one_and_what_is_empty_of
     grid = two_rooms()
     view = view_of(grid, known_room(grid))
     whole, nothing = counts_of(Truth().complete(view, 0, 0), view), counts_of(Empty().complete(view, 0, 0), view)
-    rows = things(FORM.palette)
+    rows = things(len(FORM.palette))
     assert (mean_iou(whole, rows), class_iou(whole, -1)) == (1.0, 1.0)
     assert (mean_iou(nothing, rows), class_iou(nothing, -1)) == (0.0, 0.0)
     assert np.isnan(class_iou(whole, TABLE))  # there is none

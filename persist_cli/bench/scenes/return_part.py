@@ -1,0 +1,209 @@
+"""The part "return" of the benchmark: walks into the unknown and back, rendered.
+
+An agent walks out as in the part "walk", each row in the world that it imagines itself: where its own memory or depth
+says that a wall is in the way, it turns. Then it goes back along the very poses of the way out. The frames of the way
+back are compared with the row's own frames at these poses. Only the first image is true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from persist_cli.api.observations import Observations
+from persist_cli.bench.figure_text import FigureColumn
+from persist_cli.bench.scenes.rendering import RenderedRow, Renderer, RendererLoader, rendered_rows
+from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBench
+from persist_cli.bench.scenes.views import View
+from persist_cli.bench.scenes.walk_part import Wanderer, walk_name, walked
+from persist_cli.data.reference import parse_reference
+from persist_cli.evaluate.statistics import Draws, mean_figure, number
+from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, WEIGHTS, Fvd
+from persist_cli.metrics.lpips import ALEX, LpipsAlex, perceptual_distance, tensor_shapes
+from persist_cli.metrics.networks import missing_weights, network_weights, run_network
+from persist_cli.metrics.sharpness import LAPLACIAN, energy
+from persist_cli.rollout.world_model import WorldModel
+from persist_cli.viewing.console import add_task, progress
+
+PART: Final = "return"
+
+MOST_TRIES: Final = 4  # actions for each frame of the way out; an agent that is shut in stops there
+
+COLUMNS: Final = {
+    "psnr": FigureColumn(
+        "PSNR to own first visit", "higher", False,
+        "dB of each frame of the way back to the row's own frame at the very pose on the way out, where more than one "
+        "clip lies between them; an exact copy counts as 100",
+    ),
+    "lpips": FigureColumn("LPIPS to own first visit", "lower", False, "LPIPS-Alex of the same pairs"),
+    "psnr_start": FigureColumn("PSNR at the start", "higher", False, "dB of the last frame to the given image"),
+    "sharpness": FigureColumn(
+        "sharpness", "higher", False,
+        "mean energy of the Laplacian of the walk's imagined frames over that of the true frames of the measured "
+        "houses' trajectories, which show other places",
+    ),
+    "fvd": FigureColumn(
+        "FVD", "lower", False,
+        f"of pieces of {LEAST_FRAMES} frames of all walks to as many pieces of the data's own trajectories, whose "
+        "agents walk otherwise; the count is the same for all rows, so compare them with each other only",
+    ),
+    "metres": FigureColumn("metres", None, False, "length of the way out"),
+}  # fmt: skip
+
+
+def run_returns(bench: SceneBench, plan: RenderingPlan) -> None:
+    """Walk there and back from some of the views in every row, once for each seed, but where the journal has it."""
+    loader, rows = RendererLoader(bench, plan), rendered_rows(plan)
+    with progress() as bar:
+        units = {row.name: list(missing_units(bench, row)) for row in rows}
+        task = add_task(bar, "walking there and back", sum(map(len, units.values())), "walks")
+        for row in rows:
+            bar.update(task, note=row.name)
+            renderer = loader.load(row) if units[row.name] else None
+            for view, seed in units[row.name]:
+                if renderer is not None:
+                    frames = there_and_back(bench, renderer, view, seed, plan.steps)
+                    bench.journal.write_samples(f"{PART} {row.name}", walk_name(view, seed), frames)
+                bar.advance(task)
+
+
+def missing_units(bench: SceneBench, row: RenderedRow) -> Iterator[tuple[View, int]]:
+    """Yield the walks of a row that the journal lacks."""
+    for view in walked(bench):
+        for seed in range(bench.plan.seeds):
+            if not bench.journal.has(f"{PART} {row.name}", walk_name(view, seed)):
+                yield view, seed
+
+
+def there_and_back(bench: SceneBench, renderer: Renderer, view: View, seed: int, steps: int) -> dict[str, Tensor]:
+    """Return frames and poses of a walk, the first one given: ``steps`` frames out and as many back.
+
+    Fewer where the agent is shut in.
+    """
+    world = renderer.world(renderer.memory(view), view, seed, True, bench)
+    wanderer = Wanderer(view.info.vocabulary, np.random.default_rng([seed, 1]))
+    out = walk_out(world, wanderer, view, steps)
+    back = out.cameras[torch.arange(len(out) - 2, -1, -1)] if len(out) > 1 else out.cameras[:0]
+    parts = [out]
+    if len(back):
+        parts += [seen for [seen] in world.imagine([back], [(None,) * len(back)])]
+    whole = Observations.concatenate(parts)
+    return {"rgb": whole.rgb, "poses": whole.cameras.world_from_camera, "out": torch.tensor(len(out))}
+
+
+def walk_out(world: WorldModel, wanderer: Wanderer, view: View, steps: int) -> Observations:
+    """Return the view's frame and those of the way out, without those of blocked steps."""
+    parts, count, stopped, length = [view.frame], 0, False, world.backbone.frames_per_clip - 1
+    for _ in range(MOST_TRIES * steps):
+        if count >= steps:
+            break
+        actions = [wanderer.next(stopped)]
+        actions += [wanderer.next(False) for _ in range(min(length, steps - count) - 1)]
+        result = world.step([actions])[0]
+        stopped = not bool(result.free[-1])
+        parts.append(result.seen[result.free])
+        count += len(parts[-1])
+    return Observations.concatenate(parts)
+
+
+def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
+    """Return the figures of all rows, as JSON values."""
+    views, rows = walked(bench), rendered_rows(plan)
+    scenes = {scene: place for place, scene in enumerate(dict.fromkeys(view.scene for view in views))}
+    draws = Draws.of([scenes[view.scene] for view in views])
+    true = true_pieces(bench)
+    detail = float(energy(true.flatten(0, 1), LAPLACIAN).mean())
+    length = RendererLoader(bench, plan).load(rows[0]).backbone.frames_per_clip - 1
+    figures, videos = {}, {}
+    for row in rows:
+        walks = [
+            [bench.journal.samples(f"{PART} {row.name}", walk_name(view, seed)) for view in views]
+            for seed in range(bench.plan.seeds)
+        ]
+        values = [[walk_values(walk, length, detail) for walk in of_seed] for of_seed in walks]
+        figures[row.name] = {
+            name: mean_figure(np.array([[[value[name] for value in seed] for seed in values]]), draws).to_json()
+            for name in values[0][0]
+        }
+        videos[row.name] = [piece for of_seed in walks for walk in of_seed for piece in pieces(walk["rgb"])]
+    count = min(len(true), *map(len, videos.values()))
+    return {
+        "columns": {name: column.definition for name, column in COLUMNS.items()},
+        "views": [view.name for view in views],
+        "steps": plan.steps,
+        "missing": [reason for name in (LpipsAlex.name, WEIGHTS) if (reason := missing_weights(name))],
+        "rows": {row.name: figures[row.name] | {"fvd": distance(videos[row.name], true, count)} for row in rows},
+    }
+
+
+def walk_values(walk: dict[str, Tensor], length: int, detail: float) -> dict[str, float]:
+    """Return the figures of one walk; NaN where nothing is compared.
+
+    Args:
+        walk: as ``there_and_back`` returns it.
+        length: frames that are predicted at once; frames of one clip are not compared.
+        detail: mean energy of the Laplacian of true frames.
+    """
+    rgb, out = walk["rgb"], int(walk["out"])
+    back = [frame for frame in range(out, len(rgb)) if frame - first_visit(frame, out) > length]
+    pairs = rgb[back], rgb[[first_visit(frame, out) for frame in back]]
+    moved = walk["poses"][:out, :3, 3].diff(dim=0).norm(dim=1).sum()
+    last = len(rgb) > out
+    return {
+        "psnr": float(psnr(*pairs).mean()) if back else float("nan"),
+        "lpips": float(lpips(*pairs).mean()) if back and not missing_weights(LpipsAlex.name) else float("nan"),
+        "psnr_start": float(psnr(rgb[-1:], rgb[:1])) if last else float("nan"),
+        "sharpness": float(energy(rgb[1:], LAPLACIAN).mean()) / detail if last else float("nan"),
+        "metres": float(moved),
+    }
+
+
+def first_visit(frame: int, out: int) -> int:
+    """Return the number of the frame at the same pose on the way out, of which there are ``out`` frames."""
+    return 2 * (out - 1) - frame
+
+
+def psnr(
+    one: UInt8[Tensor, "frame height width 3"], two: UInt8[Tensor, "frame height width 3"]
+) -> Float[Tensor, " frame"]:
+    """Return dB of each frame, at most 100."""
+    error = (one.double() - two.double()).square().mean((1, 2, 3))
+    return (10 * torch.log10(255.0**2 / error)).clamp_max(100.0)
+
+
+def lpips(
+    one: UInt8[Tensor, "frame height width 3"], two: UInt8[Tensor, "frame height width 3"]
+) -> Float[Tensor, " frame"]:
+    """Return LPIPS-Alex of each frame."""
+    weights = network_weights(LpipsAlex.name, tensor_shapes(ALEX))
+    return run_network(lambda a, b: perceptual_distance(weights, ALEX, a, b), one, two)
+
+
+def pieces(rgb: UInt8[Tensor, "frame height width 3"]) -> list[UInt8[Tensor, "piece height width 3"]]:
+    """Return the imagined frames of a walk in pieces of as many frames as FVD needs, without a rest."""
+    return [rgb[first : first + LEAST_FRAMES] for first in range(1, len(rgb) - LEAST_FRAMES + 1, LEAST_FRAMES)]
+
+
+def true_pieces(bench: SceneBench) -> UInt8[Tensor, "piece frame height width 3"]:
+    """Return pieces of the measured houses' own trajectories."""
+    wanted, scenes = {view.scene for view in bench.views}, []
+    for file in parse_reference(bench.plan.data).trajectories():
+        if file.info.scene in wanted and len(file) > LEAST_FRAMES:
+            scenes += pieces(file.read().observations.rgb)
+    return torch.stack(scenes)
+
+
+def distance(imagined: Sequence[Tensor], true: Tensor, count: int) -> dict[str, float | None]:
+    """Return FVD of ``count`` imagined and true pieces; ``None`` without the weights or with too few."""
+    if missing_weights(WEIGHTS) or count < LEAST_VIDEOS:
+        return {"mean": None, "low": None, "high": None}
+    metric = Fvd()
+    chosen = [torch.linspace(0, len(videos) - 1, count).round().long().tolist() for videos in (imagined, true)]
+    features = torch.stack([metric.features(imagined[place]) for place in chosen[0]])
+    truths = torch.stack([metric.features(true[place]) for place in chosen[1]])
+    return {"mean": number(metric.distance(features, truths)), "low": None, "high": None}

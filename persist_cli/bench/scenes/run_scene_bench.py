@@ -1,0 +1,100 @@
+"""``persist bench scene`` from its options to its tables and report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from persist_cli.bench.scenes.completion_part import completion_json, run_completion
+from persist_cli.bench.scenes.edit_part import edits_json, run_edits
+from persist_cli.bench.scenes.return_part import return_json, run_returns
+from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, identity, prepare
+from persist_cli.bench.scenes.scene_tables import print_results, tables_text
+from persist_cli.bench.scenes.speed_part import run_speed, speed_json
+from persist_cli.bench.scenes.walk_part import run_walks, walk_json
+from persist_cli.evaluate.provenance import command, environment
+from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
+from persist_cli.io.files import check_folder, write_json, write_text
+from persist_cli.viewing.console import print_json, say
+
+RESULTS: Final = "metrics.json"
+
+TABLES: Final = "tables.md"
+
+FORMAT, VERSION = "persist-scenes", 1
+
+BASELINES: Final = ("empty", "nearest house", "class prior")
+
+
+def run_scene_bench(plan: SceneBenchPlan, out: Path, json: bool) -> None:
+    """Run all parts and write ``metrics.json`` and ``tables.md``.
+
+    Args:
+        plan: the options.
+        out: folder of the benchmark; a stopped one goes on.
+        json: whether the results are printed as JSON instead of tables.
+
+    Raises:
+        PersistError: one line for whatever does not fit.
+    """
+    check_folder(out)
+    bench = prepare(plan, out)
+    run_parts(bench)
+    results = results_json(bench)
+    write_json(out / RESULTS, results)
+    write_text(out / TABLES, tables_text(results))
+    if json:
+        print_json(results)
+        return
+    print_results(results)
+    say(f"all columns, classes and differences: {out / TABLES}; every figure: {out / RESULTS}")
+
+
+def run_parts(bench: SceneBench) -> None:
+    """Run what the journal lacks of each part."""
+    rendering = bench.plan.rendering
+    if "completion" in bench.plan.parts:
+        run_completion(bench)
+    if "walk" in bench.plan.parts:
+        run_walks(bench)
+    if "speed" in bench.plan.parts:
+        run_speed(bench)
+    if "return" in bench.plan.parts and rendering is not None:
+        run_returns(bench, rendering)
+    if "edits" in bench.plan.parts and rendering is not None:
+        run_edits(bench, rendering)
+
+
+def results_json(bench: SceneBench) -> dict[str, Any]:
+    """Return the results and all that is needed to measure them again, as JSON values."""
+    results: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "settings": identity(bench.plan, bench.views, bench.houses, bench.trained) | {"model": bench.plan.model},
+        "palette": bench.palette,
+        "statistics": {"resamples": RESAMPLES, "least_houses": LEAST_UNITS, "drawn": "houses"},
+        "environment": environment(1),
+        "command": command(),
+    }
+    rendering = bench.plan.rendering
+    if "completion" in bench.plan.parts:
+        results["completion"] = completion_json(bench) | {"radius": bench.plan.radius}
+        results["completion"] |= against_baselines(results["completion"])
+    if "walk" in bench.plan.parts:
+        results["walk"] = walk_json(bench)
+    if "speed" in bench.plan.parts:
+        results["speed"] = speed_json(bench)
+    if "return" in bench.plan.parts and rendering is not None:
+        results["return"] = return_json(bench, rendering)
+    if "edits" in bench.plan.parts and rendering is not None:
+        results["edits"] = edits_json(bench)
+    return results
+
+
+def against_baselines(part: dict[str, Any]) -> dict[str, Any]:
+    """Return the best row without a model by mIoU, and how many times as good the model is; ``None`` without one."""
+    means = {name: part["rows"][name]["figures"]["miou"]["mean"] for name in BASELINES if name in part["rows"]}
+    best = max(means, key=lambda name: means[name] or 0.0)
+    model = part["rows"].get("model", {}).get("figures", {}).get("miou", {}).get("mean")
+    ratio = model / means[best] if model is not None and means[best] else None
+    return {"best_baseline": best, "ratio": ratio}

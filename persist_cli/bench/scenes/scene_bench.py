@@ -1,0 +1,288 @@
+"""``persist bench scene`` from its options to what is measured: all that is checked before, and the views."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from persist_cli.api.cells import CellForm, CellGrid
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.ground import Body
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.bench.scenes.completions import (
+    Completion,
+    Empty,
+    NearestHouse,
+    Outside,
+    Prior,
+    SceneCompletion,
+    Scenes,
+    Truth,
+)
+from persist_cli.bench.scenes.scene_journal import SceneJournal
+from persist_cli.bench.scenes.training_houses import House, read_houses
+from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
+from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
+from persist_cli.data.held_out import was_trained_on
+from persist_cli.data.reference import parse_reference
+from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.errors import DataError, PersistError, hint
+from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.memorize.memory_config import plugin_settings
+from persist_cli.navigation.ground_mapper import body_of
+from persist_cli.recipe import MemoryConfig
+from persist_cli.viewing.console import add_task, progress, warn
+
+PARTS: Final = ("completion", "walk", "return", "edits", "speed")
+
+RENDERED: Final = ("return", "edits")  # parts that need a checkpoint which draws scenes
+
+MEMORY, ENCODER = "scene", "classes"
+
+
+@dataclass(frozen=True)
+class RenderingPlan:
+    """What draws the frames of walks and edits.
+
+    Args:
+        checkpoint: of the world model, with an adapter that draws scenes.
+        memories: its adapters that are compared on walks.
+        steps: frames of a walk out, and of the way back.
+        sampling: in place of the checkpoint's own.
+        placement: device and precision.
+    """
+
+    checkpoint: Path
+    memories: tuple[str, ...]
+    steps: int
+    sampling: SamplingOverrides
+    placement: InferenceOptions
+
+
+@dataclass(frozen=True)
+class SceneBenchPlan:
+    """The options of ``persist bench scene``.
+
+    Args:
+        model: name or folder of a scene model; ``None`` to measure the rows that need none.
+        data: test houses with cells.
+        train: training houses, for the rows that look them up; ``None`` without these rows.
+        parts: of ``PARTS``.
+        images: most views, each of another house.
+        seeds: completions of each view.
+        radius: metres around the camera that are completed and measured.
+        houses: most training houses that are read.
+        steps: actions of a walk.
+        walks: most views from which an agent walks.
+        rendering: what draws the frames; ``None`` without such parts.
+        edits: random edits of the part "edits".
+        settings: texts ``memory.KEY=VALUE``.
+        seed: of the choice of frames.
+        allow_training_scenes: whether houses that the model was trained on may be measured.
+    """
+
+    model: str | None
+    data: str
+    train: Path | None
+    parts: tuple[str, ...]
+    images: int = 32
+    seeds: int = 3
+    radius: float = 5.0
+    houses: int = 500
+    steps: int = 1000
+    walks: int = 4
+    rendering: RenderingPlan | None = None
+    edits: int = 100
+    settings: tuple[str, ...] = ()
+    seed: int = 0
+    allow_training_scenes: bool = False
+
+    def memory(self, form: CellForm) -> MemoryConfig:
+        """Return the configuration of scenes with cells of a form."""
+        settings = plugin_settings(self.settings, ("memory",))["memory"]
+        return MemoryConfig(MEMORY, {"size": form.size, "palette": list(form.palette)} | settings, ENCODER, {})
+
+
+@dataclass(frozen=True)
+class SceneBench:
+    """A benchmark that was checked and is ready to be run.
+
+    Args:
+        plan: the options.
+        views: images that are measured.
+        houses: of the training; empty without any.
+        journal: keeps what was run.
+        trained: the scene model; ``None`` without one.
+    """
+
+    plan: SceneBenchPlan
+    views: Sequence[View]
+    houses: Sequence[House]
+    journal: SceneJournal
+    trained: TrainedSceneModel | None = None
+
+    @cached_property
+    def scenes(self) -> Scenes:
+        """Scenes with the model, if there is one."""
+        model = None if self.trained is None else self.trained.load()
+        return Scenes(MemoryFactory.of(self.plan.memory(self.views[0].truth.form)), model)
+
+    @property
+    def rows(self) -> list[Completion]:
+        """The rows of the completion; those that look training houses up only where there are any."""
+        looked_up: list[Completion] = [Prior(self.houses), NearestHouse(self.houses)] if self.houses else []
+        model: list[Completion] = [] if self.scenes.model is None else [SceneCompletion(self.scenes)]
+        return [*model, Empty(), Outside(), *looked_up, Truth()]
+
+    @property
+    def palette(self) -> tuple[str, ...]:
+        """Names of the classes of the data."""
+        return self.views[0].truth.form.palette
+
+    def body(self, view: View) -> Body:
+        """Return the body of the agent in a view's house."""
+        return body_of(view.info)
+
+
+def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
+    """Check everything that can be checked before anything is run, and read the views.
+
+    Raises:
+        PersistError: one line for whatever does not fit.
+    """
+    check_parts(plan)
+    trained = None if plan.model is None else find_scene_model(plan.model)
+    files = chosen_files(plan)
+    if trained is not None:
+        check_model(trained, files, plan.allow_training_scenes)
+    journal = SceneJournal(out)
+    views = read_views(files, plan)
+    houses = training_houses(plan, views)
+    journal.begin(identity(plan, views, houses, trained))
+    return SceneBench(plan, views, houses, journal, trained)
+
+
+def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
+    """Raise ``PersistError`` when a model knows other cells than the data's, or was trained on one of their houses."""
+    same_form(CellGrid.empty(trained.load().form.cells, files[0].info.world_up), files[0].cells(0).form, "the model")
+    names = trained.training_scenes.names if trained.training_scenes is not None else frozenset()
+    if trained.training_scenes is None or not trained.training_scenes.complete:
+        warn(f"{trained.folder}: not all scenes that this model was trained on are known")
+    known = next((file for file in files if was_trained_on(file.info, names)), None)
+    if known is not None and not allowed:
+        raise DataError(
+            f"{known.path}: the model was trained on scene {known.info.scene!r}; take data of another split, or "
+            "measure it all the same with --allow-training-scenes"
+        )
+
+
+def check_parts(plan: SceneBenchPlan) -> None:
+    """Raise ``PersistError`` when a part is unknown, or needs what is not named."""
+    for part in plan.parts:
+        if part not in PARTS:
+            raise PersistError(f"unknown part {part!r}; {hint(part, PARTS)}")
+        if part in ("walk", "speed") and plan.model is None:
+            raise PersistError(f"part {part!r} needs a scene model; name one, or measure --parts completion")
+        if part in RENDERED and plan.rendering is None:
+            raise PersistError(f"part {part!r} needs --checkpoint, whose adapter draws scenes")
+
+
+def chosen_files(plan: SceneBenchPlan) -> list[TrajectoryFile]:
+    """Return the first trajectory of each house of the data, as many as are measured, evenly spread.
+
+    Raises:
+        DataError: when the folder is no data set.
+    """
+    by_scene: dict[str, TrajectoryFile] = {}
+    for file in parse_reference(plan.data).trajectories():
+        by_scene.setdefault(file.info.scene, file)
+    files = list(by_scene.values())
+    places = np.linspace(0, len(files) - 1, min(plan.images, len(files))).round().astype(int)
+    return [files[place] for place in places]
+
+
+def read_views(files: Sequence[TrajectoryFile], plan: SceneBenchPlan) -> list[View]:
+    """Read a random frame of each trajectory, and write it into an empty scene.
+
+    Raises:
+        DataError: when a trajectory has no cells, or its cells are not those of the others.
+    """
+    scenes = Scenes(MemoryFactory.of(plan.memory(files[0].cells(0).form)), None)
+    views: list[View] = []
+    with progress() as bar:
+        task = add_task(bar, "reading houses", len(files), "houses")
+        for number, file in enumerate(files):
+            frame = int(np.random.default_rng([plan.seed, number]).integers(len(file)))
+            view = read_view(file, frame, plan.radius, scenes)
+            same_form(view.truth, views[0].truth.form if views else view.truth.form, str(file.path))
+            views.append(view)
+            bar.advance(task)
+    return views
+
+
+def read_view(file: TrajectoryFile, frame: int, radius: float, scenes: Scenes) -> View:
+    """Read one frame with the cells around it.
+
+    Raises:
+        DataError: when the trajectory has no cells.
+    """
+    cells = file.cells(frame)
+    image = file.read([frame]).observations
+    region = Region.around(cells, image.cameras.world_from_camera[0], radius)
+    truth = true_region(cells, region)
+    near = near_camera(truth, image.cameras.centers[0], radius)
+    view = View(f"{file.name}:{frame}", file.info.scene, file.info, image, region, truth, truth, near, cells)
+    known = same_form(region.of(scenes.after(view).cells), truth.form, "the scene")
+    return replace(view, known=known)
+
+
+def training_houses(plan: SceneBenchPlan, views: Sequence[View]) -> list[House]:
+    """Read the training houses.
+
+    Raises:
+        DataError: when one of them is measured, too.
+    """
+    if plan.train is None or "completion" not in plan.parts:
+        return []
+    measured = {view.scene for view in views}
+    store = Store(plan.train)
+    both = sorted({file.info.scene for file in store} & measured)
+    if both:
+        raise DataError(
+            f"{plan.train}: scene {both[0]!r} is measured, too; name training data without the test's houses"
+        )
+    return read_houses(store, plan.houses, views[0].truth.form)
+
+
+def identity(
+    plan: SceneBenchPlan, views: Sequence[View], houses: Sequence[House], trained: TrainedSceneModel | None
+) -> dict[str, Any]:
+    """Return JSON values of all that changes a figure: a benchmark with equal values goes on.
+
+    Parts, the number of seeds and that of walks may change: what is there is kept.
+    """
+    values: Mapping[str, Any] = {
+        "views": [view.name for view in views],
+        "scenes": [view.scene for view in views],
+        "houses": [house.scene for house in houses],
+        "memory": asdict(plan.memory(views[0].truth.form)),
+        "model": None if trained is None else trained.fingerprint,
+        "radius": plan.radius,
+        "seeds": plan.seeds,
+        "steps": plan.steps,
+        "rendering": None if plan.rendering is None else rendering_identity(plan.rendering),
+    }
+    return dict(json.loads(json.dumps(values, default=str)))
+
+
+def rendering_identity(plan: RenderingPlan) -> dict[str, Any]:
+    """Return JSON values of what draws the frames; memories may be added."""
+    checkpoint = find_checkpoint(plan.checkpoint)
+    sampling = asdict(checkpoint.sampling_with(plan.sampling)) | plan.placement.changes()
+    return {"checkpoint": checkpoint.fingerprint, "steps": plan.steps, "sampling": sampling}

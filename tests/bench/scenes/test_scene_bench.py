@@ -1,0 +1,107 @@
+"""The benchmark of scenes: its rows and parts, going on where it was stopped, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from persist_cli.api.actions import walking_actions
+from persist_cli.bench.scenes.walk_part import Wanderer
+from tests.conftest import Persist
+from tests.support.cell_houses import write_cell_houses
+from tests.support.micro_runs import run_persist
+
+SMALL = ("--radius", 2, "--seeds", 2, "--steps", 12, "--walks", 1, "--set", "memory.steps=1")
+
+
+@pytest.fixture(scope="module")
+def measured(
+    scene_model: Path, test_houses: Path, train_houses: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """A finished benchmark of the parts that draw no frames."""
+    out = tmp_path_factory.mktemp("bench") / "scenes"
+    options = ("--data", test_houses, "--train", train_houses, "--parts", "completion,walk,speed", "--out", out)
+    run_persist("bench", "scene", *map(str, (scene_model, *options, *SMALL)))
+    return out
+
+
+def test_every_row_is_compared_with_the_true_cells(measured: Path) -> None:
+    part = json.loads((measured / "metrics.json").read_text())["completion"]
+    assert [*part["rows"]] == ["model", "empty", "outside", "class prior", "nearest house", "truth"]
+    means = {name: row["figures"]["miou"]["mean"] for name, row in part["rows"].items()}
+    assert means["truth"] == 1.0
+    assert means["empty"] == means["outside"] == 0.0
+    assert means["nearest house"] > 0.5  # the houses differ in the place of a doorway
+    assert part["classes"] == ["floor", "ceiling", "wall"]  # the doorway is farther away
+    assert part["rows"]["model"]["seeds"] == 2
+    assert part["rows"]["model"]["figures"]["miou"]["differences"].keys() == part["rows"].keys() - {"model", "truth"}
+
+
+def test_walks_count_what_is_new_in_each_window(measured: Path) -> None:
+    windows = json.loads((measured / "metrics.json").read_text())["walk"]["windows"]
+    assert [*windows] == ["1-12"]
+    assert windows["1-12"]["new"]["mean"] > 0
+    assert 0 <= windows["1-12"]["blocked"]["mean"] <= 1
+    speed = json.loads((measured / "metrics.json").read_text())["speed"]["rows"]
+    cells = [row["cells"]["mean"] for row in speed.values()]
+    assert cells == sorted(cells)
+
+
+def test_tables_say_what_every_row_and_column_means(measured: Path) -> None:
+    text = (measured / "tables.md").read_text()
+    for words in (
+        "| model |",
+        "- **nearest house**: the training house",
+        "- **mIoU**: mean over",
+        "class drift (walk)",
+    ):
+        assert words in text
+
+
+def test_a_stopped_benchmark_goes_on_and_gives_the_same(
+    persist: Persist, measured: Path, scene_model: Path, test_houses: Path, train_houses: Path
+) -> None:
+    before = json.loads((measured / "metrics.json").read_text())
+    kept = measured / "parts" / "model"
+    times = {path.name: path.stat().st_mtime_ns for path in kept.iterdir()}
+    first = min(times)
+    (kept / first).unlink()
+    options = ("--data", test_houses, "--train", train_houses, "--parts", "completion", "--out", measured)
+    result = persist("bench", "scene", scene_model, *options, *SMALL, "--json")
+    assert result.code == 0, result.err
+    again = json.loads(result.out)["completion"]["rows"]["model"]["class_iou"]
+    assert again == before["completion"]["rows"]["model"]["class_iou"]
+    assert all((kept / name).stat().st_mtime_ns == time for name, time in times.items() if name != first)
+
+
+def test_what_does_not_fit_is_refused_in_one_line(
+    persist: Persist, walks: Path, test_houses: Path, scene_model: Path, measured: Path, tmp_path: Path
+) -> None:
+    same = write_cell_houses(tmp_path / "test", [5])
+    wrong = (
+        (("--parts", "compeltion"), "completion"),
+        (("--parts", "walk"), "needs a scene model"),
+        (("--parts", "edits"), "--checkpoint"),
+        (("--train", same), "is measured, too"),
+        (("--data", walks), "no cells"),
+        ((tmp_path,), str(tmp_path)),
+        (("--radius", 3, "--out", measured), "another benchmark"),
+    )
+    for options, cause in wrong:
+        given = () if "--data" in options else ("--data", test_houses)
+        result = persist("bench", "scene", *given, "--out", tmp_path / "out", *options)
+        assert (result.code, cause in result.err, len(result.err.strip().splitlines())) == (1, True, 1), result.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_agent_that_is_stopped_turns_before_it_goes_on() -> None:
+    wanderer = Wanderer(walking_actions(), np.random.default_rng(0))
+    assert [wanderer.next(False) for _ in range(3)] == ["forward"] * 3
+    turn = wanderer.next(True)
+    assert turn in ("left", "right")
+    rest = [wanderer.next(False) for _ in range(12)]
+    assert rest[-1] == "forward"
+    assert set(rest[: rest.index("forward")]) <= {turn}
