@@ -118,6 +118,34 @@ def test_a_thing_is_moved_with_its_colour_and_the_same_way_back_restores_the_roo
     assert not bool(changes(grid, back).any())
 
 
+def with_box_on_table() -> CellGrid:
+    grid = cell_room()
+    grid.classes[4, 7, 4], grid.colors[4, 7, 4] = BOX, torch.tensor((7, 7, 7), dtype=torch.uint8)
+    return grid
+
+
+def test_what_stands_on_a_moved_thing_goes_along():
+    grid = with_box_on_table()
+    moved = edited(grid, Move(**box_of(grid, "table#1"), by=(1.0, 0.0, -0.5)))
+    assert int(moved.classes[4, 7, 4]) == FREE
+    assert moved.colors[8, 9, 4].tolist() == [7, 7, 7]
+
+
+def test_what_stands_on_a_removed_thing_falls_on_the_floor():
+    grid = with_box_on_table()
+    gone = edited(grid, Remove(**box_of(grid, "table#1")))
+    assert not bool((gone.classes[4, 7, 2:5] != FREE).any())
+    assert gone.colors[4, 7, 1].tolist() == [7, 7, 7]
+
+
+def test_what_stands_on_something_else_too_stays():
+    grid = with_box_on_table()
+    grid.classes[4:6, 5:7, 4] = BOX
+    grid.classes[4:6, 5, 1:4] = 9  # a barrel beside the table
+    gone = edited(grid, Remove(**box_of(grid, "table#1")))
+    assert bool((gone.classes[4:6, 5:7, 4] == BOX).all())
+
+
 def test_a_copy_stands_at_both_places():
     grid = cell_room()
     copied = edited(grid, Copy(**box_of(grid, "box#1"), by=(0.0, 0.0, -1.0)))
@@ -154,6 +182,7 @@ def test_an_inserted_thing_stands_at_the_height_and_has_the_size_and_colour_that
         (Insert(kind="free", at=(2, None, 1)), "no class 'free'"),
         (Insert(kind="box", at=(None, 1, 1)), "the height alone can be left open"),
         (Insert(kind="box", at=(40, None, 1)), "reach out of the scene"),
+        (Insert(kind="box", at=(-0.5, None, 1)), "no room for it on what stands there"),
         (Insert(kind="box", at=(0.5, 0.0, 0.75)), "hold table; take another place, or let it replace them"),
         (Move(**box_of(cell_room(), "table#1"), by=(50, 0, 0)), "reach out of the scene"),
         (Move(**box_of(cell_room(), "table#1"), by=(0.1, 0, 0)), "less than half a cell of 0.25 m"),

@@ -11,7 +11,7 @@ from persist_cli.api.cells import CellForm, CellGrid, CellOrigin
 from persist_cli.api.ground import ground_axes
 
 UP = (0.0, 1.0, 0.0)
-FORM = CellForm(0.25, ("free", "solid", "outside", "floor", "ceiling", "wall", "door", "table", "box"))
+FORM = CellForm(0.25, ("free", "solid", "outside", "floor", "ceiling", "wall", "door", "table", "box", "barrel"))
 FLOOR, CEILING, WALL, TABLE, BOX = 3, 4, 5, 7, 8
 COLORS = {
     FLOOR: (120, 90, 60),

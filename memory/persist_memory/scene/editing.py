@@ -15,11 +15,13 @@ from persist_cli.api.cell_things import box_of, ceiling_level, find_things, floo
 from persist_cli.api.cells import FREE, OUTSIDE, Box, CellGrid, CellOrigin
 from persist_cli.api.scene_edits import Copy, Edit, EditOutcome, Insert, Move, Paint, Remove
 from persist_cli.errors import DataError, hint
+from persist_memory.scene.support import free_below, standing_on
 from persist_memory.scene.surroundings import fill_from_surroundings, guess, repair_floor
 
 BORDER: Final = 1e-6  # metres by which a box is grown, so that rounding leaves no cell of it out
 LEAST_REACH, MOST_REACH = 2, 8  # cells behind a removed thing that it can hide
-SIZES: Final = {  # metres along the ground axes and up, of a class of which the scene has no thing
+SIZES: Final = {  # metres along the ground axes and up, of a class of which the scene has no thing; a table is as
+    # high as that even where its thin legs are in no cell of the scene's own
     "table": (1.0, 0.5, 0.75), "wall": (0.25, 0.25, 2.5), "barrel": (0.5, 0.5, 0.75), "building": (1.5, 1.5, 1.25),
     "office_chair": (0.75, 0.75, 1.0), "office_desk": (1.0, 1.0, 0.75), "tree": (1.5, 1.5, 1.5),
     "tree_pine": (1.0, 1.0, 2.0),
@@ -94,7 +96,12 @@ def changes(before: CellGrid, after: CellGrid) -> Cells:
 def _apply(grid: CellGrid, edit: Edit) -> Cells:
     """Do an edit in the grid's tensors, and return which cells it uncovers."""
     if isinstance(edit, Remove):
-        return _remove(grid, _targets(grid, edit))
+        targets = _targets(grid, edit)
+        riders = standing_on(grid, targets)
+        uncovered = _remove(grid, targets)
+        for places in riders:
+            _fall(grid, places)
+        return uncovered
     if isinstance(edit, Move | Copy):
         return _carry(grid, edit)
     if isinstance(edit, Insert):
@@ -175,9 +182,20 @@ def _grown(cells: Cells) -> Cells:
     return grown
 
 
+def _fall(grid: CellGrid, places: Places) -> None:
+    """Let a thing down on what is below it."""
+    fall = free_below(grid, places)
+    if fall:
+        classes, colors = grid.classes[tuple(places.T)].clone(), grid.colors[tuple(places.T)].clone()
+        _set(grid, places, FREE, (0, 0, 0))
+        _set(grid, places - torch.tensor([0, 0, fall]), classes, colors)
+
+
 def _carry(grid: CellGrid, edit: Move | Copy) -> Cells:
-    """Put what is in a box at another place, and take it away where it was if it moves."""
+    """Put what is in a box at another place, and take it away where it was if it moves, with all that stands on it."""
     targets, floor = _targets(grid, edit), floor_level(grid)
+    for rider in standing_on(grid, targets) if isinstance(edit, Move) else ():
+        targets[tuple(rider.T)] = True
     shift = ((grid.axes @ torch.tensor(edit.by, dtype=torch.float64)) / grid.form.size).round().long()
     if not bool(shift.any()):
         raise DataError(f"by {_point_text(edit.by)} is less than half a cell of {grid.form.size:g} m")
@@ -202,7 +220,7 @@ def _insert(grid: CellGrid, edit: Insert) -> None:
     at = grid.axes @ torch.tensor([value or 0.0 for value in edit.at], dtype=torch.float64)
     low = torch.ceil(at / size - counts / 2 - BORDER).long() - torch.tensor(grid.corner)
     steps = [torch.arange(int(first), int(first + count)) for first, count in zip(low[:2], counts[:2], strict=True)]
-    low[2] = _rest_level(grid, steps) if rests else int(torch.floor(at[2] / size)) + 1 - grid.corner[2]
+    low[2] = _rest_level(grid, steps, int(counts[2])) if rests else int(torch.floor(at[2] / size)) + 1 - grid.corner[2]
     steps.append(torch.arange(int(low[2]), int(low[2] + counts[2])))
     places = torch.cartesian_prod(*steps)
     _check_room(grid, places, edit.overwrite)
@@ -224,18 +242,23 @@ def _usual(grid: CellGrid, edit: Insert) -> tuple[Float[Tensor, " 3"], tuple[int
         extent = (grid.axes @ torch.tensor(edit.size, dtype=torch.float64)).abs()
     elif own:
         spans = torch.stack([thing.cells.amax(0) - thing.cells.amin(0) + 1 for thing in own])
-        extent = spans.double().median(dim=0).values * grid.form.size
+        usual, extent = extent, spans.double().median(dim=0).values * grid.form.size
+        if edit.kind in SIZES:
+            extent[2] = extent[2].max(usual[2])
     colors = list(zip(*(thing.color for thing in own), strict=True))
     return extent, edit.color or (tuple(round(median(shades)) for shades in colors) if own else GREY)
 
 
-def _rest_level(grid: CellGrid, ground: Sequence[Tensor]) -> int:
-    """Return the level above all that stands in some columns, the ceiling left out."""
+def _rest_level(grid: CellGrid, ground: Sequence[Tensor], count: int) -> int:
+    """Return the level above all that stands in some columns, from which on there must be ``count`` free levels."""
     ceiling, floor = ceiling_level(grid), floor_level(grid)
     _check_inside(grid, torch.cartesian_prod(*ground, torch.zeros(1, dtype=torch.long)))
     below = grid.solid[ground[0][:, None], ground[1]].any(0).any(0).nonzero()[:, 0]
     below = below[below < ceiling] if ceiling is not None else below
-    return int(below.max()) + 1 if len(below) else (0 if floor is None else floor + 1)
+    rest = int(below.max()) + 1 if len(below) else (0 if floor is None else floor + 1)
+    if rest + count > (grid.shape[2] if ceiling is None else ceiling):
+        raise DataError("there is no room for it on what stands there; take another place, or give a height")
+    return rest
 
 
 def _check_inside(grid: CellGrid, places: Places) -> None:
