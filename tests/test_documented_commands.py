@@ -86,6 +86,7 @@ NOT_RUN = {
     "persist doctor": "takes half a minute for a published model; tests/doctor runs it on them",
     "persist bench plan": "walks through houses for minutes; tests/bench runs it small",
     "persist bench collisions": "walks through houses for minutes; tests/bench runs it small",
+    "persist bench scene": "the nearest of many houses takes minutes; tests/bench runs it small",
     "persist --install-completion": "changes the files of the shell",
     "sbatch ": "needs Slurm",
     "open ": "opens a window",

@@ -82,7 +82,8 @@ def write_cell_houses(folder: Path, doorways: Sequence[int], size: int = 32, fra
     matrix = np.array([[size / 2, 0, size / 2], [0, size / 2, size / 2], [0, 0, 1.0]])
     for number, start in enumerate(doorways):
         grid = two_rooms(slice(start, start + 4))
-        grid.colors[grid.solid] = torch.tensor([120, 110, 100], dtype=torch.uint8)
+        colors = torch.randint(60, 200, grid.colors.shape, generator=torch.Generator().manual_seed(start))
+        grid.colors[grid.solid] = colors[grid.solid].to(torch.uint8)
         info = TrajectoryInfo(
             f"cells/{folder.name}-{start}", matrix, size, size, UP, walking_actions(), {"simulator": "cells"}
         )

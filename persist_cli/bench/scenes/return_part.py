@@ -156,9 +156,9 @@ def walk_values(walk: dict[str, Tensor], length: int, detail: float) -> dict[str
     last = len(rgb) > out
     return {
         "psnr": float(psnr(*pairs).mean()) if back else float("nan"),
-        "lpips": float(lpips(*pairs).mean()) if back and not missing_weights(LpipsAlex.name) else float("nan"),
+        "lpips": float(lpips(*pairs).mean()) if back and not lpips_obstacle(rgb) else float("nan"),
         "psnr_start": float(psnr(rgb[-1:], rgb[:1])) if last else float("nan"),
-        "sharpness": float(energy(rgb[1:], LAPLACIAN).mean()) / detail if last else float("nan"),
+        "sharpness": float(energy(rgb[1:], LAPLACIAN).mean()) / detail if last and detail else float("nan"),
         "metres": float(moved),
     }
 
@@ -174,6 +174,13 @@ def psnr(
     """Return dB of each frame, at most 100."""
     error = (one.double() - two.double()).square().mean((1, 2, 3))
     return (10 * torch.log10(255.0**2 / error)).clamp_max(100.0)
+
+
+def lpips_obstacle(rgb: UInt8[Tensor, "frame height width 3"]) -> str | None:
+    """Return the reason why frames have no LPIPS: they are too small, or weights are missing."""
+    if min(rgb.shape[1:3]) < LpipsAlex.least_size:
+        return f"frames have less than {LpipsAlex.least_size} pixels"
+    return missing_weights(LpipsAlex.name)
 
 
 def lpips(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from persist_cli.checkpoints.scene_models import save_scene_model
 from tests.support.cell_houses import FORM, write_cell_houses
+from tests.support.micro_runs import run_persist, stage
 from tests.support.micro_scenes import micro_model
 
 
@@ -32,3 +34,13 @@ def scene_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model.name = "scene"
     save_scene_model(model, "scene", folder, None)
     return folder
+
+
+@pytest.fixture(scope="session")
+def renderer(train_houses: Path, stage1: Path) -> Path:
+    """A stage-2 run of four steps of an adapter that draws scenes."""
+    run = stage1.parent / "scene"
+    memory = {"name": "scene", "settings": {"palette": list(FORM.palette)}, "encoder": "classes"}
+    changes = [f"memory={json.dumps(memory)}", "adapter.form=rendered", "data.true_cells=1", "data.mirror=false"]
+    run_persist(*stage("stage2-voxel", train_houses, run, f"base={stage1}", *changes))
+    return run

@@ -1,0 +1,60 @@
+"""The parts that draw frames: the same poses there and back, the true grid as the ceiling, and edits that are seen."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_cli.bench.scenes.return_part import first_visit, psnr, walk_values
+from persist_cli.io.files import read_tensors
+from tests.support.micro_runs import run_persist
+
+
+@pytest.fixture(scope="module")
+def measured(scene_model: Path, test_houses: Path, renderer: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished benchmark of the parts that draw frames."""
+    out = tmp_path_factory.mktemp("bench") / "rendered"
+    options = ("--data", test_houses, "--parts", "return,edits", "--out", out, "--checkpoint", renderer)
+    small = ("--seeds", 1, "--walks", 1, "--return-steps", 9, "--edits", 3, "--denoising-steps", 1, "--radius", 2)
+    words = (scene_model, *options, *small, "--memories", "scene,stage1", "--set", "memory.steps=1")
+    run_persist("bench", "scene", *map(str, words))
+    return out
+
+
+def test_the_way_back_has_the_poses_of_the_way_out(measured: Path) -> None:
+    walk = read_tensors(next((measured / "parts" / "return-scene-true-grid").iterdir()))[0]
+    out, frames = int(walk["out"]), len(walk["poses"])
+    assert frames == 2 * out - 1
+    for frame in range(out, frames):
+        assert torch.equal(walk["poses"][frame], walk["poses"][first_visit(frame, out)])
+
+
+def test_each_memory_is_a_row_and_a_scene_has_one_with_true_cells(measured: Path) -> None:
+    part = json.loads((measured / "metrics.json").read_text())["return"]
+    assert [*part["rows"]] == ["scene", "scene, true grid", "stage1"]
+    assert part["rows"]["scene"]["sharpness"]["mean"] > 0
+
+
+def test_edits_are_rendered_and_counted_by_kind(measured: Path) -> None:
+    part = json.loads((measured / "metrics.json").read_text())["edits"]
+    assert part["wanted"] == 3
+    assert part["rows"]["all"]["count"] == sum(row["count"] for name, row in part["rows"].items() if name != "all") > 0
+    assert part["rows"]["all"]["outside"]["mean"] >= 0
+
+
+def test_frames_of_one_clip_are_not_compared_with_each_other() -> None:
+    rgb = torch.randint(0, 255, (9, 16, 16, 3), dtype=torch.uint8)
+    walk = {"rgb": rgb, "poses": torch.eye(4).expand(9, 4, 4), "out": torch.tensor(5)}
+    assert math.isnan(walk_values(walk, 8, 1.0)["psnr"])
+    assert math.isfinite(walk_values(walk, 4, 1.0)["psnr"])
+    same = torch.cat([rgb[:5], rgb[:4].flip(0)])
+    assert walk_values(walk | {"rgb": same}, 4, 1.0)["psnr"] == 100.0
+
+
+def test_psnr_is_that_of_the_mean_squared_error() -> None:
+    black, grey = torch.zeros(1, 4, 4, 3, dtype=torch.uint8), torch.full((1, 4, 4, 3), 51, dtype=torch.uint8)
+    assert float(psnr(black, grey)) == pytest.approx(20 * math.log10(255 / 51))
