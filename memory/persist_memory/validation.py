@@ -50,6 +50,28 @@ def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, tuple[to
             raise CheckpointError(f"{where}: tensor {name!r} has numbers that are not finite")
 
 
+def part_of(
+    tensors: Mapping[str, Tensor], expected: Mapping[str, tuple[torch.dtype, Shape]], where: str
+) -> list[Tensor]:
+    """Return the tensors of a part of a memory that it need not have, in the order of ``expected``; none without it.
+
+    Raises:
+        CheckpointError: one line naming a tensor that is missing, or of another type or shape, or not finite.
+    """
+    names = [name for name in expected if name in tensors]
+    if names and len(names) < len(expected):
+        raise CheckpointError(f"{where}: tensor {min(set(expected) - set(names))!r} is missing")
+    for name in names:
+        (dtype, shape), tensor = expected[name], tensors[name]
+        fits = tensor.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, tensor.shape, strict=True))
+        if tensor.dtype != dtype or not fits:
+            actual = f"{tensor.dtype} {list(tensor.shape)}"
+            raise CheckpointError(f"{where}: tensor {name!r} is {actual}, expected {dtype} {list(shape)}")
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(f"{where}: tensor {name!r} has numbers that are not finite")
+    return [tensors[name] for name in names]
+
+
 def with_origins(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return a memory's tensors with the origin of each item; in files of version 1, without it, all are observed."""
     if not tensors or ORIGINS in tensors:

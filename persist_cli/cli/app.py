@@ -251,6 +251,19 @@ def memorize(
     checkpoint: Annotated[
         Path | None, typer.Option(help="Whose adapter shall read it; the reference model when no setting is given.")
     ] = None,
+    model: Annotated[str | None, typer.Option(help="Of a scene: the trained scene model that imagines in it.")] = None,
+    complete: Annotated[bool, typer.Option("--complete", help="Of a scene: imagine what was not seen.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of what is imagined: other seeds, other houses.")] = 0,
+    depth: Annotated[
+        Path | None, typer.Option(help="Of a picture: .npy in metres, or PNG of 16 bits in millimetres.")
+    ] = None,
+    depth_model: Annotated[
+        str | None, typer.Option(help="Of a picture: folder or hub id of a model that estimates depth in metres.")
+    ] = None,
+    fov: Annotated[float | None, typer.Option(help="Of a picture: degrees from its top to its bottom; 75.")] = None,
+    size: Annotated[
+        int | None, typer.Option(min=8, help="Of a picture: crop it to a square of so many pixels, as a model needs.")
+    ] = None,
     merge: Annotated[list[Path] | None, typer.Option(help="Memory files to join: --merge A B.")] = None,
     verify: VerifyOption = False,
     json: JsonOption = False,
@@ -258,18 +271,25 @@ def memorize(
     """Build a memory from posed RGB-D, or join memories of one frame of reference.
 
     persist memorize runs/houses#0:0-48 --memory voxel --out house.safetensors
+
+    With a trained scene model, one frame or one picture becomes a whole place:
+
+    persist memorize hall.png --depth hall.npy --model runs/scene --complete --seed 3 --out hall.safetensors
     """
     from persist_cli.memorize.build import run_memorize, run_merge
     from persist_cli.memorize.memory_config import MemorizePlan
+    from persist_cli.memorize.picture import PictureOptions
 
     if merge:
-        if checkpoint or memory or encoder or settings:
+        if checkpoint or memory or encoder or settings or model or complete:
             raise PersistError(
-                "--merge joins memories as they are; leave out --checkpoint, --memory, --encoder and --set"
+                "--merge joins memories as they are; leave out --checkpoint, --memory, --encoder, --set, --model and "
+                "--complete"
             )
         run_merge([*merge, *(Path(name) for name in data or [])], out, json)
     else:
-        run_memorize(data or [], MemorizePlan(memory, encoder, settings or [], checkpoint), out, json)
+        plan = MemorizePlan(memory, encoder, settings or [], checkpoint, model, complete, seed)
+        run_memorize(data or [], plan, PictureOptions(depth, depth_model, fov, size), out, json)
 
 
 @app.command()

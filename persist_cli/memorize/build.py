@@ -10,38 +10,79 @@ from typing import Any
 from torch import Tensor
 
 from persist_cli.api.memory import Memory
-from persist_cli.errors import CheckpointError
+from persist_cli.api.scene import Scene
+from persist_cli.errors import CheckpointError, DataError
 from persist_cli.io.files import check_folder, remove_leftovers
+from persist_cli.memorize.imagining import of_known_cells, with_scene_model
 from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config
 from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
+from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, watched
 from persist_cli.viewing.map import draw_map
 
 
-def run_memorize(data: list[str], plan: MemorizePlan, out: Path, json: bool) -> None:
+def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, out: Path, json: bool) -> None:
     """Write the memory of some frames and its map from above, and print its size.
 
+    A picture becomes a data set of one frame beside the memory, where a rollout can start.
+
     Args:
-        data: references to frames of one scene, as in ``runs/houses#0:0-48``.
-        plan: name and settings of the memory and its encoder.
+        data: references to frames of one scene, as in ``runs/houses#0:0-48``, or a picture.
+        plan: name and settings of the memory and its encoder, and whether it is completed.
+        picture: what is known of the picture.
         out: memory file to write; the map is written beside it as PNG.
         json: whether JSON is printed instead of a table.
     """
     _check_out(out)
     config, origin = resolve_memory_config(plan)
-    sources = find_sources(data)
+    sources = find_sources(_with_picture(data, picture, out))
+    config = of_known_cells(config, sources[0].file)
     with busy("loading the encoder"):
         encoder = make_encoder(config.encoder, config.encoder_settings)
-    memory = make_memory(config.name, config.settings, encoder, common_reference(sources))
+    memory = with_scene_model(make_memory(config.name, config.settings, encoder, common_reference(sources)))
+    scene = imagining_scene(memory) if plan.complete else None
     seconds = write_sources(memory, sources)
     frames = sum(len(source.frames) for source in sources)
     paths: dict[str, Tensor] = {}
     for source in sources:
         add_paths(paths, {source.file.name: source.file.poses()[source.frames.start : source.frames.stop]})
-    rate = frames / seconds
-    _save_and_print(memory, paths, out, json, {"frames": frames, "frames_per_second": rate, "settings_of": origin})
+    extra = {"frames": frames, "frames_per_second": frames / seconds, "settings_of": origin}
+    if scene is not None:
+        began = time.perf_counter()
+        with busy("imagining"):
+            extra["completed"] = scene.complete(seed=plan.seed)
+        extra["seconds_imagining"] = time.perf_counter() - began
+    map_file = out.with_suffix(".png")
+    if is_picture(data[0]):
+        if map_file.exists() and map_file.samefile(data[0]):
+            map_file = out.with_suffix(".map.png")  # the picture is not replaced by the map of its scene
+        extra["start"] = f"{sources[0].file.path.parent}#{sources[0].file.name}:0"
+    _save_and_print(memory, paths, (out, map_file), json, extra)
+
+
+def _with_picture(data: list[str], options: PictureOptions, out: Path) -> list[str]:
+    """References to data; a picture is written as a data set beside the memory first."""
+    pictures = [text for text in data if is_picture(text)]
+    if not pictures:
+        without_picture(options)
+        return data
+    if len(data) > 1:
+        raise DataError(f"{pictures[0]}: a scene of a picture is made of one picture, here are {len(data)}")
+    return [str(write_picture(Path(pictures[0]), options, out.with_suffix(".frame")))]
+
+
+def imagining_scene(memory: Memory) -> Scene:
+    """Return a memory that can be completed.
+
+    Raises:
+        CheckpointError: when it is no scene, or has no model.
+    """
+    if not isinstance(memory, Scene):
+        raise CheckpointError(f"--complete: a memory of kind {memory.name!r} imagines nothing; take --memory scene")
+    memory.model()
+    return memory
 
 
 def run_merge(paths: list[Path], out: Path, json: bool) -> None:
@@ -62,7 +103,7 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
         except CheckpointError as error:
             raise CheckpointError(f"{paths[0]} and {path}: {error}") from error
         add_paths(walked, load_paths(path))
-    _save_and_print(merged, walked, out, json, {"merged": len(paths)})
+    _save_and_print(merged, walked, (out, out.with_suffix(".png")), json, {"merged": len(paths)})
 
 
 def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
@@ -78,8 +119,11 @@ def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
     return time.perf_counter() - start
 
 
-def _save_and_print(memory: Memory, paths: Mapping[str, Tensor], out: Path, json: bool, extra: dict[str, Any]) -> None:
-    map_file = out.with_suffix(".png")
+def _save_and_print(
+    memory: Memory, paths: Mapping[str, Tensor], files: tuple[Path, Path], json: bool, extra: dict[str, Any]
+) -> None:
+    """Write a memory and its map into the two files, and print its size."""
+    out, map_file = files
     for path in (out, map_file):
         remove_leftovers(path.parent, path.name)
     with busy("writing the memory and its map"):
@@ -107,11 +151,13 @@ def _save_and_print(memory: Memory, paths: Mapping[str, Tensor], out: Path, json
         if extra.get("settings_of"):
             say(f"settings and encoder: those of {extra['settings_of']}")
         say(f"memory: {out}\nmap: {map_file}")
+        if "start" in extra:
+            say(f"walk in it: persist rollout --start {extra['start']} --memory {out} --actions ...")
 
 
 def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return names and values for people, without paths: digits of large numbers in groups, bounds as ranges."""
-    texts = {name: value for name, value in result.items() if name not in ("file", "map", "settings_of")}
+    texts = {name: value for name, value in result.items() if name not in ("file", "map", "settings_of", "start")}
     texts["bytes"] = f"{result['bytes']:,}"
     texts |= {name: f"{result[name]:,}" for name in ("cells", "observed", "imagined")}
     if result["bounds"] is None:
@@ -121,6 +167,8 @@ def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         texts["bounds"] = " × ".join(ranges) + " m"
     if "frames_per_second" in result:
         texts["frames_per_second"] = f"{result['frames_per_second']:.3g}"
+    if "seconds_imagining" in result:
+        texts["seconds_imagining"] = f"{result['seconds_imagining']:.2f}"
     return [(name.replace("_per_second", "/s"), str(value)) for name, value in texts.items()]
 
 

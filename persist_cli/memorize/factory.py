@@ -16,6 +16,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.data.clips import ClipSample
 from persist_cli.errors import RecipeError
 from persist_cli.io.settings import parse_settings
+from persist_cli.memorize.imagining import with_scene_model
 from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.plugins import load_plugin, make_encoder
 from persist_cli.recipe import MemoryConfig
@@ -61,7 +62,7 @@ class MemoryFactory:
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """Return an empty memory in the world of a trajectory."""
-        return self.kind(self.settings, self.encoder, FrameOfReference(info.scene, info.world_up))
+        return with_scene_model(self.kind(self.settings, self.encoder, FrameOfReference(info.scene, info.world_up)))
 
 
 def memory_of(sample: ClipSample, factory: MemoryFactory) -> Memory:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
 
 USUAL = "voxel"  # the memory when neither the user nor a checkpoint names one
+SCENE = "scene"  # the memory when a model is named that imagines
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,18 @@ class MemorizePlan:
         encoder: name of its encoder, ``None`` when none is named.
         settings: texts ``memory.KEY=VALUE`` and ``encoder.KEY=VALUE``, values as in YAML.
         checkpoint: folder of the checkpoint whose adapter shall read the memory, ``None`` when none is named.
+        model: name or folder of the model that imagines in a scene, ``None`` when none is named.
+        complete: whether the scene is completed around the last frame.
+        seed: seed of what is imagined.
     """
 
     memory: str | None = None
     encoder: str | None = None
     settings: Sequence[str] = ()
     checkpoint: Path | None = None
+    model: str | None = None
+    complete: bool = False
+    seed: int = 0
 
 
 def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
@@ -41,6 +48,8 @@ def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]
     Raises:
         PersistError: when the plan has both a checkpoint and settings, or the checkpoint has no such adapter.
     """
+    if plan.model is not None:
+        return _with_model(plan)
     own = plan.encoder is not None or bool(plan.settings)
     if own and plan.checkpoint is not None:
         raise PersistError("--checkpoint brings memory settings and encoder along; leave out --encoder and --set")
@@ -53,6 +62,14 @@ def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]
     settings, name = plugin_settings(plan.settings), plan.memory or USUAL
     encoder = plan.encoder or load_plugin("memory", name).usual_encoder
     return MemoryConfig(name, settings["memory"], encoder, settings["encoder"]), None
+
+
+def _with_model(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
+    """The configuration of a scene that imagines with the plan's model; else it is as without one."""
+    rest = replace(plan, model=None, memory=plan.memory or SCENE)
+    config, origin = resolve_memory_config(rest)
+    model = str(Path(str(plan.model)).absolute()) if Path(str(plan.model)).exists() else plan.model
+    return replace(config, settings=config.settings | {"model": model}), origin
 
 
 def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig, str]:

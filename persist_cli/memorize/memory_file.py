@@ -15,6 +15,7 @@ from torch import Tensor
 from persist_cli.api.memory import FORMAT_VERSION, PATH, FrameOfReference, Memory
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import read_tensors
+from persist_cli.memorize.imagining import with_scene_model
 from persist_cli.plugins import make_encoder, make_memory
 
 FORMAT = "persist-memory"
@@ -49,7 +50,7 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def load_memory(path: Path) -> Memory:
-    """Return the memory that ``Memory.save`` wrote, with its encoder, on the CPU.
+    """Return the memory that ``Memory.save`` wrote, with its encoder, on the CPU; a scene has its model.
 
     Raises:
         CheckpointError: when the file cannot be used; one line names the file and the cause.
@@ -67,7 +68,7 @@ def load_memory(path: Path) -> Memory:
                 f"written with {header['channels']} channels, but encoder {header['encoder']!r} now has "
                 f"{encoder.channels}; build the memory anew"
             )
-        memory.restore(tensors)
+        with_scene_model(memory).restore(tensors)
     except PersistError as error:
         raise type(error)(f"{path}: {error}") from error
     if memory.figures().cells != header["cells"]:

@@ -6,7 +6,8 @@ thing passed over them. What is low and stands right before the agent's feet can
 farther away.
 
 What was observed counts before what a memory holds, and that before what was imagined. An observed frame is exact, so
-one pixel of it makes a square occupied. Imagined frames disagree with each other, so there the majority decides.
+one pixel of it makes a square occupied. Imagined frames disagree with each other, so there the majority decides. The
+imagined cells of a scene count before imagined frames, which are renderings of them.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ class Vote(IntEnum):
     REMEMBERED_FREE = 4
     IMAGINED_OCCUPIED = 5  # imagined frames, and imagined points of a memory
     IMAGINED_FREE = 6
+    SCENE_OCCUPIED = 7  # imagined cells of a scene, of which imagined frames are renderings
+    SCENE_FREE = 8
 
 
 def tells_body(info: TrajectoryInfo) -> bool:
@@ -111,7 +114,7 @@ class GroundMapper:
         for number in range(len(frames)):
             self._add_frame(frames.depth[number], frames.cameras[number], int(frames.origins[number]))
 
-    def add_points(self, points: MapPoints, floor: float) -> None:
+    def add_points(self, points: MapPoints, floor: float, of_scene: bool = False) -> None:
         """Add the points of a memory.
 
         Points between ``step_over`` and the body's height make squares occupied, those on the floor make squares free.
@@ -122,6 +125,7 @@ class GroundMapper:
         Args:
             points: of ``Memory.points``.
             floor: height of the floor along up, metres.
+            of_scene: whether imagined points are cells of a scene, which count before imagined frames.
         """
         positions = points.positions.cpu().double() @ self.axes.T
         bottom = positions[:, 2] - floor - points.rise / 2
@@ -130,15 +134,34 @@ class GroundMapper:
             return
         places, bottom, origins = positions[near, :2], bottom[near], points.origins.cpu()[near]
         blocking, observed = bottom > self.body.step_over, origins >= Origin.OBSERVED
+        imagined = (
+            (Vote.IMAGINED_OCCUPIED, Vote.IMAGINED_FREE) if not of_scene else (Vote.SCENE_OCCUPIED, Vote.SCENE_FREE)
+        )
         for chosen, vote in (
             (blocking & observed, Vote.REMEMBERED_OCCUPIED),
             (~blocking & observed, Vote.REMEMBERED_FREE),
-            (blocking & ~observed, Vote.IMAGINED_OCCUPIED),
-            (~blocking & ~observed, Vote.IMAGINED_FREE),
+            (blocking & ~observed, imagined[0]),
+            (~blocking & ~observed, imagined[1]),
         ):
             # half as large where occupied: a wall lies anywhere in its cell, and a body does not fit between two cells
-            side = points.spread / 2 if vote in (Vote.REMEMBERED_OCCUPIED, Vote.IMAGINED_OCCUPIED) else points.spread
-            self._count(vote, self._squares(places[chosen], side))
+            occupied = vote in (Vote.REMEMBERED_OCCUPIED, imagined[0])
+            self._count(vote, self._squares(places[chosen], points.spread / 2 if occupied else points.spread))
+
+    def set_scene(self, points: MapPoints, floor: float) -> None:
+        """Know the points of a scene as they are now, in place of all points before; arguments as of ``add_points``."""
+        for vote in (Vote.REMEMBERED_OCCUPIED, Vote.REMEMBERED_FREE, Vote.SCENE_OCCUPIED, Vote.SCENE_FREE):
+            self._votes[vote] = 0
+        self._map = None
+        self.add_points(points, floor, of_scene=True)
+
+    def forget(self, places: Float[Tensor, "place 2"], side: float) -> None:
+        """Forget what frames showed around places on the ground axes, in squares of a side in metres: it changed."""
+        size = torch.tensor(self._votes.shape[1:])
+        squares = self._squares(places, side) - self._low
+        rows, columns = squares[((squares >= 0) & (squares < size)).all(1)].unbind(1)
+        for vote in (Vote.OBSERVED_OCCUPIED, Vote.OBSERVED_FREE, Vote.IMAGINED_OCCUPIED, Vote.IMAGINED_FREE):
+            self._votes[vote][rows, columns] = 0
+        self._map = None
 
     def add_collision(self, camera: Cameras, forward: float) -> None:
         """Add that a true agent was stopped: what is right before its body, to half its width, is occupied.
@@ -174,6 +197,7 @@ class GroundMapper:
         states = torch.full(votes.shape[1:], int(Cover.UNKNOWN), dtype=torch.uint8)
         for occupied, free in (
             (imagined[0] > imagined[1], (imagined[1] > 0) & (imagined[0] <= imagined[1])),
+            (votes[Vote.SCENE_OCCUPIED] > 0, votes[Vote.SCENE_FREE] > 0),
             (votes[Vote.REMEMBERED_OCCUPIED] > 0, votes[Vote.REMEMBERED_FREE] > 0),
             (votes[Vote.OBSERVED_OCCUPIED] > 0, votes[Vote.OBSERVED_FREE] > 0),
         ):

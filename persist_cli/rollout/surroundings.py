@@ -11,9 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.cells import CellGrid
 from persist_cli.api.ground import Body, Cover, GroundMap
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.api.scene import Scene
 from persist_cli.navigation.ground_mapper import GroundMapper
 from persist_cli.navigation.ways import way_is_free
 
@@ -65,8 +67,32 @@ class Surroundings:
     def __init__(self, body: Body, start: Observations, info: TrajectoryInfo, memory: Memory | None) -> None:
         self.body, self._waiting = body, [start]
         self._mapper = GroundMapper(info.world_up, body)
-        if memory is not None:
-            self._mapper.add_points(memory.points(), self._mapper.floor_under(start.cameras.centers[0]))
+        self._floor = self._mapper.floor_under(start.cameras.centers[0])
+        self._cells: CellGrid | None = None  # of a scene, as they were when the map came to know them
+        if isinstance(memory, Scene):
+            self.know(memory)
+        elif memory is not None:
+            self._mapper.add_points(memory.points(), self._floor)
+
+    def know(self, scene: Scene) -> None:
+        """Know the cells of a scene as they are now."""
+        if scene.cells is not self._cells:
+            self._cells = scene.cells
+            self._mapper.set_scene(scene.points(), self._floor)
+
+    def changed(self, scene: Scene, before: CellGrid) -> None:
+        """Forget what frames showed where cells of a scene are others than before, and know its cells.
+
+        Args:
+            scene: after the change.
+            before: its cells before it.
+        """
+        self.map()  # what waits was seen before the change
+        after = scene.cells
+        then = before.box(after.corner, after.shape)
+        differ = (after.classes.cpu() != then.classes) | (after.known.cpu() != then.known)
+        self._mapper.forget(after.columns().cpu()[differ.any(-1)], after.form.size)
+        self.know(scene)
 
     def see(self, frames: Observations) -> None:
         """Add frames, observed or imagined."""
@@ -84,6 +110,7 @@ class Surroundings:
         self.map()  # what waits is added once for all copies
         copy = Surroundings.__new__(Surroundings)
         copy.body, copy._waiting, copy._mapper = self.body, [], self._mapper.copy()
+        copy._floor, copy._cells = self._floor, self._cells
         return copy
 
     def first_blocked(self, seen: Observations) -> int | None:

@@ -22,6 +22,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.ground import Body
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Origin, TrajectoryInfo
+from persist_cli.api.scene import Scene
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
@@ -98,6 +99,48 @@ class Agent:
         """Return a walk without an action yet, from the present frame."""
         return Walk(self.info, self.now.cameras, self.surroundings if self.body is not None else None)
 
+    @property
+    def scene(self) -> Scene | None:
+        """The memory, if it is a scene, which imagines what will be seen and in which interactions change things."""
+        return self.memory if isinstance(self.memory, Scene) else None
+
+    def set_out(self, actions: Sequence[str], most: int) -> Walk:
+        """Return a walk from the present frame; in a scene its first action is taken if it is an interaction.
+
+        The scene imagines first what the agent will see, so that it stops at imagined walls too.
+
+        Args:
+            actions: the next actions; without any nothing is done.
+            most: number of moves that a clip holds.
+        """
+        if self.scene is not None and actions:
+            if self.info.vocabulary[actions[0]].interaction:
+                return self.interact(actions[0])
+            self.scene.foresee([Cameras.concatenate([self.now.cameras, self.cameras_after(actions[:most])])])
+            if self.surroundings is not None:
+                self.surroundings.know(self.scene)
+        return self.walk()
+
+    def interact(self, action: str) -> Walk:
+        """Let an interaction change the scene, and return a walk that begins with it."""
+        if self.shared and self.memory is not None:
+            self.memory, self.shared = self.memory.copy(), False
+        scene, walk = self.scene, self.walk()
+        assert scene is not None
+        before = scene.cells
+        done = scene.act(self.info.vocabulary[action], walk.pose, self.body or Body())
+        if done and self.surroundings is not None:
+            self.surroundings.changed(scene, before)
+        walk.take(action, walk.after(action), done)
+        return walk
+
+    def next_clip(self, actions: Sequence[str]) -> Sequence[str]:
+        """Return the first of some actions that one clip may show: in a scene an interaction begins a new clip."""
+        if self.scene is None:
+            return actions
+        later = (n for n, name in enumerate(actions) if n > 0 and self.info.vocabulary[name].interaction)
+        return actions[: next(later, len(actions))]
+
     def cameras_after(self, actions: Sequence[str]) -> Cameras:
         """Return the cameras after each of the actions, starting at the present frame."""
         return cameras_along(self.now.cameras, self.info, actions)
@@ -150,6 +193,9 @@ class WorldModel:
         memory held at the start, or by what it imagined since. Unknown ground counts as free. A blocked action does not
         move the agent. Agents without a body are never blocked.
 
+        In a scene an interaction is done before the frames after it are imagined, and is refused where the scene
+        forbids it: its frame is then the one before it once more. In other memories it changes nothing by itself.
+
         Args:
             actions: for each agent at least one name of its vocabulary.
             check_again: whether each clip's own depth is looked at too. An agent then stops at a wall that only this
@@ -167,8 +213,13 @@ class WorldModel:
             )
         left = [tuple(names) for names in actions]
         while any(left):
-            walks = [agent.walk() for agent in self.agents]
-            plan_walks(walks, left, self.backbone.frames_per_clip - 1)
+            most, agents = self.backbone.frames_per_clip - 1, self.agents
+            walks = [agent.set_out(names, most) for agent, names in zip(agents, left, strict=True)]
+            rests = [
+                agent.next_clip(names)[len(walk.names) :]
+                for agent, names, walk in zip(agents, left, walks, strict=True)
+            ]
+            plan_walks(walks, rests, most)
             results = self.follow(walks, check_again)
             left = [names[len(walk.names) :] for names, walk in zip(left, walks, strict=True)]
             yield results

@@ -20,10 +20,8 @@ from persist_cli.api.geometry import camera_rays
 from persist_cli.api.ground import Body, ground_axes
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
 from persist_cli.api.observations import Observations, Origin
-from persist_cli.api.reach import cells_in_reach
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_edits import Edit, EditOutcome
-from persist_cli.api.scene_model import Given
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, DataError
 from persist_memory.batched_reads import distinct_cameras, same_size
@@ -31,24 +29,20 @@ from persist_memory.encoders.classes import Classes
 from persist_memory.scene.cell_store import CellStore, check_cells
 from persist_memory.scene.editing import edit_grid
 from persist_memory.scene.fusion import votes_of
-from persist_memory.scene.imagination import Carried, Imagination, View, limited, windows_over
-from persist_memory.scene.interaction import Load, Reached, changed_cells, reached_box
+from persist_memory.scene.imagination import (
+    VIEW,
+    Carried,
+    Imagination,
+    View,
+    evolved,
+    imagine_hidden,
+    limited,
+    read_view,
+    sees_unknown,
+    windows_over,
+)
+from persist_memory.scene.interaction import LOAD, Load, Reached, changed_cells, reached_box, read_load
 from persist_memory.validation import check_mergeable, check_observations
-
-FORESEEN_STRIDE = 4  # pixels from ray to ray that look for unknown cells
-
-VIEW: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {  # tensors of the newest observed frame
-    "view.rgb": (torch.uint8, (None, None, 3)),
-    "view.depth": (torch.float32, (None, None)),
-    "view.pose": (torch.float64, (4, 4)),
-    "view.intrinsics": (torch.float64, (3, 3)),
-}
-
-LOAD: dict[str, tuple[torch.dtype, tuple[int | None, ...]]] = {  # tensors of the carried thing
-    "carried.cells": (torch.int32, (None, 3)),
-    "carried.classes": (torch.uint8, (None,)),
-    "carried.colors": (torch.uint8, (None, 3)),
-}
 
 
 @dataclass(frozen=True)
@@ -264,9 +258,9 @@ class GridScene(Scene):
         if not action.interaction:
             return True
         pose = world_from_camera.cpu()
-        before = reached_box(self.cells, pose)
         if self.settings.evolution == "model":
-            return self._act_by_model(action, pose, before)
+            return self._act_by_model(action, pose)
+        before = reached_box(self.cells, pose)
         reached = Reached(before.copy(), pose, body, self.settings.carries)
         load = self._load
         if action.name == "pick_up":
@@ -289,7 +283,7 @@ class GridScene(Scene):
             imagination = self._imagination()
 
             def imagine(grid: CellGrid, hidden: Bool[Tensor, "first second level"]) -> CellGrid:
-                return _imagined(imagination, grid, hidden, seed)
+                return imagine_hidden(imagination, grid, hidden, seed)
 
         after, outcome = edit_grid(before, edits, imagine)
         self._change(after, before)
@@ -304,15 +298,8 @@ class GridScene(Scene):
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the known cells with their votes, in the order of their numbers, the newest view and the load."""
-        tensors = self._store.tensors()
-        if self._view is not None:
-            camera = self._view.camera
-            parts = (self._view.rgb, self._view.depth, camera.world_from_camera.double(), camera.intrinsics.double())
-            tensors |= dict(zip(VIEW, parts, strict=True))
-        if self._load is not None:
-            load = (self._load.cells.to(torch.int32), self._load.classes, self._load.colors)
-            tensors |= dict(zip(LOAD, load, strict=True))
-        return tensors
+        parts = [part.tensors() for part in (self._view, self._load) if part is not None]
+        return self._store.tensors() | {name: tensor for part in parts for name, tensor in part.items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Replace the content by what ``tensors()`` gave.
@@ -321,18 +308,13 @@ class GridScene(Scene):
             CheckpointError: when they are not tensors of a scene with these classes; then it stays as it was.
         """
         where = f"memory {self.name!r}"
-        view, load = (_part(tensors, expected, where) for expected in (VIEW, LOAD))
+        view, load = read_view(tensors, where), read_load(tensors, where)
         cells = {name: tensor for name, tensor in tensors.items() if name not in VIEW and name not in LOAD}
         store = self._empty_store(next(iter(cells.values())).device if cells else None)
         if cells:
             check_cells(cells, len(self._form.palette), where)
             store.fill(cells)
-        self._store, self._cells, self._view, self._load = store, None, None, None
-        if view:
-            rgb, depth, pose, matrix = view
-            self._view = View(rgb, depth, Cameras(pose, matrix, depth.shape[0], depth.shape[1]))
-        if load:
-            self._load = Load(load[0].long(), load[1], load[2])
+        self._store, self._cells, self._view, self._load = store, None, view, load
 
     def merge(self, other: Memory) -> None:
         """Add the cells of another scene: observed ones as if its frames had been written here.
@@ -427,42 +409,24 @@ class GridScene(Scene):
             camera = path[number : number + 1]
             corner = imagination.around(self._store.box.numbers(camera.centers[0].to(self._axes.device)).tolist())
             window = self._store.box.box(corner, imagination.model.form.shape)
-            if _sees_unknown(window, camera, self.settings.foresight, self.floor):
+            if sees_unknown(window, camera, self.settings.foresight, self.floor):
                 self._imagine(imagination, corner, self.settings.seed)
 
-    def _act_by_model(self, action: Action, pose: Float[Tensor, "4 4"], before: CellGrid) -> bool:
+    def _act_by_model(self, action: Action, pose: Float[Tensor, "4 4"]) -> bool:
         """Let the scene model say what becomes of the cells in reach; false when it changes nothing."""
         imagination = self._imagination()
-        known = imagination.model.form.actions
-        if action.name not in known:
-            raise CheckpointError(f"the scene model knows the interactions {', '.join(known)}, not {action.name!r}")
-        center = before.numbers(pose[:3, 3]).tolist()
-        window = self._store.box.box(imagination.around(center), imagination.model.form.shape)
-        reach = cells_in_reach(window, pose) & window.known
-        given = torch.where(window.known, int(Given.CONTENT), 0) + reach * (int(Given.PAST) - int(Given.CONTENT))
-        action_number = 1 + known.index(action.name)
-        classes, colors = imagination.sample(window, given.to(torch.uint8), action_number, self.settings.seed)
-        differs = reach & ((classes != window.classes) | ((colors != window.colors).any(-1) & window.solid))
-        if not bool(differs.any()):
+        center = self._store.box.numbers(pose[:3, 3].to(self._store.box.classes.device)).tolist()
+        before = self._store.box.box(imagination.around(center), imagination.model.form.shape)
+        after = evolved(imagination, before, action.name, pose, self.settings.seed)
+        if after is None:
             return False
-        after = window.copy()
-        after.classes[differs], after.colors[differs] = classes[differs], colors[differs]
-        after.origins[differs] = CellOrigin.IMAGINED
-        self._load = self._load_after(action.name, window, after)
-        self._change(after, window)
+        if action.name == "pick_up" and self._load is None:
+            gone = (before.solid & ~after.solid).nonzero()
+            self._load = Load.taken(before, gone) if len(gone) else None
+        elif action.name == "drop":
+            self._load = None
+        self._change(after, before)
         return True
-
-    def _load_after(self, action: str, before: CellGrid, after: CellGrid) -> Load | None:
-        """What is carried after the model changed cells: what it took away by ``pick_up``, nothing after ``drop``."""
-        if action == "drop":
-            return None
-        gone = (before.solid & ~after.solid).nonzero()
-        if action != "pick_up" or not len(gone) or self._load is not None:
-            return self._load
-        at = tuple(gone.T)
-        low, high = gone.amin(0), gone.amax(0)
-        middle = torch.stack([(low[0] + high[0]) // 2, (low[1] + high[1]) // 2, low[2]])
-        return Load(gone - middle, before.classes[at].clone(), before.colors[at].clone())
 
     def _change(self, after: CellGrid, before: CellGrid) -> None:
         """Overwrite the cells in which two grids of one box differ."""
@@ -481,46 +445,3 @@ def _seen(grid: CellGrid, cells: Tensor) -> Bool[Tensor, "layer frame row column
     known = grid.known.flatten()[cells.clamp_min(0)] if grid.known.numel() else torch.zeros_like(hit)
     ended = (hit & ~known).cumsum(0) > 0
     return hit & ~ended
-
-
-def _sees_unknown(window: CellGrid, camera: Cameras, foresight: float, floor: int) -> bool:
-    """Whether a ray of a camera meets an unknown cell before any surface."""
-    views = camera.resized(max(1, camera.height // FORESEEN_STRIDE), max(1, camera.width // FORESEEN_STRIDE))
-    classes = torch.where(window.known, window.classes, len(window.form.palette)).to(torch.uint8)
-    marked = replace(window, classes=classes)  # unknown cells are a thing of their own
-    surfaces = first_surfaces(marked, views, 1, window.solid | ~window.known, sheet_cells(window, floor))
-    unknown = ~window.known.flatten()[surfaces.cells[0].clamp_min(0)]
-    return bool((unknown & surfaces.hit[0] & (surfaces.depth[0] < foresight)).any())
-
-
-def _imagined(
-    imagination: Imagination, grid: CellGrid, hidden: Bool[Tensor, "first second level"], seed: int
-) -> CellGrid:
-    """Return a grid with its hidden cells imagined, as far as the model's windows reach."""
-    places = hidden.nonzero() + torch.tensor(grid.corner)
-    low, high = places.amin(0).tolist(), (places.amax(0) + 1).tolist()
-    center = [(a + b) // 2 for a, b in zip(low, high, strict=True)]
-    result = grid.copy()
-    wanted = replace(grid, origins=hidden.byte())
-    for x, y in windows_over(low, high, imagination.model.form, center):
-        corner = (x, y, imagination.floor)
-        window = result.box(corner, imagination.model.form.shape)
-        chosen = ~window.known & wanted.box(corner, window.shape).known
-        if bool(chosen.any()):
-            result.put(limited(imagination.fill(window, seed), window, chosen | window.known))
-    return result
-
-
-def _part(
-    tensors: dict[str, Tensor], expected: dict[str, tuple[torch.dtype, tuple[int | None, ...]]], where: str
-) -> list[Tensor]:
-    """The tensors of a part of the state, all or none; ``CheckpointError`` when they are others."""
-    names = [name for name in expected if name in tensors]
-    if names and len(names) < len(expected):
-        raise CheckpointError(f"{where}: tensor {(set(expected) - set(names)).pop()!r} is missing")
-    for name in names:
-        (dtype, shape), tensor = expected[name], tensors[name]
-        fits = tensor.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, tensor.shape, strict=True))
-        if tensor.dtype != dtype or not fits or (tensor.is_floating_point() and not bool(tensor.isfinite().all())):
-            raise CheckpointError(f"{where}: tensor {name!r} is {tensor.dtype} {list(tensor.shape)}, or not finite")
-    return [tensors[name] for name in names]

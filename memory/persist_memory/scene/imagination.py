@@ -7,7 +7,7 @@ neighbouring windows go on from each other.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,13 +15,25 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.cell_rays import first_surfaces, sheet_cells
 from persist_cli.api.cells import SOLID, CellGrid, CellOrigin
+from persist_cli.api.reach import cells_in_reach
 from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples
 from persist_cli.errors import CheckpointError
+from persist_memory.validation import Shape, part_of
 
 Corner = tuple[int, int, int]
+FORESEEN_STRIDE = 4  # pixels from ray to ray that look for unknown cells
 SEEDS = 2**62  # seeds of windows are smaller
 MIXERS = (6364136223846793005, 3202034522624059733, 7046029254386353087, 1442695040888963407)
+
+
+VIEW: dict[str, tuple[torch.dtype, Shape]] = {
+    "view.rgb": (torch.uint8, (None, None, 3)),
+    "view.depth": (torch.float32, (None, None)),
+    "view.pose": (torch.float64, (4, 4)),
+    "view.intrinsics": (torch.float64, (3, 3)),
+}
 
 
 @dataclass(frozen=True)
@@ -37,6 +49,27 @@ class View:
     rgb: UInt8[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
     camera: Cameras
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that ``read_view`` takes back."""
+        camera = self.camera
+        parts = (self.rgb, self.depth, camera.world_from_camera.double(), camera.intrinsics.double())
+        return dict(zip(VIEW, parts, strict=True))
+
+
+def read_view(tensors: Mapping[str, Tensor], where: str) -> View | None:
+    """Return the view among the tensors of a memory, ``None`` without one.
+
+    Raises:
+        CheckpointError: when a part of it is missing or damaged.
+    """
+    parts = part_of(tensors, VIEW, where)
+    if not parts:
+        return None
+    rgb, depth, pose, matrix = parts
+    if rgb.shape[:2] != depth.shape:
+        raise CheckpointError(f"{where}: its view has an image of {list(rgb.shape)} and depth of {list(depth.shape)}")
+    return View(rgb, depth, Cameras(pose, matrix, depth.shape[0], depth.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -202,3 +235,57 @@ def limited(filled: CellGrid, before: CellGrid, chosen: Bool[Tensor, "first seco
     origins = torch.where(dropped, 0, filled.origins)
     classes = torch.where(dropped, 0, filled.classes)
     return replace(filled, origins=origins, classes=classes, colors=filled.colors * ~dropped[..., None])
+
+
+def sees_unknown(window: CellGrid, camera: Cameras, foresight: float, floor: int) -> bool:
+    """Whether a ray of a camera meets an unknown cell before any surface."""
+    views = camera.resized(max(1, camera.height // FORESEEN_STRIDE), max(1, camera.width // FORESEEN_STRIDE))
+    classes = torch.where(window.known, window.classes, len(window.form.palette)).to(torch.uint8)
+    marked = replace(window, classes=classes)  # unknown cells are a thing of their own
+    surfaces = first_surfaces(marked, views, 1, window.solid | ~window.known, sheet_cells(window, floor))
+    unknown = ~window.known.flatten()[surfaces.cells[0].clamp_min(0)]
+    return bool((unknown & surfaces.hit[0] & (surfaces.depth[0] < foresight)).any())
+
+
+def imagine_hidden(
+    imagination: Imagination, grid: CellGrid, hidden: Bool[Tensor, "first second level"], seed: int
+) -> CellGrid:
+    """Return a grid with its hidden cells imagined, as far as the model's windows reach."""
+    places = hidden.nonzero() + torch.tensor(grid.corner)
+    low, high = places.amin(0).tolist(), (places.amax(0) + 1).tolist()
+    center = [(a + b) // 2 for a, b in zip(low, high, strict=True)]
+    result = grid.copy()
+    wanted = replace(grid, origins=hidden.byte())
+    for x, y in windows_over(low, high, imagination.model.form, center):
+        corner = (x, y, imagination.floor)
+        window = result.box(corner, imagination.model.form.shape)
+        chosen = ~window.known & wanted.box(corner, window.shape).known
+        if bool(chosen.any()):
+            result.put(limited(imagination.fill(window, seed), window, chosen | window.known))
+    return result
+
+
+def evolved(
+    imagination: Imagination, window: CellGrid, action: str, world_from_camera: Float[Tensor, "4 4"], seed: int
+) -> CellGrid | None:
+    """Return a window after an interaction, as the model says, or ``None`` when it says that nothing changes.
+
+    The model is given the known cells in reach as what they were before, and all other known ones as they are.
+
+    Raises:
+        CheckpointError: when the model does not know this interaction.
+    """
+    known = imagination.model.form.actions
+    if action not in known:
+        raise CheckpointError(f"the scene model knows the interactions {', '.join(known)}, not {action!r}")
+    reach = cells_in_reach(window, world_from_camera) & window.known
+    given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING))
+    given = torch.where(reach, int(Given.PAST), given).to(torch.uint8)
+    classes, colors = imagination.sample(window, given, 1 + known.index(action), seed)
+    differs = reach & ((classes != window.classes) | ((colors != window.colors).any(-1) & window.solid))
+    if not bool(differs.any()):
+        return None
+    after = window.copy()
+    after.classes[differs], after.colors[differs] = classes[differs], colors[differs]
+    after.origins[differs] = CellOrigin.IMAGINED
+    return after

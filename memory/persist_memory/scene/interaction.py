@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -13,9 +14,18 @@ from persist_cli.api.cell_things import Thing, find_things, floor_level
 from persist_cli.api.cells import FREE, CellGrid, CellOrigin
 from persist_cli.api.ground import Body
 from persist_cli.api.reach import AHEAD, CHANGED, REACH, place_and_heading
+from persist_cli.errors import CheckpointError
 from persist_memory.scene.surroundings import fill_from_surroundings
+from persist_memory.validation import Shape, part_of
 
 BEFORE = 0.3  # metres between the agent's body and the thing that it puts down
+
+
+LOAD: dict[str, tuple[torch.dtype, Shape]] = {
+    "carried.cells": (torch.int32, (None, 3)),
+    "carried.classes": (torch.uint8, (None,)),
+    "carried.colors": (torch.uint8, (None, 3)),
+}
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,30 @@ class Load:
     def color(self) -> UInt8[Tensor, " 3"]:
         """Its mean colour."""
         return self.colors.double().mean(0).round().to(torch.uint8)
+
+    @staticmethod
+    def taken(grid: CellGrid, cells: Int64[Tensor, "cell 3"]) -> Load:
+        """Return the load that some cells of a grid are, given as places in it."""
+        low, high = cells.amin(0), cells.amax(0)
+        middle = torch.stack([(low[0] + high[0]) // 2, (low[1] + high[1]) // 2, low[2]])
+        at = tuple(cells.unbind(1))
+        return Load(cells - middle, grid.classes[at].clone(), grid.colors[at].clone())
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that ``read_load`` takes back."""
+        return dict(zip(LOAD, (self.cells.to(torch.int32), self.classes, self.colors), strict=True))
+
+
+def read_load(tensors: Mapping[str, Tensor], where: str) -> Load | None:
+    """Return the carried thing among the tensors of a memory, ``None`` without one.
+
+    Raises:
+        CheckpointError: when a part of it is missing or damaged.
+    """
+    parts = part_of(tensors, LOAD, where)
+    if parts and (len({len(part) for part in parts}) > 1 or not len(parts[0])):
+        raise CheckpointError(f"{where}: the carried thing has {[len(part) for part in parts]} cells, classes, colours")
+    return Load(parts[0].long(), parts[1], parts[2]) if parts else None
 
 
 @dataclass(frozen=True)
@@ -79,9 +113,7 @@ class Reached:
         if thing is None:
             return None
         at = tuple(thing.cells.unbind(1))
-        low, high = thing.cells.amin(0), thing.cells.amax(0)
-        middle = torch.stack([(low[0] + high[0]) // 2, (low[1] + high[1]) // 2, low[2]])
-        load = Load(thing.cells - middle, self.grid.classes[at].clone(), self.grid.colors[at].clone())
+        load = Load.taken(self.grid, thing.cells)
         self.grid.classes[at], self.grid.colors[at], self.grid.origins[at] = FREE, 0, CellOrigin.IMAGINED
         self._uncover(thing.cells)
         return load

@@ -1,0 +1,71 @@
+"""Scenes get the model that imagines, and the cells that it knows."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from persist_cli.api.cells import CellForm
+from persist_cli.api.memory import Memory
+from persist_cli.api.meta_device import without_weights
+from persist_cli.api.scene import Scene
+from persist_cli.api.scene_model import SceneModel
+from persist_cli.checkpoints.scene_models import find_scene_model
+from persist_cli.data.store import TrajectoryFile
+from persist_cli.plugins import load_plugin, make_scene_model
+from persist_cli.recipe import MemoryConfig
+
+
+def with_scene_model(memory: Memory) -> Memory:
+    """Return the memory; a scene whose settings name a model imagines with it, once something is to be imagined."""
+    if isinstance(memory, Scene) and memory.wanted_model is not None:
+        memory.imagine_with(functools.partial(open_scene_model, memory.wanted_model))
+    return memory
+
+
+def open_scene_model(path: str) -> SceneModel:
+    """Return a trained model of scenes, ready to sample; it is loaded once in a process.
+
+    Raises:
+        CheckpointError: when there is none, or it is damaged.
+    """
+    return _loaded(find_scene_model(path).folder)
+
+
+@functools.lru_cache(maxsize=2)
+def _loaded(folder: Path) -> SceneModel:
+    return find_scene_model(folder).load()
+
+
+def of_known_cells(config: MemoryConfig, file: TrajectoryFile | None = None) -> MemoryConfig:
+    """Return the configuration of a scene with the cells that it shall have, where its settings leave them open.
+
+    They are those of its model, else those that are stored with the data.
+
+    Args:
+        config: of any memory; of one that is no scene it stays as it is.
+        file: a trajectory that will be written into the scene.
+
+    Raises:
+        CheckpointError: when there is no such model.
+    """
+    if not issubclass(load_plugin("memory", config.name), Scene) or "palette" in config.settings:
+        return config
+    form: CellForm | None = None
+    if config.settings.get("model") is not None:
+        form = _form_of(str(config.settings["model"]))
+    elif file is not None and file.has_cells:
+        form = file.cells(0).form
+    if form is None:
+        return config
+    cells: dict[str, Any] = {"palette": list(form.palette), "size": form.size}
+    return replace(config, settings=cells | config.settings)
+
+
+def _form_of(path: str) -> CellForm:
+    """The cells that a trained model knows."""
+    found = find_scene_model(path)
+    with without_weights():
+        return make_scene_model(found.plugin, found.settings).form.cells

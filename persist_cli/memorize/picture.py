@@ -1,0 +1,153 @@
+"""A single picture with its depth, as a data set of one frame: where a scene begins that is completed from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from persist_cli.api.actions import walking_actions
+from persist_cli.api.ground import Body
+from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.data.store import SUFFIX, write_trajectory
+from persist_cli.errors import DataError
+from persist_cli.memorize.depth_model import estimate_depth
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
+UP = (0.0, 1.0, 0.0)
+FIELD_OF_VIEW = 75.0  # degrees from the top to the bottom of the image, as ``persist collect`` has it
+HEIGHT = Body().camera_height
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """What is known of a picture beside its pixels.
+
+    Args:
+        depth: a file with its depth: ``.npy`` in metres or a PNG of 16 bits in millimetres.
+        depth_model: name or folder of a model that estimates metric depth.
+        fov: degrees from the top of the picture to its bottom; ``None`` for 75.
+        size: pixels of the square to which it is cropped and resized; ``None`` keeps it.
+    """
+
+    depth: Path | None = None
+    depth_model: str | None = None
+    fov: float | None = None
+    size: int | None = None
+
+    @property
+    def given(self) -> bool:
+        """Whether any option is given."""
+        return self != PictureOptions()
+
+
+def is_picture(text: str) -> bool:
+    """Whether a reference to data names a picture."""
+    return Path(text).suffix.lower() in PICTURES
+
+
+def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
+    """Write a data set of one frame, seen by a level camera 1.25 m above the world's origin, and return its folder.
+
+    Raises:
+        DataError: one line, when picture or depth cannot be read, do not fit, or there is no depth.
+    """
+    rgb, depth = read_rgb(picture), _depth_of(picture, options)
+    if depth.shape != rgb.shape[:2]:
+        sizes = " and ".join(f"{width}×{height}" for height, width in (rgb.shape[:2], depth.shape))
+        raise DataError(f"{picture}: picture and depth differ in size, {sizes} pixels")
+    fov = FIELD_OF_VIEW if options.fov is None else options.fov
+    if not 10.0 <= fov <= 150.0:
+        raise DataError(f"--fov {fov:g}: degrees from the picture's top to its bottom, between 10 and 150")
+    focal = rgb.shape[0] / 2 / math.tan(math.radians(fov) / 2)
+    if options.size is not None:
+        focal *= options.size / min(rgb.shape[:2])
+        rgb, depth = squared(rgb, options.size, smooth=True), squared(depth, options.size, smooth=False)
+    height, width = depth.shape
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    source = {"format": "picture", "picture": picture.name, "camera_height": HEIGHT}
+    info = TrajectoryInfo(f"picture/{picture.stem}", matrix, height, width, UP, walking_actions(), source)
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])  # level, towards -z
+    pose[1, 3] = HEIGHT
+    write_trajectory(folder / f"{picture.stem}{SUFFIX}", info, [Frame(rgb, depth, pose)])
+    return folder
+
+
+def read_rgb(path: Path) -> Array:
+    """Return ``[height, width, 3]`` uint8 of a picture.
+
+    Raises:
+        DataError: when there is none, or it cannot be read.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return np.array(image.convert("RGB"))
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such picture") from error
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise DataError(f"{path}: cannot be read as a picture ({str(error).splitlines()[0]})") from error
+
+
+def read_depth(path: Path) -> Array:
+    """Return ``[height, width]`` float32 metres of a depth file, 0 where there is none.
+
+    Raises:
+        DataError: when the file is missing, damaged, or neither ``.npy`` in metres nor a PNG of 16 bits.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        if path.suffix == ".npy":
+            values = np.load(path, allow_pickle=False)
+        else:
+            with Image.open(path) as image:
+                values = np.array(image)
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such depth file") from error
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as depth ({str(error).splitlines()[0]})") from error
+    whole = path.suffix != ".npy"
+    if values.ndim != 2 or values.dtype.kind not in ("ui" if whole else "f") or (whole and values.dtype.itemsize < 2):
+        raise DataError(
+            f"{path}: {values.dtype} {list(values.shape)} is no depth; give .npy with floats in metres, or a PNG of 16 "
+            "bits in millimetres"
+        )
+    metres = values.astype(np.float32) / (1000 if whole else 1)
+    return np.where(np.isfinite(metres) & (metres > 0), metres, 0).astype(np.float32)
+
+
+def squared(values: Array, size: int, smooth: bool) -> Array:
+    """Return the middle square of an image at ``size`` × ``size`` pixels, as means or as nearest pixels."""
+    from PIL import Image
+
+    side = min(values.shape[:2])
+    top, left = ((length - side) // 2 for length in values.shape[:2])
+    image = Image.fromarray(values[top : top + side, left : left + side])
+    return np.array(image.resize((size, size), Image.Resampling.BOX if smooth else Image.Resampling.NEAREST))
+
+
+def _depth_of(picture: Path, options: PictureOptions) -> Array:
+    if options.depth is not None and options.depth_model is not None:
+        raise DataError("give --depth or --depth-model, not both")
+    if options.depth is not None:
+        return read_depth(options.depth)
+    if options.depth_model is not None:
+        return estimate_depth(options.depth_model, read_rgb(picture))
+    raise DataError(
+        f"{picture}: a picture alone tells no depth; give --depth FILE (.npy in metres, PNG of 16 bits in millimetres) "
+        "or --depth-model NAME"
+    )
+
+
+def without_picture(options: PictureOptions) -> None:
+    """Raise ``DataError`` when options of pictures are given where there is none."""
+    if options.given:
+        named = {"--depth": options.depth, "--depth-model": options.depth_model, "--fov": options.fov}
+        names = [name for name, value in (named | {"--size": options.size}).items() if value is not None]
+        raise DataError(f"{', '.join(names)}: only for a picture; a data set has depth and cameras of its own")
