@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
-from jaxtyping import Bool, Int64, UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
@@ -83,11 +83,3 @@ def edit_locality(
     difference = (after.float() - before.float()).abs().mean(dim=-1)
     inside, outside = difference[edited].mean(), difference[~edited].mean()
     return EditLocality(float(inside), float(outside), float(edited.float().mean()))
-
-
-def nearest_colors(
-    pictures: UInt8[Tensor, "frame height width 3"], colors: UInt8[Tensor, "color 3"]
-) -> Int64[Tensor, "frame height width"]:
-    """Return for each pixel the number of the nearest colour in RGB, to say what a picture shows by colour."""
-    pixels, choices = pictures.flatten(0, 2).float(), colors.float()
-    return torch.cdist(pixels, choices).argmin(dim=1).reshape(pictures.shape[:3])
