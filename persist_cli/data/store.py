@@ -21,7 +21,7 @@ from torch import Tensor
 
 from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses
-from persist_cli.api.cells import CellGrid
+from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.observations import Frame, Observations, Trajectory, TrajectoryInfo
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
 from persist_cli.data.stored_cells import CellBox, encode_cells
@@ -125,6 +125,11 @@ class TrajectoryFile:
     def has_cells(self) -> bool:
         """Whether the scene's cells are stored with the frames."""
         return self._cell_box is not None
+
+    @property
+    def cell_form(self) -> CellForm | None:
+        """Size and classes of the stored cells, ``None`` without any."""
+        return None if self._cell_box is None else self._cell_box.form
 
     def cells(self, frame: int) -> CellGrid:
         """The scene's cells as they are at a frame, in the box that all frames of the trajectory have.

@@ -1,0 +1,407 @@
+"""Samples for models of scenes: what is known of the cells around a camera, and what is really there.
+
+Sample n depends on the seed and on n only. What is known is what a scene knows after real frames, written as in use.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from persist_cli.api.cell_things import STRUCTURE
+from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellGrid, CellOrigin
+from persist_cli.api.reach import cells_in_reach
+from persist_cli.api.scene_model import Given, SceneForm, SceneSamples
+from persist_cli.data.scene_turns import Turn, window_pose
+from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.data.written_scenes import SceneWriter, TensorStore, WrittenScene
+from persist_cli.errors import DataError
+
+MOST_FRAMES: Final = 24  # that a scene is written from
+STRIDES: Final = 4  # from frame to frame of these, at most
+FIXED: Final = 8  # single frames and as many walks that each trajectory offers, so that they come again and are kept
+JITTER: Final = 8  # cells that a window may lie beside the camera
+TRIES: Final = 16  # of finding a trajectory with interactions
+TRUTHS_KEPT: Final = 64  # grids of the latest trajectories
+PICK_UP, DROP = "pick_up", "drop"
+BESIDE: Final = ((0, 0, -1), (0, 0, 1), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0))
+
+
+@dataclass(frozen=True)
+class SampleShares:
+    """How often samples are of each kind, and what they are told.
+
+    Args:
+        frame: one frame is known.
+        walk: up to 24 frames of a walk are known.
+        grown: beside the newest frame, a large part of the truth is known, as if it had been imagined before.
+        interaction: what becomes of the known cells before the agent by an interaction.
+        named: share of the samples that know the classes of observed cells, as after they were completed.
+        unseen: share of the samples of kind grown that have no view.
+        idle: share of the interactions that find nothing to act on, and change nothing.
+    """
+
+    frame: float = 0.45
+    walk: float = 0.2
+    grown: float = 0.2
+    interaction: float = 0.15
+    named: float = 0.3
+    unseen: float = 0.15
+    idle: float = 0.15
+
+
+class Carried(NamedTuple):
+    """What the agent carries: class, 0 for nothing, and mean RGB."""
+
+    kind: int
+    color: tuple[int, int, int]
+
+
+class Interaction(NamedTuple):
+    """An interaction at a frame of a trajectory."""
+
+    frame: int
+    action: str
+
+
+NOTHING: Final = Carried(0, (0, 0, 0))
+
+
+@dataclass(frozen=True)
+class Window:
+    """One sample before it is turned and mirrored.
+
+    Args:
+        given: the ``Given`` of each cell.
+        seen: what is given.
+        truth: what the cells hold.
+        scene: gives the view.
+        action: name of the interaction, empty for none.
+        carried: what the agent carries before it.
+        blind: whether the view is left out.
+    """
+
+    given: UInt8[Tensor, "first second level"]
+    seen: CellGrid
+    truth: CellGrid
+    scene: WrittenScene
+    action: str = ""
+    carried: Carried = NOTHING
+    blind: bool = False
+
+
+class SceneSampleDataset(Dataset[SceneSamples]):
+    """Endless samples of some data sets; sample n depends on the seed and on n only.
+
+    Args:
+        folders: folders of the data sets; trajectories without cells are left out.
+        form: the windows.
+        seed: seed of the draws.
+        shares: how often samples are of each kind.
+        cache: keeps what scenes know, which takes most of the time; without it some thousand stay in memory.
+
+    Raises:
+        DataError: when no trajectory has cells, or they or the images are not those of the form.
+    """
+
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        form: SceneForm,
+        seed: int,
+        shares: SampleShares | None = None,
+        cache: TensorStore | None = None,
+    ) -> None:
+        self.form, self.seed, self.shares = form, seed, shares or SampleShares()
+        self.files = [file for folder in folders for file in Store(folder) if file.has_cells]
+        if not self.files:
+            where = " and ".join(map(str, folders))
+            raise DataError(
+                f"{where}: no trajectory has the cells of its scene; `persist collect miniworld` writes them"
+            )
+        for file in self.files:
+            _check_form(file, form)
+        self.writer = SceneWriter(form.cells, cache)
+        self._truths: OrderedDict[tuple[Path, int], CellGrid] = OrderedDict()
+        self._interactions: dict[Path, list[Interaction]] = {}
+
+    def __getitem__(self, number: int) -> SceneSamples:
+        random = np.random.default_rng((self.seed, number))
+        kinds = {"frame": self._frame, "walk": self._walk, "grown": self._grown, "interaction": self._interaction}
+        weights = np.array([getattr(self.shares, kind) for kind in kinds])
+        kind = str(random.choice(list(kinds), p=weights / weights.sum()))
+        return self._sample(kinds[kind](random), random)
+
+    def _frame(self, random: np.random.Generator) -> Window:
+        """A sample of which one frame is known."""
+        file = self._file(random)
+        return self._observed(file, self._frames(file, 2 * int(random.integers(FIXED))), random)
+
+    def _walk(self, random: np.random.Generator) -> Window:
+        """A sample of which some frames of a walk up to now are known."""
+        return self._walk_of(self._file(random), random)
+
+    def _grown(self, random: np.random.Generator) -> Window:
+        """A sample of which much is known by class, and the rest is to go on from it."""
+        file = self._file(random)
+        window = self._observed(file, self._frames(file, int(random.integers(2 * FIXED))), random, named=True)
+        known = random_part(self.form.shape, random)
+        seen, given = window.seen.copy(), window.given.clone()
+        fresh = known & (given == Given.NOTHING)
+        for mine, true in zip(seen.tensors()[:2], window.truth.tensors()[:2], strict=True):
+            mine[fresh] = true[fresh]
+        given[fresh] = int(Given.CONTENT)
+        return replace(window, seen=seen, given=given, blind=bool(random.random() < self.shares.unseen))
+
+    def _interaction(self, random: np.random.Generator) -> Window:
+        """A sample of an interaction; of a walk where the data sets have too few of them."""
+        for _ in range(TRIES):
+            file = self._file(random)
+            events = [event for event in self.interactions(file) if event.action in self.form.actions]
+            if events:
+                if random.random() < self.shares.idle:
+                    return self._idle(file, random)
+                return self._event(file, events[int(random.integers(len(events)))], random)
+        return self._walk(random)
+
+    def _event(self, file: TrajectoryFile, event: Interaction, random: np.random.Generator) -> Window:
+        """What an interaction changes; a thing that is picked up is then carried, and in no cell."""
+        before = self._observed(file, self._event_frames(file, event), random)
+        after = around(self._truth(file, event.frame + 1), before.seen)
+        was = around(self._truth(file, event.frame), before.seen)
+        if event.action == PICK_UP:
+            appeared = after.solid & ~was.solid
+            after.classes[appeared], after.colors[appeared] = FREE, 0
+        changed = (after.classes != was.classes) | (after.colors != was.colors).any(dim=-1)
+        return self._acted(before, event.action, (after, changed))
+
+    def _idle(self, file: TrajectoryFile, random: np.random.Generator) -> Window:
+        """An interaction that finds nothing to act on; a mere walk where something is in reach."""
+        window = self._walk_of(file, random)
+        action = self.form.actions[int(random.integers(len(self.form.actions)))]
+        pose = window.scene.view.cameras.world_from_camera[0]
+        things = is_thing(window.truth) & cells_in_reach(window.truth, pose)
+        if window.carried.kind or (bool(things.any()) and action != DROP):
+            return window
+        return self._acted(window, action, (window.truth, torch.zeros_like(things)))
+
+    def _walk_of(self, file: TrajectoryFile, random: np.random.Generator) -> Window:
+        return self._observed(file, self._frames(file, 2 * int(random.integers(FIXED)) + 1), random)
+
+    def _acted(
+        self, before: Window, action: str, outcome: tuple[CellGrid, Bool[Tensor, "first second level"]]
+    ) -> Window:
+        """A window in which the known cells in reach are past, and changed ones hold something else."""
+        after, changed = outcome
+        past = (before.given == Given.CONTENT) & cells_in_reach(
+            before.seen, before.scene.view.cameras.world_from_camera[0]
+        )
+        given = torch.where(past, int(Given.PAST), before.given.int()).to(torch.uint8)
+        changed = changed & (given != Given.CONTENT)
+        truth = before.truth.copy()
+        for mine, true in zip(truth.tensors()[:2], after.tensors()[:2], strict=True):
+            mine[changed] = true[changed]
+        return replace(before, given=given, truth=truth, action=action)
+
+    def _observed(
+        self, file: TrajectoryFile, frames: list[int], random: np.random.Generator, named: bool = False
+    ) -> Window:
+        """A window around the newest of some frames, of which a scene knows what these show."""
+        scene = self.writer.scene(file, frames)
+        whole = self._truth(file, frames[-1])
+        corner = self._corner(scene, whole, random)
+        seen = scene.known.box(corner, self.form.shape)
+        truth = settled(around(whole, seen), seen)
+        if named or random.random() < self.shares.named:
+            unnamed = seen.known & (seen.classes == SOLID)
+            seen.classes[unnamed] = truth.classes[unnamed]
+        given = torch.where(seen.known, int(Given.CONTENT), int(Given.NOTHING)).to(torch.uint8)
+        return Window(given, seen, truth, scene, carried=self.carried(file, frames[-1]))
+
+    def _corner(self, scene: WrittenScene, whole: CellGrid, random: np.random.Generator) -> tuple[int, int, int]:
+        """The lowest cell of a window around the camera or a little beside it, from the floor up."""
+        first, second, _ = whole.numbers(scene.view.cameras.centers[0]).tolist()
+        jitter = random.integers(-JITTER, JITTER + 1, 2) if random.random() < 0.5 else np.zeros(2, int)
+        limits = [min(JITTER, side // 2 - 1) for side in self.form.shape[:2]]
+        by_first, by_second = (int(np.clip(by, -limit, limit)) for by, limit in zip(jitter, limits, strict=True))
+        rows, columns, _ = self.form.shape
+        return first - rows // 2 + by_first, second - columns // 2 + by_second, whole.corner[2]
+
+    def _sample(self, window: Window, random: np.random.Generator) -> SceneSamples:
+        """The sample of a window, turned by right angles and mirrored at random."""
+        known = window.given > Given.NOTHING
+        view, form = window.scene.view, self.form
+        cells = {
+            "given": window.given,
+            "classes": window.seen.classes * known,
+            "colors": window.seen.colors * known[..., None],
+            "true_classes": window.truth.classes,
+            "true_colors": window.truth.colors,
+        }
+        pose, lens = window_pose(window.seen, view.cameras.world_from_camera[0]), view.cameras.intrinsics[0].double()
+        turned = Turn.draw(form.shape, random)
+        cells = {name: turned.cells(part) for name, part in cells.items()}
+        rgb, depth = (turned.image(image) for image in (view.rgb[0], view.depth[0]))
+        pose, lens = turned.pose(pose, form), turned.lens(lens, form.image[1])
+        if window.blind:
+            height, width = form.image
+            rgb, depth, pose = torch.zeros_like(rgb), torch.zeros_like(depth), torch.eye(4, dtype=torch.float64)
+            lens = torch.tensor([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1]], dtype=torch.float64)
+        return SceneSamples(
+            **cells,
+            rgb=rgb,
+            depth=depth.float(),
+            window_from_camera=pose.float(),
+            intrinsics=lens.float(),
+            action=torch.tensor(1 + form.actions.index(window.action) if window.action else 0),
+            carried=torch.tensor(window.carried.kind),
+            carried_color=torch.tensor(window.carried.color, dtype=torch.uint8),
+            seeds=torch.tensor(int(random.integers(2**62))),
+        )
+
+    def _file(self, random: np.random.Generator) -> TrajectoryFile:
+        return self.files[int(random.integers(len(self.files)))]
+
+    def _frames(self, file: TrajectoryFile, state: int) -> list[int]:
+        """The frames of one of the trajectory's fixed states; even ones are single frames, odd ones walks."""
+        random = np.random.default_rng([self.seed, len(file), state, *file.name.encode()])
+        return _frames_up_to(int(random.integers(len(file))), state % 2 == 1, random)
+
+    def _event_frames(self, file: TrajectoryFile, event: Interaction) -> list[int]:
+        """The frames of a walk up to an interaction, the same each time."""
+        return _frames_up_to(event.frame, True, np.random.default_rng([self.seed, event.frame, *file.name.encode()]))
+
+    def _truth(self, file: TrajectoryFile, frame: int) -> CellGrid:
+        """The cells at a frame; those of the latest trajectories are kept."""
+        changes = [event.frame for event in self.interactions(file)]
+        key = file.path, frame if changes else 0
+        if key not in self._truths:
+            self._truths[key] = file.cells(frame)
+            while len(self._truths) > TRUTHS_KEPT:
+                self._truths.popitem(last=False)
+        self._truths.move_to_end(key)
+        return self._truths[key]
+
+    def interactions(self, file: TrajectoryFile) -> list[Interaction]:
+        """The interactions that a trajectory really did, in their order."""
+        if file.path not in self._interactions:
+            names = {action.name for action in file.info.vocabulary.actions if action.interaction}
+            done = [Interaction(n, name) for n, name in enumerate(file.actions()) if name in names and name is not None]
+            self._interactions[file.path] = done
+        return self._interactions[file.path]
+
+    def carried(self, file: TrajectoryFile, frame: int) -> Carried:
+        """What the agent carries at a frame: what vanished from its place when it was picked up."""
+        handled = [
+            event for event in self.interactions(file) if event.frame < frame and event.action in (PICK_UP, DROP)
+        ]
+        if not handled or handled[-1].action == DROP:
+            return NOTHING
+        before, after = (self._truth(file, handled[-1].frame + later) for later in (0, 1))
+        gone = before.solid & ~after.solid
+        if not bool(gone.any()):
+            return NOTHING
+        red, green, blue = before.colors[gone].double().mean(dim=0).round().int().tolist()
+        return Carried(int(before.classes[gone].mode().values), (red, green, blue))
+
+
+def around(whole: CellGrid, window: CellGrid) -> CellGrid:
+    """The cells of a whole scene in a window; what lies outside of its box is outside."""
+    part = whole.box(window.corner, window.shape)
+    part.classes[~part.known] = OUTSIDE
+    return replace(part, origins=torch.full_like(part.origins, int(CellOrigin.OBSERVED)))
+
+
+def settled(truth: CellGrid, seen: CellGrid) -> CellGrid:
+    """The truth of a window as far as what is seen allows: where the two differ, what is seen stays.
+
+    A cell that is seen solid where the truth is free has the class of a solid neighbour, else ``SOLID``. What is seen
+    solid keeps its colour.
+    """
+    result = truth.copy()
+    solid = seen.solid
+    result.classes[seen.known & ~solid], result.colors[seen.known & ~solid] = FREE, 0
+    result.classes[solid & ~truth.solid] = _classes_beside(truth, (solid & ~truth.solid).nonzero())
+    result.colors[solid] = seen.colors[solid]
+    return result
+
+
+def _classes_beside(grid: CellGrid, places: Tensor) -> UInt8[Tensor, " cell"]:
+    """The class of a solid cell beside each of some cells, ``SOLID`` where there is none."""
+    classes = torch.full((len(places),), SOLID, dtype=torch.uint8)
+    last = torch.tensor(grid.shape) - 1
+    for step in reversed(BESIDE):
+        beside = (places + torch.tensor(step)).clamp_min(0).minimum(last).unbind(1)
+        found = grid.solid[beside]
+        classes[found] = grid.classes[beside][found]
+    return classes
+
+
+def is_thing(grid: CellGrid) -> Bool[Tensor, "first second level"]:
+    """Which cells hold a thing: something that is no floor, wall, ceiling or piece above a door."""
+    rest = [number for number, name in enumerate(grid.form.palette) if name not in (*COMMON, *STRUCTURE)]
+    return torch.isin(grid.classes, torch.tensor(rest, dtype=torch.uint8))
+
+
+def random_part(shape: tuple[int, int, int], random: np.random.Generator) -> Bool[Tensor, "first second level"]:
+    """A random part of a window that is known: a half, a corner less, a middle, or all but some boxes."""
+    known = torch.ones(shape, dtype=torch.bool)
+    kind = random.choice(["half", "corner", "middle", "boxes"])
+    if kind == "boxes":
+        for _ in range(int(random.integers(1, 5))):
+            known[_random_box(shape, random)] = False
+        return known
+    cuts = [int(random.integers(side // 5, side - side // 5)) for side in shape[:2]]
+    if kind == "middle":
+        sides = [(int(random.integers(0, side // 3)), int(random.integers(2 * side // 3, side))) for side in shape[:2]]
+        inside = torch.zeros(shape, dtype=torch.bool)
+        inside[sides[0][0] : sides[0][1], sides[1][0] : sides[1][1]] = True
+        return inside
+    first, second = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
+    first[: cuts[0]], second[:, : cuts[1]] = True, True
+    first, second = (part ^ bool(random.integers(2)) for part in (first, second))
+    if kind == "half":
+        return first if random.random() < 0.5 else second
+    return first | second
+
+
+def _random_box(shape: tuple[int, int, int], random: np.random.Generator) -> tuple[slice, slice, slice]:
+    """A box of the window, of two cells to half of it along the ground, and of any height."""
+    slices = []
+    for side in shape:
+        length = int(random.integers(min(2, side), max(3, side // 2 + 1)))
+        low = int(random.integers(0, max(1, side - length + 1)))
+        slices.append(slice(low, low + length))
+    first, second, level = slices
+    return first, second, level if random.random() < 0.5 else slice(None)
+
+
+def _frames_up_to(last: int, walk: bool, random: np.random.Generator) -> list[int]:
+    """The frame alone, or 2 to 24 frames of the way to it."""
+    if not walk:
+        return [last]
+    count = round(2 * (MOST_FRAMES / 2) ** float(random.random()))  # few frames as often as many
+    stride = int(random.integers(1, STRIDES + 1))
+    return [frame for frame in range(last - (count - 1) * stride, last + 1, stride) if frame >= 0]
+
+
+def _check_form(file: TrajectoryFile, form: SceneForm) -> None:
+    """Raise ``DataError`` where a trajectory's cells or images are not those of the form."""
+    if (file.info.height, file.info.width) != form.image:
+        size = f"{file.info.height}x{file.info.width}"
+        raise DataError(f"{file.path}: images are {size}, the scene model takes {form.image[0]}x{form.image[1]}")
+    cells = file.cell_form
+    if cells != form.cells and cells is not None:
+        raise DataError(
+            f"{file.path}: its cells of {cells.size:g} m and the classes {', '.join(cells.palette)} are not those of "
+            f"the scene model: {form.cells.size:g} m and {', '.join(form.cells.palette)}"
+        )

@@ -1,0 +1,205 @@
+"""Samples of scenes: what is known agrees with the truth, lies where the view sees it, and changes by interactions."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.cell_things import STRUCTURE
+from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellForm
+from persist_cli.api.geometry import unproject
+from persist_cli.api.reach import CHANGED
+from persist_cli.api.scene_model import Given, SceneForm, SceneSamples
+from persist_cli.data.scene_samples import SampleShares, SceneSampleDataset
+from persist_cli.data.scene_turns import Turn
+from persist_cli.data.store import write_trajectory
+from persist_cli.errors import DataError
+from persist_cli.simulators.collect import CollectPlan, collect_frames
+from persist_cli.simulators.house_cells import FORM
+from tests.support.miniworlds import make_world
+from tests.support.noise import INFO, make_frames
+
+WINDOW = SceneForm(FORM, (40, 40, 12), (32, 32))
+KINDS = [field.name for field in fields(SampleShares) if field.name not in ("named", "unseen", "idle")]
+
+
+@pytest.fixture(scope="session")
+def houses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two houses in which an agent interacts."""
+    folder, world = tmp_path_factory.mktemp("houses"), make_world(height=32, width=32)
+    plan = CollectPlan("miniworld", "0:10", frames=48, size="32x32", policy="interact")
+    for seed in (9001, 9002):
+        frames = collect_frames(world, plan, seed)
+        write_trajectory(folder / f"house-{seed}.parquet", world.info, frames)
+    return folder
+
+
+def samples_of(houses: Path, kind: str, **shares: float) -> SceneSampleDataset:
+    only = {name: float(name == kind) for name in KINDS}
+    return SceneSampleDataset([houses], WINDOW, 5, SampleShares(**only, **shares))
+
+
+def first_with(dataset: SceneSampleDataset, action: str) -> SceneSamples:
+    wanted = 1 + WINDOW.actions.index(action)
+    return next(sample for sample in map(dataset.__getitem__, range(100)) if sample.action == wanted)
+
+
+def things(classes: torch.Tensor) -> torch.Tensor:
+    return classes >= len(COMMON) + len(STRUCTURE)
+
+
+def truths(sample: SceneSamples) -> tuple[torch.Tensor, torch.Tensor]:
+    assert sample.true_classes is not None
+    assert sample.true_colors is not None
+    return sample.true_classes, sample.true_colors
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sample_depends_on_seed_and_number_alone(houses: Path, kind: str) -> None:
+    first, again = samples_of(houses, kind), samples_of(houses, kind)
+    _ = again[8], again[3]
+    mine, theirs = first[3].tensors(), again[3].tensors()
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_given_for_good_is_what_is_there(houses: Path, kind: str) -> None:
+    for number in range(6):
+        sample = samples_of(houses, kind)[number]
+        classes, colors = truths(sample)
+        content = sample.given == Given.CONTENT
+        named, solid = content & (sample.classes != SOLID), content & (sample.classes == SOLID)
+        assert content.any()
+        assert torch.equal(sample.classes[named], classes[named])
+        assert not torch.isin(classes[solid], torch.tensor([FREE, OUTSIDE])).any()
+        assert torch.equal(sample.colors[content], colors[content])
+
+
+@pytest.mark.parametrize("turn", [Turn(quarters, mirrored) for quarters in range(4) for mirrored in (False, True)])
+def test_what_the_view_sees_is_known_to_be_solid_in_every_turn(
+    houses: Path, turn: Turn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Turn, "draw", staticmethod(lambda shape, random: turn))
+    sample = samples_of(houses, "frame", named=0.0)[0]
+    cameras = Cameras(sample.window_from_camera[None].double(), sample.intrinsics[None].double(), *WINDOW.image)
+    points = unproject(sample.depth[None], cameras)[0]
+    ways = points - cameras.centers[0]
+    cells = ((points + 0.05 * ways / ways.norm(dim=-1, keepdim=True)) / FORM.size).round().long()
+    inside = ((cells >= 0) & (cells < torch.tensor(WINDOW.shape))).all(dim=-1) & (sample.depth > 0)
+    assert (sample.classes[cells[inside].unbind(-1)] == SOLID).float().mean() > 0.93
+
+
+def test_a_turn_of_all_four_quarters_and_two_mirrors_change_nothing() -> None:
+    cells, pose = torch.rand(40, 40, 12), torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([1.0, 2.0, 0.5])
+    turned, moved = cells, pose
+    for _ in range(4):
+        turned, moved = Turn(1, False).cells(turned), Turn(1, False).pose(moved, WINDOW)
+    for _ in range(2):
+        turned, moved = Turn(0, True).cells(turned), Turn(0, True).pose(moved, WINDOW)
+    assert torch.equal(turned, cells)
+    assert torch.allclose(moved, pose)
+
+
+def test_a_walk_knows_more_than_a_frame(houses: Path) -> None:
+    known = [sum(int((samples_of(houses, kind)[n].given > 0).sum()) for n in range(6)) for kind in ("frame", "walk")]
+    assert known[1] > 1.5 * known[0]
+
+
+def test_what_lies_beyond_the_house_is_outside(houses: Path) -> None:
+    classes, colors = truths(samples_of(houses, "frame")[0])
+    outside = classes == OUTSIDE
+    assert 0.1 < outside.float().mean() < 0.9
+    assert not colors[outside].any()
+
+
+def test_grown_samples_know_a_large_part_by_class_and_leave_another(houses: Path) -> None:
+    for number in range(6):
+        given = samples_of(houses, "grown")[number].given
+        assert 0.1 < (given == Given.CONTENT).float().mean() < 0.99
+
+
+def test_a_sample_without_a_view_says_nothing_about_one(houses: Path) -> None:
+    sample = samples_of(houses, "grown", unseen=1.0)[0]
+    assert not sample.rgb.any()
+    assert not sample.depth.any()
+    assert torch.equal(sample.window_from_camera, torch.eye(4))
+
+
+def test_a_thing_that_is_picked_up_is_gone(houses: Path) -> None:
+    sample = first_with(samples_of(houses, "interaction", idle=0.0), "pick_up")
+    classes, _ = truths(sample)
+    past = sample.given == Given.PAST
+    vanished = past & (sample.classes != FREE) & (classes == FREE)
+    assert vanished.any()
+    assert not (past & (sample.classes == FREE) & things(classes)).any()
+    assert sample.carried == 0
+
+
+def test_a_thing_that_is_dropped_is_there_again(houses: Path) -> None:
+    sample = first_with(samples_of(houses, "interaction", idle=0.0), "drop")
+    classes, _ = truths(sample)
+    assert things(sample.carried)
+    assert (classes[sample.given != Given.CONTENT] == sample.carried).any()
+
+
+def test_an_interaction_changes_only_cells_in_reach(houses: Path) -> None:
+    sample = first_with(samples_of(houses, "interaction", idle=0.0), "pick_up")
+    places = (sample.given == Given.PAST).nonzero()[:, :2] * FORM.size
+    assert (places - sample.window_from_camera[:2, 3]).norm(dim=-1).max() <= CHANGED + 1e-3
+
+
+def test_an_interaction_with_nothing_changes_nothing(houses: Path) -> None:
+    dataset = samples_of(houses, "interaction", idle=1.0)
+    idle = [sample for sample in map(dataset.__getitem__, range(40)) if sample.action > 0]
+    assert idle
+    for sample in idle:
+        classes, _ = truths(sample)
+        free = (sample.given == Given.PAST) & (sample.classes == FREE)
+        assert (classes[free] == FREE).all()
+
+
+class Shelf(dict[str, Any]):
+    """A cache in memory."""
+
+    def put(self, key: str, tensors: Any) -> None:
+        self[key] = tensors
+
+
+def test_a_cache_keeps_what_scenes_know_and_changes_no_sample(houses: Path) -> None:
+    shelf = Shelf()
+    bare = SceneSampleDataset([houses], WINDOW, 0)[1].tensors()
+    for _ in range(2):
+        kept = SceneSampleDataset([houses], WINDOW, 0, cache=shelf)[1].tensors()
+        assert all(torch.equal(bare[name], kept[name]) for name in bare)
+    assert len(shelf) == 1
+
+
+def test_data_without_cells_are_refused(tmp_path: Path) -> None:
+    write_trajectory(tmp_path / "one.parquet", INFO, make_frames(4))
+    with pytest.raises(DataError, match="no trajectory has the cells of its scene; `persist collect miniworld` writes"):
+        SceneSampleDataset([tmp_path], WINDOW, 0)
+
+
+@pytest.mark.parametrize(
+    ("form", "cause"),
+    [
+        (replace(WINDOW, image=(64, 64)), "images are 32x32, the scene model takes 64x64"),
+        (replace(WINDOW, cells=CellForm(0.5, FORM.palette)), "its cells of 0.25 m .* are not those of the scene model"),
+    ],
+)
+def test_data_of_another_form_are_refused(houses: Path, form: SceneForm, cause: str) -> None:
+    with pytest.raises(DataError, match=rf"house-9001\.parquet: {cause}"):
+        SceneSampleDataset([houses], form, 0)
+
+
+def test_samples_are_drawn_in_every_kind(houses: Path) -> None:
+    dataset = SceneSampleDataset([houses], WINDOW, 1)
+    actions = np.array([int(dataset[number].action) for number in range(40)])
+    assert 0 < (actions > 0).mean() < 0.5
