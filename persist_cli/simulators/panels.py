@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -48,12 +49,12 @@ class Panel:
     corners: Points
     tiles: Points
 
-    @property
+    @cached_property
     def normal(self) -> Points:
         """The unit vector that points out of its front."""
-        normal: Points = np.cross(self.corners[1] - self.corners[0], self.corners[3] - self.corners[0])
-        normal /= np.linalg.norm(normal)
-        return normal
+        (a, b, c), (d, e, f) = (self.corners[[1, 3]] - self.corners[0]).tolist()
+        normal = np.array([b * f - c * e, c * d - a * f, a * e - b * d])  # np.cross takes twenty times as long
+        return normal / math.sqrt(float(normal @ normal))
 
 
 def house_panels(house: House, things: Iterable[Thing]) -> Iterator[Panel]:

@@ -6,13 +6,14 @@ centre; at 64×64 pixels both cost centimetres. Here depth has 32 bits and its o
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib.util
 import math
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from PIL import Image
 from persist_cli.errors import PluginError
 from persist_cli.simulators.houses import House, Thing
 from persist_cli.simulators.meshes import Mesh, MeshPart, read_mesh
-from persist_cli.simulators.panels import Panel, house_panels
+from persist_cli.simulators.panels import Panel, furniture_panels, house_panels
 
 NEAR, FAR = 0.04, 100.0  # metres
 SKY = 99.0  # metres; depth beyond is stored as missing
@@ -108,23 +109,33 @@ class Renderer:
     def __init__(self, height: int, width: int) -> None:
         self.height, self.width = height, width
         self._gl = _graphics()
-        self._scene = self._gl.glGenLists(1)
+        self._walls, self._things = (self._gl.glGenLists(1) for _ in range(2))
+        self._house: House | None = None  # whose walls are drawn
         self._sampled, self._resolved, self._single = (self._frame_buffer(count) for count in (SAMPLES, 0, 0))
         self._set_up()
 
     def load(self, house: House, things: Sequence[Thing]) -> None:
         """Draw this house, with its things as they are now, in all images until the next call."""
         gl = _graphics()
-        panels = sorted(house_panels(house, things), key=lambda panel: panel.texture)
-        painted = [(texture(name), list(group)) for name, group in groupby(panels, key=lambda panel: panel.texture)]
+        if house is not self._house:
+            walls = _by_texture(house_panels(house, ()))
+            with self._recorded(self._walls):
+                gl.glLightfv(gl.GL_LIGHT0, gl.GL_POSITION, (gl.GLfloat * 4)(*house.light, 0.0))
+                self._draw_panels(walls)
+            self._house = house
         meshes = [(thing, mesh(thing.shape)) for thing in things if thing.is_mesh]
-        gl.glNewList(self._scene, gl.GL_COMPILE)
-        gl.glLightfv(gl.GL_LIGHT0, gl.GL_POSITION, (gl.GLfloat * 4)(*house.light, 0.0))
-        for number, group in painted:
-            self._draw_panels(group, number)
-        for thing, (number, shape) in meshes:
-            self._draw_mesh(thing, number, shape)
-        gl.glEndList()
+        panels = _by_texture(panel for thing in things if not thing.is_mesh for panel in furniture_panels(thing))
+        with self._recorded(self._things):
+            self._draw_panels(panels)
+            for thing, (number, shape) in meshes:
+                self._draw_mesh(thing, number, shape)
+
+    @contextlib.contextmanager
+    def _recorded(self, number: Any) -> Iterator[None]:
+        """What is drawn in the block is the display list of this number; textures of it must be uploaded before."""
+        self._gl.glNewList(number, self._gl.GL_COMPILE)
+        yield
+        self._gl.glEndList()
 
     def render(self, eye: Sequence[float], forward: Sequence[float], fov: float) -> tuple[Array, Array]:
         """Render the view from a point, with +y up.
@@ -167,7 +178,8 @@ class Renderer:
         gl.glLoadIdentity()
         target = [start + offset for start, offset in zip(eye, forward, strict=True)]
         gl.gluLookAt(*eye, *target, 0.0, 1.0, 0.0)
-        gl.glCallList(self._scene)
+        for part in (self._walls, self._things):
+            gl.glCallList(part)
 
     def _read(self, frame_buffer: Any, channels: int, kind: int, into: Array) -> None:
         gl = self._gl
@@ -212,18 +224,18 @@ class Renderer:
         gl.glLightfv(gl.GL_LIGHT0, gl.GL_AMBIENT, (gl.GLfloat * 4)(AMBIENT, AMBIENT, AMBIENT, 1.0))
         gl.glLightfv(gl.GL_LIGHT0, gl.GL_DIFFUSE, (gl.GLfloat * 4)(DIFFUSE, DIFFUSE, DIFFUSE, 1.0))
 
-    def _draw_panels(self, panels: Sequence[Panel], number: Any) -> None:
-        """All panels of one texture at once: each change of texture costs as much as thirty panels."""
+    def _draw_panels(self, by_texture: Sequence[tuple[Any, Sequence[Panel]]]) -> None:
         gl = self._gl
-        gl.glBindTexture(gl.GL_TEXTURE_2D, number)
-        gl.glBegin(gl.GL_QUADS)
-        for panel in panels:
-            gl.glColor3f(*panel.tint)
-            gl.glNormal3f(*panel.normal)
-            for tile, corner in zip(panel.tiles.tolist(), panel.corners.tolist(), strict=True):
-                gl.glTexCoord2f(*tile)
-                gl.glVertex3f(*corner)
-        gl.glEnd()
+        for number, panels in by_texture:
+            gl.glBindTexture(gl.GL_TEXTURE_2D, number)
+            gl.glBegin(gl.GL_QUADS)
+            for panel in panels:
+                gl.glColor3f(*panel.tint)
+                gl.glNormal3f(*panel.normal.tolist())
+                for tile, corner in zip(panel.tiles.tolist(), panel.corners.tolist(), strict=True):
+                    gl.glTexCoord2f(*tile)
+                    gl.glVertex3f(*corner)
+            gl.glEnd()
 
     def _draw_mesh(self, thing: Thing, number: int, shape: Mesh) -> None:
         gl = self._gl
@@ -234,6 +246,12 @@ class Renderer:
         gl.glScalef(scale, scale, scale)
         gl.glCallList(number)
         gl.glPopMatrix()
+
+
+def _by_texture(panels: Iterable[Panel]) -> list[tuple[Any, list[Panel]]]:
+    """Panels with the OpenGL number of their texture: a change of texture costs as much as thirty panels."""
+    ordered = sorted(panels, key=lambda panel: panel.texture)
+    return [(texture(name), list(group)) for name, group in groupby(ordered, key=lambda panel: panel.texture)]
 
 
 @functools.cache
