@@ -165,8 +165,8 @@ class Navigator:
     def approach(self) -> Decision:
         """Return the way to the best view nearby of a goal that was recognised; without actions: stop here.
 
-        The agent stops where no imagined view is better than the present one, and where the last approach did not make
-        the true view better.
+        The agent stops where no imagined view is better than those without a step, and where the last approach did not
+        make the true view better.
         """
         begun = time.monotonic()
         situation = Situation(self.seen, self.info, self.goal, self.ground.map())
@@ -178,8 +178,8 @@ class Navigator:
         if self.planner is not None:
             self.planner.executed(MANY)
         with torch.no_grad():
-            best = best_approach(judge, self.info.vocabulary, APPROACH)
-        return Decision(best.chosen if best.cost < now else (), judge.frames, time.monotonic() - begun)
+            actions = best_approach(judge, self.info.vocabulary, APPROACH)
+        return Decision(actions, judge.frames, time.monotonic() - begun)
 
     def _decider(
         self, simulator: Simulator, horizon: int

@@ -8,7 +8,7 @@ more beyond it: the agent imagines some steps in several directions, and goes to
 from __future__ import annotations
 
 from persist_cli.api.actions import ActionVocabulary
-from persist_cli.planning.judge import Candidate, Judge
+from persist_cli.planning.judge import Judge
 from persist_cli.policies.simple import gait
 
 SIDES = 3  # turns to each side at most
@@ -26,12 +26,24 @@ def straight_ways(vocabulary: ActionVocabulary, horizon: int) -> list[tuple[str,
     return list(dict.fromkeys(ways))
 
 
-def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> Candidate:
-    """Return the straight way that passes the best view, which ``Candidate.chosen`` leads to.
+def glances(vocabulary: ActionVocabulary) -> list[tuple[str, ...]]:
+    """Return a turn to each side and back; where there are turns to one side only, no action at all."""
+    _, turns = gait(vocabulary)
+    names = [turn.name for turn in turns]
+    return list(zip(names, reversed(names), strict=True)) if len(names) > 1 else [()]
+
+
+def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> tuple[str, ...]:
+    """Return the actions to the best view on straight ways; none where the view is as good without a step.
+
+    What is imagined costs more than what is truly seen, so the view without a step is imagined too, by ``glances``.
 
     Args:
         judge: judges every frame of a candidate (``over`` is ``best``).
         vocabulary: of the agent.
         horizon: actions of each way.
     """
-    return min(judge.judge(straight_ways(vocabulary, horizon), 1), key=lambda candidate: candidate.cost)
+    here, ways = glances(vocabulary), straight_ways(vocabulary, horizon)
+    judged = judge.judge([*here, *ways], 1)
+    stay, best = (min(part, key=lambda one: one.cost) for part in (judged[: len(here)], judged[len(here) :]))
+    return best.chosen if best.cost < stay.cost else ()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from persist_cli.api.actions import walking_actions
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal
@@ -25,6 +23,11 @@ def test_the_best_place_is_reached_in_the_middle_of_a_way(model) -> None:
     place = agent.cameras_after(("left", "forward", "forward")).centers[-1]
     goal, ground = Goal(None, place, agent.info.scene), GroundMap.empty(agent.info.world_up)
     judge = Judge(WorldFutures(model, ground), make_cost("distance", {}), goal, ground, "best")
-    best = best_approach(judge, agent.info.vocabulary, 6)
-    assert best.chosen == ("left", "forward", "forward")
-    assert best.cost == pytest.approx(0.0, abs=1e-6)
+    assert best_approach(judge, agent.info.vocabulary, 6) == ("left", "forward", "forward")
+
+
+def test_an_agent_at_the_best_place_stays(model) -> None:
+    agent = model.agents[0]
+    goal, ground = Goal(None, agent.now.cameras.centers[0], agent.info.scene), GroundMap.empty(agent.info.world_up)
+    judge = Judge(WorldFutures(model, ground), make_cost("distance", {}), goal, ground, "best")
+    assert best_approach(judge, agent.info.vocabulary, 6) == ()
