@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
-
-from jaxtyping import UInt8
-from PIL import Image
-from torch import Tensor
 
 from persist_cli.api.geometry import unproject
 from persist_cli.api.memory import MapPoints
@@ -21,13 +15,14 @@ from persist_cli.bench.plan_bench import PlanningBench
 from persist_cli.bench.planning_results import groups
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
+from persist_cli.viewing.data_uri import data_uri, png_uri
 from persist_cli.viewing.map import draw_map
 
 MOST_ROWS: Final = 4  # whose ways a map shows beside the shortest one, since it has five colours
 
-EVERY: Final = 2  # pixels of a frame from one point of the map to the next
-
 SCALE: Final = 3  # times the side of a frame in the report
+
+EVERY: Final = 2  # pixels of a frame from one point of the map to the next
 
 
 @dataclass(frozen=True)
@@ -82,14 +77,14 @@ def picture_episode(bench: PlanningBench, episode: Episode, folder: Path) -> Epi
         closed = bench.journal.read(row, episode)["closed"]
         if closed is not None:
             ways[row.name] = walked(scene, closed["actions"])
-            ends.append(EndView(row.name, data_uri(ways[row.name].rgb[-1]), end_words(closed)))
+            ends.append(EndView(row.name, data_uri(ways[row.name].rgb[-1], SCALE), end_words(closed)))
     file = folder / f"{episode.name}.png"
     drawn = ["shortest way", *drawn_rows(bench.rows, ways)]
     paths = {name: ways[name].cameras.world_from_camera for name in drawn}
     draw_map(seen_points(Observations.concatenate([given, shortest])), scene.info.world_up, paths, file)
     kind = f"{episode.bin} actions, {'in sight' if episode.in_sight else 'hidden'}"
-    picture = f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode('ascii')}"
-    return EpisodePictures(episode.name, kind, data_uri(start.rgb[0]), data_uri(scene.goal_view.rgb[0]), picture, ends)
+    picture, views = png_uri(file.read_bytes()), [data_uri(seen.rgb[0], SCALE) for seen in (start, scene.goal_view)]
+    return EpisodePictures(episode.name, kind, *views, picture, ends)
 
 
 def walked(scene: TrueScene, actions: str) -> Observations:
@@ -117,11 +112,3 @@ def end_words(closed: Mapping[str, Any]) -> str:
     figures = closed["figures"]
     result = "success" if figures["success"] else closed["ended"]
     return f"{result}, {figures['end_metres']:.1f} m left, {figures['actions']:.0f} actions"
-
-
-def data_uri(rgb: UInt8[Tensor, "height width 3"]) -> str:
-    """Return an image as a PNG in a data URI, larger than it is."""
-    image = Image.fromarray(rgb.numpy())
-    png = io.BytesIO()
-    image.resize((SCALE * image.width, SCALE * image.height), Image.Resampling.NEAREST).save(png, format="PNG")
-    return f"data:image/png;base64,{base64.b64encode(png.getvalue()).decode('ascii')}"

@@ -289,6 +289,7 @@ def bench_scene(
     seed: Annotated[int, typer.Option(min=0, help="Of the choice of images and edits.")] = 0,
     allow_training_scenes: TrainingScenesOption = False,
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-scene"),
+    report: Annotated[Path | None, typer.Option(help="Folder for report.html with plans.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Compare the scenes that a model imagines from one image with true houses, and with guesses without a model.
@@ -307,4 +308,4 @@ def bench_scene(
         model, data, train, split_names(parts), images, seeds, radius, houses, steps, walks, rendering, edits,
         tuple(settings or ()), seed, allow_training_scenes,
     )  # fmt: skip
-    run_scene_bench(plan, out, json)
+    run_scene_bench(plan, out, report, json)

@@ -7,8 +7,10 @@ from typing import Any, Final
 
 from persist_cli.bench.scenes.completion_part import completion_json, run_completion
 from persist_cli.bench.scenes.edit_part import edits_json, run_edits
+from persist_cli.bench.scenes.plan_pictures import picture_views
 from persist_cli.bench.scenes.return_part import return_json, run_returns
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, identity, prepare
+from persist_cli.bench.scenes.scene_report import PAGE, write_scene_report
 from persist_cli.bench.scenes.scene_tables import print_results, tables_text
 from persist_cli.bench.scenes.speed_part import run_speed, speed_json
 from persist_cli.bench.scenes.walk_part import run_walks, walk_json
@@ -26,28 +28,36 @@ FORMAT, VERSION = "persist-scenes", 1
 BASELINES: Final = ("empty", "nearest house", "class prior")
 
 
-def run_scene_bench(plan: SceneBenchPlan, out: Path, json: bool) -> None:
+def run_scene_bench(plan: SceneBenchPlan, out: Path, report: Path | None, json: bool) -> None:
     """Run all parts and write ``metrics.json`` and ``tables.md``.
 
     Args:
         plan: the options.
         out: folder of the benchmark; a stopped one goes on.
+        report: folder of the report, ``None`` for none.
         json: whether the results are printed as JSON instead of tables.
 
     Raises:
         PersistError: one line for whatever does not fit.
     """
-    check_folder(out)
+    for folder in (out, report):
+        if folder is not None:
+            check_folder(folder)
     bench = prepare(plan, out)
     run_parts(bench)
     results = results_json(bench)
     write_json(out / RESULTS, results)
     write_text(out / TABLES, tables_text(results))
+    if report is not None:
+        pictures = picture_views(bench) if "completion" in plan.parts else []
+        write_scene_report(results, pictures, report)
     if json:
         print_json(results)
         return
     print_results(results)
     say(f"all columns, classes and differences: {out / TABLES}; every figure: {out / RESULTS}")
+    if report is not None:
+        say(f"with plans: {report / PAGE}")
 
 
 def run_parts(bench: SceneBench) -> None:

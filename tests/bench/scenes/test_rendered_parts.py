@@ -48,7 +48,7 @@ def test_edits_are_rendered_and_counted_by_kind(measured: Path) -> None:
 
 def test_frames_of_one_clip_are_not_compared_with_each_other() -> None:
     rgb = torch.randint(0, 255, (9, 16, 16, 3), dtype=torch.uint8)
-    walk = {"rgb": rgb, "poses": torch.eye(4).expand(9, 4, 4), "out": torch.tensor(5)}
+    walk = {"rgb": rgb, "poses": torch.eye(4).expand(9, 4, 4), "out": torch.tensor(5), "seconds": torch.tensor(2.0)}
     assert math.isnan(walk_values(walk, 8, 1.0)["psnr"])
     assert math.isfinite(walk_values(walk, 4, 1.0)["psnr"])
     same = torch.cat([rgb[:5], rgb[:4].flip(0)])

@@ -24,6 +24,7 @@ def measured(
     """A finished benchmark of the parts that draw no frames."""
     out = tmp_path_factory.mktemp("bench") / "scenes"
     options = ("--data", test_houses, "--train", train_houses, "--parts", "completion,walk,speed", "--out", out)
+    options = (*options, "--report", out / "report")
     run_persist("bench", "scene", *map(str, (scene_model, *options, *SMALL)))
     return out
 
@@ -59,6 +60,13 @@ def test_tables_say_what_every_row_and_column_means(measured: Path) -> None:
         "class drift (walk)",
     ):
         assert words in text
+
+
+def test_the_report_shows_the_plans_of_every_row(measured: Path) -> None:
+    page = (measured / "report" / "report.html").read_text()
+    for words in ("model, seed 1", "plan: nearest house", "plan: truth", "plan: seen", "Cost of a completion"):
+        assert words in page
+    assert "http" not in page.replace("http-equiv", "")  # it needs no other file
 
 
 def test_a_stopped_benchmark_goes_on_and_gives_the_same(

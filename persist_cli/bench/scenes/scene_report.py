@@ -1,0 +1,36 @@
+"""The report of a benchmark of scenes: one page that needs no other file."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from persist_cli.bench.scenes.plan_pictures import COLORS, ViewPictures
+from persist_cli.bench.scenes.scene_tables import definitions, tables
+from persist_cli.io.files import write_text
+
+PAGE: Final = "report.html"
+
+
+def write_scene_report(results: Mapping[str, Any], pictures: Sequence[ViewPictures], folder: Path) -> None:
+    """Write the page, whole or not at all.
+
+    Args:
+        results: as ``results_json`` returns them.
+        pictures: of some images.
+        folder: of the page.
+    """
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+
+    packages = ("persist_cli.bench.scenes", "persist_cli.evaluate.report")  # the latter for the style of its pages
+    jinja = Environment(
+        loader=ChoiceLoader([PackageLoader(package, ".") for package in packages]), autoescape=True,
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    page = jinja.get_template("scene_report.html.jinja").render(
+        results=results, tables=tables(results, short=False), definitions=definitions(results), pictures=pictures,
+        colors=COLORS, command=shlex.join(results["command"]),
+    )  # fmt: skip
+    write_text(folder / PAGE, page)
