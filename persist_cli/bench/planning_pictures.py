@@ -83,8 +83,8 @@ def picture_episode(bench: PlanningBench, episode: Episode, folder: Path) -> Epi
     paths = {name: ways[name].cameras.world_from_camera for name in drawn}
     draw_map(seen_points(Observations.concatenate([given, shortest])), scene.info.world_up, paths, file)
     kind = f"{episode.bin} actions, {'in sight' if episode.in_sight else 'hidden'}"
-    picture, views = png_uri(file.read_bytes()), [data_uri(seen.rgb[0], SCALE) for seen in (start, scene.goal_view)]
-    return EpisodePictures(episode.name, kind, *views, picture, ends)
+    begin, goal = (data_uri(seen.rgb[0], SCALE) for seen in (start, scene.goal_view))
+    return EpisodePictures(episode.name, kind, begin, goal, png_uri(file.read_bytes()), ends)
 
 
 def walked(scene: TrueScene, actions: str) -> Observations:

@@ -82,8 +82,10 @@ def plan(
     palette = view.truth.form.palette
     top = classes.shape[2] - 1
     shown = torch.where(known, classes, SOLID)[..., 0].clone()
+    if "floor" in palette:
+        shown[shown == SOLID] = palette.index("floor")  # what was seen down there
     seen = known.any(-1)
-    for level in range(top):
+    for level in range(1, top):
         something = known[..., level] & (classes[..., level] != FREE) & (classes[..., level] != OUTSIDE)
         shown = torch.where(something, classes[..., level], shown)
     beyond = (known & (classes == OUTSIDE))[..., :top].any(-1)

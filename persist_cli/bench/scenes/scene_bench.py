@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -268,9 +269,8 @@ def identity(
     Parts, the number of seeds and that of walks may change: what is there is kept.
     """
     values: Mapping[str, Any] = {
-        "views": [view.name for view in views],
-        "scenes": [view.scene for view in views],
-        "houses": [house.scene for house in houses],
+        "views": digest([f"{view.scene} {view.name}" for view in views]),
+        "training houses": digest([house.scene for house in houses]),
         "memory": asdict(plan.memory(views[0].truth.form)),
         "model": None if trained is None else trained.fingerprint,
         "radius": plan.radius,
@@ -279,6 +279,11 @@ def identity(
         "rendering": None if plan.rendering is None else rendering_identity(plan.rendering),
     }
     return dict(json.loads(json.dumps(values, default=str)))
+
+
+def digest(names: Sequence[str]) -> str:
+    """Return how many names there are, with the beginning of a hash of all."""
+    return f"{len(names)}, hash {hashlib.sha256(json.dumps(list(names)).encode()).hexdigest()[:12]}"
 
 
 def rendering_identity(plan: RenderingPlan) -> dict[str, Any]:
