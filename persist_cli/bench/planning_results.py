@@ -12,7 +12,7 @@ from persist_cli.bench.episodes import Episode
 from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.navigation_metrics import SUCCESS_METRES
 from persist_cli.bench.plan_bench import PlanningBench
-from persist_cli.bench.rows import NO_MEMORY, SIMULATOR, PlanningRow
+from persist_cli.bench.rows import NO_MEMORY, POLICY_WALK, RETRIEVAL, SIMULATOR, PlanningRow
 from persist_cli.bench.stop_rules import AT_PLACE
 from persist_cli.evaluate.provenance import checkpoint_json, command, environment, weight_hashes, weight_sources
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, Draws, Figure, difference, mean_figure
@@ -209,5 +209,5 @@ def compared_with(row: PlanningRow, rows: Sequence[PlanningRow]) -> list[str]:
     names = [other.name for other in rows]
     alone = next((name for name in ("policy", "random") if name in names), None)
     head = row.name.partition(",")[0]
-    wanted = [f"{head}, {NO_MEMORY}", alone, "shortest-path"] if row.imagines else [alone]
+    wanted = [f"{head}, {NO_MEMORY}", alone, POLICY_WALK, "shortest-path", RETRIEVAL] if row.imagines else [alone]
     return [name for name in wanted if name is not None and name in names and name != row.name]
