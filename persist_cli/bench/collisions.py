@@ -279,7 +279,7 @@ def memory_verdicts(walk: TrueWalk, factory: MemoryFactory) -> list[Cover]:
         memory.memorize(walk.frames[written : attempt.frame + 1])
         written = attempt.frame + 1
         mapper = GroundMapper(walk.info.world_up, body)
-        mapper.add_points(memory.points(), mapper.floor_under(walk.frames.cameras.centers[attempt.frame]))
+        mapper.add_memory(memory, mapper.floor_under(walk.frames.cameras.centers[attempt.frame]))
         verdicts.append(verdict(walk, attempt, mapper, body))
     return verdicts
 

@@ -166,7 +166,7 @@ class ImaginedScenes(Scenes):
                 for piece in source.pieces():
                     mapper.add(piece)
         if settings.memory_file is not None and self.first.memory is not None:
-            mapper.add_points(self.first.memory.points(), mapper.floor_under(self.starts.positions.mean(0)))
+            mapper.add_memory(self.first.memory, mapper.floor_under(self.starts.positions.mean(0)))
         return mapper.map()
 
 

@@ -7,7 +7,8 @@ farther away.
 
 What was observed counts before what a memory holds, and that before what was imagined. An observed frame is exact, so
 one pixel of it makes a square occupied. Imagined frames disagree with each other, so there the majority decides. The
-imagined cells of a scene count before imagined frames, which are renderings of them.
+imagined cells of a scene count before imagined frames, which are renderings of them. Its observed solid cells count
+before what rays passed over: the scene was written with these frames too, and knows what is below the image.
 """
 
 from __future__ import annotations
@@ -25,13 +26,15 @@ from torch.nn import functional
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
 from persist_cli.api.ground import Body, Cover, GroundMap, ground_axes
-from persist_cli.api.memory import MapPoints
+from persist_cli.api.memory import MapPoints, Memory
 from persist_cli.api.observations import Observations, Origin, TrajectoryInfo
+from persist_cli.api.scene import Scene
 from persist_cli.errors import DataError
 
 SPACING = 0.05  # metres of a square's side
 REACH = 6.0  # metres on the ground beyond which a frame's pixels are too coarse to tell
 MARGIN = 40  # squares that a map grows by beyond what it must, so that it seldom grows
+CELL_SHARE = 0.8  # of the edge of a scene's cell that is in the way: walls of 0.2 m in cells of 0.25 m
 LEAST_AHEAD = 0.1  # of a unit view direction that must point along the ground, else nothing is ahead
 
 
@@ -45,8 +48,9 @@ class Vote(IntEnum):
     REMEMBERED_FREE = 4
     IMAGINED_OCCUPIED = 5  # imagined frames, and imagined points of a memory
     IMAGINED_FREE = 6
-    SCENE_OCCUPIED = 7  # imagined cells of a scene, of which imagined frames are renderings
-    SCENE_FREE = 8
+    SCENE_OCCUPIED = 7  # observed cells of a scene
+    SCENE_IMAGINED_OCCUPIED = 8  # imagined cells of a scene, of which imagined frames are renderings
+    SCENE_IMAGINED_FREE = 9
 
 
 def tells_body(info: TrajectoryInfo) -> bool:
@@ -114,7 +118,7 @@ class GroundMapper:
         for number in range(len(frames)):
             self._add_frame(frames.depth[number], frames.cameras[number], int(frames.origins[number]))
 
-    def add_points(self, points: MapPoints, floor: float, of_scene: bool = False) -> None:
+    def add_points(self, points: MapPoints, floor: float) -> None:
         """Add the points of a memory.
 
         Points between ``step_over`` and the body's height make squares occupied, those on the floor make squares free.
@@ -125,7 +129,6 @@ class GroundMapper:
         Args:
             points: of ``Memory.points``.
             floor: height of the floor along up, metres.
-            of_scene: whether imagined points are cells of a scene, which count before imagined frames.
         """
         positions = points.positions.cpu().double() @ self.axes.T
         bottom = positions[:, 2] - floor - points.rise / 2
@@ -134,25 +137,51 @@ class GroundMapper:
             return
         places, bottom, origins = positions[near, :2], bottom[near], points.origins.cpu()[near]
         blocking, observed = bottom > self.body.step_over, origins >= Origin.OBSERVED
-        imagined = (
-            (Vote.IMAGINED_OCCUPIED, Vote.IMAGINED_FREE) if not of_scene else (Vote.SCENE_OCCUPIED, Vote.SCENE_FREE)
-        )
         for chosen, vote in (
             (blocking & observed, Vote.REMEMBERED_OCCUPIED),
             (~blocking & observed, Vote.REMEMBERED_FREE),
-            (blocking & ~observed, imagined[0]),
-            (~blocking & ~observed, imagined[1]),
+            (blocking & ~observed, Vote.IMAGINED_OCCUPIED),
+            (~blocking & ~observed, Vote.IMAGINED_FREE),
         ):
             # half as large where occupied: a wall lies anywhere in its cell, and a body does not fit between two cells
-            occupied = vote in (Vote.REMEMBERED_OCCUPIED, imagined[0])
-            self._count(vote, self._squares(places[chosen], points.spread / 2 if occupied else points.spread))
+            side = points.spread / 2 if vote in (Vote.REMEMBERED_OCCUPIED, Vote.IMAGINED_OCCUPIED) else points.spread
+            self._count(vote, self._squares(places[chosen], side))
+
+    def add_memory(self, memory: Memory, floor: float) -> None:
+        """Add what a memory holds; the cells of a scene take the place of those it had before.
+
+        Args:
+            memory: the memory.
+            floor: height of the floor along up, metres.
+        """
+        if isinstance(memory, Scene):
+            self.set_scene(memory.points(), floor)
+        else:
+            self.add_points(memory.points(), floor)
 
     def set_scene(self, points: MapPoints, floor: float) -> None:
-        """Know the points of a scene as they are now, in place of all points before; arguments as of ``add_points``."""
-        for vote in (Vote.REMEMBERED_OCCUPIED, Vote.REMEMBERED_FREE, Vote.SCENE_OCCUPIED, Vote.SCENE_FREE):
+        """Know the solid cells of a scene as they are now, in place of all points before.
+
+        The floor lies in the middle of its cells, and what is higher is in the way: where a wall stands, nearly all of
+        its cell.
+
+        Args:
+            points: of ``Scene.points``.
+            floor: height of the floor along up, metres.
+        """
+        votes = (Vote.SCENE_OCCUPIED, Vote.REMEMBERED_FREE, Vote.SCENE_IMAGINED_OCCUPIED, Vote.SCENE_IMAGINED_FREE)
+        for vote in (*votes, Vote.REMEMBERED_OCCUPIED):
             self._votes[vote] = 0
         self._map = None
-        self.add_points(points, floor, of_scene=True)
+        positions = points.positions.cpu().double() @ self.axes.T
+        height, origins = positions[:, 2] - floor, points.origins.cpu()
+        near = (height - points.rise / 2 <= self.body.height) & (height + points.rise / 2 >= -self.body.step_over)
+        blocking, observed = height > self.body.step_over, origins >= Origin.OBSERVED
+        kinds = (blocking & observed, ~blocking & observed, blocking & ~observed, ~blocking & ~observed)
+        for chosen, vote in zip(kinds, votes, strict=True):
+            free = vote in (Vote.REMEMBERED_FREE, Vote.SCENE_IMAGINED_FREE)
+            side = points.spread if free else CELL_SHARE * points.spread
+            self._count(vote, self._squares(positions[near & chosen, :2], side))
 
     def forget(self, places: Float[Tensor, "place 2"], side: float) -> None:
         """Forget what frames showed around places on the ground axes, in squares of a side in metres: it changed."""
@@ -197,12 +226,13 @@ class GroundMapper:
         states = torch.full(votes.shape[1:], int(Cover.UNKNOWN), dtype=torch.uint8)
         for occupied, free in (
             (imagined[0] > imagined[1], (imagined[1] > 0) & (imagined[0] <= imagined[1])),
-            (votes[Vote.SCENE_OCCUPIED] > 0, votes[Vote.SCENE_FREE] > 0),
+            (votes[Vote.SCENE_IMAGINED_OCCUPIED] > 0, votes[Vote.SCENE_IMAGINED_FREE] > 0),
             (votes[Vote.REMEMBERED_OCCUPIED] > 0, votes[Vote.REMEMBERED_FREE] > 0),
             (votes[Vote.OBSERVED_OCCUPIED] > 0, votes[Vote.OBSERVED_FREE] > 0),
         ):
             states[free] = int(Cover.FREE)
             states[occupied] = int(Cover.OCCUPIED)
+        states[votes[Vote.SCENE_OCCUPIED] > 0] = int(Cover.OCCUPIED)
         states[votes[Vote.STOOD] > 0] = int(Cover.FREE)
         if self._anchor is None:
             return GroundMap(states, (0.0, 0.0), self.spacing, self.axes)

@@ -72,13 +72,13 @@ class Surroundings:
         if isinstance(memory, Scene):
             self.know(memory)
         elif memory is not None:
-            self._mapper.add_points(memory.points(), self._floor)
+            self._mapper.add_memory(memory, self._floor)
 
     def know(self, scene: Scene) -> None:
         """Know the cells of a scene as they are now."""
         if scene.cells is not self._cells:
             self._cells = scene.cells
-            self._mapper.set_scene(scene.points(), self._floor)
+            self._mapper.add_memory(scene, self._floor)
 
     def changed(self, scene: Scene, before: CellGrid) -> None:
         """Forget what frames showed where cells of a scene are others than before, and know its cells.

@@ -1,0 +1,144 @@
+"""Things in a scene are picked up, dropped and toggled, by rules or as the model says."""
+
+import pytest
+import torch
+
+from persist_cli.api.actions import walking_actions
+from persist_cli.api.cells import FREE, SOLID, CellOrigin
+from persist_cli.api.ground import Body
+from persist_cli.errors import CheckpointError
+from persist_cli.memorize.memory_file import load_memory
+from tests.support.cell_rooms import BOX, BOX_CELLS, FLOOR, WALL, camera_at, cell_room
+from tests.support.drawn_scenes import DrawnWalls, empty_scene
+
+ACTIONS = walking_actions()
+BEFORE_BOX = (5, 4, 5), (9, 4, 5)  # a metre before the box
+BEFORE_TABLE = (2, 7, 5), (9, 7, 5)
+
+
+def furnished(model=None, **settings):
+    scene = empty_scene(model, **settings)
+    scene.add(cell_room())
+    return scene
+
+
+def do(scene, name, stance=BEFORE_BOX):
+    pose = camera_at(cell_room(), *stance).world_from_camera[0]
+    return scene.act(ACTIONS[name], pose, Body())
+
+
+def classes(scene):
+    grid = cell_room()
+    return scene.cells.box(grid.corner, grid.shape).classes
+
+
+def test_a_thing_ahead_is_picked_up_and_leaves_free_cells_that_count_as_imagined():
+    scene = furnished()
+    assert do(scene, "pick_up")
+    assert int(classes(scene)[BOX_CELLS]) == FREE
+    origins = scene.cells.box(cell_room().corner, cell_room().shape).origins
+    assert int(origins[BOX_CELLS]) == CellOrigin.IMAGINED
+    assert int((origins == CellOrigin.IMAGINED).sum()) == 1
+    assert not do(scene, "pick_up", BEFORE_TABLE)  # the hands are full
+
+
+def test_what_was_picked_up_is_put_down_elsewhere_in_its_colour(tmp_path):
+    scene = furnished()
+    do(scene, "pick_up")
+    scene.save(tmp_path / "carrying.safetensors")
+    loaded = load_memory(tmp_path / "carrying.safetensors")
+    assert do(loaded, "drop", ((5, 9, 5), (9, 9, 5)))
+    [place] = (classes(loaded) == BOX).nonzero().tolist()
+    assert place[1:] == [9, 1]
+    assert 7 <= place[0] <= 8
+    colors = loaded.cells.box(cell_room().corner, cell_room().shape).colors
+    assert colors[tuple(place)].tolist() == cell_room().colors[BOX_CELLS].flatten().tolist()
+    assert not do(loaded, "drop")
+
+
+def test_nothing_is_put_down_into_a_wall():
+    scene = furnished()
+    do(scene, "pick_up")
+    before = classes(scene)
+    assert not do(scene, "drop", ((2, 7, 5), (9, 7, 5)))  # the table is there
+    assert torch.equal(classes(scene), before)
+    assert do(scene, "drop", ((7, 9, 5), (9, 9, 5)))
+
+
+def test_toggling_turns_the_colour_of_a_box_into_its_complement_and_back():
+    scene = furnished()
+    color = cell_room().colors[BOX_CELLS]
+
+    def now():
+        return scene.cells.box(cell_room().corner, cell_room().shape).colors[BOX_CELLS]
+
+    assert do(scene, "toggle")
+    assert torch.equal(now(), 255 - color)
+    assert do(scene, "toggle")
+    assert torch.equal(now(), color)
+    assert not do(scene, "toggle", BEFORE_TABLE)  # a table cannot be toggled
+
+
+@pytest.mark.parametrize(
+    "stance", [((5, 4, 5), (1, 4, 5)), ((1, 4, 5), (9, 4, 5)), ((5, 10, 5), (9, 4, 5))], ids=["behind", "far", "away"]
+)
+def test_what_is_out_of_reach_stays(stance):
+    scene = furnished()
+    before = scene.cells
+    assert not do(scene, "pick_up", stance)
+    assert scene.cells is before
+
+
+def test_a_thing_behind_another_and_one_that_is_too_large_stay():
+    hidden = furnished()
+    grid = cell_room()
+    grid.classes[7, 4, 1:4] = WALL
+    hidden.add(grid)
+    assert not do(hidden, "pick_up")
+    assert not do(furnished(carries=0.5), "pick_up", BEFORE_TABLE)
+    assert do(furnished(), "pick_up", BEFORE_TABLE)
+
+
+def test_without_classes_a_small_thing_that_stands_alone_is_picked_up():
+    scene, grid = furnished(), cell_room()
+    grid.classes[grid.solid] = SOLID
+    scene.add(grid)
+    assert do(scene, "pick_up")
+    assert int(classes(scene)[BOX_CELLS]) == FREE
+    assert not do(scene, "pick_up")
+
+
+def test_the_floor_goes_on_where_nobody_saw_it_below_a_thing():
+    scene, grid = empty_scene(), cell_room()
+    grid.origins[9, 4, 0] = 0
+    scene.add(grid)
+    assert do(scene, "pick_up")
+    assert int(classes(scene)[9, 4, 0]) == FLOOR
+
+
+def test_steps_and_turns_change_nothing():
+    scene = furnished()
+    before = scene.cells
+    assert do(scene, "forward")
+    assert do(scene, "left")
+    assert scene.cells is before
+
+
+def test_a_model_can_say_what_becomes_of_things():
+    scene = furnished(DrawnWalls(), evolution="model")
+    assert do(scene, "pick_up")
+    assert int(classes(scene)[BOX_CELLS]) == FREE
+    assert "carried.cells" in scene.tensors()
+    assert not do(scene, "toggle")  # of which this model says nothing
+    with pytest.raises(CheckpointError, match="--model"):
+        do(furnished(evolution="model"), "pick_up")
+
+
+def test_what_was_picked_up_is_not_seen_any_more():
+    scene = furnished()
+    camera = camera_at(cell_room(), (5, 4, 5), (9, 4, 1))
+    with_box = scene.read(camera, 2000).features.argmax(1)
+    do(scene, "pick_up")
+    without = scene.read(camera, 2000).features.argmax(1)
+    assert BOX in with_box.tolist()
+    assert BOX not in without.tolist()

@@ -1,0 +1,79 @@
+"""Agents in a scene act on it, and are stopped by what it holds and imagines."""
+
+import torch
+
+from persist_cli.api.cells import CellOrigin
+from tests.support.cell_rooms import BOX_CELLS, WALL, camera_at, cell_room
+from tests.support.drawn_scenes import DrawnWalls, empty_scene
+from tests.support.scene_worlds import scene_world
+
+BEFORE_BOX = (4, 4, 5), (9, 4, 5)  # 1.25 m before the box, level
+
+
+def room_scene(model=None, **settings):
+    scene = empty_scene(model, **settings)
+    scene.add(cell_room())
+    return scene
+
+
+def walk(scene, actions, stance=BEFORE_BOX):
+    world = scene_world(scene, camera_at(cell_room(), *stance, size=64))
+    [result] = world.step([actions.split()])
+    return world, result
+
+
+def test_a_thing_in_the_way_is_picked_up_and_then_the_way_is_free():
+    _, blocked = walk(room_scene(), "forward forward forward forward")
+    assert blocked.free.tolist() == [True, True, True, False]
+    world, free = walk(room_scene(), "forward pick_up forward forward forward")
+    assert free.free.tolist() == [True] * 5
+    grid = cell_room()
+    assert not bool(world.agents[0].scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any())
+
+
+def test_frames_before_an_interaction_show_the_thing_and_those_after_it_do_not():
+    _, result = walk(room_scene(), "stay pick_up stay")
+    red = ((result.seen.rgb[..., 0] > 150) & (result.seen.rgb[..., 1] < 50)).flatten(1).sum(1).tolist()
+    assert red[0] > 20
+    assert red[1:] == [0, 0]
+
+
+def test_an_interaction_with_nothing_in_reach_is_refused_and_repeats_the_frame():
+    _, result = walk(room_scene(), "right right right right right right toggle stay")
+    assert result.free.tolist() == [True] * 6 + [False, True]
+    assert torch.equal(result.seen.rgb[5], result.seen.rgb[6])
+
+
+def test_in_a_branch_an_interaction_changes_its_own_scene_alone():
+    scene = room_scene()
+    world = scene_world(scene, camera_at(cell_room(), *BEFORE_BOX, size=64))
+    branches = world.branches(2)
+    branches.step([["pick_up", "stay"], ["stay", "stay"]])
+    grid = cell_room()
+    held = [agent.scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any() for agent in branches.agents]
+    assert [bool(one) for one in held] == [False, True]
+    assert bool(scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any())
+
+
+def test_an_imagined_wall_stops_an_agent_before_its_clip_is_imagined():
+    class Walled(DrawnWalls):
+        def sample(self, samples, steps):
+            return torch.full_like(samples.classes, WALL), samples.colors
+
+    start = (2, 7, 5), (2, 3, 5)
+    known = cell_room()
+    known.origins[:, :5] = 0  # nothing is known of the room from 0.75 m ahead of the agent
+    scene = empty_scene(Walled())
+    scene.add(known)
+    world, result = walk(scene, "forward forward forward", start)
+    assert result.free.tolist() == [True, False, False]
+    assert int((world.agents[0].scene.cells.origins == CellOrigin.IMAGINED).sum()) > 100
+    without = empty_scene()
+    without.add(known)
+    assert bool(walk(without, "forward forward forward", start)[1].free.all())
+
+
+def test_imagined_frames_do_not_change_the_scene():
+    scene = room_scene()
+    world, _ = walk(scene, "left left forward")
+    assert torch.equal(world.agents[0].scene.cells.classes, scene.cells.classes)
