@@ -142,8 +142,8 @@ def interact(simulator: Simulator, random: np.random.Generator, count: int) -> A
 
     Where nothing can be moved it walks as ``path`` does.
     """
+    grid = FreeGrid(simulator)
     while True:
-        grid = FreeGrid(simulator)
         chosen = _place_before_a_thing(simulator, grid, random)
         if chosen is None:
             yield from path(simulator, random, count)
@@ -156,13 +156,13 @@ def interact(simulator: Simulator, random: np.random.Generator, count: int) -> A
         if not (yield "pick_up"):
             yield from _turned(int(random.choice([-1, 1])))
             continue
-        yield from _carry(simulator, random)
+        yield from _carry(simulator, grid, random)
         yield "drop"
+        grid = FreeGrid(simulator)
 
 
-def _carry(simulator: Simulator, random: np.random.Generator) -> ActionStream:
+def _carry(simulator: Simulator, grid: FreeGrid, random: np.random.Generator) -> ActionStream:
     """Walk with a thing to a place not far from here, or as near to it as the thing gets."""
-    grid = FreeGrid(simulator)
     away = grid.distances(simulator.agent[0])
     places = [cell for cell, distance in sorted(away.items()) if CARRY[0] <= distance <= CARRY[1]]
     if places:
