@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.support.cell_houses import FORM, write_cell_houses
 from tests.support.micro_policies import policy_stage
 from tests.support.micro_runs import MICRO_SETTINGS, run_persist, stage, write_loops, write_walks
 
@@ -127,4 +129,40 @@ def policy_run(walks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a policy's micro network of four steps."""
     run = tmp_path_factory.mktemp("policies") / "policy"
     run_persist(*policy_stage(walks, run))
+    return run
+
+
+@pytest.fixture(scope="session")
+def cell_houses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two houses to measure in."""
+    return write_cell_houses(tmp_path_factory.mktemp("cells") / "test", [5, 7])
+
+
+@pytest.fixture(scope="session")
+def training_cell_houses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five other houses."""
+    return write_cell_houses(tmp_path_factory.mktemp("cells") / "train", [2, 4, 6, 8, 10])
+
+
+@pytest.fixture(scope="session")
+def scene_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model of the houses' classes that was not trained."""
+    from persist_cli.checkpoints.scene_models import save_scene_model
+    from tests.support.micro_scenes import micro_model
+
+    folder = tmp_path_factory.mktemp("models") / "scene"
+    folder.mkdir()
+    model = micro_model(palette=list(FORM.palette), shape=[16, 16, 12])
+    model.name = "scene"
+    save_scene_model(model, "scene", folder, None)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def scene_renderer(training_cell_houses: Path, stage1: Path) -> Path:
+    """A stage-2 run of four steps of an adapter that draws scenes."""
+    run = stage1.parent / "scene"
+    memory = {"name": "scene", "settings": {"palette": list(FORM.palette)}, "encoder": "classes"}
+    changes = [f"memory={json.dumps(memory)}", "adapter.form=rendered", "data.true_cells=1", "data.mirror=false"]
+    run_persist(*stage("stage2-voxel", training_cell_houses, run, f"base={stage1}", *changes))
     return run

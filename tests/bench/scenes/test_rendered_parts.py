@@ -15,10 +15,12 @@ from tests.support.micro_runs import run_persist
 
 
 @pytest.fixture(scope="module")
-def measured(scene_model: Path, test_houses: Path, renderer: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured(
+    scene_model: Path, cell_houses: Path, scene_renderer: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A finished benchmark of the parts that draw frames."""
     out = tmp_path_factory.mktemp("bench") / "rendered"
-    options = ("--data", test_houses, "--parts", "return,edits", "--out", out, "--checkpoint", renderer)
+    options = ("--data", cell_houses, "--parts", "return,edits", "--out", out, "--checkpoint", scene_renderer)
     small = ("--seeds", 1, "--walks", 1, "--return-steps", 9, "--edits", 3, "--denoising-steps", 1, "--radius", 2)
     words = (scene_model, *options, *small, "--memories", "scene,stage1", "--set", "memory.steps=1")
     run_persist("bench", "scene", *map(str, words))

@@ -19,11 +19,11 @@ SMALL = ("--radius", 2, "--seeds", 2, "--steps", 12, "--walks", 1, "--set", "mem
 
 @pytest.fixture(scope="module")
 def measured(
-    scene_model: Path, test_houses: Path, train_houses: Path, tmp_path_factory: pytest.TempPathFactory
+    scene_model: Path, cell_houses: Path, training_cell_houses: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A finished benchmark of the parts that draw no frames."""
     out = tmp_path_factory.mktemp("bench") / "scenes"
-    options = ("--data", test_houses, "--train", train_houses, "--parts", "completion,walk,speed", "--out", out)
+    options = ("--data", cell_houses, "--train", training_cell_houses, "--parts", "completion,walk,speed", "--out", out)
     options = (*options, "--report", out / "report")
     run_persist("bench", "scene", *map(str, (scene_model, *options, *SMALL)))
     return out
@@ -70,14 +70,14 @@ def test_the_report_shows_the_plans_of_every_row(measured: Path) -> None:
 
 
 def test_a_stopped_benchmark_goes_on_and_gives_the_same(
-    persist: Persist, measured: Path, scene_model: Path, test_houses: Path, train_houses: Path
+    persist: Persist, measured: Path, scene_model: Path, cell_houses: Path, training_cell_houses: Path
 ) -> None:
     before = json.loads((measured / "metrics.json").read_text())
     kept = measured / "parts" / "model"
     times = {path.name: path.stat().st_mtime_ns for path in kept.iterdir()}
     first = min(times)
     (kept / first).unlink()
-    options = ("--data", test_houses, "--train", train_houses, "--parts", "completion", "--out", measured)
+    options = ("--data", cell_houses, "--train", training_cell_houses, "--parts", "completion", "--out", measured)
     result = persist("bench", "scene", scene_model, *options, *SMALL, "--json")
     assert result.code == 0, result.err
     again = json.loads(result.out)["completion"]["rows"]["model"]["class_iou"]
@@ -86,7 +86,7 @@ def test_a_stopped_benchmark_goes_on_and_gives_the_same(
 
 
 def test_what_does_not_fit_is_refused_in_one_line(
-    persist: Persist, walks: Path, test_houses: Path, scene_model: Path, measured: Path, tmp_path: Path
+    persist: Persist, walks: Path, cell_houses: Path, scene_model: Path, measured: Path, tmp_path: Path
 ) -> None:
     same = write_cell_houses(tmp_path / "test", [5])
     wrong = (
@@ -99,7 +99,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
         (("--radius", 3, "--out", measured), "another benchmark"),
     )
     for options, cause in wrong:
-        given = () if "--data" in options else ("--data", test_houses)
+        given = () if "--data" in options else ("--data", cell_houses)
         result = persist("bench", "scene", *given, "--out", tmp_path / "out", *options)
         assert (result.code, cause in result.err, len(result.err.strip().splitlines())) == (1, True, 1), result.err
     assert not (tmp_path / "out").exists()
