@@ -20,6 +20,7 @@ class Encoder(ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
+    reads_images: ClassVar[bool] = True  # otherwise ``encode`` always raises, and a memory makes its features
     costly: ClassVar[bool] = False  # features are kept by frame, since finding them again is quicker than encoding
     name: str = ""  # set by the registry
 

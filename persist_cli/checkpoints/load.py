@@ -14,6 +14,7 @@ from persist_cli.checkpoints.lineage import RECIPE
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
+from persist_cli.plugins import load_plugin
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
 
 if TYPE_CHECKING:
@@ -65,20 +66,33 @@ def adapter_memory(checkpoint: Checkpoint, adapter: str) -> MemoryConfig:
 def with_adapter(values: Mapping[str, Any]) -> dict[str, Any]:
     """Plain values of a recipe, with the memory of the adapter that ``adapter_from`` names, where it names one.
 
+    Settings of that memory which do not change what is read, such as the model of a scene, may be the recipe's own.
+
     Raises:
         PersistError: when that adapter is not there, or the recipe has settings of its own for it or its memory.
     """
     if not values.get("adapter_from"):
         return dict(values)
     checkpoint, name = named_adapter(str(values["adapter_from"]))
-    memory = dataclasses.asdict(adapter_memory(checkpoint, name))
-    own = [key for key, its in (("memory", memory), ("adapter", {})) if values.get(key) not in (None, {}, its)]
+    memory = _merged(dataclasses.asdict(adapter_memory(checkpoint, name)), values.get("memory"))
+    own = ["memory"] * (memory is None) + ["adapter"] * (values.get("adapter") not in (None, {}))
     if own:
         raise RecipeError(
             f"adapter_from {values['adapter_from']}: memory and settings come with that adapter; leave out "
             f"{' and '.join(own)}"
         )
     return {**values, "memory": memory}
+
+
+def _merged(memory: dict[str, Any], own: Any) -> dict[str, Any] | None:
+    """Return an adapter's memory with a recipe's settings of it, ``None`` when these would change what is read."""
+    own = own or {}
+    settings = own.get("settings") or {}
+    changeable = load_plugin("memory", memory["name"]).changeable
+    changes = {name: value for name, value in settings.items() if name in changeable}
+    merged = memory | {"settings": memory["settings"] | changes}
+    same = all(merged.get(name) == value for name, value in own.items() if name != "settings")
+    return merged if same and settings.items() <= merged["settings"].items() else None
 
 
 def add_adapter(backbone: Backbone, recipe: Recipe, name: str, channels: int) -> None:

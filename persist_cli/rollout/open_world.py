@@ -11,6 +11,7 @@ from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkp
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import TrajectoryInfo
+from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.reference import parse_reference
@@ -94,7 +95,28 @@ def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, 
     if plan.memory is None:
         return empty
     check_memory(read_header(plan.memory), empty, checkpoint, plan.memory)
-    return load_memory(plan.memory)
+    memory = load_memory(plan.memory)
+    check_cells(memory, empty, plan.memory)
+    return memory
+
+
+def check_cells(memory: Memory, wanted: Memory, path: Path) -> None:
+    """Raise ``CheckpointError`` when a scene has other cells than the one that the adapter reads.
+
+    Args:
+        memory: the memory of a file.
+        wanted: an empty memory as the adapter reads it.
+        path: the file.
+    """
+    if not isinstance(memory, Scene) or not isinstance(wanted, Scene) or memory.cells.form == wanted.cells.form:
+        return
+    own, its = memory.cells.form, wanted.cells.form
+    if own.size != its.size:
+        raise CheckpointError(f"{path}: its cells are {own.size:g} m wide, those that the adapter draws {its.size:g} m")
+    other = sorted({*own.palette} ^ {*its.palette}) or ["their order"]
+    raise CheckpointError(
+        f"{path}: its classes of cells are not those that the adapter draws; they differ in {', '.join(other)}"
+    )
 
 
 def check_memory(header: Mapping[str, Any], wanted: Memory, checkpoint: Checkpoint, path: Path) -> None:

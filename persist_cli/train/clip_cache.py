@@ -16,8 +16,12 @@ from torch.utils.data import Dataset
 
 from persist_cli import __version__
 from persist_cli.api.backbone import Backbone, Clip, ClipLatents, Clips
+from persist_cli.api.encoder import Encoder
+from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Observations
+from persist_cli.api.scene import Scene
 from persist_cli.api.tokens import MemoryTokens
+from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.data.clips import ClipDataset, ClipFrames, ClipSample
 from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.io.files import file_sha256
@@ -302,9 +306,6 @@ class ClipEncoder:
 
 def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: Backbone) -> dict[str, Any]:
     """The JSON values that memory tokens depend on; the features of a fixed picture stand for the encoder's weights."""
-    height, width = backbone.image_size
-    picture = torch.arange(height * width * 3).reshape(1, height, width, 3) * 37 % 256
-    features = factory.encoder.encode(picture.to(torch.uint8)).float().cpu().contiguous().numpy().data
     plugins = [find_plugin("memory", memory.name), find_plugin("encoder", memory.encoder)]
     return {
         "tokens": TOKENS,
@@ -312,7 +313,22 @@ def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: 
         "settings": dataclasses.asdict(factory.settings),
         "encoder": memory.encoder,
         "encoder_settings": dataclasses.asdict(factory.encoder.settings),
-        "features": hashlib.sha256(features).hexdigest(),
+        "features": _features_hash(factory.encoder, backbone) if factory.encoder.reads_images else "",
         "budget": backbone.token_budget,
+        **_imagined_by(factory),
         "packages": [[plugin.package, plugin.version] for plugin in plugins],
     }
+
+
+def _imagined_by(factory: MemoryFactory) -> dict[str, str]:
+    """The hash of the model that imagines in the memories, where there is one."""
+    memory = factory.kind(factory.settings, factory.encoder, FrameOfReference(""))
+    name = memory.wanted_model if isinstance(memory, Scene) else None
+    return {"imagined_by": find_scene_model(name).fingerprint} if name else {}
+
+
+def _features_hash(encoder: Encoder, backbone: Backbone) -> str:
+    """A hash of the features of a picture of the backbone's size."""
+    height, width = backbone.image_size
+    picture = torch.arange(height * width * 3).reshape(1, height, width, 3) * 37 % 256
+    return hashlib.sha256(encoder.encode(picture.to(torch.uint8)).float().cpu().contiguous().numpy().data).hexdigest()

@@ -28,6 +28,7 @@ class Classes(Encoder):
     """One-hot features of classes, in the order of the scene's palette."""
 
     settings_type = ClassesSettings
+    reads_images = False
     settings: ClassesSettings
 
     @property

@@ -104,6 +104,7 @@ class GridScene(Scene):
     """
 
     settings_type = GridSceneSettings
+    changeable = frozenset(("model", "steps", "seed", "foresight"))
     settings: GridSceneSettings
     encoder: Classes
 

@@ -1,0 +1,107 @@
+"""An adapter that draws scenes is trained on true cells, trained on with imagined ones, and evaluated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.checkpoints.load import adapter_memory
+from persist_cli.checkpoints.scene_models import save_scene_model
+from persist_cli.plugins import make_scene_model
+from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.simulators.house_cells import FORM as HOUSES
+from tests.support.cell_houses import FORM
+from tests.support.cell_walks import write_with_cells
+from tests.support.micro_runs import run_persist, stage
+from tests.support.micro_scenes import MICRO_SCENE
+
+SCENE = [
+    "memory.name=scene", "memory.encoder=classes", f"memory.settings={{palette: {json.dumps(FORM.palette)}}}",
+    "adapter={form: rendered, layers: 2, classes: 32, width: 16, attention_tokens: 0, token_budget: 4096}",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def cells(walks: Path, tmp_path_factory) -> Path:
+    return write_with_cells(walks, tmp_path_factory.mktemp("cells"))
+
+
+@pytest.fixture(scope="module")
+def held_out_cells(held_out: Path, tmp_path_factory) -> Path:
+    return write_with_cells(held_out, tmp_path_factory.mktemp("held-out-cells"))
+
+
+@pytest.fixture(scope="module")
+def renderer(cells: Path, stage1: Path, tmp_path_factory) -> Path:
+    """A stage-2 run of four steps on true cells."""
+    run = tmp_path_factory.mktemp("runs") / "renderer"
+    run_persist(*stage("stage2-voxel", cells, run, f"base={stage1}", *SCENE, "data.true_cells=1"))
+    return run
+
+
+@pytest.fixture(scope="module")
+def scene_model(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scene-model")
+    settings = MICRO_SCENE | {"palette": list(FORM.palette), "shape": [16, 16, 12]}
+    save_scene_model(make_scene_model("scene", settings), "scene", folder, None)
+    return folder
+
+
+def test_a_renderer_trained_on_true_cells_is_evaluated_on_its_own_scene_and_on_the_true_one(
+    renderer, held_out_cells, tmp_path, persist
+):
+    rows = ["--memories", "stage1,scene", "--controls", "true-cells"]
+    result = persist("eval", renderer, "--data", held_out_cells, "--out", tmp_path / "eval", *rows,
+                     "--clips", 1, "--seeds", 1, "--steps", 1, "--metrics", "psnr")  # fmt: skip
+    assert result.code == 0, result.err
+    rows = json.loads((tmp_path / "eval" / "metrics.json").read_text())["tables"][0]["rows"]
+    assert [*rows] == ["stage1", "scene", "scene, true cells"]
+    assert rows["scene, true cells"]["columns"]["psnr"] != rows["scene"]["columns"]["psnr"]
+
+
+def test_true_cells_as_a_control_need_a_scene(voxel, held_out_cells, persist, tmp_path):
+    rows = ["--memories", "voxel", "--controls", "true-cells", "--clips", 1]
+    result = persist("eval", voxel, "--data", held_out_cells, "--out", tmp_path / "eval", *rows)
+    assert result.code == 1
+    assert "the control 'true-cells' needs a scene among --memories" in result.err
+
+
+def test_a_renderer_is_trained_on_with_what_a_model_imagines(renderer, scene_model, cells, stage1, tmp_path, persist):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(f"extends: houses-64-stage2-scene-imagined\nbase: {stage1}\nadapter_from: {renderer}\n")
+    small = ["training.steps=2", "training.batch=2", "training.workers=0", "training.warmup=0", "training.cooldown=0"]
+    imagines = [f"memory.settings.model={scene_model}", "memory.settings.steps=1", "data.true_cells=0"]
+    cache = ["--cache", tmp_path / "cache", "data.clips_per_trajectory=1"]
+    result = persist("finetune", recipe, "--data", cells, "--out", tmp_path / "run", *small, *imagines, *cache)
+    assert result.code == 0, result.err
+    memory = adapter_memory(find_checkpoint(tmp_path / "run"), "scene")
+    assert memory.settings["model"] == str(scene_model)
+    assert memory.settings["palette"] == list(FORM.palette)
+
+
+def test_another_size_of_cells_for_a_renderer_that_is_trained_on_is_refused(renderer, cells, stage1, persist, tmp_path):
+    recipe = tmp_path / "recipe.yaml"
+    memory = "memory: {name: scene, encoder: classes, settings: {size: 0.5}}"
+    recipe.write_text(f"stage: '2'\nbase: {stage1}\nadapter_from: {renderer}\n{memory}\n")
+    result = persist("finetune", recipe, "--data", cells, "--out", tmp_path / "run")
+    assert result.code == 1
+    assert "memory and settings come with that adapter; leave out memory" in result.err
+
+
+def test_a_scene_of_other_classes_than_the_renderers_is_refused_in_one_line(renderer, cells, persist, tmp_path):
+    scene, start = tmp_path / "scene.safetensors", f"{cells}#0:0"
+    palette = json.dumps([*FORM.palette, "piano"])
+    made = persist("memorize", start, "--memory", "scene", "--set", f"memory.palette={palette}", "--out", scene)
+    assert made.code == 0, made.err
+    result = persist("rollout", renderer, "--start", start, "--memory", scene, "--actions", "left", "--out", tmp_path)
+    assert result.code == 1
+    assert "its classes of cells are not those that the adapter draws; they differ in piano" in result.err
+
+
+def test_the_recipe_of_the_renderer_has_the_classes_of_the_houses():
+    recipe = make_recipe(read_recipe("houses-64-stage2-scene"), "recipe")
+    assert tuple(recipe.memory.settings["palette"]) == HOUSES.palette
+    assert recipe.memory.settings.get("size", 0.25) == HOUSES.size
