@@ -76,6 +76,15 @@ def test_a_wall_that_a_thing_hid_goes_on_behind_it_and_never_is_a_hole():
     assert outcome.filled_by == "surroundings"
 
 
+def test_the_room_ends_where_nothing_is_known_beyond():
+    grid = cell_room()
+    grid.origins[:, 0:2] = 0  # the wall at the table's side was never seen, nor what is beyond
+    grid.classes[4:8, 2, 1:4] = TABLE
+    gone = edited(grid, Remove(**box_of(grid, "table#1")))
+    assert bool((gone.classes[4:8, 1, 1:4] == WALL).all())
+    assert not bool(gone.known[:, 0, 1:].any())
+
+
 def test_what_a_model_imagines_behind_a_removed_thing_stays():
     grid = cell_room()
     grid.origins[4:6, 9:12, 1:4] = 0
