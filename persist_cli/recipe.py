@@ -16,16 +16,19 @@ import yaml
 from pydantic import BeforeValidator, Field
 
 from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES
-from persist_cli.api.stages import Lora, Stage
+from persist_cli.api.stages import SCENE_STAGES, Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
 
 EXTENDS: Final = "extends"
 # the key that chooses a variant: settings of one variant mean nothing to another
-CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "policy": "name", "adapter": "form"}
+CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "policy": "name", "scene": "name", "adapter": "form"}
 SETTINGS: Final = ("adapter", "settings", "encoder_settings")  # keys that may be left empty
-NAMES: Final = ("backbone.name", "memory.name", "policy.name")
+NAMES: Final = ("backbone.name", "memory.name", "policy.name", "scene.name")
 SETTINGS_OF: Final = {"memory.encoder": "encoder_settings"} | dict.fromkeys(NAMES, "settings")
+# the stages of networks that are no backbones, and what of the data means something to them, by the key for one
+ALONE: Final[Mapping[str, tuple[Stage, ...]]] = {"policy": ("policy",), "scene": SCENE_STAGES}
+DATA_OF: Final = {"policy": ("path", "mirror", "detour"), "scene": ("path",)}
 OF_A_BACKBONE: Final = ("gradient_checkpointing", "compile", "frozen_precision", "vae_slicing")  # settings of training
 CHANGEABLE: Final = "a run may be resumed with another value"
 Value = TypeVar("Value")
@@ -152,6 +155,19 @@ class PolicyConfig:
     settings: Settings = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class SceneConfig:
+    """The choice of the model of scenes to train.
+
+    Args:
+        name: name of a plugin of such models.
+        settings: settings of the model.
+    """
+
+    name: str = "scene"
+    settings: Settings = field(default_factory=dict)
+
+
 def _as_list(value: Any) -> Any:
     """Make a list of a single path; pydantic checks all other values."""
     if isinstance(value, str):
@@ -220,16 +236,18 @@ class Recipe:
 
     Args:
         stage: what is trained: ``codec`` (the VAE), ``1`` (the video model), ``2`` (a memory adapter, all else
-            frozen) or ``policy`` (an agent that acts in the model, by itself).
+            frozen), ``policy`` (an agent that acts in the model, by itself), ``scene-codec`` or ``scene`` (a model that
+            imagines scenes: the codec of its cells, and then the rest).
         description: one line for ``persist recipes``.
         base: run or checkpoint to start from, ``None`` for none.
-        backbone: the video model; not for policies.
+        backbone: the video model; not for policies and models of scenes.
         memory: the memory that the adapter reads, stage 2 only.
         adapter: settings of the memory adapter, stage 2 only.
         adapter_from: run or checkpoint whose adapter is trained on, as ``reference`` or ``reference#voxel``, instead of
             a new one; memory and settings are those of that adapter.
         lora: train a change of low rank instead of all weights of the base, stage 1 only.
         policy: the policy, stage policy only.
+        scene: the model of scenes, stages scene-codec and scene only.
         data: the clips.
         training: steps, batch, optimizer and what else decides how long and how it is trained.
     """
@@ -243,6 +261,7 @@ class Recipe:
     adapter_from: str | None = None
     lora: Lora | None = None
     policy: PolicyConfig | None = None
+    scene: SceneConfig | None = None
     data: DataSettings = field(default_factory=DataSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
@@ -402,7 +421,7 @@ def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
 
 def _contradictions(recipe: Recipe) -> list[str]:
     """Describe each group of settings that are valid alone but not together."""
-    training, problems = recipe.training, [*_of_a_policy(recipe), *_of_true_cells(recipe)]
+    training, problems = recipe.training, [*_of_a_network(recipe), *_of_true_cells(recipe)]
     if training.cooldown > training.steps:
         problems.append(
             f"training.cooldown {training.cooldown} is more than training.steps {training.steps}; set both, as in "
@@ -437,15 +456,28 @@ def _of_true_cells(recipe: Recipe) -> list[str]:
     return []
 
 
-def _of_a_policy(recipe: Recipe) -> list[str]:
-    """Describe what a recipe of a policy lacks, or has that means nothing to it."""
-    if (recipe.stage == "policy") != (recipe.policy is not None):
+def network_of(recipe: Recipe) -> str | None:
+    """The key of what the recipe trains where that is no backbone: ``policy`` or ``scene``; else ``None``."""
+    return next((key for key, stages in ALONE.items() if recipe.stage in stages), None)
+
+
+def _of_a_network(recipe: Recipe) -> list[str]:
+    """Describe what a recipe of a policy or a model of scenes lacks, or has that means nothing to it."""
+    kind = network_of(recipe)
+    if (kind == "policy") != (recipe.policy is not None):
         return ["stage policy needs policy, as in policy: {name: nomad}; the other stages do not take it"]
-    data, allowed = recipe.data, DataSettings(recipe.data.path, mirror=recipe.data.mirror, detour=recipe.data.detour)
+    if (kind == "scene") != (recipe.scene is not None):
+        return ["stages scene-codec and scene need scene, as in scene: {name: scene}; the others do not take it"]
+    if kind is None:
+        return []
+    data, allowed = recipe.data, DataSettings(**{key: getattr(recipe.data, key) for key in DATA_OF[kind]})
     wrong = ["backbone"] if recipe.backbone != BackboneConfig() else []
     wrong += [f"data.{key}" for key, value in vars(allowed).items() if getattr(data, key) != value]
     wrong += [f"training.{key}" for key in OF_A_BACKBONE if getattr(recipe.training, key) not in (False, "no")]
-    return [f"stage policy takes no {', '.join(wrong)}; leave them out"] if wrong and recipe.policy else []
+    problems = [f"stage {recipe.stage} takes no {', '.join(wrong)}; leave them out"] if wrong else []
+    if recipe.stage == "scene" and recipe.base is None:
+        problems.append("stage scene needs base: the scene-codec run it stands on")
+    return problems
 
 
 def to_plain(recipe: Recipe) -> dict[str, Any]:

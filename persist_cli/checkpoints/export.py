@@ -27,6 +27,7 @@ from persist_cli.checkpoints.lineage import (
 )
 from persist_cli.checkpoints.load import empty_backbone, load_backbone
 from persist_cli.checkpoints.save import base_files, fingerprint, hash_weights, write_card
+from persist_cli.checkpoints.scene_models import find_scene_model, is_scene_model, write_scene_card
 from persist_cli.errors import CheckpointError, PersistError, hint
 from persist_cli.io.files import (
     check_folder,
@@ -38,7 +39,7 @@ from persist_cli.io.files import (
     write_tensors,
     write_text,
 )
-from persist_cli.io.sha256sums import SUMS, write_sums
+from persist_cli.io.sha256sums import SUMS, read_sums, write_sums
 from persist_cli.policies.trained import find_policy, is_policy, write_policy_card
 from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.viewing.console import busy, print_json, print_table, say, watched
@@ -96,6 +97,9 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     if is_policy(plan.checkpoint):
         export_policy(plan, out, json)
         return
+    if is_scene_model(plan.checkpoint):
+        export_scene_model(plan, out, json)
+        return
     base = find_checkpoint(plan.checkpoint)
     adapters = _find_adapters(base, plan.runs)
     defaults = {
@@ -125,19 +129,45 @@ def export_policy(plan: ExportPlan, out: Path, json: bool) -> None:
     Raises:
         PersistError: when options of world models are given.
     """
-    if plan.runs or plan.default or plan.sampling.requested() or plan.protocol_sampling:
-        raise PersistError(f"{plan.checkpoint}: a policy has no adapters and no sampling; give --dtype and --out alone")
     policy = find_policy(plan.checkpoint)
+    with _network_folder(plan, policy.folder, "a policy", out) as folder:
+        write_policy_card(folder, policy.policy, policy.settings, policy.training_scenes)
+    _print_files(out, {"policy": policy.policy, "dtype": plan.dtype}, _summed_files(out), json)
+
+
+def export_scene_model(plan: ExportPlan, out: Path, json: bool) -> None:
+    """Write a trained model of scenes as a folder that stands alone, and print a table of its files.
+
+    Raises:
+        PersistError: when options of world models are given.
+    """
+    model = find_scene_model(plan.checkpoint)
+    with _network_folder(plan, model.folder, "a model of scenes", out) as folder:
+        write_scene_card(folder, model.plugin, model.settings, model.stage, model.training_scenes)
+    _print_files(out, {"scene": model.plugin, "dtype": plan.dtype}, _summed_files(out), json)
+
+
+@contextlib.contextmanager
+def _network_folder(plan: ExportPlan, source: Path, network: str, out: Path) -> Iterator[Path]:
+    """The folder of an exported network, with its weights and recipe; the block writes its card."""
+    if plan.runs or plan.default or plan.sampling.requested() or plan.protocol_sampling:
+        raise PersistError(
+            f"{plan.checkpoint}: {network} has no adapters and no sampling; give --dtype and --out alone"
+        )
     with folder_aside(out) as folder:
-        for source in sorted(policy.folder.glob("*.safetensors")):
-            _convert(source, folder / source.name, PRECISIONS[plan.dtype])
-        recipe = policy.folder / RECIPE
+        for weights in sorted(source.glob("*.safetensors")):
+            _convert(weights, folder / weights.name, PRECISIONS[plan.dtype])
+        recipe = source / RECIPE
         if recipe.is_file():
             write_text(folder / RECIPE, _without_absolute_paths(recipe.read_text(encoding="utf-8"), str(recipe)))
-        write_policy_card(folder, policy.policy, policy.settings, policy.training_scenes)
-        hashes = write_sums(folder)
-        files = {name: {"bytes": (folder / name).stat().st_size, "sha256": hashes[name]} for name in sorted(hashes)}
-    _print_files(out, {"policy": policy.policy, "dtype": plan.dtype}, files, json)
+        yield folder
+        write_sums(folder)
+
+
+def _summed_files(folder: Path) -> dict[str, dict[str, Any]]:
+    """Bytes and hash of each file of an exported network."""
+    hashes = read_sums(folder) or {}
+    return {name: {"bytes": (folder / name).stat().st_size, "sha256": hashes[name]} for name in sorted(hashes)}
 
 
 def _find_adapters(base: Checkpoint, runs: Sequence[str]) -> dict[str, AdapterSource]:

@@ -173,7 +173,7 @@ def finetune(
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Train a stage: the codec, stage 1 (the video model) or stage 2 (a memory adapter); or a policy.
+    """Train a stage: the codec, stage 1 (the video model), stage 2 (a memory adapter); a policy; a model of scenes.
 
     persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
 
@@ -198,7 +198,8 @@ def finetune(
 @app.command()
 def export(
     checkpoint: Annotated[
-        Path, typer.Argument(help="A stage-1 run, a checkpoint folder, reference, or a policy's run.")
+        Path,
+        typer.Argument(help="A stage-1 run, a checkpoint folder, reference, or a run of a policy or scene."),
     ],
     out: Annotated[Path, typer.Option(help="Checkpoint folder to write.")],
     runs: Annotated[
@@ -216,7 +217,7 @@ def export(
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Write a base and memory adapters as one checkpoint folder that stands alone; or a trained policy.
+    """Write a base and memory adapters as one checkpoint folder that stands alone; or a policy, or a model of scenes.
 
     persist export runs/stage1 runs/none runs/voxel canvas=runs/voxel-canvas --default voxel --out runs/model
     """

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from persist_cli.doctor.machine import Machine
-from persist_cli.recipe import Recipe
+from persist_cli.recipe import Recipe, network_of
 from persist_cli.viewing.console import watched
 
 
@@ -89,13 +89,15 @@ STAGE2: Final = Strategy((Change("stage 2 only", (), 0),))  # no change but anot
 def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
     """The changes that can make this recipe need less on this machine and are not in force yet."""
     training, cuda = recipe.training, machine.kind == "cuda"
-    transformer, averaged = recipe.stage != "codec", training.ema and training.ema_device != "cpu"
+    of_a_backbone = network_of(recipe) is None
+    transformer, averaged = of_a_backbone and recipe.stage != "codec", training.ema and training.ema_device != "cpu"
+    mixed = of_a_backbone and training.precision == "bf16"
     frozen, half = FROZEN if recipe.stage == "2" else FROZEN_UNSHARDED, training.frozen_precision == "bf16"
     can_shard = transformer and training.optimizer == "adamw" and not (half and frozen.unsharded_only)
     fsdp = Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))
     changes: list[tuple[bool, Change]] = [
-        (not training.vae_slicing, SLICING),
-        (training.precision == "bf16" and not half and not (sharded and frozen.unsharded_only), frozen),
+        (of_a_backbone and not training.vae_slicing, SLICING),
+        (mixed and not half and not (sharded and frozen.unsharded_only), frozen),
         (bool(averaged) and cuda, AVERAGE),
         (training.samples_at_once(machine.devices) > 1, _single_samples(recipe, machine)),
         (machine.devices > 1 and not sharded and can_shard, fsdp),

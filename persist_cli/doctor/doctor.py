@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
+from persist_cli.api.stages import Lora
 from persist_cli.data.clips import check_batch_division
 from persist_cli.doctor.changes import (
     BITSANDBYTES,
@@ -23,10 +24,16 @@ from persist_cli.doctor.changes import (
     available_changes,
     smallest_fitting,
 )
-from persist_cli.doctor.dry_run import dry_run
+from persist_cli.doctor.dry_run import dry_run, network_dry_run, network_recipe
 from persist_cli.doctor.machine import Machine, gib
 from persist_cli.doctor.memory_estimate import Estimator, Launch, MemoryEstimate
-from persist_cli.doctor.meta_model import MetaModel, build_meta_model, build_stage2_meta_model
+from persist_cli.doctor.meta_model import (
+    MetaModel,
+    SceneMetaModel,
+    build_meta_model,
+    build_scene_meta_model,
+    build_stage2_meta_model,
+)
 from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
 from persist_cli.train.distributed import check_sharded
@@ -62,16 +69,18 @@ class Doctor:
     """Examines the training of a recipe on a machine.
 
     Args:
-        meta_model: the recipe with its backbone.
+        meta_model: the recipe with its backbone, or its model of scenes.
         machine: the machine to train on.
         sharded: whether the training uses FSDP2, whatever else is changed.
         stage2: the stage 2 that stands on this stage 1, to compare with; ``None`` when there is none.
     """
 
-    def __init__(self, meta_model: MetaModel, machine: Machine, sharded: bool, stage2: MetaModel | None = None) -> None:
+    def __init__(
+        self, meta_model: MetaModel | SceneMetaModel, machine: Machine, sharded: bool, stage2: MetaModel | None = None
+    ) -> None:
         self.meta_model, self.machine, self.sharded = meta_model, machine, sharded
         self.stage2 = stage2
-        self.estimators = {meta_model.recipe.lora: Estimator(meta_model.backbone, meta_model.channels)}
+        self.estimators: dict[Lora | None, Estimator] = {meta_model.recipe.lora: meta_model.estimator()}
         self.not_considered: dict[str, str] = {}  # changes that cannot be made here, and why
         changes = available_changes(meta_model.recipe, machine, sharded)
         self.changes = [change for change in changes if self.can_make(change)]
@@ -106,9 +115,9 @@ class Doctor:
 
     def estimator(self, recipe: Recipe) -> Estimator:
         """The estimator for the recipe's parameters, which only LoRA changes."""
-        if recipe.lora not in self.estimators:
+        if recipe.lora not in self.estimators and isinstance(self.meta_model, MetaModel):
             changed = MetaModel.of(self.meta_model.name, recipe, self.meta_model.base)
-            self.estimators[recipe.lora] = Estimator(changed.backbone, changed.channels)
+            self.estimators[recipe.lora] = changed.estimator()
         return self.estimators[recipe.lora]
 
     def changed_recipe(self, strategy: Strategy) -> Recipe:
@@ -141,18 +150,23 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     """
     if sharded and machine.devices == 1:
         raise PersistError("--fsdp shares a model out over several GPUs; give --gpus N too")
-    meta_model = build_meta_model(name, overrides)
+    meta_model = _plan_of(name, overrides)
     training = meta_model.recipe.training
     check_batch_division(training.batch, training.accumulation, machine.devices)
     samples = training.samples_at_once(machine.devices)
     if samples > MOST_SAMPLES:
         raise PersistError(f"{samples} samples at once on a device: no plan is made of more than {MOST_SAMPLES}")
-    if sharded:
+    if sharded and isinstance(meta_model, SceneMetaModel):
+        raise PersistError("--fsdp: a model of scenes is not sharded; leave it out")
+    if sharded and isinstance(meta_model, MetaModel):
         meta_model.backbone.trained_parameters(meta_model.recipe.stage)
         check_sharded(meta_model.recipe, meta_model.backbone)
     with busy("building the model without weights"):
-        doctor = Doctor(meta_model, machine, sharded, build_stage2_meta_model(meta_model, overrides))
-        model = dry_run(meta_model)
+        if isinstance(meta_model, SceneMetaModel):
+            doctor, model = Doctor(meta_model, machine, sharded), network_dry_run(meta_model.recipe)
+        else:
+            doctor = Doctor(meta_model, machine, sharded, build_stage2_meta_model(meta_model, overrides))
+            model = dry_run(meta_model)
     findings, best = doctor.findings(), doctor.smallest()
     if json:
         print_json(_record(machine, model, findings, best) | {"not_considered": doctor.not_considered})
@@ -165,6 +179,14 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
     for change, cause in doctor.not_considered.items():
         say(f"not considered: {change} ({cause})")
     say(_verdict(doctor, overrides, best))
+
+
+def _plan_of(name: str, overrides: Sequence[str]) -> MetaModel | SceneMetaModel:
+    """The recipe with its backbone, or its model of scenes, without weights."""
+    recipe = network_recipe(name, overrides)
+    if recipe is None or recipe.scene is None:
+        return build_meta_model(name, overrides)
+    return build_scene_meta_model(name, recipe)
 
 
 def _verdict(doctor: Doctor, overrides: Sequence[str], best: Finding | None) -> str:

@@ -6,23 +6,24 @@ from collections.abc import Sequence
 from typing import Any
 
 from persist_cli.api.meta_device import without_weights
-from persist_cli.api.stages import ParameterGroup, Stage
+from persist_cli.api.stages import SCENE_STAGES, ParameterGroup, Stage
 from persist_cli.doctor.machine import gib
 from persist_cli.doctor.meta_model import MetaModel, build_meta_model
+from persist_cli.plugins import make_scene_model
 from persist_cli.policies.trained import make_network
-from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe
+from persist_cli.recipe import ALONE, Recipe, apply_overrides, make_recipe, read_recipe
 from persist_cli.viewing.console import print_json, print_table
 
 
 def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:
     """Print every part's parameters, how many are new and how many each stage trains; nothing is read or written."""
-    values = make_recipe(apply_overrides(read_recipe(recipe), overrides), recipe) if _is_policy(recipe) else None
-    record = dry_run(build_meta_model(recipe, overrides)) if values is None else policy_dry_run(values)
+    network = network_recipe(recipe, overrides)
+    record = dry_run(build_meta_model(recipe, overrides)) if network is None else network_dry_run(network)
     if json:
         print_json({"recipe": recipe} | record)
         return
     stages = [f"stage {stage}" if stage.isdigit() else stage for stage in record["total"]["trained"]]
-    title = f"{recipe}: stage {record['stage']} of {record.get('backbone') or record['policy']}"
+    title = f"{recipe}: stage {record['stage']} of {record.get('backbone') or record.get('policy') or record['scene']}"
     columns = ["part", "parameters", "GiB", "new", *(f"{stage} trains" for stage in stages)]
     print_table(title, columns, [_row(part) for part in [*record["parts"], record["total"]]])
 
@@ -39,18 +40,27 @@ def dry_run(meta_model: MetaModel) -> dict[str, Any]:
     }
 
 
-def policy_dry_run(recipe: Recipe) -> dict[str, Any]:
-    """The parts of a policy's network as JSON values, as those of ``dry_run``."""
-    assert recipe.policy is not None
+def network_recipe(name: str, overrides: Sequence[str]) -> Recipe | None:
+    """The recipe with KEY=VALUE changes where it trains a policy or a model of scenes, ``None`` for a backbone."""
+    values = apply_overrides(read_recipe(name), overrides)
+    if not any(values.get("stage") in stages for stages in ALONE.values()):
+        return None
+    return make_recipe(values, name)
+
+
+def network_dry_run(recipe: Recipe) -> dict[str, Any]:
+    """The parts of a policy's network or of a model of scenes as JSON values, as those of ``dry_run``."""
     with without_weights():
-        network = make_network(recipe.policy.name, recipe.policy.settings)
-    trained: dict[Stage, set[str]] = {"policy": set(network.trained_parameters())}
-    named = {"stage": recipe.stage, "policy": recipe.policy.name, "base": recipe.base}
-    return named | _parts(network.parameter_groups(), trained)
-
-
-def _is_policy(recipe: str) -> bool:
-    return str(read_recipe(recipe).get("stage")) == "policy"
+        if recipe.policy is not None:
+            network = make_network(recipe.policy.name, recipe.policy.settings)
+            trained: dict[Stage, set[str]] = {"policy": set(network.trained_parameters())}
+            named = {"stage": recipe.stage, "policy": recipe.policy.name, "base": recipe.base}
+            return named | _parts(network.parameter_groups(), trained)
+        assert recipe.scene is not None
+        model = make_scene_model(recipe.scene.name, recipe.scene.settings)
+    trained = {stage: set(model.trained_parameters(stage)) for stage in SCENE_STAGES}
+    named = {"stage": recipe.stage, "scene": recipe.scene.name, "base": recipe.base}
+    return named | _parts(model.parameter_groups(), trained)
 
 
 def _parts(groups: Sequence[ParameterGroup], trained: dict[Stage, set[str]]) -> dict[str, Any]:

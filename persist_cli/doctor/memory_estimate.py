@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Final
 
 from torch import nn
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.doctor.step import Activations, Encoding, ShallowCopies, StepKind
+from persist_cli.api.scene_model import SceneModel
+from persist_cli.doctor.step import Activations, Encoding, SceneCopies, ShallowCopies, StepCopies, StepKind
 from persist_cli.recipe import Recipe
 
 FLOAT32: Final = 4
@@ -93,16 +95,16 @@ class MemoryEstimate:
         return dataclasses.asdict(self) | {"peak": self.peak}
 
 
-class Estimator:
-    """Estimates the memory that trainings of one backbone need with different settings; each kind of step runs once.
+class Estimator(ABC):
+    """Estimates the memory that trainings of one model need with different settings; each kind of step runs once.
 
     Args:
-        backbone: a backbone on the meta device.
-        channels: the number of channels of the memory's features, ``None`` without a memory.
+        model: a model on the meta device.
+        copies: what runs its steps.
     """
 
-    def __init__(self, backbone: Backbone, channels: int | None) -> None:
-        self.backbone, self.copies = backbone, ShallowCopies(backbone, channels)
+    def __init__(self, model: Backbone | SceneModel, copies: StepCopies) -> None:
+        self.model, self.copies = model, copies
         self._encodings: dict[tuple[object, ...], Encoding] = {}
         self._steps: dict[tuple[object, ...], Activations] = {}
 
@@ -118,7 +120,7 @@ class Estimator:
     def without_step(self, recipe: Recipe, launch: Launch) -> MemoryEstimate:
         """A lower bound that is found without running a step: encoding and activations are left out."""
         training = recipe.training
-        trained = [parameter.numel() for parameter in self.backbone.trained_parameters(recipe.stage).values()]
+        trained = [parameter.numel() for parameter in self.model.trained_parameters(recipe.stage).values()]
         count, largest = sum(trained), max(trained, default=0)
         share = launch.share
         buckets = 2 if launch.devices > 1 and not launch.sharded else 1
@@ -159,12 +161,55 @@ class Estimator:
             self._steps[key] = self.copies.activations(recipe, kind, self.encoding(recipe, kind))
         return self._steps[key]
 
+    @abstractmethod
+    def weights(self, recipe: Recipe, launch: Launch) -> int:
+        """Bytes of parameters and buffers, with FSDP2 those of this process and what it gathers from others at once."""
+
+    @abstractmethod
+    def parameter_bytes(self, recipe: Recipe) -> tuple[int, int]:
+        """Bytes of the parameters that FSDP2 never shards, and of all others; frozen ones in their own precision."""
+
+    def buffer_bytes(self) -> int:
+        """Bytes of the buffers."""
+        return sum(buffer.numel() * buffer.element_size() for buffer in self.model.buffers())
+
+
+class SceneEstimator(Estimator):
+    """Estimates the memory that trainings of a model of scenes need, which is never sharded.
+
+    Args:
+        model: a model on the meta device.
+    """
+
+    def __init__(self, model: SceneModel) -> None:
+        super().__init__(model, SceneCopies(model))
+
+    def weights(self, recipe: Recipe, launch: Launch) -> int:
+        """Bytes of parameters and buffers."""
+        return self.parameter_bytes(recipe)[1] + self.buffer_bytes()
+
+    def parameter_bytes(self, recipe: Recipe) -> tuple[int, int]:
+        """Bytes of all parameters, as those that FSDP2 could shard."""
+        return 0, sum(parameter.numel() * FLOAT32 for parameter in self.model.parameters())
+
+
+class BackboneEstimator(Estimator):
+    """Estimates the memory that trainings of a backbone need.
+
+    Args:
+        backbone: a backbone on the meta device.
+        channels: the number of channels of the memory's features, ``None`` without a memory.
+    """
+
+    def __init__(self, backbone: Backbone, channels: int | None) -> None:
+        super().__init__(backbone, ShallowCopies(backbone, channels))
+        self.backbone = backbone
+
     def weights(self, recipe: Recipe, launch: Launch) -> int:
         """Bytes of parameters and buffers, with FSDP2 those of this process and what it gathers from others at once."""
         never_sharded, sharded = self.parameter_bytes(recipe)
         gathered = self.gathered(recipe) if launch.sharded else 0
-        buffers = sum(buffer.numel() * buffer.element_size() for buffer in self.backbone.buffers())
-        return never_sharded + buffers + round(sharded * launch.share) + gathered
+        return never_sharded + self.buffer_bytes() + round(sharded * launch.share) + gathered
 
     def parameter_bytes(self, recipe: Recipe) -> tuple[int, int]:
         """Bytes of the parameters that FSDP2 never shards, and of all others; frozen ones in their own precision."""

@@ -11,6 +11,8 @@ import torch
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, checkpoint_folder, find_checkpoint
+from persist_cli.api.meta_device import without_weights
+from persist_cli.api.scene_model import SceneModel
 from persist_cli.checkpoints.load import (
     add_adapter,
     named_adapter,
@@ -18,8 +20,10 @@ from persist_cli.checkpoints.load import (
     starts_from_random_codec,
     with_adapter,
 )
+from persist_cli.doctor.memory_estimate import BackboneEstimator, SceneEstimator
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.plugins import make_scene_model
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import warn
 
@@ -55,10 +59,46 @@ class MetaModel:
                 add_adapter(backbone, recipe, recipe.memory.name, channels)
         return MetaModel(name, recipe, backbone, channels, base)
 
+    def estimator(self) -> BackboneEstimator:
+        """What estimates the memory of its training."""
+        return BackboneEstimator(self.backbone, self.channels)
+
     @property
     def begins_random(self) -> bool:
         """Whether the training begins with random weights, those of the codec too."""
         return starts_from_random_codec(self.recipe, self.backbone)
+
+
+@dataclass(frozen=True)
+class SceneMetaModel:
+    """A recipe and the model of scenes that it trains, which has shapes but no weights.
+
+    Args:
+        name: the name of the recipe, or its file.
+        recipe: the resolved recipe.
+        model: the model on the meta device.
+    """
+
+    name: str
+    recipe: Recipe
+    model: SceneModel
+
+    def estimator(self) -> SceneEstimator:
+        """What estimates the memory of its training."""
+        return SceneEstimator(self.model)
+
+    @property
+    def begins_random(self) -> bool:
+        """Never: a codec is what its first stage trains."""
+        return False
+
+
+def build_scene_meta_model(name: str, recipe: Recipe) -> SceneMetaModel:
+    """The meta model of a recipe for a model of scenes; its base is not read."""
+    assert recipe.scene is not None
+    with without_weights():
+        model = make_scene_model(recipe.scene.name, recipe.scene.settings)
+    return SceneMetaModel(name, recipe, model)
 
 
 def build_meta_model(name: str, overrides: Sequence[str]) -> MetaModel:

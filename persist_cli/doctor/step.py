@@ -11,13 +11,16 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
+from torch import nn
 
 from persist_cli.api.backbone import Backbone, ClipLatents, Clips
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.scene_model import SceneForm, SceneModel, SceneSamples
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.doctor.tracing import LiveBytes, device_kernels, fake_tensors
 from persist_cli.recipe import Recipe
@@ -67,7 +70,48 @@ class Activations:
     shallow: int
 
 
-class ShallowCopies:
+class StepCopies(ABC):
+    """Runs the steps of a model on fake tensors."""
+
+    @abstractmethod
+    def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
+        """The memory that encoding takes; none where the stage encodes nothing before its step."""
+
+    @abstractmethod
+    def activations(self, recipe: Recipe, kind: StepKind, encoding: Encoding) -> Activations:
+        """The memory that forward and backward pass take."""
+
+
+class SceneCopies(StepCopies):
+    """Runs a whole model of scenes, whose few layers need no shallow copies.
+
+    Args:
+        model: a model on the meta device.
+    """
+
+    def __init__(self, model: SceneModel) -> None:
+        self.model = model
+
+    def encoding(self, recipe: Recipe, kind: StepKind) -> Encoding:
+        """None: cells are encoded in the step itself."""
+        return Encoding(0)
+
+    def activations(self, recipe: Recipe, kind: StepKind, encoding: Encoding) -> Activations:
+        """The memory that forward and backward pass take."""
+        model = copy.deepcopy(self.model)
+        with fake_tensors():
+            _fill_with_fakes(model)
+            parameters = model.trained_parameters(recipe.stage)
+            with _counted(model, parameters, kind, recipe) as live:
+                samples = _fake_samples(model.form, kind.batch)
+                with _autocast(recipe):
+                    loss = model(samples, recipe.stage)["loss"]
+                forward, live.peak = live.peak, live.now
+                loss.backward()
+                return Activations(max(forward, live.peak), live.now)
+
+
+class ShallowCopies(StepCopies):
     """Two copies of a backbone with few layers each, which run on fake tensors.
 
     Args:
@@ -118,18 +162,32 @@ class ShallowCopies:
         backbone = copy.deepcopy(model)
         settings = dataclasses.replace(recipe.training, compile=False)
         with fake_tensors():
-            # to_empty would make two fake tensors for each parameter, one of it as it is and the new one
-            backbone._apply(lambda old: torch.empty(old.shape, dtype=old.dtype, device="cpu"))  # type: ignore[no-untyped-call]
+            _fill_with_fakes(backbone)
             parameters = backbone.trained_parameters(recipe.stage)
             backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
             if kind.sharded:
                 _halve(backbone)
-            threads = None if kind.cuda else settings.threads or torch.get_num_threads()
-            live = LiveBytes([*backbone.parameters(), *backbone.buffers()], threads)
-            for parameter in parameters.values():
-                parameter.register_post_accumulate_grad_hook(live.set_aside)
-            with live, device_kernels(kind.cuda):
+            with _counted(backbone, parameters, kind, recipe) as live:
                 yield backbone, live
+
+
+def _fill_with_fakes(model: nn.Module) -> None:
+    """Put fake tensors of the CPU in the place of those of the meta device."""
+    # to_empty would make two fake tensors for each parameter, one of it as it is and the new one
+    model._apply(lambda old: torch.empty(old.shape, dtype=old.dtype, device="cpu"))
+
+
+@contextlib.contextmanager
+def _counted(
+    model: nn.Module, parameters: Mapping[str, nn.Parameter], kind: StepKind, recipe: Recipe
+) -> Iterator[LiveBytes]:
+    """Within the block the bytes of all new tensors are counted, without the parameters' gradients."""
+    threads = None if kind.cuda else recipe.training.threads or torch.get_num_threads()
+    live = LiveBytes([*model.parameters(), *model.buffers()], threads)
+    for parameter in parameters.values():
+        parameter.register_post_accumulate_grad_hook(live.set_aside)
+    with live, device_kernels(kind.cuda):
+        yield live
 
 
 def _autocast(recipe: Recipe) -> torch.autocast:
@@ -142,6 +200,18 @@ def _halve(backbone: Backbone) -> None:
     for parameter in backbone.parameters():
         if id(parameter) not in never_sharded:
             parameter.data = parameter.data.to(torch.bfloat16)
+
+
+def _fake_samples(form: SceneForm, batch: int) -> SceneSamples:
+    """Windows of a form, of which nothing is given."""
+    cells, colors = torch.zeros(batch, *form.shape, dtype=torch.uint8), torch.zeros(batch, 3, dtype=torch.uint8)
+    painted = torch.zeros(batch, *form.shape, 3, dtype=torch.uint8)
+    rgb, numbers = torch.zeros(batch, *form.image, 3, dtype=torch.uint8), torch.zeros(batch, dtype=torch.long)
+    pose, pinhole = torch.eye(4).expand(batch, 4, 4), torch.eye(3).expand(batch, 3, 3)
+    return SceneSamples(
+        cells, cells, painted, rgb, torch.zeros(batch, *form.image), pose, pinhole, numbers, numbers, colors, numbers,
+        cells, painted,
+    )  # fmt: skip
 
 
 def _fake_clips(backbone: Backbone, channels: int | None, batch: int) -> Clips:

@@ -19,20 +19,33 @@ from accelerate import Accelerator, PartialState
 from accelerate.utils import InitProcessGroupKwargs, broadcast_object_list, set_seed
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.checkpoint import PLAIN, Checkpoint, base_pointer, find_checkpoint, read_card, step_folders
+from persist_cli.api.checkpoint import (
+    PLAIN,
+    Checkpoint,
+    TrainingScenes,
+    base_pointer,
+    find_checkpoint,
+    read_card,
+    step_folders,
+)
 from persist_cli.api.policy_network import PolicyNetwork
+from persist_cli.api.scene_model import SceneModel
+from persist_cli.api.stages import SCENE_STAGES
 from persist_cli.checkpoints.load import add_adapter, start_backbone, starts_from_random_codec, with_adapter
 from persist_cli.checkpoints.relink import run_base, weights_at
 from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
+from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.plugins import make_scene_model
 from persist_cli.policies.trained import find_policy, make_network
 from persist_cli.recipe import (
     Recipe,
     apply_overrides,
     changeable_on_resume,
     make_recipe,
+    network_of,
     parse_yaml_mapping,
     read_recipe,
     recipe_names,
@@ -46,7 +59,8 @@ from persist_cli.train.distributed import (
     zero_plugin,
 )
 from persist_cli.train.policy_trainer import PolicyTrainer
-from persist_cli.train.run_folder import RunFolder
+from persist_cli.train.run_folder import AnyTrainer, RunFolder
+from persist_cli.train.scene_trainer import SceneTrainer
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
@@ -118,7 +132,7 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     before = to_plain(make_recipe(values, str(path)))  # settings that the run's version did not have get their defaults
     changeable = changeable_on_resume()
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]
-    pointer = base_pointer(read_card(steps[-1] / "model")) if recipe.policy is None else None
+    pointer = base_pointer(read_card(steps[-1] / "model")) if network_of(recipe) is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
         changed.remove("base")
     if changed:
@@ -138,7 +152,7 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
         The signal that ended the run before its last step, ``None`` when it reached that.
     """
     accelerator = make_accelerator(recipe, run)
-    with held_base(recipe.base if recipe.policy is None else None, run) as base:
+    with held_base(recipe.base if network_of(recipe) is None else None, run) as base:
         with busy("loading model and data"):
             trainer = prepare_trainer(recipe, run, base, accelerator, plan)
             folder = prepare_run(trainer, run, base, plan)
@@ -189,10 +203,12 @@ def held_base(base: str | None, run: Path) -> Iterator[Checkpoint | None]:
 
 def prepare_trainer(
     recipe: Recipe, run: Path, base: Checkpoint | None, accelerator: Accelerator, plan: FinetunePlan
-) -> Trainer | PolicyTrainer:
+) -> AnyTrainer:
     """The trainer of a recipe, which begins at its base or with fresh weights."""
     if recipe.policy is not None:
         return PolicyTrainer(recipe, prepare_policy(recipe, run, plan), accelerator)
+    if recipe.scene is not None:
+        return SceneTrainer(recipe, *prepare_scene_model(recipe, run), accelerator, plan.cache)
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
     backbone = prepare_backbone(recipe, base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
@@ -200,7 +216,7 @@ def prepare_trainer(
     return Trainer(recipe, backbone, factory, accelerator, plan.cache)
 
 
-def prepare_run(trainer: Trainer | PolicyTrainer, run: Path, base: Checkpoint | None, plan: FinetunePlan) -> RunFolder:
+def prepare_run(trainer: AnyTrainer, run: Path, base: Checkpoint | None, plan: FinetunePlan) -> RunFolder:
     """The run's folder, with its trainer in the state of the folder's newest checkpoint where there is one."""
     trainer.times.enabled = plan.profile
     load_state(run, trainer.state)
@@ -225,6 +241,26 @@ def prepare_policy(recipe: Recipe, run: Path, plan: FinetunePlan) -> PolicyNetwo
             raise RecipeError(f"base {recipe.base} is of policy {base.policy!r}, not {recipe.policy.name!r}")
         network.load(base.folder)
     return network
+
+
+def prepare_scene_model(recipe: Recipe, run: Path) -> tuple[SceneModel, TrainingScenes]:
+    """The model to train, with the weights of its base or of the run's newest checkpoint, and the scenes of these.
+
+    A stage scene begins with the codec of a base of either stage.
+
+    Raises:
+        PersistError: when the base is not there, or is another model.
+    """
+    assert recipe.scene is not None
+    model = make_scene_model(recipe.scene.name, recipe.scene.settings)
+    steps = step_folders(run)
+    if not steps and recipe.base is None:
+        return model, TrainingScenes()
+    begun = find_scene_model(steps[-1] if steps else str(recipe.base))
+    if begun.plugin != recipe.scene.name:
+        raise RecipeError(f"base {recipe.base} is a model of scenes {begun.plugin!r}, not {recipe.scene.name!r}")
+    begun.load_into(model, min(begun.stage, recipe.stage, key=SCENE_STAGES.index))
+    return model, begun.training_scenes or TrainingScenes(complete=False)
 
 
 def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
@@ -291,13 +327,18 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
     """
     if recipe.policy is not None:
         return f"persist bench plan --policy {run}"
+    data = " ".join(f"--data {folder}" for folder in recipe.data.path)
+    if recipe.stage == "scene-codec":
+        return f"persist finetune {name.removesuffix('-codec')} {data} base={run}"
+    if recipe.stage == "scene":
+        train = " ".join(f"--train {folder}" for folder in recipe.data.path)
+        return f"persist bench scene {run} --data HELD_OUT_DATA {train} --out runs/bench-scene"
     if recipe.memory is not None:
         return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN},{recipe.memory.name}"
     stage = re.fullmatch(r"(.+)-(?:codec|stage1)(.*)", name)
     following = "stage1" if recipe.stage == "codec" else "stage2-voxel"
     guesses = [f"{stage[1]}-{following}{stage[2]}", f"{stage[1]}-{following}"] if stage else []
     known = next((guess for guess in guesses if guess in recipe_names()), "RECIPE")
-    data = " ".join(f"--data {folder}" for folder in recipe.data.path)
     return f"persist finetune {known} {data} base={run}"
 
 

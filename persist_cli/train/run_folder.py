@@ -10,10 +10,12 @@ from safetensors import SafetensorError
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, step_folders
 from persist_cli.api.policy_network import PolicyNetwork
+from persist_cli.api.scene_model import SceneModel
 from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
 from persist_cli.checkpoints.load import named_adapter
 from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept_checkpoints, remove_superseded
 from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
+from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
 from persist_cli.io.sha256sums import rewrite_files
@@ -21,10 +23,14 @@ from persist_cli.policies.trained import save_policy
 from persist_cli.recipe import Recipe, to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
 from persist_cli.train.policy_trainer import PolicyTrainer
+from persist_cli.train.scene_trainer import SceneTrainer
 from persist_cli.train.state import save_state
 from persist_cli.train.trainer import Trainer
 
 CODEC_BATCHES: Final = 4  # for measuring the scale of the codec's latents at the end of its stage
+
+
+AnyTrainer = Trainer | PolicyTrainer | SceneTrainer
 
 
 def adapter_scenes(recipe: Recipe) -> TrainingScenes:
@@ -42,7 +48,7 @@ class RunFolder:
             the runs behind it may be removed later.
     """
 
-    def __init__(self, path: Path, trainer: Trainer | PolicyTrainer, base: Checkpoint | None) -> None:
+    def __init__(self, path: Path, trainer: AnyTrainer, base: Checkpoint | None) -> None:
         self.path, self.trainer, self.base = path, trainer, base
         self.saved = trainer.state.step
         self.scenes, self.recipes = trainer.scenes, dict[str, str]()
@@ -105,6 +111,11 @@ class RunFolder:
                 if main:
                     self._write_policy(network, folder)
             return
+        if isinstance(trainer, SceneTrainer):
+            with trainer.model_to_save() as model:
+                if main:
+                    self._write_scene_model(trainer, model, folder)
+            return
         with trainer.model_to_save() as backbone:
             if main:
                 self._write_model(trainer, backbone, folder, home)
@@ -114,6 +125,13 @@ class RunFolder:
         folder.mkdir()
         write_text(folder / RECIPE, to_yaml(recipe))
         save_policy(network, recipe.policy.name if recipe.policy else "", folder, self.scenes)
+
+    def _write_scene_model(self, trainer: SceneTrainer, model: SceneModel, folder: Path) -> None:
+        recipe = trainer.recipe
+        folder.mkdir()
+        model.finish_stage(recipe.stage, trainer.first_batches(CODEC_BATCHES))
+        write_text(folder / RECIPE, to_yaml(recipe))
+        save_scene_model(model, recipe.stage, folder, self.scenes)
 
     def _write_model(self, trainer: Trainer, backbone: Backbone, folder: Path, home: Path) -> None:
         recipe = trainer.recipe

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from typing import Any, Final
 
 import torch
@@ -129,12 +128,6 @@ class Trainer(TrainingLoop[Backbone]):
         keys = CacheKeys.of(recipe, backbone, self.factory, self.accelerator.device.type)
         kept = ClipCache.of(TensorCache(settings), keys, self.factory)
         return ClipEncoder(backbone, self.factory, self.accelerator, kept)
-
-    def first_batches(self, count: int) -> Iterator[Clips]:
-        """So many batches of the first samples, of which something is measured before or after training."""
-        size = self.recipe.training.batch
-        for number in range(count):
-            yield self.to_batch([self.dataset[number * size + row] for row in range(size)])
 
     def to_batch(self, samples: list[Any]) -> Clips:
         """Make a batch of samples of ``dataset``, with memory tokens in stage 2 and latents where clips come again."""

@@ -138,6 +138,12 @@ class TrainingLoop(ABC, Generic[Model]):
                 return
             yield self.to_batch(samples)
 
+    def first_batches(self, count: int) -> Iterator[Any]:
+        """So many batches of the first samples, of which something is measured before or after training."""
+        size = self.recipe.training.batch
+        for number in range(count):
+            yield self.to_batch([self.dataset[number * size + row] for row in range(size)])
+
     def steps(self) -> Iterator[dict[str, float]]:
         """Train to the last step; yields the logged values of each optimizer step."""
         batches = self.loader()

@@ -10,19 +10,28 @@ from typing import Any, Final
 
 import yaml
 
+from persist_cli.api.stages import Stage
 from persist_cli.io.setting_docs import Setting, settings_of
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import load_plugin, network_type
-from persist_cli.recipe import OF_A_BACKBONE, Recipe, make_recipe, read_recipe, recipe_comment, to_plain
+from persist_cli.recipe import (
+    ALONE,
+    DATA_OF,
+    OF_A_BACKBONE,
+    Recipe,
+    make_recipe,
+    network_of,
+    read_recipe,
+    recipe_comment,
+    to_plain,
+)
 from persist_cli.viewing.console import busy, print_json, say
 
 WIDTH: Final = 80  # columns of a comment
 
-STAGE_OF: Final = {"memory": "2", "adapter": "2", "lora": "1", "policy": "policy"}  # the only one that has the setting
+STAGES_OF: Final[dict[str, tuple[Stage, ...]]] = {"memory": ("2",), "adapter": ("2",), "lora": ("1",), **ALONE}
 
-NOT_OF_A_POLICY: Final = {"backbone", "adapter_from"}  # settings of the stages of a backbone
-
-OF_A_POLICY: Final = {"path", "mirror"}  # all that a policy's recipe says about its data
+NOT_ALONE: Final = {"backbone", "adapter_from"}  # settings of the stages of a backbone
 
 OF_THE_BASE: Final = "what is not set here is as in the checkpoint that base names, not as shown"
 
@@ -72,9 +81,10 @@ def recipe_entries(recipe: Recipe) -> list[Entry]:
         PersistError: when a plugin cannot be used, or does not have the settings that the recipe gives it.
     """
     values, of_plugins = to_plain(recipe), _plugin_settings(recipe)
-    settings = [setting for setting in settings_of(Recipe) if STAGE_OF.get(setting.name, recipe.stage) == recipe.stage]
-    if recipe.policy is not None:
-        settings = [*map(_of_a_policy, (setting for setting in settings if setting.name not in NOT_OF_A_POLICY))]
+    kind, stage = network_of(recipe), recipe.stage
+    settings = [setting for setting in settings_of(Recipe) if stage in STAGES_OF.get(setting.name, (stage,))]
+    if kind is not None:
+        settings = [_of_a_network(setting, kind) for setting in settings if setting.name not in NOT_ALONE]
     return [_entry(setting, values[setting.name], setting.name, of_plugins) for setting in settings]
 
 
@@ -97,6 +107,10 @@ def _plugin_settings(recipe: Recipe) -> dict[str, list[Setting]]:
         network = network_type(recipe.policy.name).settings_type
         parse_settings(network, recipe.policy.settings, f"the network of policy {recipe.policy.name!r}")
         return {"policy.settings": settings_of(network)}
+    if recipe.scene is not None:
+        model = load_plugin("scene model", recipe.scene.name).settings_type
+        parse_settings(model, recipe.scene.settings, f"scene model {recipe.scene.name!r}")
+        return {"scene.settings": settings_of(model)}
     config = recipe.backbone
     backbone = load_plugin("backbone", config.name)
     parse_settings(backbone.settings_type, config.settings, f"backbone {config.name!r}")
@@ -111,9 +125,9 @@ def _plugin_settings(recipe: Recipe) -> dict[str, list[Setting]]:
     return settings
 
 
-def _of_a_policy(setting: Setting) -> Setting:
-    """The setting without those inside that mean nothing to a policy."""
-    absent = {"data": {inner.name for inner in setting.inside} - OF_A_POLICY, "training": {*OF_A_BACKBONE}}
+def _of_a_network(setting: Setting, kind: str) -> Setting:
+    """The setting without those inside that mean nothing to a policy or a model of scenes."""
+    absent = {"data": {inner.name for inner in setting.inside} - {*DATA_OF[kind]}, "training": {*OF_A_BACKBONE}}
     hidden = absent.get(setting.name, set())
     return replace(setting, inside=tuple(inner for inner in setting.inside if inner.name not in hidden))
 

@@ -15,7 +15,7 @@ from persist_cli.api.backbone import ClipLatents
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
 from persist_cli.doctor.machine import GIB, Machine
-from persist_cli.doctor.memory_estimate import Estimator, Launch
+from persist_cli.doctor.memory_estimate import Launch
 from persist_cli.doctor.meta_model import build_meta_model
 from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
 from persist_cli.doctor.tracing import LiveBytes, fake_tensors
@@ -41,7 +41,7 @@ def micro_meta_model(*settings: str, recipe: str = "tiny-stage1"):
 def estimator(*settings: str):
     """An estimator that several tests share, because it runs each kind of step only once."""
     meta_model = micro_meta_model(*settings)
-    return Estimator(meta_model.backbone, meta_model.channels)
+    return meta_model.estimator()
 
 
 def estimate(*settings: str, launch: Launch = ONE_GPU):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_cli.doctor.memory_estimate import Estimator, Launch
+from persist_cli.doctor.memory_estimate import Launch
 from persist_cli.doctor.meta_model import build_meta_model
 from tests.support import resident_memory as resident
 from tests.support.measured_memory import SHORT, Run, measured_peaks, trained_bytes
@@ -52,7 +52,7 @@ def walks_of(tmp_path_factory: pytest.TempPathFactory):
 def estimate(run: Run, cuda: bool = False) -> int:
     recipe, _, settings = run
     meta_model = build_meta_model(recipe, [*SHORT, *settings])
-    return Estimator(meta_model.backbone, meta_model.channels).estimate(meta_model.recipe, Launch(1, cuda)).peak
+    return meta_model.estimator().estimate(meta_model.recipe, Launch(1, cuda)).peak
 
 
 def trained_stage1(data: str, settings: list[str]) -> Path:

@@ -50,19 +50,11 @@ def random_sample(form: SceneForm, seed: int) -> SceneSamples:
     """A window of which one view is known: what its rays pass is free, what they hit is solid."""
     classes, colors = random_window(form.shape, seed)
     draw = torch.Generator().manual_seed(seed + 1)
-    free = (classes[:, :, min(EYE, form.shape[2] - 2)] == FREE).nonzero()
-    place = free[int(torch.randint(len(free), (), generator=draw))].tolist()
-    angle = float(torch.rand((), generator=draw)) * 2 * math.pi
-    ahead, aside = (math.cos(angle), math.sin(angle), 0.0), (math.sin(angle), -math.cos(angle), 0.0)
-    pose = torch.eye(4)
-    pose[:3, :3] = torch.tensor([aside, (0.0, 0.0, -1.0), ahead]).T
-    pose[:3, 3] = torch.tensor([*map(float, place), float(min(EYE, form.shape[2] - 2))]) * form.cells.size
-    height, width = form.image
-    lens = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
-    given, depth = _see(classes, form, pose, lens)
+    pose, lens = random_camera(classes, form, draw)
+    given, depth = see(classes, form, pose, lens)
     hit = given == Given.CONTENT
     seen = torch.where(classes == FREE, FREE, SOLID) * hit
-    rgb = torch.randint(0, 256, (height, width, 3), generator=draw, dtype=torch.uint8)
+    rgb = torch.randint(0, 256, (*form.image, 3), generator=draw, dtype=torch.uint8)
     none = torch.tensor(0)
     return SceneSamples(
         given, seen.to(torch.uint8), colors * hit[..., None], rgb, depth, pose, lens, none, none,
@@ -70,7 +62,21 @@ def random_sample(form: SceneForm, seed: int) -> SceneSamples:
     )  # fmt: skip
 
 
-def _see(classes: Tensor, form: SceneForm, pose: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
+def random_camera(classes: Tensor, form: SceneForm, draw: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Pose and intrinsics of a level camera in a free cell, which looks anywhere around."""
+    level = min(EYE, form.shape[2] - 2)
+    free = (classes[:, :, level] == FREE).nonzero()
+    place = free[int(torch.randint(len(free), (), generator=draw))].tolist()
+    angle = float(torch.rand((), generator=draw)) * 2 * math.pi
+    ahead, aside = (math.cos(angle), math.sin(angle), 0.0), (math.sin(angle), -math.cos(angle), 0.0)
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.tensor([aside, (0.0, 0.0, -1.0), ahead]).T
+    pose[:3, 3] = torch.tensor([*map(float, place), float(level)]) * form.cells.size
+    height, width = form.image
+    return pose, torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
+
+
+def see(classes: Tensor, form: SceneForm, pose: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
     """Follow the rays of a view in small steps; returns what is given then, and depth."""
     height, width = form.image
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")

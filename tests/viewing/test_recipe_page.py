@@ -46,7 +46,7 @@ def test_what_is_shown_is_the_recipe_with_all_settings_and_a_comment_at_each(nam
     recipe = make_recipe(read_recipe(str(tmp_path / "mine.yaml")), "mine.yaml")
     assert recipe == make_recipe(read_recipe(name), name)
     lines = shown(name).splitlines()
-    hidden = OF_A_BACKBONE if recipe.policy else ()
+    hidden = OF_A_BACKBONE if recipe.policy or recipe.scene else ()
     for setting in (field for field in dataclasses.fields(recipe.training) if field.name not in hidden):
         number = next(number for number, line in enumerate(lines) if line.startswith(f"  {setting.name}: "))
         assert lines[number - 1].startswith("  # ")

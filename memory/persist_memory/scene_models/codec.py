@@ -44,8 +44,8 @@ class SceneCodec(nn.Module):
         )  # fmt: skip
         self.decoder = nn.Sequential(
             self._conv(codec.latent, far, 3), *self._blocks(far),
-            self._conv(far, HALF**self.axes * near, 1), Unfold(self.axes), *self._blocks(near),
-            self._conv(near, HALF**self.axes * levels * codec.cell, 1), Unfold(self.axes),
+            self._conv(far, HALF**self.axes * near, 1), Unfold(), *self._blocks(near),
+            self._conv(near, HALF**self.axes * levels * codec.cell, 1),
         )  # fmt: skip
         self.cell = nn.Sequential(nn.SiLU(), nn.Linear(codec.cell, len(settings.palette) + COLORS))
         self.register_buffer("latent_mean", torch.zeros(codec.latent))
@@ -76,7 +76,7 @@ class SceneCodec(nn.Module):
         self, latents: Float[Tensor, "batch channel *latent"]
     ) -> tuple[Float[Tensor, "batch first second level klass"], Float[Tensor, "batch first second level 3"]]:
         """Return the logits of classes and the colours (1 = 255) of latents that are not normalised."""
-        cells = self.cell(channels_last(self.decoder(latents), self.axes, self.settings.shape[2])).float()
+        cells = self.cell(unfolded_cells(self.decoder(latents), self.axes, self.settings.shape[2])).float()
         return cells[..., :-COLORS], cells[..., -COLORS:]
 
     def measure(self, latents: Sequence[Float[Tensor, "batch channel *latent"]]) -> None:
@@ -122,15 +122,7 @@ class ResidualBlock(nn.Module):
 
 
 class Unfold(nn.Module):
-    """Turns channels into twice as many places along each axis.
-
-    Args:
-        axes: 2 or 3.
-    """
-
-    def __init__(self, axes: int) -> None:
-        super().__init__()
-        self.axes = axes
+    """Turns channels into twice as many places along each axis."""
 
     def forward(self, values: Float[Tensor, "batch folded *place"]) -> Float[Tensor, "batch channel *finer"]:
         """Return the finer values."""
@@ -151,13 +143,15 @@ def channels_first(
     return cells.permute(0, 4, 1, 2, 3).contiguous()
 
 
-def channels_last(
-    values: Float[Tensor, "batch channels *place"], axes: int, levels: int
+def unfolded_cells(
+    values: Float[Tensor, "batch folded *place"], axes: int, levels: int
 ) -> Float[Tensor, "batch first second level channel"]:
-    """Undo ``channels_first``."""
+    """Return values of cells, which were folded in halves and, with two axes, by levels too; one copy of memory."""
     if axes == 2:
-        return torch.unflatten(values.permute(0, 2, 3, 1), 3, (levels, -1))
-    return values.permute(0, 2, 3, 4, 1)
+        blocks = torch.unflatten(values, 1, (levels, -1, HALF, HALF)).permute(0, 5, 3, 6, 4, 1, 2)
+        return blocks.flatten(3, 4).flatten(1, 2)
+    blocks = torch.unflatten(values, 1, (-1, HALF, HALF, HALF)).permute(0, 5, 2, 6, 3, 7, 4, 1)
+    return blocks.flatten(5, 6).flatten(3, 4).flatten(1, 2)
 
 
 def fold(values: Shaped[Tensor, "batch channel *place"], edge: int) -> Shaped[Tensor, "batch folded *coarser"]:

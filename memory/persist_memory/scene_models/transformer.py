@@ -30,14 +30,14 @@ class Attention(nn.Module):
         super().__init__()
         self.heads = heads
         self.to_q, self.to_kv = nn.Linear(width, width), nn.Linear(width, 2 * width)
-        self.norm_q, self.norm_k = nn.RMSNorm(width // heads), nn.RMSNorm(width // heads)
+        self.norm_q, self.norm_k = (nn.Parameter(torch.ones(width // heads)) for _ in range(2))
         self.to_out = nn.Linear(width, width)
 
     def forward(self, tokens: Tensor, others: Tensor, rotary: tuple[Tensor, Tensor] | None = None) -> Tensor:
         """Return what tokens read from others; rotary positions are those of both."""
         query = self.to_q(tokens).unflatten(-1, (self.heads, -1)).transpose(1, 2)
         key, value = self.to_kv(others).unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        query, key = self.norm_q(query), self.norm_k(key)
+        query, key = normalised(query, self.norm_q), normalised(key, self.norm_k)
         if rotary is not None:
             query, key = rotate(query, rotary), rotate(key, rotary)
         attended: Tensor = self.to_out(F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2))
@@ -124,6 +124,11 @@ class SceneTransformer(nn.Module):
         shift, scale = level[..., 0, :], level[..., 1, :]
         predicted = self.outputs(self.norm(tokens) * (1 + scale) + shift)
         return unfold(predicted.transpose(1, 2).unflatten(2, self.settings.tokens), patch)
+
+
+def normalised(heads: Float[Tensor, "batch head token channel"], scale: Float[Tensor, " channel"]) -> Tensor:
+    """Return channels divided by their root mean square and scaled, in their own precision."""
+    return F.rms_norm(heads, heads.shape[-1:], scale.to(heads.dtype))
 
 
 def waves_of(levels: Float[Tensor, "batch token"]) -> Float[Tensor, "batch token wave"]:

@@ -1,0 +1,41 @@
+"""Plans of memory for models of scenes, and what they count."""
+
+from __future__ import annotations
+
+import json
+
+from tests.support.micro_scenes import MICRO_SCENE
+
+MICRO = [f"scene.settings.{name}={json.dumps(value)}" for name, value in MICRO_SCENE.items()]
+
+
+def plan(persist, *arguments):
+    ended = persist("doctor", *arguments, "--json")
+    assert ended.code == 0, ended.err
+    return json.loads(ended.out)
+
+
+def test_a_dry_run_counts_the_parts_of_a_model_of_scenes_and_what_each_stage_trains(persist):
+    record = json.loads(persist("finetune", "houses-64-scene", "--dry-run", "--json").out)
+    trained = record["total"]["trained"]
+    assert (record["scene"], trained["scene-codec"] + trained["scene"]) == ("scene", record["total"]["parameters"])
+    assert [part["name"] for part in record["parts"]] == ["codec", "given", "view", "action", "transformer"]
+    assert 2 * record["total"]["parameters"] < 15_000_000  # bytes in half precision
+
+
+def test_more_samples_at_once_need_more_activations_and_no_more_weights(persist):
+    few, many = (plan(persist, "tiny-scene", *MICRO, f"training.batch={batch}") for batch in (2, 8))
+    few, many = few["strategies"][0]["need"], many["strategies"][0]["need"]
+    assert few["weights"] == many["weights"]
+    assert 3 < many["activations"] / few["activations"] < 5
+
+
+def test_the_codec_needs_moments_for_its_own_parameters_alone(persist):
+    codec, rest = (plan(persist, name, *MICRO)["strategies"][0]["need"] for name in ("tiny-scene-codec", "tiny-scene"))
+    record = json.loads(persist("finetune", "tiny-scene", *MICRO, "--dry-run", "--json").out)["total"]["trained"]
+    assert (codec["optimizer"], rest["optimizer"]) == (8 * record["scene-codec"], 8 * record["scene"])
+
+
+def test_a_model_of_scenes_is_not_sharded(persist):
+    ended = persist("doctor", "tiny-scene", "--gpus", "2", "--gpu-memory", "24", "--fsdp")
+    assert (ended.code, "a model of scenes is not sharded" in ended.err) == (1, True)

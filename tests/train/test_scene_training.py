@@ -1,0 +1,138 @@
+"""Training runs of models of scenes: two stages, of which the second stands on the first and stands alone after it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict
+
+import pytest
+
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.scene_model import SceneSamples
+from persist_cli.checkpoints.scene_models import find_scene_model
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_tensors
+from tests.support.micro_runs import equal_runs, losses, run_persist
+from tests.support.micro_scenes import MICRO_SCENE, micro_samples, scene_stage, write_scenes
+
+KEPT = ("training.checkpoint_every=2", "training.keep_checkpoints=9")
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "scenes"
+    folder.mkdir()
+    return write_scenes(folder)
+
+
+@pytest.fixture(scope="module")
+def runs(scenes, tmp_path_factory):
+    """A run of each stage."""
+    folder = tmp_path_factory.mktemp("runs")
+    run_persist(*scene_stage("tiny-scene-codec", scenes, folder / "codec", *KEPT))
+    run_persist(*scene_stage("tiny-scene", scenes, folder / "scene", f"base={folder / 'codec'}", *KEPT))
+    return folder
+
+
+def test_a_run_of_each_stage_leaves_what_it_trained_with_its_scenes(runs):
+    files = {"card": {"scene.json", "recipe.yaml", "SHA256SUMS"}, "codec": {"codec.safetensors"}}
+    models = {name: runs / name / "step-00000004/model" for name in ("codec", "scene")}
+    assert {path.name for path in models["codec"].iterdir()} == files["card"] | files["codec"]
+    both = files["card"] | files["codec"] | {"transformer.safetensors"}
+    assert {path.name for path in models["scene"].iterdir()} == both
+    found = find_scene_model(runs / "scene")
+    assert (found.plugin, found.stage, found.training_scenes.names) == ("scene", "scene", {"house-0", "house-1"})
+    assert {"cross_entropy", "color_error", "wrong_solid"} < set(json.loads(first_line(runs / "codec")))
+    assert len(losses(runs / "scene")) == 4
+
+
+def first_line(run):
+    return (run / "log.jsonl").read_text().splitlines()[0]
+
+
+def test_the_second_stage_keeps_the_codec_of_its_base_with_the_scale_of_its_latents(runs):
+    codec, kept = (
+        read_tensors(runs / name / "step-00000004/model/codec.safetensors")[0] for name in ("codec", "scene")
+    )
+    assert codec.keys() == kept.keys()
+    assert all(codec[name].equal(kept[name]) for name in codec)
+    assert (codec["codec.latent_deviation"] != 1).all()
+
+
+@pytest.mark.parametrize("name", ["codec", "scene"])
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, scenes, runs, tmp_path, name):
+    shutil.copytree(runs / name, tmp_path / "halves")
+    shutil.rmtree(tmp_path / "halves/step-00000004")
+    stage = {"codec": ["tiny-scene-codec"], "scene": ["tiny-scene"]}[name]
+    base = [] if name == "codec" else [f"base={runs / 'codec'}"]
+    ended = persist(*scene_stage(*stage, scenes, tmp_path / "halves", *base, *KEPT, "--resume"))
+    assert ended.code == 0, ended.err
+    assert equal_runs(runs / name, tmp_path / "halves")
+    for whole in (runs / name / "step-00000004/model").glob("*.safetensors"):
+        again = read_tensors(tmp_path / "halves/step-00000004/model" / whole.name)[0]
+        assert all(again[key].equal(value) for key, value in read_tensors(whole)[0].items())
+
+
+def test_a_trained_model_samples_and_a_codec_alone_says_what_is_missing(runs):
+    model = find_scene_model(runs / "scene").load()
+    samples = micro_samples(1)
+    assert isinstance(samples, SceneSamples)
+    assert model.sample(samples, 1)[0].shape == samples.given.shape
+    with pytest.raises(CheckpointError, match="the codec of a model of scenes alone"):
+        find_scene_model(runs / "codec").load()
+
+
+def test_an_exported_model_stands_alone_in_half_the_bytes(persist, runs, tmp_path):
+    ended = persist("export", str(runs / "scene"), "--out", str(tmp_path / "scene"))
+    assert ended.code == 0, ended.err
+    found = find_scene_model(tmp_path / "scene")
+    sizes = [sum(path.stat().st_size for path in folder.glob("*.safetensors"))
+             for folder in (found.folder, runs / "scene/step-00000004/model")]  # fmt: skip
+    assert sizes[0] < 0.75 * sizes[1]  # of so small a file the header is a part
+    assert asdict(found.load().settings)["palette"] == tuple(MICRO_SCENE["palette"])
+    assert persist("export", str(runs / "scene"), "--out", str(tmp_path / "again"), "--steps", "5").code == 1
+
+
+def test_what_scenes_know_may_be_kept_in_a_cache(persist, scenes, runs, tmp_path):
+    ended = persist(
+        *scene_stage("tiny-scene-codec", scenes, tmp_path / "run", *KEPT, "--cache", str(tmp_path / "kept"))
+    )
+    assert ended.code == 0, ended.err
+    assert any((tmp_path / "kept").rglob("*.safetensors"))
+    assert losses(tmp_path / "run") == losses(runs / "codec")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("base=null", "stage scene needs base: the scene-codec run it stands on"),
+        ("base=runs/nothing", "runs/nothing: no model of scenes there"),
+        ("scene.name=nothing", "unknown scene model 'nothing'"),
+        ("scene.settings.transformer.layer=2", "did you mean 'transformer.layers'"),
+        ("scene.settings.codec.latent=6", "tensors differ"),
+        ("data.own_writes=0.5", "stage scene takes no data.own_writes"),
+        ("training.compile=true", "stage scene takes no training.compile"),
+        ("stage=policy", "stage policy needs policy"),
+    ],
+)
+def test_what_means_nothing_to_a_model_of_scenes_is_refused_before_anything_is_written(
+    persist, scenes, runs, tmp_path, change, message
+):
+    ended = persist(*scene_stage("tiny-scene", scenes, tmp_path / "run", f"base={runs / 'codec'}", change))
+    assert ended.code == 1
+    assert message in ended.err
+    assert len(ended.err.strip().splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_data_without_cells_are_refused(persist, walks, tmp_path):
+    ended = persist(*scene_stage("tiny-scene-codec", walks, tmp_path / "run"))
+    assert (ended.code, "no trajectory has the cells of its scene" in ended.err) == (1, True)
+
+
+def test_a_model_of_scenes_is_no_world_model_and_no_data_set(persist, runs):
+    with pytest.raises(CheckpointError, match="a model of scenes, no world model"):
+        find_checkpoint(runs / "scene")
+    ended = persist("inspect", str(runs / "scene"))
+    assert "a trained model of scenes" in ended.out + ended.err
