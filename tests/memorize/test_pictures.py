@@ -1,0 +1,166 @@
+"""A picture with its depth becomes a scene that is completed, saved and walked in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from persist_cli.api.geometry import unproject
+from persist_cli.checkpoints.scene_models import save_scene_model
+from persist_cli.data.reference import parse_reference
+from persist_cli.memorize.memory_file import load_memory
+from tests.memorize.test_memorize import failure, memorize
+from tests.support.cell_rooms import FORM
+from tests.support.micro_scenes import micro_model
+from tests.support.rooms import Room, look
+
+PALETTE = FORM.palette
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory):
+    """A picture of the room from 1.25 m, with its depth in metres and in millimetres."""
+    folder = tmp_path_factory.mktemp("hall")
+    seen = Room(48, 64, 90.0).see(look((0.0, 1.25, 0.0), 0.0, 0.0))
+    Image.fromarray(seen.rgb).save(folder / "hall.png")
+    np.save(folder / "hall.npy", seen.depth)
+    Image.fromarray(np.round(seen.depth * 1000).astype(np.uint16)).save(folder / "depth.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """An untrained scene model."""
+    folder = tmp_path_factory.mktemp("model")
+    network = micro_model(palette=list(PALETTE), shape=[16, 16, 12])
+    network.name = "scene"
+    save_scene_model(network, "scene", folder, None)
+    return folder
+
+
+FOV = 2 * np.degrees(np.arctan(24 / 32))  # of ``hall``, from top to bottom
+
+
+def test_a_picture_becomes_a_scene_and_a_frame_to_start_from(hall, tmp_path, capsys):
+    out = tmp_path / "hall.safetensors"
+    arguments = (hall / "hall.png", "--memory", "scene", "--fov", FOV, "--out", out)
+    result = memorize(capsys, *arguments, "--depth", hall / "hall.npy")
+    frame = parse_reference(result["start"]).trajectories()[0].read()
+    seen = Room(48, 64, 90.0).see(look((0.0, 1.25, 0.0), 0.0, 0.0))
+    points = unproject(frame.observations.depth, frame.observations.cameras)[0]
+    assert np.array_equal(frame.observations.rgb[0].numpy(), seen.rgb)
+    assert abs(float(points[..., 1].min())) < 0.002  # the floor lies 1.25 m below the camera
+    assert frame.info.source["camera_height"] == 1.25
+    again = memorize(capsys, *arguments, "--depth", hall / "depth.png")
+    assert again["cells"] == result["cells"] > 300
+    assert result["imagined"] == 0
+
+
+def test_a_seed_makes_one_house_of_a_picture_and_another_seed_another(hall, model, tmp_path, capsys):
+    def house(seed):
+        out = tmp_path / f"{seed}.safetensors"
+        result = memorize(
+            capsys, hall / "hall.png", "--depth", hall / "hall.npy", "--fov", FOV, "--model", model, "--complete",
+            "--seed", seed, "--out", out,
+        )  # fmt: skip
+        scene = load_memory(out)
+        assert result["completed"] == scene.figures().imagined == result["imagined"] > 500
+        assert scene.settings.palette == PALETTE
+        return scene.cells.classes
+
+    assert not torch.equal(house(3), house(4))
+    assert torch.equal(house(3), house(3))
+
+
+def test_frames_of_data_are_completed_too_and_their_map_shows_what_is_imagined(model, tmp_path, capsys):
+    Room(32, 32).write(tmp_path / "data" / "a.parquet", np.stack([look((0.0, 1.25, 0.0), 0.0, 0.0)] * 2))
+    out = tmp_path / "house.safetensors"
+    result = memorize(capsys, f"{tmp_path}/data#0:0", "--model", model, "--complete", "--out", out)
+    assert result["memory"] == "scene"
+    assert result["imagined"] > result["observed"] > 50
+    assert out.with_suffix(".png").is_file()
+
+
+def test_a_picture_is_not_replaced_by_the_map_of_its_scene(hall, tmp_path, capsys):
+    picture = tmp_path / "room.png"
+    picture.write_bytes((hall / "hall.png").read_bytes())
+    result = memorize(
+        capsys, picture, "--memory", "scene", "--depth", hall / "hall.npy", "--out", tmp_path / "room.safetensors"
+    )
+    assert picture.read_bytes() == (hall / "hall.png").read_bytes()
+    assert result["map"].endswith("room.map.png")
+
+
+def test_a_picture_is_cropped_and_resized_as_a_model_needs(hall, tmp_path, capsys):
+    result = memorize(
+        capsys, hall / "hall.png", "--memory", "scene", "--depth", hall / "hall.npy", "--fov", FOV, "--size", 32,
+        "--out", tmp_path / "small.safetensors",
+    )  # fmt: skip
+    frame = parse_reference(result["start"]).trajectories()[0].read().observations
+    assert frame.depth.shape == (1, 32, 32)
+    points = unproject(frame.depth, frame.cameras)[0]
+    assert abs(float(points[..., 1].min())) < 0.05
+    assert float((points[..., 2] + 2.0).abs().min()) < 0.002  # the wall at z = -2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "cause"),
+    [
+        ([], "give --depth FILE"),
+        (["--depth", "none.npy"], "no such depth file"),
+        (["--depth", "hall.png"], "is no depth"),
+        (["--depth", "torn.png"], "cannot be read as depth"),
+        (["--depth", "small.npy"], "differ in size"),
+        (["--depth", "pickled.npy"], "cannot be read as depth"),
+        (["--depth", "hall.npy", "--fov", "200"], "between 10 and 150"),
+        (["--depth", "hall.npy", "--depth-model", "some"], "not both"),
+        (["--depth-model", "empty"], "no usable folder"),
+        (["--depth", "hall.npy", "--complete"], "no model that imagines"),
+        (["--depth", "hall.npy", "--model", "nowhere"], "nowhere"),
+    ],
+)
+def test_a_picture_that_cannot_become_a_scene_is_refused_in_one_line(
+    hall, tmp_path, capsys, monkeypatch, arguments, cause
+):
+    (tmp_path / "torn.png").write_bytes((hall / "depth.png").read_bytes()[:200])
+    np.save(tmp_path / "small.npy", np.ones((4, 4), np.float32))
+    np.save(tmp_path / "pickled.npy", np.array([{}]), allow_pickle=True)
+    (tmp_path / "empty").mkdir()
+    for name in ("hall.png", "hall.npy"):
+        (tmp_path / name).write_bytes((hall / name).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    assert cause in failure(capsys, "hall.png", "--memory", "scene", *arguments, "--out", "out.safetensors")
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_other_memories_are_not_completed_and_data_have_depth_of_their_own(hall, tmp_path, capsys):
+    Room(32, 32).write(tmp_path / "data" / "a.parquet", np.stack([look((0.0, 1.25, 0.0), 0.0, 0.0)]))
+    data, out = f"{tmp_path}/data", tmp_path / "out.safetensors"
+    assert "take --memory scene" in failure(capsys, data, "--memory", "voxel", "--complete", "--out", out)
+    assert "--fov: only for a picture" in failure(capsys, data, "--memory", "scene", "--fov", 60, "--out", out)
+    assert "made of one picture" in failure(capsys, hall / "hall.png", data, "--memory", "scene", "--out", out)
+
+
+def test_depth_comes_from_a_model_of_metres_and_one_without_a_unit_is_refused(hall, tmp_path, capsys):
+    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config, DPTImageProcessor
+
+    backbone = Dinov2Config(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, image_size=28, patch_size=14,
+        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False, apply_layernorm=True,
+    )  # fmt: skip
+    for kind in ("metric", "relative"):
+        config = DepthAnythingConfig(
+            backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 8, 8], fusion_hidden_size=8,
+            head_hidden_size=4, depth_estimation_type=kind, max_depth=20,
+        )  # fmt: skip
+        DepthAnythingForDepthEstimation(config).save_pretrained(tmp_path / kind)
+        DPTImageProcessor(size={"height": 28, "width": 28}).save_pretrained(tmp_path / kind)
+    picture, out = hall / "hall.png", tmp_path / "out.safetensors"
+    result = memorize(capsys, picture, "--memory", "scene", "--depth-model", tmp_path / "metric", "--out", out)
+    frame = parse_reference(result["start"]).trajectories()[0].read().observations
+    assert frame.depth.shape == (1, 48, 64)
+    assert 0 < float(frame.depth.min()) <= float(frame.depth.max()) < 20
+    refused = failure(capsys, picture, "--memory", "scene", "--depth-model", tmp_path / "relative", "--out", out)
+    assert "has no unit" in refused
