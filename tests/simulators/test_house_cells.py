@@ -66,6 +66,18 @@ def test_a_doorway_is_free_and_a_door_is_above_it(structure: CellGrid) -> None:
         assert [class_at(structure, x, height, z) for height in heights] == [FLOOR, FREE, FREE, DOOR]
 
 
+def test_one_can_walk_through_every_doorway() -> None:
+    """At least three cells beside each other are free up to the height of an agent."""
+    for house in map(build_house, range(4)):
+        grid = structure_cells(house)
+        for door in house.doors:
+            area = door.passage
+            inside = [area.contains((x, z)) for x, _, z in grid.centers()[:, :, 0].reshape(-1, 3).tolist()]
+            columns = grid.classes.reshape(-1, grid.shape[2])[torch.tensor(inside)]
+            assert len(columns) >= 3
+            assert (columns[:, 1:6] == FREE).all()
+
+
 def house_without_a_ceiling() -> House:
     houses = map(build_house, range(100))
     return next(house for house in houses if any(room.ceiling is None for room in house.rooms))
