@@ -28,6 +28,8 @@ from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
 APPROACH = 8  # actions of the ways that are compared before an agent stops
 
+KEPT = 0.5  # share of the last plan's distributions that ``cem`` begins with
+
 MANY = 1_000_000  # actions after which nothing is left of a plan
 
 DECISIONS = 100_000  # more than an episode has, so that no two decisions of all episodes share a seed
@@ -44,7 +46,7 @@ class PlanSettings:
         frames: most imagined frames of a decision; ``None`` for no bound.
         seconds: most seconds of a decision, likewise.
         body: whether imagined moves over ground known to be occupied do not move.
-        keep: whether ``rank-N`` judges what is left of its last plan again.
+        keep: whether what is left of the last plan is judged again; ``cem`` begins near its distributions, too.
         approach: whether an agent that recognises the goal goes on to the best view before it stops.
     """
 
@@ -244,7 +246,8 @@ def make_world(
 def make_planner(row: PlanningRow, policy: Policy | None, settings: PlanSettings, horizon: int) -> Planner:
     """Return the planner of a row that imagines."""
     if row.planner == "cem":
-        return Cem(CemSettings(horizon=horizon, candidates=row.candidates, rounds=settings.rounds))
+        shift = KEPT if settings.keep else 0.0
+        return Cem(CemSettings(horizon=horizon, candidates=row.candidates, rounds=settings.rounds, shift=shift), policy)
     if policy is None:
         raise ValueError(f"row {row.name!r} ranks and has no policy")
     return Rank(policy, RankSettings(horizon=horizon, candidates=row.candidates, keep=settings.keep))

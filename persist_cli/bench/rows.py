@@ -20,6 +20,8 @@ POLICY_WALK: Final = "policy-walk"  # the same, given the walk, so that it knows
 
 RETRIEVAL: Final = "shortest-path-retrieval"  # to the place of the given frame that is most like the goal image
 
+CEM_POLICY: Final = "cem-policy"  # ``cem`` whose first round the policy begins
+
 POLICIES: Final = (POLICY, POLICY_WALK)
 
 RANK = re.compile(r"rank-(?P<count>[1-9]\d*)")
@@ -92,7 +94,7 @@ class RowChoice:
     """What the rows are made of.
 
     Args:
-        names: of ``ALONE``, of ``POLICIES``, ``rank-N`` or ``cem``.
+        names: of ``ALONE``, of ``POLICIES``, ``rank-N``, ``cem`` or ``cem-policy``.
         memories: of the world model, and ``simulator``; each makes a row of every ``rank-N`` and of ``cem``.
         policy: name or folder of the policy of ``policy`` and ``rank-N``; ``None`` where none is named, which ranks
             ``random``.
@@ -114,11 +116,11 @@ class RowChoice:
         """
         names, memories = list(dict.fromkeys(self.names)), list(dict.fromkeys(self.memories))
         for name in names:
-            if name not in (*ALONE, *POLICIES, "cem") and not RANK.fullmatch(name):
-                raise PersistError(f"unknown row {name!r}; {hint(name, [*ALONE, *POLICIES, *PLANNED])}")
+            if name not in (*ALONE, *POLICIES, "cem", CEM_POLICY) and not RANK.fullmatch(name):
+                raise PersistError(f"unknown row {name!r}; {hint(name, [*ALONE, *POLICIES, *PLANNED, CEM_POLICY])}")
             if self.goal == "place" and (name == RETRIEVAL or ALONE.get(name, ("", "", False))[1] == "image"):
                 raise PersistError(f"row {name!r} is shown the goal image, and the cost reads a place; leave it out")
-        alone = next((name for name in names if name in POLICIES), None)
+        alone = next((name for name in names if name in (*POLICIES, CEM_POLICY)), None)
         if alone is not None and self.policy is None:
             raise PersistError(f"the row {alone!r} needs a policy; give --policy a name or the folder of a trained one")
         rows = [row for name in names for row in self._rows_of(name, memories)]
@@ -130,13 +132,14 @@ class RowChoice:
         if name in POLICIES:
             yield PlanningRow(name, "policy", self.policy, None, self.goal, name == POLICY_WALK)
         elif name in ALONE:
-            policy, goal, walk = ALONE[name]
-            yield PlanningRow(name, "policy", policy, None, goal or self.goal, walk, retrieves=name == RETRIEVAL)
+            alone, goal, walk = ALONE[name]
+            yield PlanningRow(name, "policy", alone, None, goal or self.goal, walk, retrieves=name == RETRIEVAL)
         else:
             ranked = RANK.fullmatch(name)
             count = int(ranked["count"]) if ranked else self.cem_candidates
+            policy = (self.policy or "random") if ranked else self.policy if name == CEM_POLICY else None
             for memory in memories:
                 yield PlanningRow(
-                    f"{name}, {memory}", "rank" if ranked else "cem", (self.policy or "random") if ranked else None,
-                    memory, self.goal, memory != NO_MEMORY, count,
+                    f"{name}, {memory}", "rank" if ranked else "cem", policy, memory, self.goal, memory != NO_MEMORY,
+                    count,
                 )  # fmt: skip

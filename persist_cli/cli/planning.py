@@ -58,7 +58,7 @@ def plan(
         str, typer.Option(help="rank: a policy proposes; cem: the best of a round lead the next.")
     ] = "cem",
     policy: Annotated[
-        str | None, typer.Option(help="Of rank: of `persist plugins`, or a trained one's folder; random.")
+        str | None, typer.Option(help="Proposes: of `persist plugins`, or a trained one's folder. rank: random.")
     ] = None,
     cost: Annotated[str | None, typer.Option(help="Of `persist plugins`; lpips, or geodesic to a place.")] = None,
     over: Annotated[str, typer.Option(help="Which frame counts: last, or the best of the clip.")] = "last",

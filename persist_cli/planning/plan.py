@@ -159,11 +159,11 @@ def plan_parts(options: PlanOptions) -> PlanParts:
 
 
 def chosen_policy(options: PlanOptions, settings: dict[str, Any]) -> Policy | None:
-    """Return the policy of a method that ranks one's proposals, ``None`` for another method."""
-    if options.method == "rank":
+    """Return the policy that proposes; ``None`` for a method that needs none, where none is named."""
+    if options.method == "rank" or options.policy is not None:
         return open_policy(options.policy or "random", settings)
-    if options.policy is not None or settings:
-        raise PersistError(f"--policy {options.policy}: --method {options.method} needs none; give --method rank")
+    if settings:
+        raise PersistError(f"--set policy.{next(iter(settings))}: no policy proposes here; name one with --policy")
     return None
 
 
@@ -175,14 +175,14 @@ def chosen_planner(options: PlanOptions, policy: Policy | None, settings: dict[s
     """
     if options.method not in METHODS:
         raise PersistError(f"unknown --method {options.method!r}; {hint(options.method, METHODS)}")
-    if options.actions and policy is not None:
+    if options.actions and options.method != "cem":
         raise PersistError("--actions are those that --method cem chooses from; a policy has its own")
     named = {"horizon": options.horizon, "candidates": options.candidates, "rounds": options.rounds}
     given = settings | {name: value for name, value in named.items() if value is not None}
     if options.actions:
         given["actions"] = list(options.actions)
-    if policy is None:
-        return Cem(parse_settings(CemSettings, given, "method 'cem'"))
+    if options.method == "cem" or policy is None:
+        return Cem(parse_settings(CemSettings, given, "method 'cem'"), policy)
     return Rank(policy, parse_settings(RankSettings, given, "method 'rank'"))
 
 

@@ -103,11 +103,7 @@ class Rank:
     settings_type = RankSettings
 
     def __init__(self, policy: Policy, settings: RankSettings) -> None:
-        if policy.longest is not None and settings.horizon > policy.longest:
-            raise PersistError(
-                f"policy {policy.name!r} looks at most {policy.longest} actions ahead, not {settings.horizon}; give "
-                f"--horizon {policy.longest}"
-            )
+        check_horizon(policy, settings.horizon)
         self.policy, self.settings = policy, settings
         self._last: tuple[str, ...] = ()  # what is left of the last plan
 
@@ -129,6 +125,15 @@ class Rank:
         self._last = self._last[count:]
 
 
+def check_horizon(policy: Policy | None, horizon: int) -> None:
+    """Raise ``PersistError`` when a policy does not look as far ahead as a horizon."""
+    if policy is not None and policy.longest is not None and horizon > policy.longest:
+        raise PersistError(
+            f"policy {policy.name!r} looks at most {policy.longest} actions ahead, not {horizon}; give "
+            f"--horizon {policy.longest}"
+        )
+
+
 @dataclass(frozen=True)
 class CemSettings:
     """The cross-entropy method over discrete actions (PEWM, section 4.3), with options of iCEM (Pinneri et al. 2020).
@@ -142,6 +147,7 @@ class CemSettings:
         kept: share of the elites that the next round judges again beside its own, as in iCEM; 0 for none.
         shift: share of the last plan's distributions, shifted by what was executed, in those that the next plan begins
             with, and whether its best candidate is among the first; 0 begins uniform each time.
+        proposed: share of the first round's candidates that the policy proposes, where there is one.
         actions: names of the actions to choose from; by default those that walk ahead or turn.
     """
 
@@ -152,12 +158,13 @@ class CemSettings:
     smoothing: float = 0.2
     kept: float = 0.0
     shift: float = 0.0
+    proposed: float = 0.5
     actions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name, value, low in (
             ("elites", self.elites, 1e-9), ("smoothing", self.smoothing, 0.0), ("kept", self.kept, 0.0),
-            ("shift", self.shift, 0.0),
+            ("shift", self.shift, 0.0), ("proposed", self.proposed, 0.0),
         ):  # fmt: skip
             if not low <= value <= 1:
                 place = "above 0 and at most at 1" if low else "between 0 and 1"
@@ -172,11 +179,20 @@ class Cem:
 
     Args:
         settings: of the method.
+        policy: proposes a part of the first round; ``None`` to draw all of it. Random actions hardly ever lead to a
+            hidden goal, so that without proposals there is nothing to follow.
+
+    Raises:
+        PersistError: when the policy does not look as far ahead as the horizon.
     """
 
     settings: CemSettings
+    policy: Policy | None = None
     settings_type = CemSettings
     _last: tuple[Float[Tensor, "action name"], tuple[str, ...]] | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        check_horizon(self.policy, self.settings.horizon)
 
     def plan(self, situation: Situation, judge: Judge, generator: torch.Generator, on_round: OnRound = nothing) -> Plan:
         """Return all judged candidates; see ``Planner``.
@@ -186,6 +202,7 @@ class Cem:
         """
         settings, names = self.settings, action_names(situation.info.vocabulary, self.settings.actions)
         probabilities, kept, number = *self._begin(names), 0
+        kept = [*kept, *self._proposals(situation, names, generator)][: settings.candidates]
         while number < settings.rounds and not judge.exhausted:
             number += 1
             drawn = draw(probabilities, names, settings.candidates - len(kept), generator)
@@ -198,7 +215,7 @@ class Cem:
             ranked = sorted([*kept, *drawn], key=lambda one: costs[one])
             elites = ranked[: max(1, round(settings.elites * len(ranked)))]
             share = settings.smoothing
-            probabilities = share * probabilities + (1 - share) * frequencies(elites, names)
+            probabilities = share * probabilities + (1 - share) * frequencies(elites, names, probabilities)
             kept = list(dict.fromkeys(elites))[: round(settings.kept * len(elites))]
         plan = finished(judge, number)
         self._last = probabilities, plan.best.actions
@@ -211,6 +228,16 @@ class Cem:
             uniform = torch.full_like(probabilities, 1 / probabilities.shape[1])
             shifted = torch.cat([probabilities[count:], uniform[:count]])[: len(probabilities)]
             self._last = shifted, (best + best[-1:] * count)[count : count + len(best)]
+
+    def _proposals(
+        self, situation: Situation, names: Sequence[str], generator: torch.Generator
+    ) -> list[tuple[str, ...]]:
+        """Return the policy's share of the first round: its proposals of these actions."""
+        count = round(self.settings.proposed * self.settings.candidates)
+        if self.policy is None or not count:
+            return []
+        proposals = self.policy.propose(situation, self.settings.horizon, count, generator)
+        return [proposal for proposal in proposals if set(proposal) <= set(names)]
 
     def _begin(self, names: Sequence[str]) -> tuple[Float[Tensor, "action name"], list[tuple[str, ...]]]:
         """Return the distributions of the first round, and candidates to judge beside those that are drawn."""
@@ -244,10 +271,22 @@ def draw(
     return [tuple(names[number] for number in row) for row in numbers.tolist()]
 
 
-def frequencies(sequences: Sequence[Sequence[str]], names: Sequence[str]) -> Float[Tensor, "action name"]:
-    """Return how often each action has each name, as shares."""
-    numbers = torch.tensor([[names.index(name) for name in sequence] for sequence in sequences])
-    return torch.nn.functional.one_hot(numbers, len(names)).double().mean(0)
+def frequencies(
+    sequences: Sequence[Sequence[str]], names: Sequence[str], otherwise: Float[Tensor, "action name"]
+) -> Float[Tensor, "action name"]:
+    """Return how often each action has each name, as shares.
+
+    Args:
+        sequences: some may be shorter than others.
+        names: of the actions.
+        otherwise: shares of the actions that no sequence is long enough for.
+    """
+    counts = torch.zeros_like(otherwise)
+    for sequence in sequences:
+        for place, name in enumerate(sequence):
+            counts[place, names.index(name)] += 1
+    total = counts.sum(1, keepdim=True)
+    return torch.where(total > 0, counts / total.clamp_min(1), otherwise)
 
 
 def least(judge: Judge) -> float:

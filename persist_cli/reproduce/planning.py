@@ -81,7 +81,7 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
     if not (figures.out / "collisions.json").is_file():
         yield f"bench collisions {model} {SAMPLING} --memories voxel,none --out {home}/collisions.json"
     closed = f"{plan} --loops closed"
-    yield f"{closed} --bins 16 --rows cem --memories {MEMORIES} {_to(home, 'cem')}"
+    yield f"{closed} --bins 16 --rows cem,cem-policy --memories {MEMORIES} {_to(home, 'cem')}"
     yield f"{closed} {LOOP} --rows rank-16 --memories {MEMORIES} --cost dino {_to(home, 'dino')}"
     yield f"{closed} {LOOP} --rows rank-16 --memories {MEMORIES} --cost geodesic {_to(home, 'geodesic')}"
 

@@ -44,6 +44,11 @@ def test_the_policy_alone_can_be_given_the_walk_too() -> None:
         choice("policy-walk").rows()
 
 
+def test_the_cross_entropy_method_can_begin_with_a_policy() -> None:
+    alone, led = choice("cem", "cem-policy", memories=("none",), policy="straight").rows()
+    assert (alone.policy, led.policy, led.planner, led.candidates) == (None, "straight", "cem", 60)
+
+
 def test_a_named_policy_proposes_what_is_ranked_and_has_a_row() -> None:
     alone, ranked = choice("policy", "rank-8", memories=("none",), policy="straight").rows()
     assert (alone.policy, ranked.policy) == ("straight", "straight")

@@ -117,7 +117,7 @@ PLACE = ("--cost", "distance")
         ((*PLACE, "--frames", 2), "a budget of 2 frames does not suffice for one candidate of 3 actions"),
         ((*PLACE, "--seconds", 0), "a budget of 0 seconds imagines nothing"),
         ((*PLACE, "--actions", "forward,jump"), "unknown action 'jump'"),
-        ((*PLACE, "--policy", "random"), "--policy random: --method cem needs none; give --method rank"),
+        ((*PLACE, "--set", "policy.weights={left: 1}"), "policy.weights: no policy proposes here; name one"),
         ((*PLACE, "--set", "method.elites=2"), "elites 2 is a share"),
         ((*PLACE, "--set", "elites=2"), "write method.KEY=VALUE or policy.KEY=VALUE or cost.KEY=VALUE"),
         ((*PLACE, "--method", "rank", "--actions", "left"), "--actions are those that --method cem chooses from"),

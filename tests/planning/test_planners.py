@@ -99,9 +99,19 @@ def test_later_rounds_draw_what_the_elites_did(judge, situation):
     assert plan.frames < 5 * 60 * 4  # as the distributions narrow, sequences come again
 
 
+def test_a_policy_proposes_half_of_the_first_round(judge, situation):
+    settings = CemSettings(horizon=4, candidates=8, rounds=1)
+    plan = Cem(settings, make_policy("straight", {})).plan(situation, judge(), seeded())
+    assert plan.candidates[0].actions == AHEAD
+    assert plan.best.cost == pytest.approx(0.0, abs=1e-6)
+    alone = Cem(settings).plan(situation, judge(), seeded())
+    assert AHEAD not in [candidate.actions for candidate in alone.candidates]
+
+
 def test_frequencies_are_shares_of_each_place():
-    shares = frequencies([("a", "b"), ("a", "a"), ("b", "a"), ("a", "a")], ["a", "b"])
-    assert shares.tolist() == [[0.75, 0.25], [0.75, 0.25]]
+    before = torch.full((3, 2), 0.5, dtype=torch.float64)
+    shares = frequencies([("a", "b"), ("a", "a"), ("b", "a"), ("a",)], ["a", "b"], before)
+    assert shares.tolist() == [[0.75, 0.25], [pytest.approx(2 / 3), pytest.approx(1 / 3)], [0.5, 0.5]]
 
 
 def test_a_shifted_plan_goes_on_where_the_last_one_was_left(judge, situation):
