@@ -416,7 +416,7 @@ def doctor(
 
 @app.command()
 def plugins(json: JsonOption = False) -> None:
-    """List every plugin: backbones, memories, encoders, simulators, importers, policies, costs."""
+    """List every plugin: backbones, memories, encoders, simulators, importers, policies, costs, scene models."""
     from persist_cli.viewing.listings import show_plugins
 
     show_plugins(json)
