@@ -17,6 +17,7 @@ from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder
 from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
+from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
 from tests.support.micro_runs import MICRO_SETTINGS, SIZE, losses, run_persist, stage
 from tests.support.room_views import empty_memory, room_walk, same_bits
@@ -73,6 +74,21 @@ def test_a_map_of_means_is_that_of_the_cpu_but_for_the_order_of_sums():
     mine, others = here.tensors(), there.tensors()
     assert torch.equal(mine["counts"], others["counts"].cpu())
     assert torch.allclose(mine["features"], others["features"].cpu(), rtol=1e-4, atol=1e-3)
+
+
+def test_a_scene_lies_where_its_frames_do_and_is_that_of_the_cpu():
+    frames, here, there = room_walk(4), empty_scene(DrawnWalls()), empty_scene(DrawnWalls())
+    for scene, device in ((here, "cpu"), (there, DEVICE)):
+        scene.write(frames[:3].to(device))
+        scene.foresee([frames.cameras])
+        scene.merge(scene.copy())
+        scene.write(frames[3:].to(device))
+        scene.complete(seed=2)
+    assert everywhere(there.tensors().values())
+    tokens = (one.read(frames.cameras, 1000).tensors() for one in (here, there))
+    pairs = [*zip(here.tensors().values(), there.tensors().values(), strict=True)]
+    pairs += zip(*(one.values() for one in tokens), strict=True)
+    assert all(close(one, other) for one, other in pairs)
 
 
 def test_a_full_album_drops_the_same_snapshots_as_on_the_cpu():

@@ -37,6 +37,13 @@ class Surfaces:
         """Where there is a surface."""
         return self.cells >= 0
 
+    def known(self, grid: CellGrid) -> Bool[Tensor, "layer frame height width"]:
+        """Where there is a surface of a known cell; a ray sees nothing from an unknown one on, if it met one."""
+        if not grid.known.numel():
+            return self.hit
+        unknown = self.hit & ~grid.known.flatten()[self.cells.clamp(min=0)]
+        return self.hit & (unknown.cumsum(0) == 0)
+
     def classes(self, grid: CellGrid) -> UInt8[Tensor, "layer frame height width"]:
         """Return the class of each surface's cell, 0 (free) where there is none."""
         return grid.classes.flatten()[self.cells.clamp(min=0)] * self.hit

@@ -146,6 +146,11 @@ class CellGrid:
         """Return classes, colours and origins."""
         return self.classes, self.colors, self.origins
 
+    def to(self, device: torch.device | str) -> CellGrid:
+        """Return these cells on ``device``."""
+        classes, colors, origins = (tensor.to(device) for tensor in self.tensors())
+        return replace(self, classes=classes, colors=colors, origins=origins, axes=self.axes.to(device))
+
     def copy(self) -> CellGrid:
         """Return the same cells in tensors of their own."""
         classes, colors, origins = (tensor.clone() for tensor in self.tensors())

@@ -57,6 +57,11 @@ class CellStore:
         return CellGrid(classes, colors, origins, self.corner, self.form, self.axes)
 
     @property
+    def device(self) -> torch.device:
+        """The device that holds the cells."""
+        return self.columns["classes"].device
+
+    @property
     def shape(self) -> tuple[int, int, int]:
         """The number of cells along each axis."""
         return self.box.shape
@@ -145,14 +150,14 @@ class CellStore:
         columns["colors"][at] = torch.where(solid[:, None], mean, 0).to(torch.uint8)
         columns[ORIGINS][at] = int(CellOrigin.OBSERVED)
 
-    def put(self, cells: CellGrid) -> Bool[Tensor, "first second level"]:
-        """Take over the known cells of a grid whose origin is not below that of the cell there, and return which.
+    def put(self, cells: CellGrid) -> None:
+        """Take over the known cells of a grid whose origin is not below that of the cell there.
 
         What is given as observed counts as ``GIVEN`` frames that saw it, all else has no votes.
         """
-        changed = torch.zeros_like(cells.known)
         if not bool(cells.known.any()):
-            return changed
+            return
+        cells = cells.to(self.device)
         self.reach(cells.corner, [a + b for a, b in zip(cells.corner, cells.shape, strict=True)])
         part = self._part(cells)
         changed = cells.known & (cells.origins >= self.columns[ORIGINS][part])
@@ -163,12 +168,12 @@ class CellStore:
         self.columns["passes"][part][changed] = (GIVEN * (observed & ~solid)[changed]).int()
         colors = torch.cat([cells.colors.long(), torch.ones_like(cells.colors[..., :1]).long()], dim=-1)
         self.columns["sums"][part][changed] = (GIVEN * colors * (observed & solid)[..., None])[changed]
-        return changed
 
     def replace(self, cells: CellGrid, changed: Bool[Tensor, "first second level"]) -> None:
         """Overwrite chosen cells of a grid, whatever they were before; they have no votes then."""
         if not bool(changed.any()):
             return
+        cells, changed = cells.to(self.device), changed.to(self.device)
         self.reach(cells.corner, [a + b for a, b in zip(cells.corner, cells.shape, strict=True)])
         part = self._part(cells)
         for name, values in zip(CONTENT, cells.tensors(), strict=True):
@@ -179,16 +184,17 @@ class CellStore:
 
     def name(self, cells: CellGrid, chosen: Bool[Tensor, "first second level"]) -> None:
         """Give chosen cells of a grid, which lie in the box, their classes there; votes, colours and origins stay."""
-        self.columns["classes"][self._part(cells)][chosen] = cells.classes[chosen]
+        chosen = chosen.to(self.device)
+        self.columns["classes"][self._part(cells)][chosen] = cells.classes.to(self.device)[chosen]
 
     def merge(self, other: CellStore) -> None:
         """Add what another store knows: observed cells as if its frames had been written here.
 
         Of other cells the one of higher origin stays, and of equal ones the own.
         """
-        theirs = other.box
-        if not bool(theirs.known.any()):
+        if not bool(other.box.known.any()):
             return
+        theirs = other.box.to(self.device)
         self.reach(other.corner, [a + b for a, b in zip(other.corner, other.shape, strict=True)])
         part = self._part(theirs)
         mine = self.columns[ORIGINS][part]
@@ -197,11 +203,11 @@ class CellStore:
         named = both & (self.columns["classes"][part] <= SOLID) & (theirs.classes > OUTSIDE)
         for name in CONTENT:
             taken = higher | named if name == "classes" else higher
-            self.columns[name][part][taken] = other.columns[name][taken]
+            self.columns[name][part][taken] = other.columns[name].to(self.device)[taken]
         for name in set(COLUMNS) - set(CONTENT):
-            values = self.columns[name][part]
-            values[higher] = other.columns[name][higher]
-            values[both] += other.columns[name][both]
+            values, added = self.columns[name][part], other.columns[name].to(self.device)
+            values[higher] = added[higher]
+            values[both] += added[both]
         self._decide(both.nonzero() + both.nonzero().new_tensor(other.corner))
 
     def tensors(self) -> dict[str, Tensor]:

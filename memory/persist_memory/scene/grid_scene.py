@@ -200,7 +200,7 @@ class GridScene(Scene):
 
     def read_batch(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
         """Return for each camera path what ``read`` gives it; each distinct camera casts its rays once."""
-        paths = [path.to(self._store.box.classes.device) for path in cameras]
+        paths = [path.to(self._store.device) for path in cameras]
         strides = {self._stride(path, budget) for path in paths}
         if not same_size(paths) or len(strides) > 1:
             return [self.read_batch([path], budget)[0] for path in paths]
@@ -211,10 +211,10 @@ class GridScene(Scene):
         opaque = grid.solid if self.settings.unknown == "clear" else grid.solid | ~grid.known
         surfaces = first_surfaces(grid, views, self.settings.layers, opaque, sheet_cells(grid, self.floor))
         rays = torch.einsum("fij,fhwj->fhwi", views.world_from_camera.double()[:, :3, :3], camera_rays(views))
-        tokens = []
+        tokens, seen = [], surfaces.known(grid)
         for group in groups:
             depth, cells = surfaces.depth[:, group], surfaces.cells[:, group]
-            layer, frame, row, column = _seen(grid, cells).nonzero()[:budget].unbind(1)
+            layer, frame, row, column = seen[:, group].nonzero()[:budget].unbind(1)
             camera = group[frame]
             along = depth[layer, frame, row, column][:, None]
             positions = views.centers[camera].double() + along * rays[camera, row, column]
@@ -240,8 +240,8 @@ class GridScene(Scene):
             assert region is not None
             middle = torch.tensor([region.low, region.high], dtype=torch.float64).mean(0)
         else:
-            middle = self._view.camera.centers.cpu()
-        center = self._store.box.numbers(middle.to(self._store.box.classes.device)).tolist()
+            middle = self._view.camera.centers
+        center = self._number_at(middle)
         if region is None:
             return self._imagine(imagination, imagination.around(center), seed)
         picks = torch.tensor([region.low, region.high], dtype=torch.float64)
@@ -365,6 +365,11 @@ class GridScene(Scene):
             replace(empty, **{name: getattr(empty, name).to(device) for name in ("classes", "colors", "origins")})
         )
 
+    def _number_at(self, position: Float[Tensor, " 3"]) -> list[int]:
+        """The number of the cell at a place in world metres."""
+        numbers: list[int] = (self._axes @ position.cpu().double() / self.settings.size).round().long().tolist()
+        return numbers
+
     def _stride(self, path: Cameras, budget: int) -> int:
         """The pixels from ray to ray with which the first surfaces of a path fit into a budget."""
         stride = self.settings.stride
@@ -408,7 +413,7 @@ class GridScene(Scene):
         imagination = self._imagination()
         for number in range(len(path)):
             camera = path[number : number + 1]
-            corner = imagination.around(self._store.box.numbers(camera.centers[0].to(self._axes.device)).tolist())
+            corner = imagination.around(self._number_at(camera.centers[0]))
             window = self._store.box.box(corner, imagination.model.form.shape)
             if sees_unknown(window, camera, self.settings.foresight, self.floor):
                 self._imagine(imagination, corner, self.settings.seed)
@@ -416,7 +421,7 @@ class GridScene(Scene):
     def _act_by_model(self, action: Action, pose: Float[Tensor, "4 4"]) -> bool:
         """Let the scene model say what becomes of the cells in reach; false when it changes nothing."""
         imagination = self._imagination()
-        center = self._store.box.numbers(pose[:3, 3].to(self._store.box.classes.device)).tolist()
+        center = self._number_at(pose[:3, 3])
         before = self._store.box.box(imagination.around(center), imagination.model.form.shape)
         after = evolved(imagination, before, action.name, pose, self.settings.seed)
         if after is None:
@@ -438,11 +443,3 @@ class GridScene(Scene):
         """Take over the known cells of a grid where nothing is known."""
         unknown = cells.known & ~self._store.box.box(cells.corner, cells.shape).known.to(cells.classes.device)
         self._store.replace(cells, unknown)
-
-
-def _seen(grid: CellGrid, cells: Tensor) -> Bool[Tensor, "layer frame row column"]:
-    """Which surfaces are known: a ray that ends at an unknown cell sees nothing from there on."""
-    hit = cells >= 0
-    known = grid.known.flatten()[cells.clamp_min(0)] if grid.known.numel() else torch.zeros_like(hit)
-    ended = (hit & ~known).cumsum(0) > 0
-    return hit & ~ended
