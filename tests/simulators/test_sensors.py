@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from persist_cli.simulators.sensors import Look, in_shadow, kinect_depth
+import numpy as np
+import torch
+
+from persist_cli.api.cells import CellForm, CellGrid
+from persist_cli.simulators.sensors import Look, in_shadow, kinect_depth, sensed
+from tests.support.noise import make_frames
 
 INTRINSICS = np.array([[58.0, 0.0, 32.0], [0.0, 58.0, 32.0], [0.0, 0.0, 1.0]])
 
@@ -52,3 +57,13 @@ def test_light_and_tint_change_every_frame_of_a_scene_alike() -> None:
 def test_without_light_and_tint_no_pixel_changes() -> None:
     image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     assert np.array_equal(Look.draw(1.0, 0.0, np.random.default_rng(1)).apply(image), image)
+
+
+def test_the_cells_of_a_scene_have_the_colours_of_its_frames() -> None:
+    grid = CellGrid.empty(CellForm(), (0.0, 1.0, 0.0)).box((0, 0, 0), (2, 1, 1))
+    grid.colors[:] = 100
+    frame = replace(make_frames(1)[0], cells=grid)
+    dark = sensed(frame, Look(0.5, (1.0, 0.9, 1.1)), "exact", INTRINSICS, np.random.default_rng(0))
+    assert dark.cells is not None
+    assert dark.cells.colors.reshape(-1, 3).tolist() == [[50, 45, 55]] * 2
+    assert torch.equal(grid.colors, torch.full_like(grid.colors, 100))
