@@ -134,6 +134,20 @@ def test_a_model_can_say_what_becomes_of_things():
         do(furnished(evolution="model"), "pick_up")
 
 
+def test_a_model_that_blurs_colours_and_names_classes_changes_nothing_else():
+    class Blurring(DrawnWalls):
+        def sample(self, samples, steps):
+            classes, colors = super().sample(samples, steps)
+            return torch.where(classes == SOLID, WALL, classes), (colors // 8 * 8).to(torch.uint8)
+
+    scene, grid = furnished(Blurring(), evolution="model"), cell_room()
+    grid.classes[grid.classes == WALL] = SOLID
+    scene.add(grid)
+    assert do(scene, "pick_up")
+    origins = scene.cells.box(grid.corner, grid.shape).origins
+    assert int((origins == CellOrigin.IMAGINED).sum()) == 1
+
+
 def test_what_was_picked_up_is_not_seen_any_more():
     scene = furnished()
     camera = camera_at(cell_room(), (5, 4, 5), (9, 4, 1))

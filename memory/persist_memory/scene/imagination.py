@@ -24,6 +24,7 @@ from persist_memory.validation import Shape, part_of
 
 Corner = tuple[int, int, int]
 FORESEEN_STRIDE = 4  # pixels from ray to ray that look for unknown cells
+REPAINTED = 48  # of 255, by which a channel must differ after an interaction: models do not keep colours to the bit
 SEEDS = 2**62  # seeds of windows are smaller
 MIXERS = (6364136223846793005, 3202034522624059733, 7046029254386353087, 1442695040888963407)
 
@@ -282,10 +283,14 @@ def evolved(
     given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING))
     given = torch.where(reach, int(Given.PAST), given).to(torch.uint8)
     classes, colors = imagination.sample(window, given, 1 + known.index(action), seed)
-    differs = reach & ((classes != window.classes) | ((colors != window.colors).any(-1) & window.solid))
+    after = replace(window, classes=classes, colors=colors)
+    repainted = (colors.int() - window.colors.int()).abs().amax(-1) > REPAINTED
+    other = (classes != window.classes) & (window.classes != SOLID)  # else it is only told what it is
+    differs = reach & ((after.solid != window.solid) | (window.solid & (other | repainted)))
     if not bool(differs.any()):
         return None
     after = window.copy()
-    after.classes[differs], after.colors[differs] = classes[differs], colors[differs]
+    after.classes[differs] = classes[differs]
+    after.colors[differs] = colors[differs] * after.solid[differs][:, None]
     after.origins[differs] = CellOrigin.IMAGINED
     return after
