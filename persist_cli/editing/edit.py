@@ -188,8 +188,8 @@ def write_outputs(
 def summary(report: Mapping[str, Any], files: Mapping[str, str]) -> str:
     """Return what became of the edits, for people."""
     filled = "a model" if report["filled_by"] == "model" else "their surroundings"
-    uncovered = report["uncovered"]
-    lines = [f"{len(report['edits'])} edits changed {report['changed']:,} cells of {report['scene']}"]
+    uncovered, count = report["uncovered"], len(report["edits"])
+    lines = [f"{count} edit{'s' * (count > 1)} changed {report['changed']:,} cells of {report['scene']}"]
     if uncovered:
         lines.append(f"{uncovered:,} of these were never seen before; {filled} say what they hold")
     lines += [

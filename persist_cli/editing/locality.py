@@ -63,8 +63,9 @@ def flat_cells(grid: CellGrid) -> Bool[Tensor, "first second level"]:
 
 
 def changed_cells(before: CellGrid, after: CellGrid) -> Bool[Tensor, "first second level"]:
-    """Return which cells of two grids of one box look different: what is solid, its class or its colour."""
+    """Return which cells of two grids of one box look different: what is solid, its class, colour or shape."""
     content = (before.classes != after.classes) | (before.colors != after.colors).any(dim=-1)
+    content |= flat_cells(before) != flat_cells(after)
     return (before.solid != after.solid) | (before.solid & after.solid & content)
 
 

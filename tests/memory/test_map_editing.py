@@ -48,6 +48,17 @@ def test_paint_shows_in_points_and_tokens_and_lasts_when_the_place_is_seen_again
     assert int(tokens.origins.max()) == Origin.OBSERVED
 
 
+@pytest.mark.parametrize("pooling", ["max", "mean"])
+def test_painted_cells_have_the_features_of_a_picture_of_that_colour(pooling):
+    room = written_memory("voxel", room_walk(4), cell=FINE, pooling=pooling)
+    room.edit([Paint(**BOX, color=(1, 2, 3))])
+    tensors = room.tensors()
+    painted = tensors["origins"] == CellOrigin.EDITED
+    picture = torch.tensor([1, 2, 3], dtype=torch.uint8).expand(1, 48, 64, 3)
+    expected = room.encoder.encode(picture)[0, 0, 0]
+    torch.testing.assert_close(tensors["features"][painted], expected.expand(int(painted.sum()), -1))
+
+
 def test_moved_cells_take_features_and_colours_along_and_a_way_back_restores_them(room):
     before = room.tensors()
     room.edit([Move(**BOX, by=(0.0, 20.0, 0.0))])

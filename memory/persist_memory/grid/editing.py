@@ -1,7 +1,7 @@
 """Edits of a map of pooled features by hand: its cells are removed, painted, moved and copied.
 
 Such a map knows no classes and no free space. Where a cell is removed nothing is known any more, so that a model
-imagines something there or a new observation fills it; a painted cell keeps the features of what was seen.
+imagines something there or a new observation fills it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from persist_cli.api.cells import CellOrigin
+from persist_cli.api.encoder import Encoder
 from persist_cli.api.scene_edits import Copy, Edit, EditOutcome, Insert, Move, Paint, Remove
 from persist_cli.errors import DataError
 from persist_memory.grid.pooling import Lattice
@@ -22,21 +23,25 @@ from persist_memory.validation import ORIGINS
 
 Boxed = Remove | Paint | Move | Copy
 
+PICTURE = 64  # pixels of the side of a picture of one colour, whose features painted cells get
+
 BORDER = 1e-6  # metres by which a box is grown, so that rounding leaves no cell of it out
 CELLS = "cells"  # the tensor with the coordinates of each cell
 
 
 @dataclass(frozen=True)
-class MapPlace:
-    """Where the cells of a map lie in the world.
+class MapForm:
+    """Where the cells of a map lie in the world, and what makes their features.
 
     Args:
-        lattice: their size and axes.
+        lattice: size and axes of the cells.
         world_up: unit vector that points up in the world.
+        encoder: the map's encoder.
     """
 
     lattice: Lattice
     world_up: tuple[float, float, float]
+    encoder: Encoder
 
     @property
     def height_axis(self) -> int:
@@ -45,13 +50,13 @@ class MapPlace:
 
 
 def edit_cells(
-    tensors: Mapping[str, Tensor], place: MapPlace, edits: Sequence[Edit]
+    tensors: Mapping[str, Tensor], form: MapForm, edits: Sequence[Edit]
 ) -> tuple[dict[str, Tensor], EditOutcome]:
     """Return the tensors of a map after some edits, and how many cells they changed.
 
     Args:
         tensors: as ``GridMemory.tensors`` gives them; they stay as they are.
-        place: where the cells lie.
+        form: where the cells lie, and what makes their features.
         edits: done one after the other.
 
     Raises:
@@ -60,38 +65,36 @@ def edit_cells(
     edited, changed = dict(tensors), 0
     for number, edit in enumerate(edits, 1):
         try:
-            edited, count = _apply(edited, place, edit)
+            edited, count = _apply(edited, form, edit)
         except DataError as error:
             raise DataError(f"edit {number} ({edit.edit}): {error}") from error
         changed += count
     return edited, EditOutcome(changed)
 
 
-def _apply(tensors: dict[str, Tensor], place: MapPlace, edit: Edit) -> tuple[dict[str, Tensor], int]:
+def _apply(tensors: dict[str, Tensor], form: MapForm, edit: Edit) -> tuple[dict[str, Tensor], int]:
     """Return the tensors after an edit, and how many cells it removed, changed or added."""
     if isinstance(edit, Insert):
         raise DataError(
             "a map stores features of images, and a thing that was never seen has none; scenes take what is inserted"
         )
-    inside = _in_box(tensors, place, edit)
+    inside = _in_box(tensors, form, edit)
     count = int(inside.sum())
     if isinstance(edit, Paint):
-        return _painted(tensors, inside, edit), count
+        return _painted(tensors, inside, form, edit), count
     left = tensors if isinstance(edit, Copy) else {name: tensor[~inside] for name, tensor in tensors.items()}
     if isinstance(edit, Remove):
         return left, count
     taken = {name: tensor[inside] for name, tensor in tensors.items()}
-    joined = _joined(left, _shifted(taken, place, edit), edit.overwrite)
+    joined = _joined(left, _shifted(taken, form, edit), edit.overwrite)
     return joined, count * (2 if isinstance(edit, Move) else 1)
 
 
-def _in_box(
-    tensors: Mapping[str, Tensor], place: MapPlace, edit: Remove | Paint | Move | Copy
-) -> Bool[Tensor, " cell"]:
+def _in_box(tensors: Mapping[str, Tensor], form: MapForm, edit: Remove | Paint | Move | Copy) -> Bool[Tensor, " cell"]:
     """Return which cells have their middle in a box seen from above, and are touched by it in height."""
     if not tensors:
         raise DataError("the memory is empty")
-    lattice, height = place.lattice, place.height_axis
+    lattice, height = form.lattice, form.height_axis
     cells = tensors[CELLS].cpu().double()
     corners = torch.tensor([edit.low, edit.high], dtype=torch.float64)
     around = torch.cartesian_prod(*corners.T.unbind(0)) @ lattice.grid_from_world.T
@@ -109,21 +112,29 @@ def _in_box(
     return inside.to(tensors[CELLS].device)
 
 
-def _painted(tensors: Mapping[str, Tensor], inside: Bool[Tensor, " cell"], edit: Paint) -> dict[str, Tensor]:
+def _painted(
+    tensors: Mapping[str, Tensor], inside: Bool[Tensor, " cell"], form: MapForm, edit: Paint
+) -> dict[str, Tensor]:
+    """Return the tensors with cells that are as if a picture of the colour alone had been seen there."""
+    picture = torch.tensor(edit.color, dtype=torch.uint8).expand(1, PICTURE, PICTURE, 3)
+    encoded = form.encoder.encode(picture.to(tensors[CELLS].device))[0]
+    painted = {name: tensor.clone() for name, tensor in tensors.items()}
     red, green, blue = edit.color
-    colors, origins = tensors["colors"].clone(), tensors[ORIGINS].clone()
-    colors[inside] = (red << 16) | (green << 8) | blue  # at depth 0: no later pixel is nearer
-    origins[inside] = CellOrigin.EDITED
-    return {**tensors, "colors": colors, ORIGINS: origins}
+    painted["colors"][inside] = (red << 16) | (green << 8) | blue  # at depth 0: no later pixel is nearer
+    painted["features"][inside] = encoded[encoded.shape[0] // 2, encoded.shape[1] // 2].to(painted["features"])
+    painted[ORIGINS][inside] = CellOrigin.EDITED
+    if "counts" in painted:
+        painted["counts"][inside] = 1
+    return painted
 
 
-def _shifted(taken: Mapping[str, Tensor], place: MapPlace, edit: Move | Copy) -> dict[str, Tensor]:
+def _shifted(taken: Mapping[str, Tensor], form: MapForm, edit: Move | Copy) -> dict[str, Tensor]:
     """Return cells at their new places."""
-    lattice = place.lattice
+    lattice = form.lattice
     by = lattice.grid_from_world @ torch.tensor(edit.by, dtype=torch.float64)
     shift = (by / lattice.size).round().clamp(-2 * LIMIT, 2 * LIMIT).long()
     if lattice.flat:
-        shift[place.height_axis] = 0
+        shift[form.height_axis] = 0
     if not bool(shift.any()):
         sizes = " × ".join(f"{side:g}" for side in lattice.size.tolist())
         raise DataError(f"by {','.join(f'{value:g}' for value in edit.by)} is less than half a cell of {sizes} m")

@@ -20,7 +20,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.detail import feature_across
-from persist_memory.grid.editing import MapPlace, edit_cells
+from persist_memory.grid.editing import MapForm, edit_cells
 from persist_memory.grid.occlusion import with_enough_new, without_edges, without_known
 from persist_memory.grid.pooling import (
     GridSettings,
@@ -162,11 +162,13 @@ class GridMemory(Memory):
         """Remove, paint, move or copy cells; where one is removed nothing is known any more, so no seed is needed.
 
         An edit takes the cells whose middle lies in its box seen from above, and that the box touches in height.
+        Painted cells get the features of a picture of the colour alone.
 
         Raises:
             DataError: when an edit cannot be done; then the map stays as it was.
         """
-        edited, outcome = edit_cells(self.tensors(), MapPlace(self.lattice, self.reference.world_up), edits)
+        form = MapForm(self.lattice, self.reference.world_up, self.encoder)
+        edited, outcome = edit_cells(self.tensors(), form, edits)
         self.restore(edited if len(edited.get("cells", ())) else {})
         return outcome
 
