@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -170,6 +170,11 @@ class Scenes:
             raise PersistError(f"memory {memory.name!r} is no scene: it imagines nothing; take the memory 'scene'")
         memory.imagine_with(None if model is None else lambda: model)
         return memory
+
+    def seeded(self, seed: int) -> Scenes:
+        """Return the same with another seed of what scenes imagine while an agent walks."""
+        settings = replace(self.factory.settings, seed=seed)
+        return replace(self, factory=replace(self.factory, settings=settings))
 
     def after(self, view: View) -> Scene:
         """Return a scene that holds one image."""

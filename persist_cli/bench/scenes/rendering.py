@@ -56,15 +56,15 @@ class Renderer:
     factory: MemoryFactory | None
     model: SceneModel | None
 
-    def memory(self, view: View) -> Memory | None:
-        """Return the memory with which the row begins at a view: empty, or the true cells."""
+    def memory(self, view: View, seed: int = 0) -> Memory | None:
+        """Return the memory with which the row begins at a view: empty, or the true cells; a scene has the seed."""
         if self.factory is None:
             return None
         if not issubclass(self.factory.kind, Scene):
             return self.factory.empty(view.info).to(self.backbone.device)
-        return self.scene(view).to(self.backbone.device)
+        return self.scene(view, seed).to(self.backbone.device)
 
-    def scene(self, view: View) -> Scene:
+    def scene(self, view: View, seed: int = 0) -> Scene:
         """Return the scene with which the row begins at a view, with true cells or with the model.
 
         Raises:
@@ -72,7 +72,7 @@ class Renderer:
         """
         if self.factory is None:
             raise PersistError(f"row {self.row.name!r} has no memory")
-        scene = Scenes(self.factory, None if self.row.true_grid else self.model).empty(view.info)
+        scene = Scenes(self.factory, None if self.row.true_grid else self.model).seeded(seed).empty(view.info)
         if self.row.true_grid:
             scene.add(view.house)
         return scene

@@ -88,7 +88,7 @@ def there_and_back(bench: SceneBench, renderer: Renderer, view: View, seed: int,
     Fewer where the agent is shut in.
     """
     begun = time.perf_counter()
-    world = renderer.world(renderer.memory(view), view, seed, True, bench)
+    world = renderer.world(renderer.memory(view, seed), view, seed, True, bench)
     wanderer = Wanderer(view.info.vocabulary, np.random.default_rng([seed, 1]))
     out = walk_out(world, wanderer, view, steps)
     back = out.cameras[torch.arange(len(out) - 2, -1, -1)] if len(out) > 1 else out.cameras[:0]

@@ -99,7 +99,7 @@ def walk_name(view: View, seed: int) -> str:
 
 def walk(bench: SceneBench, view: View, seed: int) -> Iterator[dict[str, Any]]:
     """Yield a record of each window of a walk from a view."""
-    scene, body = bench.scenes.after(view), bench.body(view)
+    scene, body = bench.scenes.seeded(seed).after(view), bench.body(view)
     scene.complete(view.region.box(view.truth), seed)
     up = torch.tensor(view.info.world_up, dtype=torch.float64)
     camera, vocabulary = view.frame.cameras, view.info.vocabulary

@@ -7,8 +7,8 @@ import torch
 
 from persist_cli.api.cells import FREE, OUTSIDE
 from persist_cli.api.ground import Body
-from persist_cli.bench.scenes.connectedness import BorderCounts, DoorCounts, count_borders, count_doors
-from tests.support.cell_houses import DOORWAY, TABLE, WALL, two_rooms
+from persist_cli.bench.scenes.connectedness import BorderCounts, DoorCounts, count_borders, count_doors, may_step
+from tests.support.cell_houses import DOORWAY, TABLE, WALL, camera_in, two_rooms
 
 BODY = Body()
 
@@ -78,3 +78,24 @@ def test_a_room_that_is_open_to_the_sky_and_faces_that_were_known_do_not_count()
     assert count_borders(grid, nothing_known(grid)) == before
     grid.classes[0, 5, 5], grid.classes[1, 5, 5] = OUTSIDE, FREE
     assert count_borders(grid, torch.ones(grid.shape, dtype=torch.bool)) == BorderCounts(0, 0)
+
+
+def places(grid, *columns):
+    """World places 1.25 m above some columns."""
+    return [camera_in(grid, column)[:3, 3] for column in columns]
+
+
+def test_an_agent_steps_through_the_doorway_and_not_into_the_wall():
+    grid = two_rooms()
+    near, inside, behind = places(grid, (15, 8), (16, 8), (17, 8))
+    assert may_step(grid, BODY, near, inside)
+    assert may_step(grid, BODY, inside, behind)
+    room, wall = places(grid, (15, 3), (16, 3))
+    assert not may_step(grid, BODY, room, wall)
+
+
+def test_an_agent_that_stands_too_near_to_a_wall_may_leave_it_and_not_go_nearer():
+    grid = two_rooms()
+    touching, away = places(grid, (1, 3), (2, 3))
+    assert may_step(grid, BODY, touching, away)
+    assert not may_step(grid, BODY, away, touching)
