@@ -10,6 +10,7 @@ from persist_cli.errors import DataError
 from persist_memory.scene.editing import apply_edits, changes, edit_grid
 from persist_memory.scene.surroundings import guess
 from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, TABLE, TABLE_CELLS, WALL, cell_room
+from tests.support.drawn_scenes import DrawnWalls, empty_scene
 
 EVERYWHERE = {"low": (-9.0, -9.0, -9.0), "high": (9.0, 9.0, 9.0)}
 
@@ -97,6 +98,20 @@ def test_what_a_model_imagines_behind_a_removed_thing_stays():
     gone, outcome = edit_grid(grid, [Remove(**box_of(grid, "table#1"))], imagine)
     assert bool((gone.classes[4:6, 9:12, 1:4] == BOX).all())
     assert outcome.filled_by == "model"
+
+
+def test_a_scene_with_a_model_imagines_by_a_seed_what_a_removed_thing_hid():
+    grid = cell_room()
+    grid.origins[4:6, 9:12, 1:4] = 0
+    known, scenes = grid.known, []
+    for seed in (1, 1, 2):
+        scene = empty_scene(DrawnWalls())
+        scene.add(grid)
+        assert scene.edit([Remove(**box_of(grid, "table#1"))], seed).filled_by == "model"
+        assert not bool(changes(grid, scene.cells)[known & (grid.classes != TABLE)].any())
+        scenes.append(scene.cells.classes[4:6, 9:12, 1:4])
+    assert torch.equal(scenes[0], scenes[1])
+    assert not torch.equal(scenes[0], scenes[2])
 
 
 def test_things_of_no_known_class_are_removed_and_walls_stay():
