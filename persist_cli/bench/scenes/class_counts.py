@@ -67,7 +67,9 @@ def class_iou(counts: Counts | Numbers, row: int) -> Numbers:
 
 
 def mean_iou(counts: Counts | Numbers, rows: Sequence[int]) -> Numbers:
-    """Return the mean over those of some classes that neither lack in the truth nor in what is said."""
+    """Return the mean over those of some classes that neither lack in the truth nor in what is said; NaN for none."""
+    if not rows:
+        return np.full(counts.shape[:-2], np.nan)
     values = np.stack([class_iou(counts, row) for row in rows], -1)
     known = np.isfinite(values)
     total: Numbers = np.where(known, values, 0.0).sum(-1) / np.where(known.any(-1), known.sum(-1), np.nan)

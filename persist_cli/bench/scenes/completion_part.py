@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from persist_cli.api.cell_things import STRUCTURE
 from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.scenes.class_counts import class_counts, iou_figure, share_figure, things
 from persist_cli.bench.scenes.completions import Completion
@@ -31,6 +32,9 @@ COLUMNS: Final = {
         "mIoU", "higher", True,
         f"mean over the classes of things that the truth has of intersection over union of {UNSEEN}; counts are added "
         "over houses first; free and outside are no things", digits=1,
+    ),
+    "structure": FigureColumn(
+        "mIoU of structure", "higher", True, f"the same over those of {', '.join(STRUCTURE)} alone", digits=1
     ),
     "iou": FigureColumn("IoU", "higher", True, "the same of being occupied: neither free nor outside"),
     "free_iou": FigureColumn("free IoU", "higher", True, "the same of the class free"),
@@ -140,6 +144,7 @@ def row_figures(
     seconds = torch.stack([samples[view.name]["seconds"] for view in bench.views], 1).double().numpy()
     return {
         "miou": iou_figure(counts, present, draws),
+        "structure": iou_figure(counts, [n for n in present if bench.palette[n] in STRUCTURE], draws),
         "iou": iou_figure(counts, [-1], draws),
         "free_iou": iou_figure(counts, [0], draws),
         "outside_iou": iou_figure(counts, [2], draws),

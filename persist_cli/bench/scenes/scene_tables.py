@@ -9,7 +9,7 @@ from persist_cli.bench.figure_text import FigureColumn, markdown_table
 from persist_cli.bench.scenes import completion_part, edit_part, return_part, speed_part, walk_part
 from persist_cli.viewing.console import print_table, say
 
-SHORT: Final = ("miou", "iou", "doors", "leading", "open", "disagreement", "seconds")
+SHORT: Final = ("miou", "structure", "iou", "doors", "leading", "open", "disagreement", "seconds")
 
 IOU: Final = FigureColumn("IoU", "higher", True, "intersection over union")
 
@@ -42,7 +42,9 @@ def difference_table(part: Mapping[str, Any]) -> Table | None:
     """Return the paired differences of the model to other rows; ``None`` without a model."""
     columns = completion_part.COLUMNS
     figures = part["rows"].get("model", {}).get("figures", {})
-    shown = [name for name in ("miou", "iou", "free_iou", "outside_iou", "leading", "open") if name in figures]
+    shown = [
+        name for name in ("miou", "structure", "iou", "free_iou", "outside_iou", "leading", "open") if name in figures
+    ]
     others = list(figures["miou"]["differences"]) if figures else []
     rows = [
         [f"model − {other}", *(columns[name].gap(figures[name]["differences"].get(other)) for name in shown)]

@@ -34,6 +34,7 @@ def test_what_is_true_has_an_intersection_over_union_of_one_and_what_is_empty_of
     assert (mean_iou(whole, rows), class_iou(whole, -1)) == (1.0, 1.0)
     assert (mean_iou(nothing, rows), class_iou(nothing, -1)) == (0.0, 0.0)
     assert np.isnan(class_iou(whole, TABLE))  # there is none
+    assert np.isnan(mean_iou(whole, []))
     assert 0 < class_iou(nothing, FREE) < 1
 
 
