@@ -113,13 +113,22 @@ class Agent:
             actions: the next actions; without any nothing is done.
             most: number of moves that a clip holds.
         """
-        if self.scene is not None and actions:
-            if self.info.vocabulary[actions[0]].interaction:
-                return self.interact(actions[0])
-            self.scene.foresee([Cameras.concatenate([self.now.cameras, self.cameras_after(actions[:most])])])
-            if self.surroundings is not None:
-                self.surroundings.know(self.scene)
-        return self.walk()
+        if self.scene is None or not actions:
+            return self.walk()
+        walk = self.interact(actions[0]) if self.info.vocabulary[actions[0]].interaction else self.walk()
+        self.look_ahead(self.next_clip(actions)[len(walk.names) :], most)
+        return walk
+
+    def look_ahead(self, actions: Sequence[str], most: int) -> None:
+        """Let the scene imagine what will be seen on the way as far as it is free by what is known, and know that."""
+        assert self.scene is not None
+        trial = self.walk()
+        plan_walks([trial], [actions], most)
+        self.scene.foresee(
+            [self.now.cameras.at(torch.stack([self.now.cameras.world_from_camera[0].double(), *trial.poses]))]
+        )
+        if self.surroundings is not None:
+            self.surroundings.know(self.scene)
 
     def interact(self, action: str) -> Walk:
         """Let an interaction change the scene, and return a walk that begins with it."""
