@@ -12,7 +12,7 @@ from torch import Tensor
 
 from persist_cli.api.geometry import small_motions
 from persist_cli.api.observations import Observations
-from persist_cli.recipe import DataSettings
+from persist_cli.training_settings import DataSettings
 
 PATCHES = 4  # the error of depth is smooth: it is drawn at so many places along each edge of an image
 

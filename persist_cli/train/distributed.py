@@ -19,7 +19,8 @@ from torch import Tensor, distributed, nn
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import step_folders
 from persist_cli.errors import PersistError
-from persist_cli.recipe import Recipe, TrainingSettings
+from persist_cli.recipe import Recipe
+from persist_cli.training_settings import TrainingSettings
 
 CHECKPOINT_WRAPPER: Final = "_checkpoint_wrapped_module."  # accelerate's activation checkpointing adds it to names
 

@@ -12,7 +12,7 @@ from torch import nn
 
 from persist_cli.api.stages import MemorySavings
 from persist_cli.errors import PersistError
-from persist_cli.recipe import TrainingSettings
+from persist_cli.training_settings import TrainingSettings
 
 if TYPE_CHECKING:
     from diffusers.training_utils import EMAModel

@@ -18,13 +18,14 @@ from persist_cli.data.reference import data_folder
 from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
-from persist_cli.recipe import DataSettings, Recipe
+from persist_cli.recipe import Recipe
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.distributed import Sharding, uses_zero
 from persist_cli.train.optimizer import requested_savings
 from persist_cli.train.own_writes import OwnWrites
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 from persist_cli.train.training_loop import TrainingLoop
+from persist_cli.training_settings import DataSettings
 
 START_BATCHES: Final = 16  # from which fresh weights are set at the beginning of a stage
 

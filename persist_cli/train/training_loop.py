@@ -20,11 +20,12 @@ from torch.utils.data import DataLoader, Dataset
 from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError
-from persist_cli.recipe import Recipe, TrainingSettings
+from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import make_average, make_optimizer, update_average
 from persist_cli.train.state import TrainingState
+from persist_cli.training_settings import TrainingSettings
 from persist_cli.viewing.console import add_task, progress
 
 Model = TypeVar("Model", bound=nn.Module)

@@ -21,10 +21,11 @@ from persist_cli.io.files import ASIDE, read_tensors
 from persist_cli.memorize import sources
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import find_plugin, make_backbone
-from persist_cli.recipe import DataSettings, Recipe, TrainingSettings
+from persist_cli.recipe import Recipe
 from persist_cli.train import clip_cache
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.tensor_cache import STALE, CacheSettings, TensorCache, cache_key
+from persist_cli.training_settings import DataSettings, TrainingSettings
 from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO, MICRO_SETTINGS, SIZE, equal_runs, losses, stage
 from tests.support.processes import start_persist
