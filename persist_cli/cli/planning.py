@@ -249,19 +249,16 @@ def bench_plan(
 
     persist bench plan --scenes 0:24 --rows random,rank-8 --memories none,voxel --report runs/plans
     """
-    from persist_cli.bench.navigator import PlanSettings
-    from persist_cli.bench.plan_bench import BenchPlan, EpisodeSource
-    from persist_cli.bench.run_episode import LoopSettings
-    from persist_cli.bench.run_plan_bench import run_plan_bench
+    from persist_cli.bench import navigator, plan_bench, run_episode, run_plan_bench
 
-    plan = BenchPlan(
-        EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each), checkpoint,
-        split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
-        PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach), split_names(loops),
-        LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
+    plan = plan_bench.BenchPlan(
+        plan_bench.EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each),
+        checkpoint, split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
+        navigator.PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach), split_names(loops),
+        run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
         SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
     )  # fmt: skip
-    run_plan_bench(plan, out, report, json)
+    run_plan_bench.run_plan_bench(plan, out, report, json)
 
 
 @bench_app.command("scene")

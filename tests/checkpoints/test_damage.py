@@ -11,7 +11,8 @@ import torch
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
-from persist_cli.data.store import TrajectoryFile, schema
+from persist_cli.data.store import TrajectoryFile
+from persist_cli.data.store_header import schema
 from persist_cli.errors import PersistError
 from persist_cli.io import checksums
 from persist_cli.io.checksums import verifying

@@ -13,7 +13,8 @@ from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.held_out import HELD_OUT_FROM, ONLY_BEFORE
 from persist_cli.data.images import CropResize, crop_resize, parse_size
-from persist_cli.data.store import SUFFIX, TrajectoryFile, schema, write_trajectory
+from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
+from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError, PluginError
 from persist_cli.io.files import ASIDE
 from persist_cli.plugins import find_plugin, make_importer
