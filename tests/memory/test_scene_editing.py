@@ -3,13 +3,15 @@
 import pytest
 import torch
 
+from persist_cli.api.cell_rays import first_surfaces, sheet_cells
 from persist_cli.api.cell_things import find_things, floor_level, structure
 from persist_cli.api.cells import FREE, SOLID, CellGrid, CellOrigin
+from persist_cli.api.observations import Observations
 from persist_cli.api.scene_edits import Copy, Edit, Insert, Move, Paint, Remove
 from persist_cli.errors import DataError
 from persist_memory.scene.editing import apply_edits, changes, edit_grid
 from persist_memory.scene.surroundings import guess
-from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, TABLE, TABLE_CELLS, WALL, cell_room
+from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, TABLE, TABLE_CELLS, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
 
 EVERYWHERE = {"low": (-9.0, -9.0, -9.0), "high": (9.0, 9.0, 9.0)}
@@ -238,3 +240,15 @@ def test_the_surroundings_guess_every_cell_and_close_walls_but_not_doorways():
     assert bool(guessed.known.all())
     assert bool((guessed.classes[6:8, 0, 1:8] == FREE).all())
     assert bool((guessed.classes[3:5, 0, 1:8] == WALL).all())
+
+
+def test_where_a_thing_hid_the_floor_behind_it_up_to_the_wall_the_view_has_no_hole():
+    room = cell_room()
+    camera = camera_at(room, (10, 8, 5), (4, 7, 2))
+    drawn = first_surfaces(room, camera, sheets=sheet_cells(room, 0))
+    scene = empty_scene()
+    scene.write(Observations(drawn.colors(room)[0], drawn.depth[0].float(), camera))
+    room.origins[~scene.cells.box(room.corner, room.shape).known] = 0
+    gone = edited(room, Remove(**box_of(room, "table#1")))
+    holes = ~first_surfaces(gone, camera, sheets=sheet_cells(gone, 0)).hit
+    assert not bool((holes & drawn.hit).any())

@@ -19,7 +19,7 @@ from persist_memory.scene.support import free_below, standing_on
 from persist_memory.scene.surroundings import fill_from_surroundings, guess, repair_floor
 
 BORDER: Final = 1e-6  # metres by which a box is grown, so that rounding leaves no cell of it out
-LEAST_REACH, MOST_REACH = 2, 8  # cells behind a removed thing that it can hide
+REACH: Final = 16  # cells from face to face behind a removed thing that it may have hidden
 SIZES: Final = {  # metres along the ground axes and up, of a class of which the scene has no thing; a table is as
     # high as that even where its thin legs are in no cell of the scene's own
     "table": (1.0, 0.5, 0.75), "wall": (0.25, 0.25, 2.5), "barrel": (0.5, 0.5, 0.75), "building": (1.5, 1.5, 1.25),
@@ -162,12 +162,14 @@ def _uncovered(grid: CellGrid, freed: Cells) -> Cells:
     floor = floor_level(grid)
     if floor is not None:
         unknown[:, :, :floor] = False
-    extent = [int(ends.max() - ends.min()) + 1 for ends in freed.nonzero().T[:2]] if bool(freed.any()) else [0]
     hidden, front = torch.zeros_like(freed), freed
-    for _ in range(min(max(*extent, LEAST_REACH), MOST_REACH)):
+    for _ in range(REACH):
         reached = _grown(front) & unknown & ~hidden
         hidden |= reached
         front = reached & (guessed.classes == FREE)
+    if floor is not None and floor + 1 < grid.shape[2]:  # the feet of walls
+        standing = guessed.classes[:, :, floor + 1] != FREE
+        hidden[:, :, floor] |= (_grown(hidden) & unknown)[:, :, floor] & standing
     return hidden
 
 

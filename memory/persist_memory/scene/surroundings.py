@@ -29,8 +29,9 @@ def guess(grid: CellGrid) -> CellGrid:
     """Return a grid without an unknown cell.
 
     An unknown cell on the level of the floor or the ceiling is as the nearest known one there. Others are wall where a
-    wall goes on above them, or on both sides along an axis, or where nothing is known beyond: there the room ends. They
-    are outside where the cell above is, and else free, as they are in a doorway.
+    wall goes on above them, or on both sides along an axis, or where nothing is known beyond: there the room ends.
+    There is no wall where the first known cell above is free, since walls go up. Cells are outside where the one above
+    is, and else free, as they are in a doorway.
     """
     guessed = grid.copy()
     unknown = ~grid.known
@@ -79,12 +80,13 @@ def _flat_sources(grid: CellGrid, level: int) -> Bool[Tensor, "first second"]:
 def _continue_walls(grid: CellGrid, guessed: CellGrid) -> None:
     wall, unknown = walls(grid), ~grid.known
     up = _first_known(grid.known, 2, forward=True)
+    open_above = _at(grid.known & (grid.classes == FREE), up, 2)
     sides = [(_first_known(grid.known, axis, False), _first_known(grid.known, axis, True)) for axis in (0, 1)]
     inside = torch.stack([(low >= 0) & (high >= 0) for low, high in sides]).any(0)
     for level in range(grid.shape[2]):
-        continue_level(guessed, level, (unknown & ~inside)[:, :, level], wall[:, :, level])
+        continue_level(guessed, level, (unknown & ~inside & ~open_above)[:, :, level], wall[:, :, level])
     for axis, (low, high) in reversed(list(enumerate(sides))):
-        between = unknown & _at(wall, low, axis) & _at(wall, high, axis)
+        between = unknown & ~open_above & _at(wall, low, axis) & _at(wall, high, axis)
         _take(grid, guessed, between, low, axis)
     guessed.classes[unknown & _at(of_classes(grid, (DOOR,)), up, 2)] = FREE
     _take(grid, guessed, unknown & _at(wall | (grid.known & (grid.classes == OUTSIDE)), up, 2), up, 2)
