@@ -19,7 +19,7 @@ from persist_memory.scene.support import free_below, standing_on
 from persist_memory.scene.surroundings import fill_from_surroundings, guess, repair_floor
 
 BORDER: Final = 1e-6  # metres by which a box is grown, so that rounding leaves no cell of it out
-REACH: Final = 16  # cells from face to face behind a removed thing that it may have hidden
+REACH: Final = 8  # cells from face to face behind a removed thing that it may have hidden
 SIZES: Final = {  # metres along the ground axes and up, of a class of which the scene has no thing; a table is as
     # high as that even where its thin legs are in no cell of the scene's own
     "table": (1.0, 0.5, 0.75), "wall": (0.25, 0.25, 2.5), "barrel": (0.5, 0.5, 0.75), "building": (1.5, 1.5, 1.25),
