@@ -10,6 +10,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from persist_backbones.cogvideox import cpu_attention
 from persist_backbones.cogvideox.cogvideox import CogVideoX
+from persist_cli.api.stages import MemorySavings
 from tests.support.micro_model import micro, random_clips, shaken
 
 FUSED = "aten::_scaled_dot_product_flash_attention_for_cpu"
@@ -44,8 +45,8 @@ def test_float32_and_steps_without_gradients_keep_the_fused_kernel() -> None:
 
 def test_blocks_that_are_computed_again_keep_the_fused_kernel() -> None:
     backbone = model()
-    backbone.transformer.base.enable_gradient_checkpointing()
-    assert uses_fused(lambda: loss(backbone.train(), torch.bfloat16).backward())
+    backbone.apply_memory_savings("1", MemorySavings(gradient_checkpointing=True))
+    assert uses_fused(lambda: loss(backbone, torch.bfloat16).backward())
 
 
 def test_more_weights_than_fit_keep_the_fused_kernel(monkeypatch: pytest.MonkeyPatch) -> None:

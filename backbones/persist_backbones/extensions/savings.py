@@ -49,6 +49,7 @@ class FrozenWeights:
 def apply_memory_savings(backbone: CogVideoX, stage: Stage, savings: MemorySavings) -> FrozenWeights:
     """Make training steps cheaper; exact values of frozen weights are kept if the stage saves them."""
     transformer, adapter = backbone.transformer.base, backbone.adapter
+    transformer.gradient_checkpointing = savings.gradient_checkpointing
     blocks = [*transformer.transformer_blocks, *(adapter.blocks.values() if adapter else ())]
     for block in blocks:
         if savings.gradient_checkpointing:
