@@ -12,6 +12,8 @@ import numpy as np
 from persist_cli.api.actions import walking_actions
 from persist_cli.api.ground import Body
 from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.data.images import crop_resize
+from persist_cli.data.importers.readers import read_color
 from persist_cli.data.store import SUFFIX, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.memorize.depth_model import estimate_depth
@@ -56,42 +58,27 @@ def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
     Raises:
         DataError: one line, when picture or depth cannot be read, do not fit, or there is no depth.
     """
-    rgb, depth = read_rgb(picture), _depth_of(picture, options)
+    rgb = read_color(picture)
+    depth = _depth_of(picture, rgb, options)
     if depth.shape != rgb.shape[:2]:
         sizes = " and ".join(f"{width}×{height}" for height, width in (rgb.shape[:2], depth.shape))
         raise DataError(f"{picture}: picture and depth differ in size, {sizes} pixels")
     fov = FIELD_OF_VIEW if options.fov is None else options.fov
     if not 10.0 <= fov <= 150.0:
         raise DataError(f"--fov {fov:g}: degrees from the picture's top to its bottom, between 10 and 150")
-    focal = rgb.shape[0] / 2 / math.tan(math.radians(fov) / 2)
-    if options.size is not None:
-        focal *= options.size / min(rgb.shape[:2])
-        rgb, depth = squared(rgb, options.size, smooth=True), squared(depth, options.size, smooth=False)
     height, width = depth.shape
+    focal = height / 2 / math.tan(math.radians(fov) / 2)
     matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    if options.size is not None:
+        fit = crop_resize((height, width), (options.size, options.size))
+        rgb, depth, matrix = fit.rgb(rgb), fit.depth(depth), fit.intrinsics(matrix)
+        height = width = options.size
     source = {"format": "picture", "picture": picture.name, "camera_height": HEIGHT}
     info = TrajectoryInfo(f"picture/{picture.stem}", matrix, height, width, UP, walking_actions(), source)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])  # level, towards -z
     pose[1, 3] = HEIGHT
     write_trajectory(folder / f"{picture.stem}{SUFFIX}", info, [Frame(rgb, depth, pose)])
     return folder
-
-
-def read_rgb(path: Path) -> Array:
-    """Return ``[height, width, 3]`` uint8 of a picture.
-
-    Raises:
-        DataError: when there is none, or it cannot be read.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return np.array(image.convert("RGB"))
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: no such picture") from error
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise DataError(f"{path}: cannot be read as a picture ({str(error).splitlines()[0]})") from error
 
 
 def read_depth(path: Path) -> Array:
@@ -122,23 +109,13 @@ def read_depth(path: Path) -> Array:
     return np.where(np.isfinite(metres) & (metres > 0), metres, 0).astype(np.float32)
 
 
-def squared(values: Array, size: int, smooth: bool) -> Array:
-    """Return the middle square of an image at ``size`` × ``size`` pixels, as means or as nearest pixels."""
-    from PIL import Image
-
-    side = min(values.shape[:2])
-    top, left = ((length - side) // 2 for length in values.shape[:2])
-    image = Image.fromarray(values[top : top + side, left : left + side])
-    return np.array(image.resize((size, size), Image.Resampling.BOX if smooth else Image.Resampling.NEAREST))
-
-
-def _depth_of(picture: Path, options: PictureOptions) -> Array:
+def _depth_of(picture: Path, rgb: Array, options: PictureOptions) -> Array:
     if options.depth is not None and options.depth_model is not None:
         raise DataError("give --depth or --depth-model, not both")
     if options.depth is not None:
         return read_depth(options.depth)
     if options.depth_model is not None:
-        return estimate_depth(options.depth_model, read_rgb(picture))
+        return estimate_depth(options.depth_model, rgb)
     raise DataError(
         f"{picture}: a picture alone tells no depth; give --depth FILE (.npy in metres, PNG of 16 bits in millimetres) "
         "or --depth-model NAME"
