@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +18,7 @@ from persist_cli.bench.planning_tables import (
     loop_columns,
     success_rows,
 )
+from persist_cli.evaluate.report.templates import environment_facts, page_templates
 from persist_cli.io.files import write_text
 
 PAGE: Final = "report.html"
@@ -39,18 +39,10 @@ def write_planning_report(results: Mapping[str, Any], pictures: Sequence[Episode
 
 def report_page(results: Mapping[str, Any], pictures: Sequence[EpisodePictures]) -> str:
     """Return the page's HTML."""
-    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-
-    packages = ("persist_cli.bench", "persist_cli.evaluate.report")  # the latter for the style of its pages
-    jinja = Environment(
-        loader=ChoiceLoader([PackageLoader(package, ".") for package in packages]), autoescape=True,
-        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    jinja.filters["shell"] = shlex.join
     closed = "closed" in results["settings"]["loops"]
-    return jinja.get_template("planning_report.html.jinja").render(
+    return page_templates("persist_cli.bench").get_template("planning_report.html.jinja").render(
         results=results, sections=[section(table, results) for table in results["tables"]], pictures=pictures,
-        success=success_rows(results) if closed else None, facts=facts(results["environment"]),
+        success=success_rows(results) if closed else None, facts=environment_facts(results["environment"]),
     )  # fmt: skip
 
 
@@ -84,12 +76,3 @@ def loop_table(table: Mapping[str, Any], results: Mapping[str, Any], loop: str) 
             for row, figures in table["rows"].items()
         ],
     }
-
-
-def facts(environment: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return name and text of each entry of the environment, packages one by one."""
-    found: list[tuple[str, str]] = []
-    for name, value in environment.items():
-        entries = value if isinstance(value, Mapping) else {name: value}
-        found += [(str(key), str(entry)) for key, entry in entries.items()]
-    return found

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from persist_cli.bench.scenes.plan_pictures import COLORS, ViewPictures
 from persist_cli.bench.scenes.scene_tables import definitions, tables
+from persist_cli.evaluate.report.templates import page_templates
 from persist_cli.io.files import write_text
 
 PAGE: Final = "report.html"
@@ -22,14 +23,7 @@ def write_scene_report(results: Mapping[str, Any], pictures: Sequence[ViewPictur
         pictures: of some images.
         folder: of the page.
     """
-    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-
-    packages = ("persist_cli.bench.scenes", "persist_cli.evaluate.report")  # the latter for the style of its pages
-    jinja = Environment(
-        loader=ChoiceLoader([PackageLoader(package, ".") for package in packages]), autoescape=True,
-        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    page = jinja.get_template("scene_report.html.jinja").render(
+    page = page_templates("persist_cli.bench.scenes").get_template("scene_report.html.jinja").render(
         results=results, tables=tables(results, short=False), definitions=definitions(results), pictures=pictures,
         colors=COLORS, command=shlex.join(results["command"]),
     )  # fmt: skip

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from persist_cli.errors import PersistError
 from persist_cli.evaluate.report.curves import COLORS, DARK_COLORS, HEIGHT, WIDTH, Plot, plots, row_styles
@@ -27,12 +27,9 @@ from persist_cli.evaluate.report.remarks import (
 from persist_cli.evaluate.report.result_file import FILE, EvalResults, check_results
 from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
 from persist_cli.evaluate.report.tables import CompactTable, compact_tables
+from persist_cli.evaluate.report.templates import environment_facts, page_templates
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json, write_text
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
-
 
 PAGE = "report.html"
 
@@ -76,7 +73,7 @@ def write_report(results: Mapping[str, Any], pictures: Pictures, folder: Path) -
 
 def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
     """The page's HTML; curves, sheets and clips are left in the folder."""
-    jinja = _jinja()
+    jinja = page_templates()
     curve = jinja.get_template("curve.svg.jinja")
     styles = row_styles(results)
     rows = write_row_clips(pictures, folder)
@@ -97,32 +94,10 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
         drawn_units=drawn_units(results), scenes=len({(clip.data, clip.scene) for clip in results.measured.clips}),
         answers=scrutiny(results), windows=windows_tables(results),
         sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
-        facts=_environment_facts(results), lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
+        facts=environment_facts(results.environment),
+        lasts=[_last_seen(clip.seen_before) for clip in results.measured.clips],
         **common,
     )  # fmt: skip
-
-
-def _environment_facts(results: EvalResults) -> list[tuple[str, str]]:
-    """Name and text of each entry of the environment, packages one by one."""
-    facts: list[tuple[str, str]] = []
-    for name, value in results.environment.items():
-        entries = value if isinstance(value, Mapping) else {name: value}
-        facts += [(str(key), str(entry)) for key, entry in entries.items()]
-    return facts
-
-
-def _jinja() -> Environment:
-    """The templates of this package; all values that are filled in are escaped."""
-    import shlex
-
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    jinja = Environment(
-        loader=PackageLoader("persist_cli.evaluate.report", "."), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    jinja.filters["shell"] = shlex.join
-    return jinja
 
 
 def _last_seen(shares: list[float | None]) -> str:
