@@ -193,6 +193,12 @@ def uses_zero(accelerator: Accelerator) -> bool:
     return bool(accelerator.distributed_type == DistributedType.DEEPSPEED)
 
 
+def refuse_sharding(accelerator: Accelerator, what: str) -> None:
+    """Raise ``PersistError`` when the launcher asks to shard what is small and not sharded."""
+    if accelerator.is_fsdp2 or uses_zero(accelerator):
+        raise PersistError(f"{what} not sharded; launch with --multi_gpu")
+
+
 @contextlib.contextmanager
 def unflattened(parameters: Iterable[nn.Parameter]) -> Iterator[None]:
     """Within the block each parameter has memory of its own; DeepSpeed's are pieces of one and cannot be saved."""

@@ -11,9 +11,8 @@ from persist_cli.api.policy_network import PolicyNetwork, PolicySamples
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.policy_samples import PolicySampleDataset
 from persist_cli.data.reference import data_folder
-from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe
-from persist_cli.train.distributed import uses_zero
+from persist_cli.train.distributed import refuse_sharding
 from persist_cli.train.training_loop import TrainingLoop
 
 
@@ -44,8 +43,7 @@ class PolicyTrainer(TrainingLoop[PolicyNetwork]):
         Raises:
             PersistError: when the launcher asks for sharding.
         """
-        if self.accelerator.is_fsdp2 or uses_zero(self.accelerator):
-            raise PersistError("a policy's network is small and not sharded; launch with --multi_gpu")
+        refuse_sharding(self.accelerator, "a policy's network is small and")
 
     def to_batch(self, samples: list[Any]) -> PolicySamples:
         """Make a batch of samples on the device."""

@@ -11,9 +11,8 @@ from persist_cli.api.scene_model import SceneModel, SceneSamples
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.scene_samples import SampleShares, SceneSampleDataset
-from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe
-from persist_cli.train.distributed import uses_zero
+from persist_cli.train.distributed import refuse_sharding
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 from persist_cli.train.training_loop import TrainingLoop
 
@@ -58,8 +57,7 @@ class SceneTrainer(TrainingLoop[SceneModel]):
         Raises:
             PersistError: when the launcher asks for sharding.
         """
-        if self.accelerator.is_fsdp2 or uses_zero(self.accelerator):
-            raise PersistError("a model of scenes is not sharded; launch with --multi_gpu")
+        refuse_sharding(self.accelerator, "a model of scenes is")
 
     def to_batch(self, samples: list[Any]) -> SceneSamples:
         """Make a batch of samples on the device."""
