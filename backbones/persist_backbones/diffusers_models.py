@@ -35,7 +35,7 @@ with deferred_imports(WAITING, LEFT_OUT):
         CogVideoXSafeConv3d,
     )
     from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
-    from diffusers.models.embeddings import get_3d_rotary_pos_embed
+    from diffusers.models.embeddings import CogVideoXPatchEmbed, get_3d_rotary_pos_embed
     from diffusers.models.transformers.cogvideox_transformer_3d import CogVideoXTransformer3DModel
     from diffusers.schedulers.scheduling_ddim_cogvideox import CogVideoXDDIMScheduler
     from diffusers.schedulers.scheduling_dpm_cogvideox import CogVideoXDPMScheduler
@@ -49,6 +49,7 @@ __all__ = [
     "CogVideoXCausalConv3d",
     "CogVideoXDDIMScheduler",
     "CogVideoXDPMScheduler",
+    "CogVideoXPatchEmbed",
     "CogVideoXResnetBlock3D",
     "CogVideoXSafeConv3d",
     "CogVideoXTransformer3DModel",

@@ -108,6 +108,30 @@ class Clips:
             latents=ClipLatents.stack(latents) if latents else None,
         )
 
+    def shortened(self, frames: int) -> Clips:
+        """Return the first frames of each clip, with their latents and rendered views; other tokens all stay."""
+        count = self.cameras.world_from_camera.shape[1]
+
+        def cut(part: Tensor) -> Tensor:  # of latents, whose codec may fold time
+            return part[:, : (frames - 1) * (part.shape[1] - 1) // (count - 1) + 1]
+
+        tokens, latents = self.tokens, self.latents
+        if tokens is not None and tokens.rendered is not None:
+            tokens = dataclasses.replace(tokens, rendered=cut(tokens.rendered))
+        return dataclasses.replace(
+            self,
+            rgb=self.rgb[:, :frames],
+            depth=self.depth[:, :frames],
+            cameras=dataclasses.replace(
+                self.cameras,
+                world_from_camera=self.cameras.world_from_camera[:, :frames],
+                intrinsics=self.cameras.intrinsics[:, :frames],
+            ),
+            interactions=[names[: frames - 1] for names in self.interactions],
+            tokens=tokens,
+            latents=None if latents is None else ClipLatents(cut(latents.video), latents.image),
+        )
+
     def first_frames(self) -> tuple[UInt8[Tensor, "batch 1 height width 3"], Float[Tensor, "batch 1 height width"]]:
         """Return RGB and depth of the first frames, uint8 and float32 metres."""
         return self.rgb[:, :1], self.depth[:, :1]
@@ -174,7 +198,10 @@ class Backbone(nn.Module, ABC):
     @property
     @abstractmethod
     def frames_per_clip(self) -> int:
-        """The number of frames of a clip, the first one included, which is an input."""
+        """The number of frames of a clip in training, the first one included, which is an input.
+
+        ``generate`` may make shorter clips; see ``check_clip_frames``.
+        """
 
     @property
     @abstractmethod
@@ -196,6 +223,17 @@ class Backbone(nn.Module, ABC):
             raise PersistError(f"guidance over memory of {sampling.memory_guidance}; it must be a number of at least 0")
         if not 0 <= sampling.context_noise < math.inf:
             raise PersistError(f"context noise of {sampling.context_noise}; it must be a number of at least 0")
+
+    def check_clip_frames(self, frames: int) -> None:
+        """Raise ``PersistError`` with one line when ``generate`` cannot make clips of so many frames.
+
+        A clip has as many frames as cameras, the given one included. By default it must have ``frames_per_clip``.
+        """
+        if frames != self.frames_per_clip:
+            raise PersistError(
+                f"clips of {frames} frames, the given one included; backbone {self.name!r} makes clips of "
+                f"{self.frames_per_clip} frames only"
+            )
 
     @property
     def gives_depth(self) -> bool:

@@ -172,7 +172,7 @@ def imagined_before_and_after(imagination: Imagination, text: str, file: Path, e
     checkpoint = find_checkpoint(imagination.checkpoint)
     world = assemble_world(checkpoint, checkpoint.chosen_adapter(imagination.adapter), plan, source.info)
     if len(frames) == 1:
-        frames = range(max(0, frames.start - world.backbone.frames_per_clip + 1), frames.stop)
+        frames = range(max(0, frames.start - world.clip_frames + 1), frames.stop)
     if len(frames) < 2:
         raise DataError(f"--camera {text}: no frame leads to the first one; name a later one, or several as in :0-9")
     part, pictures = source.read(slice(frames.start, frames.stop)), []

@@ -51,7 +51,7 @@ class ImaginedPlace:
         """Begin walks; see ``PracticePlace``."""
         memory, body = self.first.memory, self.first.body
         agents = [Agent(memory, seed, shared=memory is not None, body=body) for seed in seeds]
-        self.world = WorldModel(self.world.backbone, agents, self.world.sampling)
+        self.world = WorldModel(self.world.backbone, agents, self.world.sampling, self.world.clip_frames)
         self.world.reset(starts, [self.info] * len(starts))
 
     @torch.no_grad()

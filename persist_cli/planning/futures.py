@@ -103,7 +103,7 @@ class WorldFutures:
         self, paths: Mapping[tuple[str, ...], Float[Tensor, "action 4 4"]], over: Over
     ) -> dict[tuple[str, ...], tuple[Tensor, Tensor]]:
         """Return for each way of free actions RGB and depth of the present frame, and of those after it to judge."""
-        now, length = self.model.agents[0].now, self.model.backbone.frames_per_clip - 1
+        now, length = self.model.agents[0].now, self.model.clip_frames - 1
         seen = {names: (now.rgb, now.depth) for names in paths}
         clips = {names: -(-len(names) // length) for names in paths}
         for count in sorted(set(clips.values()) - {0}):
@@ -118,7 +118,7 @@ class WorldFutures:
     ) -> list[tuple[Tensor, Tensor]]:
         """Return RGB and depth of the frames to judge, of ways that take equally many clips."""
         branches = self.model.branches(len(poses))
-        length, agents = branches.backbone.frames_per_clip - 1, branches.agents
+        length, agents = branches.clip_frames - 1, branches.agents
         paths = [agent.now.cameras.at(way) for agent, way in zip(agents, poses, strict=True)]
         interactions = [interactions_of(names, agents[0].info.vocabulary) for names in candidates]
         lead = (max(map(len, candidates)) - 1) // length * length

@@ -107,7 +107,7 @@ def roll(model: WorldModel, paths: Sequence[CameraPath]) -> list[Rollout]:
     model.reset([paths[0].start], [paths[0].info])
     branches = model.branches(len(paths)) if len(paths) > 1 else model
     left, clips = [len(path.actions) for path in paths], []
-    steps, total, length = model.sampling.steps, sum(left), model.backbone.frames_per_clip - 1
+    steps, total, length = model.sampling.steps, sum(left), model.clip_frames - 1
     with progress() as bar:
         task = add_task(bar, "rollout", -(-max(left) // length) * steps, "denoising steps", f"0 of {total} frames")
         with on_denoised(model.backbone, partial(bar.advance, task)):

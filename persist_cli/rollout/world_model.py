@@ -180,10 +180,29 @@ class WorldModel:
         backbone: the backbone, which already uses the adapter, if any.
         agents: one agent for each rollout.
         sampling: steps, sampler and guidance of each clip.
+        clip_frames: frames of a clip, the present one included: with 2 each action is a clip of its own, which takes
+            less time than a whole clip, but more a frame. By default as many as in training.
+
+    Raises:
+        PersistError: when the backbone cannot make clips of so many frames.
     """
 
-    def __init__(self, backbone: Backbone, agents: Sequence[Agent], sampling: Sampling) -> None:
+    def __init__(
+        self, backbone: Backbone, agents: Sequence[Agent], sampling: Sampling, clip_frames: int | None = None
+    ) -> None:
         self.backbone, self.agents, self.sampling = backbone, list(agents), sampling
+        self.clip_frames = backbone.frames_per_clip if clip_frames is None else clip_frames
+
+    @property
+    def clip_frames(self) -> int:
+        """Frames of a clip, the present one included; ``PersistError`` when the backbone cannot make such clips."""
+        return self._clip_frames
+
+    @clip_frames.setter
+    def clip_frames(self, frames: int) -> None:
+        if frames != self.backbone.frames_per_clip:
+            self.backbone.check_clip_frames(frames)
+        self._clip_frames = frames
 
     def reset(self, observations: Sequence[Observations], infos: Sequence[TrajectoryInfo]) -> None:
         """Let each agent begin at one observed frame; its info has the frame's scene, up axis and vocabulary."""
@@ -222,7 +241,7 @@ class WorldModel:
             )
         left = [tuple(names) for names in actions]
         while any(left):
-            most, agents = self.backbone.frames_per_clip - 1, self.agents
+            most, agents = self.clip_frames - 1, self.agents
             walks = [agent.set_out(names, most) for agent, names in zip(agents, left, strict=True)]
             rests = [
                 agent.next_clip(names)[len(walk.names) :]
@@ -290,7 +309,7 @@ class WorldModel:
             cameras: for each agent the cameras of the frames to come.
             interactions: for each agent the interaction before each of these frames.
         """
-        length = self.backbone.frames_per_clip - 1
+        length = self.clip_frames - 1
         for first in range(0, max(map(len, cameras)), length):
             clip = slice(first, first + length)
             moving = [number for number, path in enumerate(cameras) if len(path) > first]
@@ -347,7 +366,7 @@ class WorldModel:
 
     def clip_path(self, agent: Agent, way: Cameras) -> Cameras:
         """Return the present camera and the next ones, the last of them repeated to fill a clip."""
-        missing = self.backbone.frames_per_clip - 1 - len(way)
+        missing = self.clip_frames - 1 - len(way)
         return Cameras.concatenate([agent.now.cameras, way, *[way[-1:]] * missing])
 
     def read_memories(self, agents: Sequence[Agent], paths: Sequence[Cameras]) -> list[MemoryTokens | None]:

@@ -20,6 +20,8 @@ from tests.support.micro_runs import MICRO, SIZE
 
 CHANNELS = 6
 
+FRAMEWISE = {"vae": MICRO["vae"] | {"temporal_compression_ratio": 1}}  # settings of a codec that codes frames alone
+
 POINT_FORMS = [name for name, form in FORMS.items() if not form.reads_frames]  # of tokens that are points
 
 

@@ -14,9 +14,9 @@ from persist_cli.rollout.world_model import Agent, WorldModel
 from tests.support.micro_model import micro, shaken
 
 
-def remembering_model() -> CogVideoX:
+def remembering_model(**settings: Any) -> CogVideoX:
     """Make a micro model with an adapter for patches, all of whose parts have an effect."""
-    backbone = micro()
+    backbone = micro(**settings)
     backbone.add_adapter("voxel", make_encoder("patches", {}).channels, {"width": 16, "heads": 2})
     shaken(backbone)
     return backbone

@@ -32,11 +32,13 @@ from persist_backbones.cogvideox.diffusion import (
     sample_generators,
 )
 from persist_backbones.cogvideox.inputs import (
+    ClipShape,
     camera_latents,
     camera_tokens,
     check_fit,
     clip_shape,
     fit_positions,
+    frame_step,
     interaction_rows,
     model_input,
     rotary_grid,
@@ -151,8 +153,9 @@ class CogVideoX(AdaptedBackbone):
         latents = clips.latents or self.encode(clips)
         image_noise = draw_levels(generators, self.settings.image_noise)
         given = latents.image if not image_noise.any() else add_level(latents.image, image_noise, generators)
-        image = self.image_condition(given)
-        clean = self.shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
+        shape = self.shape.of(clips)
+        image = self.image_condition(given, shape)
+        clean = shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
         # noise
         timesteps = draw_timesteps(self.scheduler, generators).to(self.device)
         noise = noise_like(clean, generators)
@@ -171,7 +174,8 @@ class CogVideoX(AdaptedBackbone):
         generators, clips = sample_generators(clips.seeds), clips.to(self.device)
         predicted, _, noisy, timesteps = self.predict_noised(clips, generators)
         latents = noise_level(self.scheduler, timesteps).clean(predicted.float(), noisy.float())
-        colors, depth = self.codec.decode_images(self.shape.drop_padding(latents), self.settings.depth)
+        shown = self.shape.of(clips).drop_padding(latents)
+        colors, depth = self.codec.decode_images(shown, self.settings.depth)
         return to_uint8(colors).cpu(), depth.float().cpu()
 
     @torch.no_grad()
@@ -253,7 +257,7 @@ class CogVideoX(AdaptedBackbone):
         """Generate clips and return a frame of each; a codec that codes every frame alone decodes no others."""
         if not self.framewise or 0 in frames:
             return super().generate_frame(first, sampling, frames)
-        latents = self.shape.drop_padding(self.sample_noticed(first, sampling))
+        latents = self.shape.of(first).drop_padding(self.sample_noticed(first, sampling))
         chosen = latents[torch.arange(len(frames)), list(frames)][:, None]
         colors, depth = self.codec.decode_images(chosen, self.settings.depth)
         return to_uint8(colors)[:, 0], depth[:, 0]
@@ -268,7 +272,8 @@ class CogVideoX(AdaptedBackbone):
         self, latents: Float[Tensor, "batch frame channel height width"], first: Clips
     ) -> tuple[Float[Tensor, "batch 3 frame height width"], Float[Tensor, "batch frame height width"]]:
         """Decode sampled latents to colours, [-1, 1] and beyond, and depth in metres; frame 0 is that of ``first``."""
-        colors, depth = self.codec.decode_images(self.shape.drop_padding(latents), self.settings.depth)
+        shown = self.shape.of(first).drop_padding(latents)
+        colors, depth = self.codec.decode_images(shown, self.settings.depth)
         colors[:, :, 0] = first.rgb[:, 0].movedim(-1, 1).to(colors) / 127.5 - 1
         depth[:, 0] = first.depth[:, 0]
         return colors, depth
@@ -289,11 +294,11 @@ class CogVideoX(AdaptedBackbone):
 
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Encode the clips' first frames as the image condition, float32 also for a model in lower precision."""
-        return self.image_condition(self.codec.encode(*clips.first_frames()).float())
+        return self.image_condition(self.codec.encode(*clips.first_frames()).float(), self.shape.of(clips))
 
-    def image_condition(self, first: Float[Tensor, "batch 1 channel height width"]) -> Tensor:
-        """Scale latents of the first frame alone for the model, and add zeros for all other latent frames."""
-        return self.shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
+    def image_condition(self, first: Float[Tensor, "batch 1 channel height width"], shape: ClipShape) -> Tensor:
+        """Scale latents of the first frame alone for the model, and add zeros for the other latent frames of a clip."""
+        return shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
 
     def conditions(
         self,
@@ -303,7 +308,8 @@ class CogVideoX(AdaptedBackbone):
         image_noise: Tensor | None = None,
     ) -> Conditions:
         """Collect prompt, interactions, cameras, memory and the noise level of the given frames of a batch."""
-        printed, steps = self.settings.rays == "printed", self.settings.frames - 1
+        printed, steps = self.settings.rays == "printed", clips.cameras.world_from_camera.shape[1] - 1
+        grid = self.shape.of(clips).tokens
         rays = (self.codec.spatial, self.codec.temporal, printed, self.shape.token_frames)
         return Conditions(
             text=self.prompt.expand(len(clips.seeds), -1, -1),
@@ -311,7 +317,7 @@ class CogVideoX(AdaptedBackbone):
             level=noise_level(self.scheduler, timesteps),
             interactions=interaction_rows(clips.interactions, self.settings.interactions, steps).to(self.device),
             camera=camera_latents(clips.cameras, *rays),
-            rotary=rotary_positions(self.transformer.base.config, self.shape.tokens, self.rotary_grid, self.device),
+            rotary=rotary_positions(self.transformer.base.config, grid, self.rotary_grid, self.device),
             memory=memory,
             image_noise=None if image_noise is None else image_noise.to(self.device),
         )
@@ -325,6 +331,16 @@ class CogVideoX(AdaptedBackbone):
     def frames_per_clip(self) -> int:
         """Number of frames of a clip, including the given first frame."""
         return self.settings.frames
+
+    def check_clip_frames(self, frames: int) -> None:
+        """Raise ``PersistError`` for clips that are longer than trained, or that the codec cannot code."""
+        longest, step = self.settings.frames, frame_step(self.codec.temporal)
+        if 2 <= frames <= longest and (frames - 1) % step == 0:
+            return
+        lengths = f"2 to {longest}" if step == 1 else ", ".join(map(str, range(1 + step, longest + 1, step)))
+        raise PersistError(
+            f"clips of {frames} frames, the given one included; this model makes clips of {lengths} frames"
+        )
 
     @property
     def image_size(self) -> tuple[int, int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,11 +20,12 @@ from persist_backbones.cogvideox.diffusion import Prediction
 from persist_backbones.cogvideox.parts import DiffusersParts
 from persist_backbones.diffusers_models import (
     CogVideoXDDIMScheduler,
+    CogVideoXPatchEmbed,
     CogVideoXTransformer3DModel,
     get_3d_rotary_pos_embed,
 )
 from persist_backbones.tensors import fold_frames, frames_per_token, tokens_of
-from persist_cli.api.backbone import Interactions
+from persist_cli.api.backbone import Clips, Interactions
 from persist_cli.api.cameras import Cameras, invert_rigid
 from persist_cli.api.geometry import plucker
 from persist_cli.errors import CheckpointError, DataError
@@ -38,6 +41,7 @@ class ClipShape:
         width: width in latent pixels.
         patch: latent pixels along the edge of a video token.
         token_frames: number of latent frames that a video token stands for.
+        temporal: number of frames that a latent frame stands for, after the first.
     """
 
     frames: int
@@ -45,6 +49,12 @@ class ClipShape:
     width: int
     patch: int
     token_frames: int
+    temporal: int = 1
+
+    def of(self, clips: Clips) -> ClipShape:
+        """Return this shape with the latent frames of some clips, which may be shorter; their cameras say how long."""
+        longest, frames = (self.frames - 1) * self.temporal + 1, clips.cameras.world_from_camera.shape[1]
+        return self if frames == longest else dataclasses.replace(self, frames=(frames - 1) // self.temporal + 1)
 
     @property
     def padded_frames(self) -> int:
@@ -108,10 +118,15 @@ def check_prediction(scheduler: CogVideoXDDIMScheduler, wanted: Prediction | Non
         raise CheckpointError(f"prediction is {wanted!r}, but the weights were trained for {kind!r}; leave it out")
 
 
+def frame_step(temporal: int) -> int:
+    """Return n of the lengths 1, 1 + n, 1 + 2n, … of the clips that a codec of this compression in time codes."""
+    # diffusers' decoder doubles time in halves, and takes an odd number of latent frames as a sign of a first frame
+    return 2 * temporal if temporal > 1 else 1
+
+
 def check_frames(temporal: int, settings: CogVideoXSettings) -> None:
     """Raise ``CheckpointError`` when a codec of this compression in time cannot code the settings' frames."""
-    # diffusers' decoder doubles time in halves, and takes an odd number of latent frames as a sign of a first frame
-    step = 2 * temporal if temporal > 1 else 1
+    step = frame_step(temporal)
     rule, window = f"{step}n + 1, " if step > 1 else "", (settings.codec_window or (1,))[0]
     if settings.frames < 2 or (settings.frames - 1) % step:
         raise CheckpointError(f"frames must be {rule}at least 2, not {settings.frames}")
@@ -128,6 +143,7 @@ def clip_shape(transformer: Any, vae: Any, settings: CogVideoXSettings) -> ClipS
         width=settings.width // spatial,
         patch=config.patch_size,
         token_frames=frames_per_token(config),
+        temporal=int(vae.config.temporal_compression_ratio),
     )
 
 
@@ -244,7 +260,7 @@ def middle_region(shape: tuple[int, int], trained: tuple[int, int]) -> Region:
     return (top, left), (top + rows, left + columns)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _fitted_positions(channels: int, grid: tuple[int, int, int], region: Region, device: str) -> tuple[Tensor, Tensor]:
     cosines, sines = get_3d_rotary_pos_embed(
         embed_dim=channels,
@@ -256,7 +272,7 @@ def _fitted_positions(channels: int, grid: tuple[int, int, int], region: Region,
     return cosines, sines
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _counted_positions(channels: int, grid: tuple[int, int, int], device: str) -> tuple[Tensor, Tensor]:
     cosines, sines = get_3d_rotary_pos_embed(
         embed_dim=channels,
@@ -268,6 +284,25 @@ def _counted_positions(channels: int, grid: tuple[int, int, int], device: str) -
         device=torch.device(device),
     )
     return cosines, sines
+
+
+class ShorterClipsPatchEmbed(CogVideoXPatchEmbed):  # type: ignore[misc]
+    """diffusers' patch embedding, which gives shorter clips the first frames of its table of positions.
+
+    diffusers makes a sinusoidal table at every call for clips of another length, and in the place of a learned one too.
+    """
+
+    def _get_positional_embeddings(
+        self, sample_height: int, sample_width: int, sample_frames: int, device: torch.device | None = None
+    ) -> Float[Tensor, "1 word+token channel"]:
+        size = (self.sample_height, self.sample_width)
+        if (sample_height, sample_width) != size or sample_frames > self.sample_frames:
+            made: Tensor = super()._get_positional_embeddings(sample_height, sample_width, sample_frames, device)
+            return made
+        frames = (sample_frames - 1) // self.temporal_compression_ratio + 1
+        tokens = frames * math.prod(side // self.patch_size for side in size)
+        table: Tensor = self.pos_embedding
+        return table[:, : self.max_text_seq_length + tokens]
 
 
 def fit_positions(transformer: CogVideoXTransformer3DModel, size: tuple[int, int, int]) -> None:
@@ -285,6 +320,8 @@ def fit_positions(transformer: CogVideoXTransformer3DModel, size: tuple[int, int
         CheckpointError: for clips that are longer than a learned table.
     """
     table = transformer.patch_embed
+    if table.use_positional_embeddings or table.use_learned_positional_embeddings:
+        table.__class__ = ShorterClipsPatchEmbed
     sample_size = dict(zip(("sample_frames", "sample_height", "sample_width"), size, strict=True))
     sample_size["sample_frames"] = (size[0] - 1) * table.temporal_compression_ratio + 1
     if all(getattr(table, name) == value for name, value in sample_size.items()):

@@ -102,7 +102,7 @@ def there_and_back(bench: SceneBench, renderer: Renderer, view: View, seed: int,
 
 def walk_out(world: WorldModel, wanderer: Wanderer, view: View, steps: int) -> Observations:
     """Return the view's frame and those of the way out, without those of blocked steps."""
-    parts, count, stopped, length = [view.frame], 0, False, world.backbone.frames_per_clip - 1
+    parts, count, stopped, length = [view.frame], 0, False, world.clip_frames - 1
     for _ in range(MOST_TRIES * steps):
         if count >= steps:
             break

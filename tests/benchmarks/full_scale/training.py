@@ -83,7 +83,7 @@ def plain_batch(bench: Bench, clips: Clips) -> tuple[Tensor, Tensor, Tensor]:
     """Latents, image latents and camera latents of the clips, for the plain loop."""
     assert clips.latents is not None
     camera = bench.backbone.conditions(clips, torch.zeros(len(clips.seeds)).long()).camera
-    image = bench.backbone.image_condition(clips.latents.image)
+    image = bench.backbone.image_condition(clips.latents.image, bench.backbone.shape)
     return bench.backbone.shape.pad(clips.latents.video), image.to(bench.precision), camera.to(bench.precision)
 
 
