@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import torch
-from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.nn.functional import scaled_dot_product_attention
+from torch.overrides import TorchFunctionMode
 
 from persist_backbones.diffusers_models import CogVideoXTransformer3DModel
 from persist_backbones.tensors import frames_per_token
@@ -35,10 +37,40 @@ def kernel_for_training(model: CogVideoXTransformer3DModel, latents: torch.Tenso
     if latents.device.type != "cpu" or precision != torch.bfloat16 or not fits or not wanted:
         yield
         return
-    before = torch.backends.cuda.fp16_bf16_reduction_math_sdp_allowed()
-    torch.backends.cuda.allow_fp16_bf16_reduction_math_sdp(True)  # else products of bfloat16 are made in float32
-    try:
-        with sdpa_kernel(SDPBackend.MATH):
-            yield
-    finally:
-        torch.backends.cuda.allow_fp16_bf16_reduction_math_sdp(before)
+    with MatrixProducts():
+        yield
+
+
+class MatrixProducts(TorchFunctionMode):
+    """Within the block, attention is made of matrix products in bfloat16.
+
+    PyTorch's own kernel of products looks for rows without any key in all weights, which takes as long as the softmax.
+    """
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """Call any other function as it is."""
+        return (attend if func is scaled_dot_product_attention else func)(*args, **(kwargs or {}))
+
+
+def attend(
+    query: torch.Tensor,
+    key: torch.Tensor,
+    value: torch.Tensor,
+    attn_mask: torch.Tensor | None = None,
+    dropout_p: float = 0.0,
+    is_causal: bool = False,
+) -> torch.Tensor:
+    """Return attention with all its weights at once; arguments as of PyTorch's function, without mask and dropout."""
+    if attn_mask is not None or dropout_p or is_causal:
+        raise NotImplementedError("attention of matrix products has no mask and no dropout")
+    with torch.autocast(query.device.type, enabled=False):
+        query, key, value = (part.to(torch.bfloat16) for part in (query, key, value))
+        weights = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
+        attended: torch.Tensor = weights.softmax(-1) @ value
+    return attended
