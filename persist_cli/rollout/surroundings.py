@@ -118,14 +118,17 @@ class Surroundings:
 
         The frames before that one, or all of them, are seen from now on.
         """
+        poses = seen.cameras.world_from_camera
         for number in range(1, len(seen)):
             self.see(seen[number - 1 : number])
-            if blocked([self], [seen.cameras.world_from_camera[number - 1]], [seen.cameras.world_from_camera[number]])[
-                0
-            ]:
+            if self.blocks(poses[number - 1], poses[number]):
                 return number
         self.see(seen[-1:])
         return None
+
+    def blocks(self, start: Pose, end: Pose) -> bool:
+        """Return whether something known is in the way between two poses; what is unknown counts as free."""
+        return blocked([self], [start], [end])[0]
 
 
 def blocked(surroundings: Sequence[KnownSurroundings], starts: Sequence[Pose], ends: Sequence[Pose]) -> list[bool]:

@@ -162,7 +162,12 @@ class Agent:
 
     def observe(self, seen: Observations) -> None:
         """Make the last of the frames the present one, and count their clip."""
-        self.now, self.clips = seen[-1:], self.clips + 1
+        self.stand_at(seen[-1:])
+        self.clips += 1
+
+    def stand_at(self, frame: Observations) -> None:
+        """Make a single frame the present one; neither the clip is counted nor anything remembered."""
+        self.now = frame
 
     def memorize(self, seen: Observations, device: torch.device) -> None:
         """Write frames into the memory on ``device``, unless there is no memory or it is not written."""

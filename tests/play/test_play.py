@@ -1,0 +1,119 @@
+"""A walk with the keys gives what a rollout of the same actions gives, and remembers what was shown alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.memory import FrameOfReference, Memory
+from persist_cli.data.store import Store
+from persist_cli.errors import DataError, PersistError
+from persist_cli.play.play import Play
+from persist_cli.play.settings import PlaySettings
+from persist_cli.play.walkers import AdaptedWorld
+from persist_cli.plugins import make_encoder, make_memory
+from persist_cli.rollout.world_model import Agent, WorldModel
+from tests.support.micro_worlds import remembering_model
+
+FORWARD, LEFT = frozenset({"forward"}), frozenset({"left"})
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    return remembering_model()
+
+
+def voxels() -> Memory:
+    return make_memory("voxel", {}, make_encoder("patches", {}), FrameOfReference("room-0", (0.0, 1.0, 0.0)))
+
+
+def play_on(backbone, walks: Path, **settings) -> Play:
+    """A walk from the ninth frame of the first trajectory, with a voxel memory and without one."""
+    start = Store(walks)[0].read([8])
+    worlds = {
+        "voxel": AdaptedWorld(backbone, [Agent(voxels())], Sampling(), "voxel"),
+        "stage1": AdaptedWorld(backbone, [Agent(None)], Sampling(), None),
+    }
+    return Play(worlds, start, PlaySettings(steps=2, **settings))
+
+
+def rollout_world(backbone, walks: Path) -> WorldModel:
+    """A world model at the same frame."""
+    start = Store(walks)[0].read([8])
+    backbone.use_adapter("voxel")
+    world = WorldModel(backbone, [Agent(voxels())], Sampling(2))
+    world.reset([start.observations], [start.info])
+    return world
+
+
+def walked(play: Play, held, frames: int):
+    return [play.advance(held) for _ in range(frames)]
+
+
+def test_held_keys_show_the_frames_of_a_rollout(backbone, walks):
+    play, world = play_on(backbone, walks), rollout_world(backbone, walks)
+    shown = walked(play, FORWARD, 8) + walked(play, LEFT, 8)
+    backbone.use_adapter("voxel")
+    [truth] = world.step([["forward"] * 8 + ["left"] * 8])
+    assert torch.equal(torch.stack([one.images["voxel"] for one in shown]), truth.seen.rgb)
+    assert [one.number for one in shown] == list(range(1, 17))
+    assert not torch.equal(shown[-1].images["stage1"], shown[-1].images["voxel"])
+
+
+def test_frames_of_keys_that_are_let_go_are_dropped_and_not_remembered(backbone, walks):
+    play, world = play_on(backbone, walks), rollout_world(backbone, walks)
+    walked(play, FORWARD, 3)
+    shown = walked(play, LEFT, 2)
+    backbone.use_adapter("voxel")
+    agent = world.agents[0]
+    seen = world.predict([0], [agent.cameras_after(["forward"] * 8)], [(None,) * 8])[0]
+    world.take(agent, seen[:3])
+    truth = world.predict([0], [agent.cameras_after(["left"] * 8)], [(None,) * 8])[0]
+    assert torch.equal(torch.stack([one.images["voxel"] for one in shown]), truth.rgb[:2])
+
+
+def test_nothing_is_shown_while_no_key_is_held(backbone, walks):
+    play = play_on(backbone, walks)
+    first = play.advance(FORWARD)
+    assert play.advance(frozenset()) is None
+    assert play.shown is first
+
+
+def test_a_reset_begins_the_same_walk_and_another_seed_another_one(backbone, walks):
+    play = play_on(backbone, walks)
+    start, before = play.shown, walked(play, FORWARD, 10)
+    again = play.reset()
+    assert again.pose == start.pose
+    assert torch.equal(again.images["voxel"], start.images["voxel"])
+    after = walked(play, FORWARD, 10)
+    assert all(torch.equal(one.images["voxel"], two.images["voxel"]) for one, two in zip(before, after, strict=True))
+    play.reset(seed=5)
+    assert not torch.equal(walked(play, FORWARD, 1)[0].images["voxel"], before[0].images["voxel"])
+
+
+def test_home_is_the_start_pose_as_it_is_imagined(backbone, walks):
+    play = play_on(backbone, walks)
+    start = play.shown
+    walked(play, FORWARD, 4)
+    shown = play.home()
+    assert shown.action is None
+    assert (shown.pose.x, shown.pose.y) == pytest.approx((start.pose.x, start.pose.y))
+    assert not torch.equal(shown.images["voxel"], start.images["voxel"])
+
+
+def test_an_unknown_action_changes_nothing(backbone, walks):
+    play = play_on(backbone, walks)
+    first = walked(play, FORWARD, 1)[0]
+    with pytest.raises(DataError, match="unknown action 'fly'"):
+        play.advance(frozenset({"fly"}))
+    assert play.shown is first
+
+
+def test_settings_that_cannot_be_used_leave_the_old_ones(backbone, walks):
+    play = play_on(backbone, walks)
+    with pytest.raises(PersistError, match="0 denoising steps"):
+        play.set(PlaySettings(steps=0))
+    assert play.settings.steps == 2
