@@ -65,12 +65,14 @@ class Play:
         Raises:
             PersistError: when the model cannot imagine with them; then they stay as they were.
         """
-        worlds = self._walkers.worlds.values()
-        sampling = {id(world): self._sampling(world, settings) for world in worlds}
-        for world in worlds:
-            world.backbone.check_sampling(sampling[id(world)])
-        for world in worlds:
-            world.sampling, world.agents[0].seed = sampling[id(world)], settings.seed
+        worlds = list(self._walkers.worlds.values())
+        samplings = [self._sampling(world, settings) for world in worlds]
+        for world, sampling in zip(worlds, samplings, strict=True):
+            world.backbone.check_sampling(sampling)
+        frames = settings.clip_frames
+        for world, sampling in zip(worlds, samplings, strict=True):
+            world.clip_frames = world.backbone.frames_per_clip if frames is None else frames  # refused by the first
+            world.sampling, world.agents[0].seed = sampling, settings.seed
         self.settings, self._ahead = settings, None
 
     def reset(self, seed: int | None = None) -> Shown:
@@ -108,7 +110,7 @@ class Play:
             self._ahead = None
             return None
         if ahead is None or ahead.actions != actions or not (ahead.left or ahead.stuck):
-            ahead = self._ahead = self._imagine(actions)
+            ahead = self._ahead = self._walkers.imagine(actions)
         elif ahead.stuck:
             return None
         name = ahead.names[ahead.taken]
@@ -132,10 +134,6 @@ class Play:
         begun, self._ahead = time.monotonic(), None
         self._walkers.stand_at(self._walkers.look_from(pose))
         return self._show(None, True, begun)
-
-    def _imagine(self, actions: tuple[str, ...]) -> Ahead:
-        longest = self._walkers.longest
-        return self._walkers.imagine(actions, min(self.settings.frames or longest, longest))
 
     def _show(self, action: str | None, free: bool, begun: float) -> Shown:
         """Return the present frames as shown now, and keep them as ``shown``."""

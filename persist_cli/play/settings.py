@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -28,14 +27,15 @@ class PlaySettings:
         guidance: weight of guidance over memory, at least 0; 1 means none.
         seed: of the sampling noise.
         ahead: whether the likely next actions are imagined while no key is held.
-        frames: most frames of a clip, where the model has shorter ones; ``None`` for its own length.
+        clip_frames: frames of a clip, the present one included; ``None`` for as many as in training. Short clips answer
+            a key sooner and take more time a frame.
     """
 
     steps: int = 1
     guidance: float = 1.0
     seed: int = 0
     ahead: bool = True
-    frames: int | None = None
+    clip_frames: int | None = None
 
     def __post_init__(self) -> None:
         if self.steps < 1:
@@ -44,8 +44,6 @@ class PlaySettings:
             raise PersistError(f"guidance over memory of {self.guidance}; it must be a number of at least 0")
         if self.seed < 0:
             raise PersistError(f"seed {self.seed}; it must be at least 0")
-        if self.frames is not None and self.frames < 1:
-            raise PersistError(f"clips of {self.frames} frames; it must be at least 1")
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,8 @@ class Walkers:
 
     @property
     def longest(self) -> int:
-        """The number of frames that a clip of the model shows."""
-        return next(iter(self.worlds.values())).backbone.frames_per_clip - 1
+        """The number of frames that a clip shows."""
+        return next(iter(self.worlds.values())).clip_frames - 1
 
     def begin(self, start: Observations, info: TrajectoryInfo) -> None:
         """Let all agents stand at an observed frame, and remember it."""
@@ -116,20 +116,19 @@ class Walkers:
             world.reset([start], [info])
         self._shown = [[] for _ in self.worlds]
 
-    def imagine(self, actions: Sequence[str], most: int) -> Ahead:
+    def imagine(self, actions: Sequence[str]) -> Ahead:
         """Return a clip of some actions in turn; nothing of it is shown yet.
 
         In a scene an interaction is done here. It is the only action of its clip.
 
         Args:
             actions: names in the vocabulary, repeated until the clip is full; an interaction is done once.
-            most: number of frames of the clip.
         """
         self.remember()
         once = self.info.vocabulary[actions[0]].interaction
-        names = tuple(actions[:1]) if once else tuple(itertools.islice(itertools.cycle(actions), most))
-        walk = self.lead.set_out(names, most)
-        plan_walks([walk], [names[len(walk.names) :]], most)
+        names = tuple(actions[:1]) if once else tuple(itertools.islice(itertools.cycle(actions), self.longest))
+        walk = self.lead.set_out(names, self.longest)
+        plan_walks([walk], [names[len(walk.names) :]], self.longest)
         if once and walk.free[0]:
             for agent in self.agents[1:]:
                 if agent.scene is not None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkpoint
+from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import TrajectoryInfo
@@ -78,10 +79,14 @@ def assemble_world(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPla
     sampling = checkpoint.sampling_with(plan.sampling)
     backbone.check_sampling(sampling)
     backbone.prepare_inference(plan.placement)
-    collides = not plan.follow and (tells_body(info) if plan.body is None else plan.body)
-    body = body_of(info) if collides else None
-    agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write, body=body)
+    agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write, body=body_for(plan, info))
     return WorldModel(backbone, [agent], sampling)
+
+
+def body_for(plan: RolloutPlan, info: TrajectoryInfo) -> Body | None:
+    """Return the body of a plan's agent, ``None`` for a camera that nothing stops."""
+    collides = not plan.follow and (tells_body(info) if plan.body is None else plan.body)
+    return body_of(info) if collides else None
 
 
 def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
