@@ -69,7 +69,7 @@ def open_play(options: PlayOptions) -> Play:
         backbone = _load(checkpoint, names)
     backbone.prepare_inference(options.placement)
     sampling, body = checkpoint.sampling_with(SamplingOverrides()), body_for(options.begin.plan, start.info)
-    worlds = {}
+    worlds: dict[str, AdaptedWorld] = {}
     for name, memory in memories.items():
         agent = Agent(memory and memory.to(backbone.device), body=None if worlds else body)
         worlds[name] = AdaptedWorld(backbone, [agent], sampling, None if name == PLAIN else name)
@@ -126,9 +126,7 @@ def _memorize(sources: Sequence[Source], memories: dict[str, Memory | None], sta
     for source in sources:
         scene = source.file.info.scene
         if scene != start.info.scene:
-            raise DataError(
-                f"{source.text}: is of scene {scene!r}, and the start of {start.info.scene!r}; name one scene"
-            )
+            raise DataError(f"{source.text}: is of scene {scene!r}, the start of {start.info.scene!r}; name one scene")
         for piece in source.pieces():
             for memory in memories.values():
                 if memory is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
@@ -31,7 +31,7 @@ class StartOptions:
     """
 
     start: str = SAMPLE_START
-    picture: PictureOptions = PictureOptions()
+    picture: PictureOptions = field(default_factory=PictureOptions)
     step: float | None = None
     turn: float | None = None
     body: bool | None = None
@@ -40,8 +40,8 @@ class StartOptions:
     def plan(self) -> RolloutPlan:
         """The same options as a rollout's."""
         return RolloutPlan(
-            self.start, (), False, 0, None, None, True, 0, SamplingOverrides(), InferenceOptions(), self.step, self.turn,
-            body=self.body,
+            self.start, (), False, 0, None, None, True, 0, SamplingOverrides(), InferenceOptions(),
+            self.step, self.turn, body=self.body,
         )  # fmt: skip
 
 

@@ -160,10 +160,10 @@ class Walkers:
         frames = [seen[frame : frame + 1] for seen in ahead.seen]
         walks = self.info.vocabulary[ahead.names[ahead.taken - 1]].forward
         known = self.lead.surroundings
-        if frame and walks and known is not None:
-            if known.blocks(self.pose, frames[0].cameras.world_from_camera[0]):
-                ahead.taken = len(ahead.names)
-                return False
+        there = frames[0].cameras.world_from_camera[0]
+        if frame and walks and known is not None and known.blocks(self.pose, there):
+            ahead.taken = len(ahead.names)
+            return False
         self.stand_at(frames, begins=frame == 0)
         return True
 
