@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -56,6 +56,15 @@ def open_play(options: PlayOptions) -> Play:
     Raises:
         PersistError: one line when something is missing or damaged, or does not go together.
     """
+    return open_walks(options)()
+
+
+def open_walks(options: PlayOptions) -> Callable[[], Play]:
+    """Return what makes walks from one start that share a model, as several people walk at once; one acts at a time.
+
+    Raises:
+        PersistError: as ``open_play``; what it returns raises it where the settings are wrong.
+    """
     options.placement.device()  # a missing accelerator is an error before anything is loaded
     checkpoint = find_checkpoint(Path(options.checkpoint))
     names = chosen_memories(checkpoint, options.memories)
@@ -68,12 +77,17 @@ def open_play(options: PlayOptions) -> Play:
     with busy("loading the model"):
         backbone = _load(checkpoint, names)
     backbone.prepare_inference(options.placement)
+    placed = {name: memory and memory.to(backbone.device) for name, memory in memories.items()}
     sampling, body = checkpoint.sampling_with(SamplingOverrides()), body_for(options.begin.plan, start.info)
-    worlds: dict[str, AdaptedWorld] = {}
-    for name, memory in memories.items():
-        agent = Agent(memory and memory.to(backbone.device), body=None if worlds else body)
-        worlds[name] = AdaptedWorld(backbone, [agent], sampling, None if name == PLAIN else name)
-    return Play(worlds, start, options.settings, checkpoint.name)
+
+    def walk() -> Play:
+        worlds: dict[str, AdaptedWorld] = {}
+        for name, memory in placed.items():  # each walk writes into copies
+            agent = Agent(memory, body=None if worlds else body)
+            worlds[name] = AdaptedWorld(backbone, [agent], sampling, None if name == PLAIN else name)
+        return Play(worlds, start, options.settings, checkpoint.name)
+
+    return walk
 
 
 def chosen_memories(checkpoint: Checkpoint, names: Sequence[str]) -> tuple[str, ...]:

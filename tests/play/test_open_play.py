@@ -10,7 +10,7 @@ from PIL import Image
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError, DataError, PersistError
 from persist_cli.memorize.picture import PictureOptions
-from persist_cli.play.open_play import PlayOptions, open_play
+from persist_cli.play.open_play import PlayOptions, open_play, open_walks
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import StartOptions
 from tests.support.micro_runs import SIZE
@@ -84,3 +84,13 @@ def test_memories_that_do_not_fit_are_refused(persist, voxel, walks, tmp_path):
         opened(voxel, f"{walks}#0:0", given=(f"{walks}#1:0-4",))
     with pytest.raises(PersistError, match="no checkpoint there"):
         opened(tmp_path, f"{walks}#0:0")
+
+
+def test_walks_that_share_a_model_do_not_share_what_they_remember(voxel, walks):
+    begin = StartOptions(f"{walks}#0:2")
+    walk = open_walks(PlayOptions(voxel, begin, settings=FAST, memories=("voxel",), given=(f"{walks}#0:0-3",)))
+    one, two = walk(), walk()
+    alone = [one.advance(FORWARD) for _ in range(10)]
+    beside = [two.advance(FORWARD) for _ in range(10)]
+    pairs = zip(alone, beside, strict=True)
+    assert all(torch.equal(first.images["voxel"], second.images["voxel"]) for first, second in pairs)
