@@ -281,7 +281,7 @@ def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
 
 def _contradictions(recipe: Recipe) -> list[str]:
     """Describe each group of settings that are valid alone but not together."""
-    training, problems = recipe.training, [*_of_a_network(recipe), *_of_true_cells(recipe)]
+    training, problems = recipe.training, [*_of_a_network(recipe), *_of_data(recipe)]
     if training.cooldown > training.steps:
         problems.append(
             f"training.cooldown {training.cooldown} is more than training.steps {training.steps}; set both, as in "
@@ -295,10 +295,6 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("lora is for stage 1 only; leave it out")
     if not recipe.data.strides or 0 in recipe.data.strides:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")
-    if recipe.data.own_writes and recipe.stage == "codec":
-        problems.append("data.own_writes is for stages 1 and 2; leave it out")
-    if recipe.data.detour is not None and recipe.stage != "policy":
-        problems.append("data.detour is for stage policy only; leave it out")
     if training.frozen_precision == "bf16" and training.precision == "no":
         problems.append("training.frozen_precision bf16 needs training.precision bf16")
     if training.batch % training.accumulation:
@@ -306,14 +302,20 @@ def _contradictions(recipe: Recipe) -> list[str]:
     return problems
 
 
-def _of_true_cells(recipe: Recipe) -> list[str]:
-    """Describe why a recipe cannot train on true cells, where it shall."""
-    data = recipe.data
+def _of_data(recipe: Recipe) -> list[str]:
+    """Describe settings of the data that are not for the recipe's stage, or not for each other."""
+    data, problems = recipe.data, []
+    if data.own_writes and recipe.stage == "codec":
+        problems.append("data.own_writes is for stages 1 and 2; leave it out")
+    if data.clip_frames and recipe.stage not in ("1", "2"):
+        problems.append("data.clip_frames is for stages 1 and 2 only; leave it out")
+    if data.detour is not None and recipe.stage != "policy":
+        problems.append("data.detour is for stage policy only; leave it out")
     if data.true_cells and recipe.stage != "2":
-        return ["data.true_cells is for stage 2 only; leave it out"]
-    if data.true_cells and (data.mirror or data.color_jitter):
-        return ["data.true_cells takes no data.mirror and no data.color_jitter, which change frames and no cells"]
-    return []
+        problems.append("data.true_cells is for stage 2 only; leave it out")
+    elif data.true_cells and (data.mirror or data.color_jitter):
+        problems.append("data.true_cells takes no data.mirror and no data.color_jitter, which change frames, no cells")
+    return problems
 
 
 def network_of(recipe: Recipe) -> str | None:

@@ -129,6 +129,9 @@ class DataSettings:
             ``null`` every later frame may be one.
         true_cells: share of the clips whose memory, a scene, holds the data's own cells, all of them known, in the
             place of what the context's frames show.
+        clip_frames: lengths of the clips of stages 1 and 2 in frames with the given one, such as 2, 3, 5 and 9; one is
+            drawn for each batch. Without any all clips have the model's. Shorter ones cost less, and a model that knows
+            them can be walked in step by step.
     """
 
     path: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
@@ -149,3 +152,4 @@ class DataSettings:
     depth_noise: Amount = 0.0
     detour: Annotated[float, Field(ge=1, allow_inf_nan=False)] | None = None
     true_cells: Share = 0.0
+    clip_frames: tuple[int, ...] = ()

@@ -55,6 +55,8 @@ class Trainer(TrainingLoop[Backbone]):
         super().__init__(recipe, accelerator)
         self.backbone, self.factory = backbone, factory
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
+        for frames in recipe.data.clip_frames:
+            backbone.check_clip_frames(frames)
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
         self.scenes = scenes_of(clips)
@@ -142,7 +144,15 @@ class Trainer(TrainingLoop[Backbone]):
                 if self.own_writes is not None:
                     encoded = self.own_writes.written(encoded)
                 clips = [self.encoder.with_tokens(sample) for sample in encoded]
-        return Clips.stack(clips).to(self.accelerator.device)
+        return self.shortened(Clips.stack(clips)).to(self.accelerator.device)
+
+    def shortened(self, clips: Clips) -> Clips:
+        """The clips, cut to one of the lengths of ``data.clip_frames``, which the first sample's seed draws."""
+        lengths = self.recipe.data.clip_frames
+        if not lengths:
+            return clips
+        generator = torch.Generator().manual_seed(clips.seeds[0])
+        return clips.shortened(lengths[int(torch.randint(len(lengths), (), generator=generator))])
 
     def encoded(self, clips: Clips) -> Clips:
         """The clips; when times are taken with their latents, which the model would else make in its forward pass."""
