@@ -5,14 +5,23 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
-QUIET = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--virtual-time-budget=10000", "--enable-logging=stderr",
+OFFLINE = (
+    "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync",
 )  # fmt: skip
+
+QUIET = ("--headless", *OFFLINE, "--virtual-time-budget=10000", "--enable-logging=stderr")
 
 # A script that describes the page from inside. It runs in a copy, because the page's own policy forbids scripts.
 DESCRIBE_PAGE = """<script>
@@ -50,3 +59,32 @@ def open_page(page: Path, profile: Path, width: int = 1280) -> tuple[str, list[s
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     return ended.stdout, [line for line in ended.stderr.splitlines() if "CONSOLE" in line]
+
+
+@contextmanager
+def driven_chromium(*flags: str) -> Iterator[Browser]:
+    """Give a headless browser that Playwright drives, with more flags than those that keep it on this machine."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*OFFLINE, *flags])
+        yield browser
+        browser.close()
+
+
+def watched(page: Page) -> list[str]:
+    """Return a list that grows by each error of a page, and by each address that it asks for on another machine."""
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+
+    def keep_foreign(address: str) -> None:
+        if urlsplit(address).scheme not in ("data", "blob") and urlsplit(address).hostname not in (
+            "127.0.0.1",
+            "localhost",
+        ):
+            complaints.append(f"asked for {address}")
+
+    page.on("request", lambda request: keep_foreign(request.url))
+    page.on("websocket", lambda socket: keep_foreign(socket.url))
+    return complaints

@@ -1,0 +1,61 @@
+// The WebSocket to the server: JSON both ways, pictures as binary messages. A lost connection comes back by itself.
+
+const PROTOCOL = 1;
+const FIRST_WAIT = 400, LONGEST_WAIT = 5000; // milliseconds between two attempts
+const ENDED = new Set([1008, 1009, 1011]); // this session has failed; another one is begun by hand
+
+class Connection {
+  // `on` has a function for each type of message, and `open`, `lost(wait)` and `ended`.
+  constructor(on) {
+    this.on = on;
+    this.wait = FIRST_WAIT;
+    this.turn = Promise.resolve(); // messages are handled one after the other, though pictures are decoded aside
+    this.open();
+  }
+
+  open() {
+    clearTimeout(this.later);
+    const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/walk`);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = ({ data }) => {
+      this.turn = this.turn.then(() => this.socket === socket && this.read(data)).catch(error => this.on.fault(error));
+    };
+    socket.onclose = ({ code }) => this.socket === socket && this.turn.then(() => this.closed(code));
+    this.socket = socket;
+  }
+
+  async read(data) {
+    if (typeof data === "string") {
+      const message = JSON.parse(data);
+      if (message.type === "welcome") this.wait = FIRST_WAIT;
+      this.on[message.type]?.(message);
+    } else {
+      const { header, images } = await unpack(data);
+      this.on[header.type]?.(header, images);
+    }
+  }
+
+  closed(code) {
+    if (ENDED.has(code)) return this.on.ended();
+    this.on.lost(this.wait);
+    this.later = setTimeout(() => this.open(), this.wait);
+    this.wait = Math.min(2 * this.wait, LONGEST_WAIT);
+  }
+
+  send(type, values = {}) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ type, ...values }));
+  }
+}
+
+// A binary message: the length of the header, the header, and the images one after another, here as bitmaps.
+async function unpack(buffer) {
+  const length = new DataView(buffer).getUint32(0);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  let place = 4 + length;
+  const blobs = header.images.map(({ bytes }) => {
+    const blob = new Blob([new Uint8Array(buffer, place, bytes)], { type: "image/png" });
+    place += bytes;
+    return blob;
+  });
+  return { header, images: await Promise.all(blobs.map(blob => createImageBitmap(blob))) };
+}
