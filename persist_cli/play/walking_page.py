@@ -1,4 +1,4 @@
-"""The page of ``persist play``: one HTML file with its style and its script in it, and the policy that it works under."""
+"""The page of ``persist play``: one HTML file with its style and script in it, and the policy that it works under."""
 
 from __future__ import annotations
 

@@ -27,8 +27,8 @@ class Controls {
     const input = byId(name), now = byId(`${name}-now`);
     input.oninput = () => now && (now.textContent = input.value);
     input.onchange = () => (input.checkValidity() && input.value !== "" ? this.send("settings", { [name]: Number(input.value) }) : this.fill());
-    input.onpointerup = () => input.type === "range" && input.blur(); // the keys walk again
-    input.onkeydown = event => (event.key === "Enter" || event.key === "Escape") && input.blur();
+    if (input.type === "range") input.onpointerup = () => input.blur(); // the keys walk again
+    input.onkeydown = event => void (["Enter", "Escape"].includes(event.key) && input.blur()); // false would stop the key
   }
 
   begin({ can, limits, actions, settings }) {
