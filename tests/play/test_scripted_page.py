@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from persist_cli.play.messages import Error, Notice, Recorded
-from tests.support.browser import CHROMIUM, driven_chromium, watched
+from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
+from tests.support.browser import watched
 from tests.support.scripted_walks import ScriptedWalks, serving
 
 if TYPE_CHECKING:

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from persist_cli.reproduce.pages import CHROMIUM, OFFLINE
+
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-
-OFFLINE = (
-    "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-component-update",
-    "--disable-sync",
-)  # fmt: skip
+    from playwright.sync_api import Page
 
 QUIET = ("--headless", *OFFLINE, "--virtual-time-budget=10000", "--enable-logging=stderr")
 
@@ -59,17 +51,6 @@ def open_page(page: Path, profile: Path, width: int = 1280) -> tuple[str, list[s
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     return ended.stdout, [line for line in ended.stderr.splitlines() if "CONSOLE" in line]
-
-
-@contextmanager
-def driven_chromium(*flags: str) -> Iterator[Browser]:
-    """Give a headless browser that Playwright drives, with more flags than those that keep it on this machine."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*OFFLINE, *flags])
-        yield browser
-        browser.close()
 
 
 def watched(page: Page) -> list[str]:

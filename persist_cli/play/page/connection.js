@@ -2,10 +2,11 @@
 
 const PROTOCOL = 1;
 const FIRST_WAIT = 400, LONGEST_WAIT = 5000; // milliseconds between two attempts
+const TAKEN = 1013; // all sessions are taken
 const ENDED = new Set([1008, 1009, 1011]); // this session has failed; another one is begun by hand
 
 class Connection {
-  // `on` has a function for each type of message, and `open`, `lost(wait)` and `ended`.
+  // `on` has a function for each type of message, and `open`, `lost(wait, taken)` and `ended`.
   constructor(on) {
     this.on = on;
     this.wait = FIRST_WAIT;
@@ -37,7 +38,7 @@ class Connection {
 
   closed(code) {
     if (ENDED.has(code)) return this.on.ended();
-    this.on.lost(this.wait);
+    this.on.lost(this.wait, code === TAKEN);
     this.later = setTimeout(() => this.open(), this.wait);
     this.wait = Math.min(2 * this.wait, LONGEST_WAIT);
   }

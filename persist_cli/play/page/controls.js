@@ -50,6 +50,7 @@ class Controls {
 
   command(name) {
     if (byId(name).disabled) return;
+    this.tookGoal ||= name === "goal"; // its picture is shown when the server has it
     this.send(name, name === "record" ? { on: !this.state.recording } : {});
   }
 

@@ -2,7 +2,7 @@
 
 const PATIENCE = 350; // milliseconds without a frame after which the page says that the model is thinking
 
-let connected = false, standing = true, blocked = false, lastFrame = 0;
+let connected = false, ever = false, standing = true, blocked = false, lastFrame = 0;
 const views = new Views(), figures = new Figures();
 const controls = new Controls((type, values) => connection.send(type, values));
 const ground = new Ground((x, y) => connection.send("jump", { x, y }));
@@ -18,7 +18,7 @@ const held = new Held((actions, { pressed, first, at }) => {
 const connection = new Connection({
   welcome(message) {
     if (message.protocol !== PROTOCOL) return controls.say("this page is older or newer than the server; reload it", "error");
-    connected = true;
+    connected = ever = true;
     blocked = false;
     byId("model").textContent = message.model;
     views.begin(message.memories, message.image);
@@ -42,17 +42,18 @@ const connection = new Connection({
   },
   map: (header, images) => ground.draw(header, images),
   state(state) {
-    if (state.goal && !controls.state.goal) keepGoal();
+    if (state.goal && (controls.tookGoal || !controls.state.goal)) keepGoal();
+    controls.tookGoal = false;
     controls.show(state);
     tell();
   },
   notice: ({ text }) => controls.say(text, "notice"),
   error: ({ text }) => controls.say(text, "error"),
   recorded: message => controls.recorded(message),
-  lost(wait) {
+  lost(wait, taken) {
     connected = false;
     held.releaseAll();
-    tell(`Connection lost; trying again in ${Math.ceil(wait / 1000)} s`);
+    tell(`${taken ? "No free session" : "Connection lost"}; trying again in ${Math.ceil(wait / 1000)} s`);
   },
   ended() {
     connected = false;
@@ -83,7 +84,7 @@ function tell(trouble) {
   const late = performance.now() - lastFrame > PATIENCE;
   const walking = controls.state.planning || !standing;
   let kind = "ready", words = "Ready";
-  if (!connected) [kind, words] = ["lost", trouble ?? byId("state").textContent];
+  if (!connected) [kind, words] = [ever ? "lost" : "wait", trouble ?? byId("state").textContent];
   else if (walking && late) [kind, words] = ["busy", "Thinking …"];
   else if (blocked && walking) [kind, words] = ["blocked", "Blocked: something is in the way"];
   else if (controls.state.planning) [kind, words] = ["busy", "Walking to the goal"];
@@ -91,7 +92,7 @@ function tell(trouble) {
   const state = byId("state");
   if (state.textContent !== words) state.textContent = words; // screen readers say what changes
   state.dataset.kind = kind;
-  byId("stage").classList.toggle("lost", !connected);
+  byId("stage").classList.toggle("lost", ever && !connected);
   controls.able(connected);
 }
 

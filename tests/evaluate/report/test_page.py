@@ -9,7 +9,8 @@ import re
 import pytest
 
 from persist_cli.evaluate.report.page import write_report
-from tests.support.browser import CHROMIUM, DESCRIBE_PAGE, POLICY, open_page
+from persist_cli.reproduce.pages import CHROMIUM
+from tests.support.browser import DESCRIBE_PAGE, POLICY, open_page
 from tests.support.example_results import ROWS, example_pictures, example_results
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium or Chrome on this machine")

@@ -1,0 +1,75 @@
+"""Pages of persist in a browser: a command that serves one, and a headless Chromium that Playwright drives."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+from persist_cli.errors import PersistError
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+CHROMIUM: Final = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+OFFLINE: Final = (
+    "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync",
+)  # fmt: skip
+
+PATIENCE: Final = 20.0  # seconds in which a command that is stopped ends
+
+
+@contextmanager
+def served_page(line: str) -> Iterator[str]:
+    """Run a command of persist that serves a page, such as ``play --memories none,voxel``, and give its address.
+
+    The command is told to take a free port, to open no browser, and to print its address as JSON.
+
+    Raises:
+        PersistError: when the command ends before it serves; it has said why itself.
+    """
+    command = [sys.executable, "-m", "persist_cli", *shlex.split(line), "--port", "0", "--no-open", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"})
+    try:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        if not first:
+            raise PersistError(f"`persist {line}` ended with exit code {process.wait()} and served no page")
+        yield json.loads(first)["address"]
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+@contextmanager
+def driven_chromium(*flags: str) -> Iterator[Browser]:
+    """Give a headless browser that Playwright drives.
+
+    Args:
+        flags: more than those that keep it from asking other machines.
+
+    Raises:
+        PersistError: when there is no Playwright or no Chromium.
+    """
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError as error:
+        raise PersistError("a browser is driven by Playwright; pip install 'persist-cli[dev]'") from error
+    if CHROMIUM is None:
+        raise PersistError("no chromium, chromium-browser or google-chrome on PATH; install one of them")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*OFFLINE, *flags])
+        yield browser
+        browser.close()

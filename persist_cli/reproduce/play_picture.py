@@ -1,0 +1,83 @@
+"""A picture of ``persist play``: ``python -m persist_cli.reproduce.play_picture play.png``.
+
+A browser opens the page, walks some frames by its keys, and takes the picture; what follows ``--`` is given to
+``persist play``. Playwright and Chromium must be installed (``pip install 'persist-cli[dev]'``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from persist_cli.errors import PersistError
+from persist_cli.io.files import written_aside
+from persist_cli.reproduce.pages import driven_chromium, served_page
+from persist_cli.viewing.console import say
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+WALK: Final = "a*4 w*6 d*6 w*4"  # keys, and the frames that each is held for
+COMPARED: Final = ("--memories", "none,voxel")
+READY: Final = 300_000  # milliseconds in which the model is loaded
+
+
+def take_picture(address: str, out: Path, walk: str, size: tuple[int, int]) -> None:
+    """Walk in the page at an address, and write a picture of it.
+
+    Args:
+        address: of the page.
+        out: PNG file.
+        walk: keys and frames, as in ``WALK``.
+        size: width and height of the window in pixels.
+    """
+    with driven_chromium() as browser:
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        page.goto(address)
+        page.wait_for_selector("#stage[data-number]", timeout=READY)
+        for word in walk.split():
+            key, _, count = word.partition("*")
+            hold(page, key, int(count or 1))
+        page.wait_for_timeout(500)  # the map follows the frames
+        with written_aside(out) as aside:
+            page.screenshot(path=aside, type="png")
+
+
+def hold(page: Page, key: str, frames: int) -> None:
+    """Hold a key until so many more frames are drawn."""
+    last = frame_number(page) + frames
+    page.keyboard.down(key)
+    while frame_number(page) < last:
+        page.wait_for_timeout(10)
+    page.keyboard.up(key)
+
+
+def frame_number(page: Page) -> int:
+    """Return the number of the frame that the page shows."""
+    return int(page.locator("#stage").get_attribute("data-number") or 0)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Take the picture; exit code 1 and one line for an error that the user can mend."""
+    parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.play_picture")
+    parser.add_argument("out", type=Path, help="PNG file to write")
+    parser.add_argument("--walk", default=WALK, help=f"keys, and the frames that each is held for; {WALK!r} by default")
+    parser.add_argument("--size", default="1360x800", help="of the window; 1360x800 by default")
+    parser.add_argument("play", nargs="*", default=COMPARED, help="after --: arguments of `persist play`")
+    options = parser.parse_args(arguments)
+    try:
+        width, height = (int(side) for side in options.size.split("x"))
+        with served_page(shlex.join(["play", *options.play])) as address:
+            take_picture(address, options.out, options.walk, (width, height))
+    except PersistError as error:
+        say(f"error: {error}")
+        sys.exit(1)
+    say(f"wrote {options.out}")
+
+
+if __name__ == "__main__":
+    main()
