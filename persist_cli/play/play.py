@@ -36,7 +36,6 @@ class Play:
     ) -> None:
         self.model, self._start = model, start
         self._walkers = Walkers(worlds)
-        self._first_memories = {name: world.agents[0].memory for name, world in worlds.items()}
         self._number = -1
         self._ahead: Ahead | None = None
         self._done: frozenset[str] = frozenset()  # interactions that are still held and were done
@@ -84,9 +83,6 @@ class Play:
         if seed is not None:
             self.set(dataclasses.replace(self.settings, seed=seed))
         self._ahead, self._done = None, frozenset()
-        for name, world in self._walkers.worlds.items():
-            memory = self._first_memories[name]
-            world.agents[0].memory = None if memory is None else memory.copy()
         self._walkers.begin(self._start.observations, self.info)
         return self._show(None, True, time.monotonic())
 

@@ -18,6 +18,7 @@ from persist_cli.api.backbone import Backbone, Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.clips import interactions_of
+from persist_cli.play.history import Checkpoint, History, Step
 from persist_cli.rollout.surroundings import plan_walks
 from persist_cli.rollout.world_model import Agent, WorldModel
 
@@ -83,7 +84,9 @@ class Walkers:
 
     def __init__(self, worlds: Mapping[str, WorldModel]) -> None:
         self.worlds = dict(worlds)
+        self._start = [world.agents[0].memory for world in worlds.values()]
         self._shown: list[list[Observations]] = [[] for _ in worlds]  # of each world, not remembered yet
+        self._history: History
 
     @property
     def agents(self) -> list[Agent]:
@@ -111,10 +114,12 @@ class Walkers:
         return next(iter(self.worlds.values())).clip_frames - 1
 
     def begin(self, start: Observations, info: TrajectoryInfo) -> None:
-        """Let all agents stand at an observed frame, and remember it."""
-        for world in self.worlds.values():
+        """Let all agents stand at an observed frame, and remember it beside what they remembered at first."""
+        for world, memory in zip(self.worlds.values(), self._start, strict=True):
+            world.agents[0].memory = memory and memory.copy()
             world.reset([start], [info])
         self._shown = [[] for _ in self.worlds]
+        self._history = History(Checkpoint.of(self.agents))
 
     def imagine(self, actions: Sequence[str]) -> Ahead:
         """Return a clip of some actions in turn; nothing of it is shown yet.
@@ -130,9 +135,7 @@ class Walkers:
         walk = self.lead.set_out(names, self.longest)
         plan_walks([walk], [names[len(walk.names) :]], self.longest)
         if once and walk.free[0]:
-            for agent in self.agents[1:]:
-                if agent.scene is not None:
-                    agent.interact(names[0])
+            self._interact(names[0], self.agents[1:])
         seen = [agent.now[:0] for agent in self.agents]
         if walk.poses:
             seen = self._predict(walk.cameras, interactions_of(walk.moves, self.info.vocabulary))
@@ -164,25 +167,64 @@ class Walkers:
         if frame and walks and known is not None and known.blocks(self.pose, there):
             ahead.taken = len(ahead.names)
             return False
-        self.stand_at(frames, begins=frame == 0)
+        self.stand_at(frames, ahead.names[ahead.taken - 1], begins=frame == 0)
         return True
 
-    def stand_at(self, frames: Sequence[Observations], begins: bool = True) -> None:
-        """Make a frame of each world model the present one, to be remembered; ``begins``: it is the first of a clip."""
-        for agent, frame, shown in zip(self.agents, frames, self._shown, strict=True):
-            agent.notice(frame)
-            if begins:
-                agent.observe(frame)
-            else:
-                agent.stand_at(frame)
-            shown.append(frame)
+    def stand_at(self, frames: Sequence[Observations], action: str | None = None, begins: bool = True) -> None:
+        """Make a frame of each world model the present one, to be remembered.
+
+        Args:
+            frames: one of each.
+            action: that led there.
+            begins: whether it is the first of a clip.
+        """
+        clips = tuple(agent.clips + begins for agent in self.agents)
+        step = Step(action, tuple(frames), clips, begins)
+        self._take(step)
+        self._history.add(step)
+
+    def undo(self) -> bool:
+        """Go back to the frame before the present one, also in the memories; false where there is none to undo."""
+        last = self._history.undo()
+        if last is None:
+            return False
+        checkpoint, steps = last
+        checkpoint.restore(self.agents)
+        self._shown = [[] for _ in self.worlds]
+        for step in steps:
+            if step.begins:
+                self._write()
+            if step.action is not None and self.info.vocabulary[step.action].interaction:
+                self._interact(step.action, self.agents)
+            self._take(step)
+        return True
 
     def remember(self) -> None:
         """Write what was shown into the memories."""
+        self._write()
+        self._history.remembered(self.agents)
+
+    def _take(self, step: Step) -> None:
+        """Let the agents stand at the frames of a step."""
+        for agent, frame, clips, shown in zip(self.agents, step.frames, step.clips, self._shown, strict=True):
+            agent.notice(frame)
+            agent.stand_at(frame)
+            agent.clips = clips
+            shown.append(frame)
+
+    def _write(self) -> None:
         for world, agent, shown in zip(self.worlds.values(), self.agents, self._shown, strict=True):
             if shown:
                 agent.memorize(Observations.concatenate(shown), world.backbone.device)
                 shown.clear()
+                agent.reads.clear()  # of figures that nobody asks for here
+
+    @staticmethod
+    def _interact(action: str, agents: Sequence[Agent]) -> None:
+        """Let an interaction change the scenes of agents."""
+        for agent in agents:
+            if agent.scene is not None:
+                agent.interact(action)
 
     def _predict(self, cameras: Cameras, interactions: Interactions) -> list[Observations]:
         with torch.no_grad():
