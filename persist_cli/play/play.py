@@ -9,11 +9,15 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Collection, Mapping
+from pathlib import Path
 
 from persist_cli.api.actions import Action
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
+from persist_cli.errors import PersistError
+from persist_cli.play.ground import check_free, pose_at
 from persist_cli.play.keys import held_actions, walking_keys
+from persist_cli.play.recording import Recording, SavedRecording
 from persist_cli.play.settings import GroundPose, PlaySettings, Shown
 from persist_cli.play.walkers import Ahead, Pose, Walkers
 from persist_cli.rollout.world_model import WorldModel
@@ -38,7 +42,12 @@ class Play:
         self._walkers = Walkers(worlds)
         self._number = -1
         self._ahead: Ahead | None = None
+        self._thoughts: dict[tuple[str, ...], Ahead] = {}  # clips from the present state, by their actions
+        self._last: tuple[str, ...] = ()  # actions that were held last
+        self._blocked = 0  # of these, one after the other
         self._done: frozenset[str] = frozenset()  # interactions that are still held and were done
+        self._recording: Recording | None = None
+        self._records = False
         self.settings = settings
         self.set(settings)
         self.shown = self.reset()
@@ -72,7 +81,8 @@ class Play:
         for world, sampling in zip(worlds, samplings, strict=True):
             world.clip_frames = world.backbone.frames_per_clip if frames is None else frames  # refused by the first
             world.sampling, world.agents[0].seed = sampling, settings.seed
-        self.settings, self._ahead = settings, None
+        self.settings = settings
+        self._drop()
 
     def reset(self, seed: int | None = None) -> Shown:
         """Begin again at the start, with the memories as they were there, and return the start frame.
@@ -82,9 +92,11 @@ class Play:
         """
         if seed is not None:
             self.set(dataclasses.replace(self.settings, seed=seed))
-        self._ahead, self._done = None, frozenset()
+        begun, self._done = time.monotonic(), frozenset()
+        self._drop()
         self._walkers.begin(self._start.observations, self.info)
-        return self._show(None, True, time.monotonic())
+        self._record(None)
+        return self._show(None, True, begun)
 
     def advance(self, held: Collection[str]) -> Shown | None:
         """Return the next frame under the held actions, or ``None`` when there is nothing new to show.
@@ -101,16 +113,46 @@ class Play:
         """
         begun = time.monotonic()
         actions = self._next_actions(frozenset(held))
-        ahead = self._ahead
         if not actions:
-            self._ahead = None
+            self._ahead, self._blocked = None, 0
             return None
-        if ahead is None or ahead.actions != actions or not (ahead.left or ahead.stuck):
-            ahead = self._ahead = self._walkers.imagine(actions)
-        elif ahead.stuck:
+        if actions != self._last:
+            self._last, self._blocked = actions, 0
+        if self._blocked >= len(actions):
             return None
-        name = ahead.names[ahead.taken]
-        return self._show(name, self._walkers.show(ahead), begun)
+        ahead = self._ahead
+        if ahead is None or ahead.actions != actions or not ahead.left:
+            ahead = self._ahead = self._thoughts.pop(actions, None) or self._walkers.imagine(actions)
+        return self._take(ahead, begun)
+
+    def think(self, seconds: float) -> bool:
+        """Imagine what the likely next actions lead to, while nobody waits, and return whether more is left to imagine.
+
+        Each clip is imagined alone, so that a key waits for one at most: on a processor a batch of clips takes no less
+        time. What was imagined is dropped as soon as anything else is shown.
+
+        Args:
+            seconds: after which no further clip is begun; one that is begun is finished.
+        """
+        begun = time.monotonic()
+        while (actions := self._next_thought()) is not None:
+            if time.monotonic() - begun >= seconds:
+                return True
+            self._thoughts[actions] = self._walkers.imagine(actions)
+        return False
+
+    def undo(self) -> Shown | None:
+        """Go back to the frame before the present one, and forget that; ``None`` where no more can be undone.
+
+        At least ``UNDO`` frames can be undone. A blocked action is no frame of its own.
+        """
+        begun = time.monotonic()
+        if not self._walkers.undo():
+            return None
+        self._drop()
+        if self._recording is not None and self._records:
+            self._recording.undo()
+        return self._show(None, True, begun)
 
     def _next_actions(self, held: frozenset[str]) -> tuple[str, ...]:
         """Return the actions to take in turn: an interaction that is newly held, else what moves."""
@@ -119,23 +161,91 @@ class Play:
         fresh = sorted(name for name in held - done if self.info.vocabulary[name].interaction)
         self._done = done | frozenset(fresh[:1])
         if fresh:
-            self._ahead = None
+            self._ahead, self._last = None, ()
         return tuple(fresh[:1]) or moving
 
     def home(self) -> Shown:
         """Stand at the start pose again, and return what is imagined there; nothing is forgotten."""
         return self._jump(self._start.observations.cameras.world_from_camera[0])
 
+    def jump(self, x: float, y: float) -> Shown:
+        """Stand at another place with the same heading, and return what is imagined there; nothing is forgotten.
+
+        Args:
+            x: metres along the first ground axis.
+            y: metres along the second.
+
+        Raises:
+            PersistError: when the place is not on ground known to be free; without a body all places are allowed.
+        """
+        check_free(self._walkers.lead.surroundings, x, y)
+        return self._jump(pose_at(self._walkers.pose, x, y, self.info))
+
+    @property
+    def recording(self) -> bool:
+        """Whether frames are recorded; ``LONGEST`` of them at most."""
+        return self._recording is not None and self._records and not self._recording.full
+
+    def record(self, on: bool) -> None:
+        """Begin a recording with the present frame, or end it; what was recorded stays until the next begins."""
+        self._records = on
+        if on:
+            self._recording = Recording(self.memories, self._frames)
+
+    def save_recording(self, folder: Path) -> SavedRecording:
+        """Write the last recording as a video and a data set of a trajectory for each memory.
+
+        Raises:
+            PersistError: when nothing was recorded, or the folder cannot be written.
+        """
+        if self._recording is None:
+            raise PersistError("nothing was recorded; begin a recording first")
+        return self._recording.save(folder, self.info, {"checkpoint": self.model, "start": self._start.name})
+
+    @property
+    def _frames(self) -> tuple[Observations, ...]:
+        return tuple(agent.now for agent in self._walkers.agents)
+
+    def _drop(self) -> None:
+        """Drop all that is imagined and not shown."""
+        self._ahead, self._blocked = None, 0
+        self._thoughts.clear()
+
+    def _next_thought(self) -> tuple[str, ...] | None:
+        """Return the likeliest next actions of which nothing is imagined yet: those before, else a single move."""
+        if not self.settings.ahead or (self._ahead is not None and self._ahead.left):
+            return None
+        moves = [action for action in self.actions if action.forward or action.turn]
+        moves.sort(key=lambda action: (action.forward < 0, -action.forward))
+        singles = [(action.name,) for action in moves]
+        before = [self._last] if self._last and all((name,) in singles for name in self._last) else []
+        return next((one for one in [*before, *singles] if one not in self._thoughts), None)
+
+    def _take(self, ahead: Ahead, begun: float) -> Shown:
+        """Show the next action of a clip."""
+        name = ahead.names[ahead.taken]
+        free = self._walkers.show(ahead)
+        self._thoughts.clear()
+        self._blocked = 0 if free else self._blocked + 1
+        if free:
+            self._record(name)
+        return self._show(name, free, begun)
+
     def _jump(self, pose: Pose) -> Shown:
-        begun, self._ahead = time.monotonic(), None
+        begun = time.monotonic()
+        self._drop()
         self._walkers.stand_at(self._walkers.look_from(pose))
+        self._record(None)
         return self._show(None, True, begun)
+
+    def _record(self, action: str | None) -> None:
+        if self._recording is not None and self._records:
+            self._recording.add(action, self._frames)
 
     def _show(self, action: str | None, free: bool, begun: float) -> Shown:
         """Return the present frames as shown now, and keep them as ``shown``."""
         self._number += 1
-        frames: list[Observations] = [agent.now for agent in self._walkers.agents]
-        images = {name: frame.rgb[0] for name, frame in zip(self.memories, frames, strict=True)}
+        images = {name: frame.rgb[0] for name, frame in zip(self.memories, self._frames, strict=True)}
         pose = GroundPose.of(self._walkers.pose, self.info.world_up)
         milliseconds = 1000 * (time.monotonic() - begun)
         self.shown = Shown(self._number, action, free, pose, images, milliseconds)

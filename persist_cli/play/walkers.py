@@ -67,11 +67,6 @@ class Ahead:
         """Whether a frame is left to show."""
         return self.taken < len(self.names)
 
-    @property
-    def stuck(self) -> bool:
-        """Whether all of its actions are blocked."""
-        return not any(self.free)
-
 
 class Walkers:
     """The agents of several world models, which all stand at one pose.

@@ -117,3 +117,23 @@ def test_settings_that_cannot_be_used_leave_the_old_ones(backbone, walks):
     with pytest.raises(PersistError, match="0 denoising steps"):
         play.set(PlaySettings(steps=0))
     assert play.settings.steps == 2
+
+
+def test_a_clip_that_was_thought_of_is_what_the_key_shows(backbone, walks):
+    play, other = play_on(backbone, walks), play_on(backbone, walks)
+    assert not play.think(600)
+    shown, truth = walked(play, LEFT, 3), walked(other, LEFT, 3)
+    assert all(torch.equal(one.images["voxel"], two.images["voxel"]) for one, two in zip(shown, truth, strict=True))
+    play.advance(frozenset())
+    assert play.think(0)  # something is left to imagine, and no time
+    play.set(PlaySettings(steps=2, ahead=False))
+    assert not play.think(0)
+
+
+def test_a_jump_keeps_height_and_heading(backbone, walks):
+    play = play_on(backbone, walks)
+    before = play.shown.pose
+    shown = play.jump(before.x + 0.5, before.y - 0.25)
+    assert (shown.pose.x, shown.pose.y) == pytest.approx((before.x + 0.5, before.y - 0.25))
+    assert shown.pose.degrees == pytest.approx(before.degrees)
+    assert play.advance(FORWARD).action == "forward"

@@ -1,0 +1,55 @@
+"""A step that is undone leaves no trace, in the picture, the memory or on the ground."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from persist_cli.play import history
+from tests.play.test_play import FORWARD, LEFT, play_on, walked
+from tests.support.micro_worlds import remembering_model
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    return remembering_model()
+
+
+def memory_of(play):
+    play._walkers.remember()
+    return play._walkers.lead.memory.tensors()
+
+
+def same(one, two):
+    return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
+
+
+def test_an_undone_walk_goes_on_as_if_it_had_never_been_walked(backbone, walks):
+    play, other = play_on(backbone, walks), play_on(backbone, walks)
+    shown = walked(play, FORWARD, 3)
+    walked(other, FORWARD, 3)
+    walked(play, LEFT, 2)
+    play.undo()
+    back = play.undo()
+    assert torch.equal(back.images["voxel"], shown[-1].images["voxel"])
+    assert same(memory_of(play), memory_of(other))
+    assert torch.equal(walked(play, LEFT, 1)[0].images["voxel"], walked(other, LEFT, 1)[0].images["voxel"])
+
+
+def test_the_start_cannot_be_undone(backbone, walks):
+    play = play_on(backbone, walks)
+    walked(play, FORWARD, 1)
+    assert play.undo() is not None
+    assert play.undo() is None
+
+
+def test_undo_reaches_back_over_copies_of_the_memory_and_is_bounded(backbone, walks, monkeypatch):
+    monkeypatch.setattr(history, "UNDO", 4)
+    play, shown = play_on(backbone, walks), []
+    for held in (FORWARD, LEFT) * 5:
+        shown += walked(play, held, 2)
+    back = [play.undo() for _ in range(20)]
+    undone = [one for one in back if one is not None]
+    assert 4 <= len(undone) < 20
+    for one, truth in zip(undone, shown[-2::-1], strict=False):
+        assert torch.equal(one.images["voxel"], truth.images["voxel"])
