@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import pytest
 import torch
+from torch.nn.functional import scaled_dot_product_attention
 from torch.profiler import ProfilerActivity, profile
 
 from persist_backbones.cogvideox import cpu_attention
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.stages import MemorySavings
-from tests.support.micro_model import micro, random_clips, shaken
+from tests.support.micro_model import micro, random_clips, random_tokens, shaken, trained
 
 FUSED = "aten::_scaled_dot_product_flash_attention_for_cpu"
 
@@ -67,3 +69,21 @@ def test_losses_and_gradients_are_those_of_the_fused_kernel_up_to_rounding(monke
         for it in (by_products, fused)
     )
     assert float((one - two).norm()) < 0.02 * float(two.norm())
+
+
+def test_keys_that_a_mask_hides_are_not_attended_to() -> None:
+    torch.manual_seed(0)
+    query, key, value = (torch.randn(2, 3, count, 8) for count in (4, 6, 6))
+    mask = torch.rand(2, 1, 1, 6) < 0.6
+    wanted = scaled_dot_product_attention(query, key, value, attn_mask=mask)
+    torch.testing.assert_close(cpu_attention.attend(query, key, value, mask).float(), wanted, rtol=0.05, atol=0.02)
+
+
+@pytest.mark.parametrize("form", ["cross", "projected"])
+def test_an_adapter_that_attends_to_memory_trains_in_bfloat16(form: str) -> None:
+    backbone = trained(form)
+    clips = dataclasses.replace(random_clips(2), tokens=random_tokens(2, 6))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        backbone(clips, "2")["loss"].backward()
+    gradients = [part.grad for part in backbone.trained_parameters("2").values()]
+    assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)

@@ -66,11 +66,16 @@ def attend(
     dropout_p: float = 0.0,
     is_causal: bool = False,
 ) -> torch.Tensor:
-    """Return attention with all its weights at once; arguments as of PyTorch's function, without mask and dropout."""
-    if attn_mask is not None or dropout_p or is_causal:
-        raise NotImplementedError("attention of matrix products has no mask and no dropout")
+    """Return attention with all its weights at once, in bfloat16; arguments as of PyTorch's function.
+
+    A mask is true where a query sees a key, and each query must see one. There is no dropout and no causal mask.
+    """
+    if dropout_p or is_causal or (attn_mask is not None and attn_mask.dtype != torch.bool):
+        raise NotImplementedError("attention of matrix products has masks of truth values alone, and no dropout")
     with torch.autocast(query.device.type, enabled=False):
         query, key, value = (part.to(torch.bfloat16) for part in (query, key, value))
         weights = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
+        if attn_mask is not None:
+            weights = weights.masked_fill(~attn_mask, -torch.inf)
         attended: torch.Tensor = weights.softmax(-1) @ value
     return attended
