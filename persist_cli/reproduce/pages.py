@@ -10,8 +10,9 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.errors import PersistError
 
@@ -28,9 +29,17 @@ OFFLINE: Final = (
 PATIENCE: Final = 20.0  # seconds in which a command that is stopped ends
 
 
+@dataclass(frozen=True)
+class ServedPage:
+    """A page that a process of persist serves: its address, and the number of the process."""
+
+    address: str
+    process: int
+
+
 @contextmanager
-def served_page(line: str) -> Iterator[str]:
-    """Run a command of persist that serves a page, such as ``play --memories none,voxel``, and give its address.
+def served_page(line: str) -> Iterator[ServedPage]:
+    """Run a command of persist that serves a page, such as ``play --memories none,voxel``, until the block ends.
 
     The command is told to take a free port, to open no browser, and to print its address as JSON.
 
@@ -40,17 +49,24 @@ def served_page(line: str) -> Iterator[str]:
     command = [sys.executable, "-m", "persist_cli", *shlex.split(line), "--port", "0", "--no-open", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"})
     try:
-        assert process.stdout is not None
-        first = process.stdout.readline()
-        if not first:
-            raise PersistError(f"`persist {line}` ended with exit code {process.wait()} and served no page")
-        yield json.loads(first)["address"]
+        yield ServedPage(first_json(process, line)["address"], process.pid)
     finally:
         process.send_signal(signal.SIGINT)
         try:
             process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             process.kill()
+
+
+def first_json(process: subprocess.Popen[str], line: str) -> Any:
+    """Return the first value that a command of persist prints as JSON, in one line or several."""
+    assert process.stdout is not None
+    text = ""
+    for part in process.stdout:
+        text += part
+        with suppress(json.JSONDecodeError):
+            return json.loads(text)
+    raise PersistError(f"`persist {line}` ended with exit code {process.wait()} and served no page")
 
 
 @contextmanager

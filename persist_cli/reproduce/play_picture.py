@@ -71,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     try:
         width, height = (int(side) for side in options.size.split("x"))
-        with served_page(shlex.join(["play", *options.play])) as address:
-            take_picture(address, options.out, options.walk, (width, height))
+        with served_page(shlex.join(["play", *options.play])) as served:
+            take_picture(served.address, options.out, options.walk, (width, height))
     except PersistError as error:
         say(f"error: {error}")
         sys.exit(1)
