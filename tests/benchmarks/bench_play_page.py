@@ -31,10 +31,10 @@ from persist_cli.viewing.console import print_table, say
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-KEYS = ("a", "w", "d", "w", "w", "s")
+KEYS = ("a", "w", "d", "d", "s", "a")
 PAUSES = (300, 900)  # milliseconds between two presses, at least and at most
 STILL = 250  # milliseconds without a frame after which the agent stands
-STUCK = 60.0  # seconds after which a frame that does not come is given up
+STUCK = 30.0  # seconds after which frames that do not come are given up
 LOOK = 20  # milliseconds between two looks at the page
 
 # The times at which frames were drawn, and the latencies of keys, kept for this program.
@@ -82,6 +82,7 @@ def measure(page: Page, server: psutil.Process, presses: int, hold: int) -> Answ
         page.wait_for_timeout(chance.uniform(*PAUSES))
         rates.append(press(page, KEYS[number % len(KEYS)], hold))
     wait_until_still(page)
+    rates = [rate for rate in rates if rate is not None]
     latencies, walked = page.evaluate("latencies"), frame_number(page) - after
     seconds = processor_seconds(server) - began
     return Answers(
@@ -90,17 +91,17 @@ def measure(page: Page, server: psutil.Process, presses: int, hold: int) -> Answ
     )  # fmt: skip
 
 
-def press(page: Page, key: str, hold: int) -> float:
-    """Hold a key until some frames are drawn, and return how many a second."""
+def press(page: Page, key: str, hold: int) -> float | None:
+    """Hold a key until some frames are drawn, and return how many a second; ``None`` where the way ends before."""
     page.evaluate("() => { drawn.length = 0; }")
     page.keyboard.down(key)
     waited = 0
-    while page.evaluate("drawn.length") < hold and waited < 1000 * STUCK:
+    while page.evaluate("drawn.length") < hold and waited < 1000 * STUCK and not page.locator("#stage.blocked").count():
         page.wait_for_timeout(LOOK)
         waited += LOOK
     page.keyboard.up(key)
     times = page.evaluate(f"drawn.slice(0, {hold})")
-    return 1000 * (len(times) - 1) / (times[-1] - times[0])
+    return 1000 * (hold - 1) / (times[-1] - times[0]) if len(times) == hold else None
 
 
 def wait_until_still(page: Page) -> None:

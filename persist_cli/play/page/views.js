@@ -1,6 +1,7 @@
 // The imagined views, one pane for each memory, and the figures below them.
 
 const SHOWN = 200; // the frames and keys of which the 95th percentile is told
+const FEW = 10; // frames whose mean is told: those of a clip are imagined together
 const PAUSE = 1000; // milliseconds without a frame that are no part of frames a second
 const CAPTION = 30; // pixels around a view: its name and the gap
 
@@ -79,7 +80,8 @@ class Figures {
     byId("number").textContent = number;
     byId("place").textContent = `${pose.x.toFixed(2)}, ${pose.y.toFixed(2)} m, ${Math.round(pose.degrees)}°`;
     if (action === null) return;
-    this.frames = show("frame", this.frames, milliseconds);
+    this.frames = [...this.frames, milliseconds].slice(-SHOWN);
+    show("frame", mean(this.frames.slice(-FEW)), this.frames);
     this.rate(performance.now());
     const { waiting } = this;
     if (!waiting || waiting.action !== action || number <= waiting.after) return;
@@ -89,7 +91,8 @@ class Figures {
 
   answered(start) {
     const { duration } = performance.measure("key to picture", { start, end: performance.now() });
-    this.keys = show("key", this.keys, duration);
+    this.keys = [...this.keys, duration].slice(-SHOWN);
+    show("key", duration, this.keys);
   }
 
   rate(now) {
@@ -100,13 +103,15 @@ class Figures {
   }
 }
 
-// Show the newest of some durations and their 95th percentile, and return those that count.
-function show(name, durations, duration) {
-  const kept = [...durations, duration].slice(-SHOWN);
-  const sorted = [...kept].sort((a, b) => a - b);
+// Show a duration, and the 95th percentile of those that count.
+function show(name, duration, durations) {
+  const sorted = [...durations].sort((a, b) => a - b);
   byId(`last-${name}`).textContent = Math.round(duration);
   byId(`slow-${name}`).textContent = Math.round(sorted[Math.ceil(0.95 * sorted.length) - 1]);
-  return kept;
+}
+
+function mean(numbers) {
+  return numbers.reduce((sum, number) => sum + number, 0) / numbers.length;
 }
 
 function drawImage(canvas, image) {
