@@ -52,13 +52,25 @@ def fill_missing(depth: Float[Tensor, "frame height width"]) -> Float[Tensor, "f
 class SingleFrameConv(CogVideoXSafeConv3d):  # type: ignore[misc]
     """The convolution inside ``FramewiseConv``: on a single frame, all taps in time take that same frame."""
 
+    _flat: tuple[Tensor, tuple[object, ...], Tensor] | None = None  # the weight, its state, and its sum over time
+
+    def flat_weight(self) -> Tensor:
+        """Return the sum of the taps in time, which is made again after the weight was changed or moved."""
+        weight: Tensor = self.weight
+        if torch.is_grad_enabled() or weight.is_meta:
+            return weight.sum(2)
+        state = (weight.data_ptr(), weight._version, weight.dtype)
+        if self._flat is None or self._flat[0] is not weight or self._flat[1] != state:
+            self._flat = weight, state, weight.sum(2)
+        return self._flat[2]
+
     def forward(self, input: Tensor) -> Tensor:
         """Convolve the video, here in the module with the weights, which offloading moves when it is called."""
         if input.shape[2] != 1:
             convolved: Tensor = super().forward(input)
             return convolved
         strides = (self.stride[1:], self.padding[1:], self.dilation[1:])
-        return F.conv2d(input[:, :, 0], self.weight.sum(2), self.bias, *strides)[:, :, None]
+        return F.conv2d(input[:, :, 0], self.flat_weight(), self.bias, *strides)[:, :, None]
 
 
 class FramewiseConv(CogVideoXCausalConv3d):  # type: ignore[misc]

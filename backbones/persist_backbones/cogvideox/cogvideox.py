@@ -273,9 +273,12 @@ class CogVideoX(AdaptedBackbone):
     ) -> tuple[Float[Tensor, "batch 3 frame height width"], Float[Tensor, "batch frame height width"]]:
         """Decode sampled latents to colours, [-1, 1] and beyond, and depth in metres; frame 0 is that of ``first``."""
         shown = self.shape.of(first).drop_padding(latents)
+        shown = shown[:, 1:] if self.framewise else shown  # the first one is given
         colors, depth = self.codec.decode_images(shown, self.settings.depth)
-        colors[:, :, 0] = first.rgb[:, 0].movedim(-1, 1).to(colors) / 127.5 - 1
-        depth[:, 0] = first.depth[:, 0]
+        skipped = 0 if self.framewise else 1
+        given = first.rgb[:, :1].movedim(-1, 1).to(colors) / 127.5 - 1
+        colors = torch.cat([given.expand(len(colors), -1, -1, -1, -1), colors[:, :, skipped:]], dim=2)
+        depth = torch.cat([first.depth[:, :1].to(depth).expand(len(depth), -1, -1, -1), depth[:, skipped:]], dim=1)
         return colors, depth
 
     @torch.no_grad()

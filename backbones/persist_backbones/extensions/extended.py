@@ -116,5 +116,5 @@ class ExtendedCogVideoX(CogVideoX):
 
 def has_cache(transformer: WorldTransformer) -> bool:
     """Whether one of diffusers' caches is enabled, or its hooks are still on the transformer."""
-    hooked = any(getattr(module, "_diffusers_hook", None) is not None for module in transformer.modules())
+    hooked = any("_diffusers_hook" in vars(module) for module in transformer.modules())
     return hooked or transformer.base._cache_config is not None

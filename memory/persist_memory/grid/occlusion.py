@@ -59,16 +59,18 @@ def covered(centers: Float[Tensor, "cell 3"], edge: float, cameras: Cameras) -> 
     pixels, depth = project(centers.expand(frames, -1, -1), cameras)
     ahead = depth > edge / 2
     sizes = cameras.intrinsics[:, 0, 0].double()[:, None] * edge / depth.clamp(min=edge / 2)  # pixels
-    levels = sizes.log2().ceil().clamp(min=0).long()
-    frame = torch.arange(frames, device=depth.device)[:, None].expand_as(depth)
+    levels = sizes.log2().ceil().clamp(min=0)
+    size = pixels.new_tensor([cameras.width, cameras.height])
+    sides = levels.exp2()[..., None]
+    places = (pixels / sides).floor()
+    inside = ahead & ((places >= 0) & (places < (size / sides).ceil())).all(-1)
+    frame, cell = inside.nonzero(as_tuple=True)
+    levels, (column, row) = levels[frame, cell].long(), places[frame, cell].long().unbind(-1)
     found = torch.zeros(frames, cameras.height, cameras.width, dtype=torch.bool, device=depth.device)
-    for level in levels[ahead].unique().tolist():
-        side = 1 << level
-        rows, columns = math.ceil(cameras.height / side), math.ceil(cameras.width / side)
-        column, row = (pixels / side).floor().long().unbind(-1)
-        inside = ahead & (levels == level) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        image = found.new_zeros(frames, rows, columns)
-        image[frame[inside], row[inside], column[inside]] = True
+    for level in levels.unique().tolist():
+        side, here = 1 << level, levels == level
+        image = found.new_zeros(frames, math.ceil(cameras.height / side), math.ceil(cameras.width / side))
+        image[frame[here], row[here], column[here]] = True
         image = image.repeat_interleave(side, 1).repeat_interleave(side, 2)
         found |= image[:, : cameras.height, : cameras.width]
     return found

@@ -188,16 +188,13 @@ class SparseGrid:
             buffer[old : old + new] = values[name][selected]
         new_positions = positions + torch.arange(new, device=self.device)
         new_rows = torch.arange(old, old + new, device=self.device)
-        self._rows = _insert(self._rows, new_rows, new_positions)
-        self.keys = _insert(self.keys, keys, new_positions)
+        is_new = torch.zeros(old + new, dtype=torch.bool, device=self.device).index_fill_(0, new_positions, True)
+        self._rows = _insert(self._rows, new_rows, is_new)
+        self.keys = _insert(self.keys, keys, is_new)
         self._blocks = None
 
 
-def _insert(old: Tensor, new: Tensor, new_positions: Tensor) -> Tensor:
-    """One tensor of both, the new values at ``new_positions`` of it and the old ones in order at the others."""
-    joined = torch.empty(len(old) + len(new), dtype=old.dtype, device=old.device)
-    is_old = torch.ones(len(joined), dtype=torch.bool, device=old.device)
-    is_old[new_positions] = False
-    joined[is_old] = old
-    joined[new_positions] = new
-    return joined
+def _insert(old: Tensor, new: Tensor, is_new: Tensor) -> Tensor:
+    """One tensor of both, each in order: the new values where ``is_new`` is true and the old ones elsewhere."""
+    joined = torch.empty(len(is_new), dtype=old.dtype, device=old.device)
+    return joined.masked_scatter_(~is_new, old).masked_scatter_(is_new, new)

@@ -1,0 +1,189 @@
+"""Processor time and quality of clips of each length and number of denoising steps, for walking frame by frame.
+
+    python tests/benchmarks/bench_clip_lengths.py --checkpoint reference --data runs/test --clips 12
+
+Prints one table, asserts nothing; ``--out`` keeps it as JSON. Each way of eight frames is that of ``persist eval
+--protocol revisit`` and is imagined by clips of each length, one after the other: with clips of one frame eight of
+them, with clips of eight frames one. The memory holds the true frames before and is not written. Only frames at new
+poses are scored: ``first`` are the first frames of the ways, ``later`` all others. Without a checkpoint it is the
+reference model on the sample houses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
+
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.observations import Observations
+from persist_cli.evaluate.backbones import BackboneLoader
+from persist_cli.evaluate.cases import CaseFrames, read_case
+from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_setup
+from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
+from persist_cli.evaluate.rows.build_rows import PLAIN, RowConfig, build_model_rows
+from persist_cli.evaluate.rows.model_rows import ModelRow
+from persist_cli.io.files import write_json
+from persist_cli.metrics import METRICS
+from persist_cli.metrics.metric import Prediction
+from persist_cli.rollout.world_model import WorldModel, clip_seed
+from persist_cli.viewing.console import print_table, say, watched
+from tests.benchmarks.bench_sampling import find_model
+from tests.benchmarks.timing import say_conditions
+
+PROTOCOL = PROTOCOLS["revisit"]
+FIGURES = ("psnr", "lpips-alex", "sharpness")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One way to imagine: a row of the table.
+
+    Args:
+        row: the model with a memory, or with none.
+        frames: frames that a clip adds to the present one.
+        sampling: sampling of the clips.
+    """
+
+    row: ModelRow
+    frames: int
+    sampling: Sampling
+
+
+@dataclass
+class Measured:
+    """What was measured of a choice, with an entry for each way.
+
+    Args:
+        first: processor seconds until the first frames are there.
+        all: processor seconds of all frames.
+        figures: figures of each frame, with an axis of metrics.
+        weights: how much each figure counts, 0 where the frame's pose is not new.
+    """
+
+    first: list[float] = field(default_factory=list)
+    all: list[float] = field(default_factory=list)
+    figures: list[np.ndarray] = field(default_factory=list)
+    weights: list[np.ndarray] = field(default_factory=list)
+
+    def values(self, names: Sequence[str]) -> dict[str, float]:
+        """Milliseconds until the first frame and of a frame, medians over the ways, and mean figures."""
+        figures, weights = np.stack(self.figures), np.stack(self.weights)  # [way, frame, metric]
+        parts = {"first": slice(1), "later": slice(1, None)}
+        means = {
+            f"{name} {part}": float(np.average(figures[:, frames, place], weights=weights[:, frames, place]))
+            for place, name in enumerate(names)
+            for part, frames in parts.items()
+        }
+        frame = 1000 * float(np.median(self.all)) / figures.shape[1]
+        return {"first_milliseconds": 1000 * float(np.median(self.first)), "frame_milliseconds": frame} | means
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure all choices on all ways, print the table and write what ``--out`` asks for."""
+    options = parse(arguments)
+    say_conditions("processor time of this process; all choices take turns on each way")
+    with TemporaryDirectory() as folder:
+        if not options.checkpoint:
+            find_model(Path(folder), options)
+        results, names = measure(options)
+    show(results, names)
+    if options.out:
+        write_json(options.out, {"rows": results, "threads": torch.get_num_threads()})
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", type=Path, nargs="+", default=[], help="finetune runs or checkpoints")
+    parser.add_argument("--data", type=Path, nargs="+", default=[], help="data sets of held-out scenes")
+    parser.add_argument("--clips", type=int, default=12, help="most ways")
+    parser.add_argument("--adapters", default=f"{PLAIN},voxel", help="separated by commas")
+    parser.add_argument("--frames", default="1,2,4,8", help="frames that a clip adds, separated by commas")
+    parser.add_argument("--steps", default="1,2,4", help="separated by commas")
+    parser.add_argument("--guidance", type=float, default=1.0, help="weight of guidance over memory")
+    parser.add_argument("--sampler", default="unipc")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    options = parser.parse_args(arguments)
+    if bool(options.checkpoint) != bool(options.data):
+        parser.error("--checkpoint and --data go together")
+    return options
+
+
+def measure(options: argparse.Namespace) -> tuple[list[dict[str, Any]], list[str]]:
+    """Times and figures of each choice as JSON values, and the names of the metrics."""
+    checkpoints, loader = [find_checkpoint(path) for path in options.checkpoint], BackboneLoader()
+    longest = loader.load(checkpoints[0]).frames_per_clip - 1
+    samplings = [Sampling(int(steps), options.sampler, options.guidance) for steps in options.steps.split(",")]
+    rows = build_model_rows(checkpoints, RowConfig(options.adapters.split(","), (), samplings[0]), PROTOCOL)
+    lengths = [int(frames) for frames in options.frames.split(",")]
+    choices = [Choice(row, frames, sampling) for row in rows for frames in lengths for sampling in samplings]
+    cases = PROTOCOL.find(ClipSearch(options.data, 0, options.clips, longest))
+    suite = MetricSuite(choose_metrics(FIGURES, METRICS), make_setup(cases))
+    measured = [Measured() for _ in choices]
+    for number in watched(range(len(cases)), "ways", "way"):
+        way = read_case(cases[number])
+        for choice, found in zip(choices, measured, strict=True):
+            if number == 0:
+                imagine(choice, loader, way, 0)  # a warm-up that does not count
+            first, total, video = imagine(choice, loader, way, clip_seed(0, number))
+            prediction = suite.prediction(video.rgb, video.depth, way, choice.row.name)
+            found.first.append(first)
+            found.all.append(total)
+            found.figures.append(suite.figures(prediction)[1:].double().numpy())
+            found.weights.append(weights_of(suite, prediction, way).numpy())
+    names = [*suite.frame_metrics]
+    results = [
+        {"model": choice.row.name, "frames": choice.frames, "steps": choice.sampling.steps} | found.values(names)
+        for choice, found in zip(choices, measured, strict=True)
+    ]
+    return results, names
+
+
+def weights_of(suite: MetricSuite, prediction: Prediction, way: CaseFrames) -> Tensor:
+    """How much each predicted frame counts for each metric, ``[frame, metric]``."""
+    weights = [metric.frame_weights(prediction).double() for metric in suite.frame_metrics.values()]
+    return (torch.stack(weights, dim=1) * torch.tensor(way.case.counted)[:, None])[1:]
+
+
+def imagine(choice: Choice, loader: BackboneLoader, way: CaseFrames, seed: int) -> tuple[float, float, Observations]:
+    """Processor seconds until the first frames are there and of all frames, and all frames, the given one included."""
+    agent, given = choice.row.agent(way, seed), way.observations[:1]
+    model = WorldModel(loader.load_for(choice.row), [agent], choice.sampling, choice.frames + 1)
+    model.reset([given], [way.info])
+    parts, started, first = [given], time.process_time(), 0.0
+    for [frames] in model.imagine([way.observations.cameras[1:]], [way.interactions]):
+        parts.append(frames)
+        first = first or time.process_time() - started
+    return first, time.process_time() - started, Observations.concatenate(parts)
+
+
+def show(results: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
+    """Print the table."""
+    columns = ["model", "frames", "steps", "ms to the first", "ms a frame"]
+    columns += [f"{METRICS[name].title} {part}" for name in names for part in ("first", "later")]
+    rows = [
+        [result["model"], str(result["frames"]), str(result["steps"])]
+        + [f"{result['first_milliseconds']:.0f}", f"{result['frame_milliseconds']:.0f}"]
+        + [f"{result[f'{name} {part}']:.3f}" for name in names for part in ("first", "later")]
+        for result in results
+    ]
+    print_table("clips of each length, processor time", columns, rows)
+    if not names:
+        say("no metric could be measured")
+
+
+if __name__ == "__main__":
+    main()
