@@ -39,12 +39,35 @@ def take_picture(address: str, out: Path, walk: str, size: tuple[int, int]) -> N
         page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         page.goto(address)
         page.wait_for_selector("#stage[data-number]", timeout=READY)
-        for word in walk.split():
-            key, _, count = word.partition("*")
-            hold(page, key, int(count or 1))
+        for key, frames in presses(walk):
+            hold(page, key, frames)
         page.wait_for_timeout(500)  # the map follows the frames
         with written_aside(out) as aside:
             page.screenshot(path=aside, type="png")
+
+
+def presses(walk: str) -> list[tuple[str, int]]:
+    """Return the keys of a text such as ``"a*4 w"``, and the frames that each is held for.
+
+    Raises:
+        PersistError: when a count is no number.
+    """
+    parts = [word.partition("*") for word in walk.split()]
+    if not all(count.isdecimal() or not star for _, star, count in parts):
+        raise PersistError(f"cannot read the walk {walk!r}; write keys and frames, as in 'a*4 w'")
+    return [(key, int(count or 1)) for key, _, count in parts]
+
+
+def window_size(text: str) -> tuple[int, int]:
+    """Return width and height of a text such as ``1360x800``.
+
+    Raises:
+        PersistError: when it is something else.
+    """
+    width, cross, height = text.partition("x")
+    if not (width.isdecimal() and cross and height.isdecimal()):
+        raise PersistError(f"cannot read the size {text!r}; write width x height in pixels, as in 1360x800")
+    return int(width), int(height)
 
 
 def hold(page: Page, key: str, frames: int) -> None:
@@ -70,9 +93,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("play", nargs="*", default=COMPARED, help="after --: arguments of `persist play`")
     options = parser.parse_args(arguments)
     try:
-        width, height = (int(side) for side in options.size.split("x"))
+        presses(options.walk)  # a mistake is said at once
+        size = window_size(options.size)
         with served_page(shlex.join(["play", *options.play])) as served:
-            take_picture(served.address, options.out, options.walk, (width, height))
+            take_picture(served.address, options.out, options.walk, size)
     except PersistError as error:
         say(f"error: {error}")
         sys.exit(1)

@@ -10,6 +10,7 @@ const held = new Held((actions, { pressed, first, at }) => {
   connection.send("keys", { held: actions });
   byId("hint").hidden = true;
   standing = !actions.length;
+  if (pressed) blocked = false; // the next frame says whether this way is free
   lastFrame = performance.now();
   if (pressed && first && connected && !controls.state.planning) figures.press(pressed, at);
   tell();
@@ -21,6 +22,7 @@ const connection = new Connection({
     connected = ever = true;
     blocked = false;
     byId("model").textContent = message.model;
+    document.title = `persist play: ${message.model}`;
     views.begin(message.memories, message.image);
     held.begin(message.actions, byId("moves"));
     controls.begin(message);
@@ -45,6 +47,7 @@ const connection = new Connection({
     if (state.goal && (controls.tookGoal || !controls.state.goal)) keepGoal();
     controls.tookGoal = false;
     controls.show(state);
+    byId("stage").classList.toggle("recording", state.recording);
     tell();
   },
   notice: ({ text }) => controls.say(text, "notice"),
@@ -85,8 +88,8 @@ function tell(trouble) {
   const walking = controls.state.planning || !standing;
   let kind = "ready", words = "Ready";
   if (!connected) [kind, words] = [ever ? "lost" : "wait", trouble ?? byId("state").textContent];
+  else if (walking && blocked) [kind, words] = ["blocked", "Blocked: something is in the way"];
   else if (walking && late) [kind, words] = ["busy", "Thinking …"];
-  else if (blocked && walking) [kind, words] = ["blocked", "Blocked: something is in the way"];
   else if (controls.state.planning) [kind, words] = ["busy", "Walking to the goal"];
   else if (walking) [kind, words] = ["busy", "Walking"];
   const state = byId("state");

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from persist_cli.errors import PersistError
+from persist_cli.reproduce.pages import CHROMIUM, served_page
+from persist_cli.reproduce.play_picture import main, presses, take_picture
+from tests.support.scripted_walks import ScriptedWalks, serving
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+def test_a_picture_of_the_page_is_taken_after_a_walk(tmp_path: Path) -> None:
+    walks = ScriptedWalks({"none": [np.full((16, 16, 3), 250, np.uint8)]})
+    with serving(walks) as address:
+        take_picture(address, tmp_path / "play.png", "a*2 w", (800, 600))
+    picture = Image.open(tmp_path / "play.png")
+    assert picture.size == (800, 600)
+    assert len(picture.convert("L").getcolors() or []) > 10
+    assert [message["held"] for message in walks.messages("keys", 4)] == [["left"], [], ["forward"], []]
+
+
+def test_a_walk_is_keys_and_frames() -> None:
+    assert presses("a*4 w d*12") == [("a", 4), ("w", 1), ("d", 12)]
+
+
+@pytest.mark.parametrize(("option", "message"), [("--walk=a*b", "as in 'a*4 w'"), ("--size=big", "as in 1360x800")])
+def test_a_mistake_is_one_line(option: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="1"):
+        main(["play.png", option])
+    assert message in capsys.readouterr().out
+    assert not Path("play.png").exists()
+
+
+def test_a_command_that_serves_no_page_is_named_with_its_exit_code(capfd: pytest.CaptureFixture[str]) -> None:
+    with (
+        pytest.raises(PersistError, match=r"`persist nonsense` ended with exit code 2 and served no page"),
+        served_page("nonsense"),
+    ):
+        pass
+    assert "nonsense" in capfd.readouterr().err
