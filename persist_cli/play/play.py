@@ -16,9 +16,11 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
 from persist_cli.errors import PersistError
 from persist_cli.play.ground import check_free, pose_at
+from persist_cli.play.ground_picture import GroundPicture
 from persist_cli.play.keys import held_actions, walking_keys
 from persist_cli.play.recording import Recording, SavedRecording
 from persist_cli.play.settings import GroundPose, PlaySettings, Shown
+from persist_cli.play.surveyor import Surveyor
 from persist_cli.play.walkers import Ahead, Pose, Walkers
 from persist_cli.rollout.world_model import WorldModel
 
@@ -50,6 +52,8 @@ class Play:
         self._records = False
         self.settings = settings
         self.set(settings)
+        self._walkers.begin(start.observations, start.info)
+        self._surveyor = Surveyor(self._walkers)
         self.shown = self.reset()
 
     @property
@@ -95,6 +99,7 @@ class Play:
         begun, self._done = time.monotonic(), frozenset()
         self._drop()
         self._walkers.begin(self._start.observations, self.info)
+        self._surveyor.begin()
         self._record(None)
         return self._show(None, True, begun)
 
@@ -150,6 +155,7 @@ class Play:
         if not self._walkers.undo():
             return None
         self._drop()
+        self._surveyor.undo()
         if self._recording is not None and self._records:
             self._recording.undo()
         return self._show(None, True, begun)
@@ -180,6 +186,19 @@ class Play:
         """
         check_free(self._walkers.lead.surroundings, x, y)
         return self._jump(pose_at(self._walkers.pose, x, y, self.info))
+
+    def map(self, size: int = 512) -> GroundPicture:
+        """Return the map of what the first memory holds, seen from above, with the way, the start and the agent.
+
+        What is imagined is pale with stripes. A memory without places shows the ground as far as it is known. What was
+        shown last may be missing until the next clip begins.
+
+        Args:
+            size: pixels of the longer side.
+        """
+        if self._ahead is None or not self._ahead.left:
+            self._walkers.remember()
+        return self._surveyor.draw(size, None)
 
     @property
     def recording(self) -> bool:
@@ -228,6 +247,7 @@ class Play:
         self._thoughts.clear()
         self._blocked = 0 if free else self._blocked + 1
         if free:
+            self._surveyor.went(jumped=False)
             self._record(name)
         return self._show(name, free, begun)
 
@@ -235,6 +255,7 @@ class Play:
         begun = time.monotonic()
         self._drop()
         self._walkers.stand_at(self._walkers.look_from(pose))
+        self._surveyor.went(jumped=True)
         self._record(None)
         return self._show(None, True, begun)
 

@@ -82,6 +82,7 @@ class Walkers:
         self._start = [world.agents[0].memory for world in worlds.values()]
         self._shown: list[list[Observations]] = [[] for _ in worlds]  # of each world, not remembered yet
         self._history: History
+        self.version = 0  # grows with every change of the memories and of what is known of the ground
 
     @property
     def agents(self) -> list[Agent]:
@@ -115,6 +116,7 @@ class Walkers:
             world.reset([start], [info])
         self._shown = [[] for _ in self.worlds]
         self._history = History(Checkpoint.of(self.agents))
+        self.version += 1
 
     def imagine(self, actions: Sequence[str]) -> Ahead:
         """Return a clip of some actions in turn; nothing of it is shown yet.
@@ -186,6 +188,7 @@ class Walkers:
         checkpoint, steps = last
         checkpoint.restore(self.agents)
         self._shown = [[] for _ in self.worlds]
+        self.version += 1
         for step in steps:
             if step.begins:
                 self._write()
@@ -206,6 +209,7 @@ class Walkers:
             agent.stand_at(frame)
             agent.clips = clips
             shown.append(frame)
+        self.version += 1
 
     def _write(self) -> None:
         for world, agent, shown in zip(self.worlds.values(), self.agents, self._shown, strict=True):

@@ -229,14 +229,14 @@ def paint(
     order = np.lexsort((heights[visible], origins != CellOrigin.IMAGINED))
     colors = points.colors.cpu().numpy()[visible] / 255.0
     image, extent = _stamp(places[visible][order, :2], np.column_stack([colors, origins])[order], points.spread)
-    return _hatched(image), extent
+    return hatched(image), extent
 
 
 def _of_origin(points: MapPoints, origin: CellOrigin) -> Array:
     return (points.origins == origin).cpu().numpy()
 
 
-def _hatched(image: Array) -> Array:
+def hatched(image: Array) -> Array:
     """Return RGBA of an image whose fifth channel is the origin of each dot."""
     from matplotlib.colors import to_rgb
 

@@ -11,6 +11,7 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
+from persist_cli.play import surveyor
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.walkers import AdaptedWorld
@@ -128,6 +129,17 @@ def test_a_clip_that_was_thought_of_is_what_the_key_shows(backbone, walks):
     assert play.think(0)  # something is left to imagine, and no time
     play.set(PlaySettings(steps=2, ahead=False))
     assert not play.think(0)
+
+
+def test_the_map_grows_with_the_walk(backbone, walks, monkeypatch):
+    monkeypatch.setattr(surveyor, "SOON", 600)  # drawn anew each time
+    play = play_on(backbone, walks)
+    before = play.map(128)
+    walked(play, LEFT, 9)
+    play.advance(frozenset())
+    after = play.map(128)
+    assert max(after.picture.shape) == 128
+    assert before.extent != after.extent
 
 
 def test_a_jump_keeps_height_and_heading(backbone, walks):
