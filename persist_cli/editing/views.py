@@ -102,13 +102,14 @@ def view_of_paths(paths: Mapping[str, Float[Tensor, "frame 4 4"]], before: CellG
         return None
     numbers = torch.linspace(0, len(places) - 1, min(len(places), SEARCHED)).round().long().unique().tolist()
     chosen = [places[number] for number in numbers]
-    seen = edited_pixels(before, after, _path_cameras([pose for *_, pose in chosen], COARSE)).flatten(1).sum(1)
+    seen = edited_pixels(before, after, path_cameras([pose for *_, pose in chosen], COARSE)).flatten(1).sum(1)
     best = max(range(len(chosen)), key=lambda number: (int(seen[number]), number))
     name, frame, pose = chosen[best]
-    return View(_path_cameras([pose], SIDE), f"frame {frame} of path {name!r}")
+    return View(path_cameras([pose], SIDE), f"frame {frame} of path {name!r}")
 
 
-def _path_cameras(poses: Sequence[Float[Tensor, "4 4"]], side: int) -> Cameras:
+def path_cameras(poses: Sequence[Float[Tensor, "4 4"]], side: int) -> Cameras:
+    """Return square cameras of ``side`` pixels at poses of a path whose intrinsics are not known: 75 degrees wide."""
     focal = side / 2 / math.tan(math.radians(FIELD) / 2)
     matrix = torch.tensor([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1]], dtype=torch.float64)
     return Cameras(torch.stack(list(poses)), matrix.expand(len(poses), 3, 3), side, side)

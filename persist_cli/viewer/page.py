@@ -1,0 +1,316 @@
+"""The panel of the page and what its buttons do; the state lies in ``EditSession`` and ``Stage``."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+import viser
+from torch import Tensor
+
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.cells import CellOrigin
+from persist_cli.errors import PersistError
+from persist_cli.viewer.camera_view import camera_of_view, world_from
+from persist_cli.viewer.drawn_cells import ORIGIN_COLORS, cells_of_memory, class_colors
+from persist_cli.viewer.edit_panel import EditPanel
+from persist_cli.viewer.edit_session import EditSession
+from persist_cli.viewer.imagine import Imaginer
+from persist_cli.viewer.notes import Legend, Note, Pictures
+from persist_cli.viewer.stage import FULL_SIZE, SELECTED_COLOR, Look, Stage
+from persist_cli.viewer.subject import MAP, Subject, Walk
+
+TOKENS: Final = 256  # that a reading draws when nobody says how many
+MOST_TOKENS: Final = 4096
+FRAMES_A_SECOND: Final = 6.0
+NEARER: Final = 0.5  # metres that the view must have moved until large maps are drawn anew around it
+QUIET: Final = 0.5  # seconds at least between two of these drawings
+COLORINGS: Final = {"own colour": "color", "origin": "origin", "class": "class"}
+
+
+class Page:
+    """Everything on the page. All tabs that show it share it.
+
+    Args:
+        server: its server.
+        subject: what is shown.
+        look: how it is drawn at first.
+        session: the edits; ``None`` where there is no memory.
+        imaginer: the world model; ``None`` where no true frame is known from which it could begin.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        subject: Subject,
+        look: Look,
+        session: EditSession | None,
+        imaginer: Imaginer | None,
+    ) -> None:
+        self.server, self.subject, self.look = server, subject, look
+        self.session, self.imaginer = session, imaginer
+        self.lock = threading.RLock()  # viser calls back in many threads
+        self.stage = Stage(server, subject, look)
+        self.focus: np.ndarray[Any, Any] | None = None
+        self._drawn_at = 0.0
+        self._placed: Any = None  # the gizmo of the camera that was placed by hand
+        self._imagining, self._wanted = False, False
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Look"):
+            self._add_map_panel()
+            if subject.walks:
+                self._add_time_panel()
+        if session is not None:
+            with tabs.add_tab("Edit"):
+                self.edit_panel = EditPanel(self, session)
+            with tabs.add_tab("Reading"):
+                self._add_reading_panel()
+        if imaginer is not None:
+            with tabs.add_tab("Imagine"):
+                self._add_imagine_panel()
+        server.on_client_connect(self._follow_view)
+
+    # what every button does around its work
+
+    def guarded(self, work: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return a callback that does some work alone, and shows an error that the user can mend."""
+
+        def callback(event: Any) -> None:
+            with self.lock:
+                try:
+                    work(event)
+                except PersistError as error:
+                    self.tell(str(error), event)
+                except OSError as error:
+                    self.tell(f"{error.filename}: {error.strerror}; make room there, or give another --out", event)
+
+        return callback
+
+    def tell(self, text: str, event: Any, title: str = "That did not work") -> None:
+        """Show a line in the tab where something happened, or in all tabs."""
+        clients = [event.client] if getattr(event, "client", None) is not None else self.server.get_clients().values()
+        for client in clients:
+            client.add_notification(title, text, auto_close_seconds=12.0)
+
+    # the map
+
+    def _add_map_panel(self) -> None:
+        gui, look = self.server.gui, self.look
+        with gui.add_folder("Map"):
+            for name in self.stage.layers:
+                box = gui.add_checkbox(name, name in look.layers)
+                box.on_update(self.guarded(partial(self._toggle, name)))
+            named = any(cells.palette for cells in self.stage.layers.values())
+            colors = gui.add_dropdown("Colour", [text for text in COLORINGS if named or text != "class"])
+            colors.on_update(self.guarded(lambda event: self._set(colors=COLORINGS[event.target.value])))
+            form = gui.add_dropdown("Draw as", ["cubes", "points"], initial_value=look.form)
+            form.on_update(self.guarded(lambda event: self._set(form=event.target.value)))
+            self._add_cut()
+            if len(self.stage.layers) > 1:
+                beside = gui.add_checkbox("Truth beside", look.beside)
+                beside.on_update(self.guarded(lambda event: self._set(beside=event.target.value)))
+            self._legend, self._drawn_text = Legend(gui), Note(gui)
+        self._say_drawn()
+
+    def _add_cut(self) -> None:
+        low, high = (float(end[2]) for end in self.stage.bounds())
+        if high - low < 0.1:
+            return
+        first = min(max(self.look.cut, low), high)
+        cut = self.server.gui.add_slider(
+            "Cut at (m)", round(low, 2), round(high + 0.1, 2), 0.05, round(first, 2),
+            hint="Height above which nothing is drawn, so that one looks into rooms.",
+        )  # fmt: skip
+        cut.on_update(self.guarded(lambda event: self._set(cut=event.target.value)))
+
+    def _toggle(self, layer: str, event: Any) -> None:
+        (self.look.layers.add if event.target.value else self.look.layers.discard)(layer)
+        self.draw()
+
+    def _set(self, **changes: Any) -> None:
+        for name, value in changes.items():
+            setattr(self.look, name, value)
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw the layers anew, and say how much of them is drawn."""
+        self.stage.draw(self.focus)
+        self._drawn_at = time.monotonic()
+        self._say_drawn()
+
+    def show_memory(self, part: str) -> None:
+        """Draw the memory ``before`` the edits, ``after`` them, or the ``changes``."""
+        assert self.session is not None
+        before, after = (cells_of_memory(memory) for memory in (self.session.original, self.session.edited))
+        if part == "changes":
+            self.stage.draw_changes(before, after)
+        else:
+            self.stage.layers[MAP] = after if part == "after" else before
+        self.draw()
+
+    def _say_drawn(self) -> None:
+        lines = [
+            f"{name}: {blocks:,} blocks" + (f" stand for {cells:,} cells" if blocks < cells else "")
+            for name, (blocks, cells) in self.stage.drawn.items()
+        ]
+        if any(blocks < cells for blocks, cells in self.stage.drawn.values()):
+            lines.append("Come nearer for smaller blocks; --most allows more of them.")
+        self._drawn_text.say(*self.subject.notices, *lines)
+        self._legend.show(self._meanings())
+
+    def _meanings(self) -> list[tuple[str, Any]]:
+        """Return what the present colours mean."""
+        if self.look.colors == "origin":
+            return [(CellOrigin(origin).name.lower(), color) for origin, color in ORIGIN_COLORS.items()]
+        kinds: dict[str, Any] = {}
+        if self.look.colors == "class":
+            for name in self.look.layers:
+                cells = self.stage.layers[name]
+                table = class_colors(len(cells.palette))
+                kinds |= {cells.palette[n]: table[n] for n in np.unique(cells.kinds) if n < len(cells.palette)}
+        return list(kinds.items())
+
+    def _follow_view(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda camera: self._on_moved(np.asarray(camera.position)))
+
+    def _on_moved(self, position: np.ndarray[Any, Any]) -> None:
+        """Draw maps that are too large for single cells in more detail near the view, at most twice a second."""
+        if all(blocks == cells for blocks, cells in self.stage.drawn.values()):
+            return
+        moved = self.focus is None or float(np.linalg.norm(position - self.focus)) > NEARER
+        if moved and time.monotonic() - self._drawn_at > QUIET and self.lock.acquire(blocking=False):
+            try:
+                self.focus = position
+                self.draw()
+            finally:
+                self.lock.release()
+
+    # time
+
+    def _add_time_panel(self) -> None:
+        gui, length = self.server.gui, max(map(len, self.subject.walks))
+        with gui.add_folder("Time"):
+            self.frame: Any = gui.add_slider("Frame", 0, max(length - 1, 1), 1, 0)
+            self.frame.on_update(self.guarded(lambda event: self._show_frame()))
+            if length > 1:
+                play = gui.add_checkbox("Play", False)
+                play.on_update(lambda event: self._play(event.target))
+            self._pictures = Pictures(gui)
+        self._show_frame()
+
+    def _show_frame(self) -> None:
+        frame = int(self.frame.value)
+        self.stage.draw_time(frame)
+        self._pictures.show(_pictures(self.subject.walks, frame))
+
+    def _play(self, box: Any) -> None:
+        """Go on frame by frame until the box is no longer checked or nobody looks."""
+        last = int(self.frame.max)
+        while box.value and self.server.get_clients():
+            with self.lock:
+                self.frame.value = 0 if self.frame.value >= last else int(self.frame.value) + 1
+                self._show_frame()
+            time.sleep(1 / FRAMES_A_SECOND)
+
+    def present_camera(self) -> Cameras | None:
+        """Return the camera of the first walk at the present frame, with a frame axis of one; ``None`` without one."""
+        if not self.subject.walks:
+            return None
+        walk = self.subject.walks[0]
+        frame = min(int(self.frame.value), len(walk) - 1)
+        return walk.cameras[frame : frame + 1]
+
+    # what a camera reads
+
+    def _add_reading_panel(self) -> None:
+        gui = self.server.gui
+        self._read_text = Note(gui, "What the memory tells a camera: its tokens, drawn in yellow.")
+        self._budget = gui.add_slider("Most tokens", 1, MOST_TOKENS, 1, TOKENS)
+        if self.subject.walks:
+            here = gui.add_button("Read at this frame")
+            here.on_click(self.guarded(lambda event: self._read(self.present_camera())))
+        view = gui.add_button("Read from this view")
+        view.on_click(self.guarded(lambda event: self._read(camera_of_view(event.client))))
+        clear = gui.add_button("Clear")
+        clear.on_click(self.guarded(lambda event: self.stage.draw_tokens(None)))
+
+    def _read(self, camera: Cameras | None) -> None:
+        assert self.session is not None
+        if camera is None:
+            return
+        tokens = self.session.edited.read(camera, int(self._budget.value))
+        self.stage.draw_tokens(tokens)
+        imagined = int((tokens.origins == CellOrigin.IMAGINED).sum())
+        self._read_text.say(f"{len(tokens):,} tokens, {imagined:,} of them imagined, {tokens.bytes:,} bytes")
+
+    # what the model imagines
+
+    def _add_imagine_panel(self) -> None:
+        gui = self.server.gui
+        Note(gui, "A camera that you place shows what the world model imagines there. Move it, and it imagines anew.")
+        place = gui.add_button("Camera at this view")
+        place.on_click(self.guarded(self._place))
+        self._imagined_text, self._imagined_picture = Note(gui), Pictures(gui)
+
+    def _place(self, event: Any) -> None:
+        """Place a camera where the view of a tab is, and imagine what it sees."""
+        view = event.client.camera
+        self._placed = self.server.scene.add_transform_controls(
+            "/placed", scale=0.6, wxyz=view.wxyz, position=view.position, depth_test=False
+        )
+        self._placed.on_update(lambda moved: self._imagine(moved) if moved.phase == "end" else None)
+        self._draw_placed(None)
+        threading.Thread(target=self._imagine, args=(event,), daemon=True).start()
+
+    def _draw_placed(self, picture: np.ndarray[Any, Any] | None) -> None:
+        assert self.imaginer is not None
+        camera = self.imaginer.start.cameras([0])
+        identity = camera.at(world_from(np.array([1.0, 0, 0, 0]), np.zeros(3))[None])
+        self.stage.draw_frustum("/placed/camera", identity, picture, FULL_SIZE, SELECTED_COLOR)
+
+    def _imagine(self, event: Any) -> None:
+        """Imagine at the placed camera; while that goes on, the newest place that is asked for waits."""
+        with self.lock:
+            self._wanted = True
+            if self._imagining:
+                return
+            self._imagining = True
+        try:
+            while self._wanted:
+                self._imagine_once(event)
+        finally:
+            self._imagining = False
+
+    def _imagine_once(self, event: Any) -> None:
+        assert self.imaginer is not None
+        with self.lock:
+            self._wanted = False
+            pose: Tensor = world_from(self._placed.wxyz, self._placed.position)
+            memory = None if self.session is None else self.session.edited
+            self._imagined_text.say("imagining … the first time the model is loaded")
+        began = time.monotonic()
+        try:
+            view = self.imaginer.imagine(pose, memory)
+        except PersistError as error:
+            self._imagined_text.say(str(error))
+            return self.tell(str(error), event)
+        with self.lock:
+            self._draw_placed(view.picture.numpy())
+            self._imagined_picture.show([("imagined", view.picture)])
+            self._imagined_text.say(
+                f"{view.frames} frames on from frame {view.began} of {self.imaginer.start.name}, "
+                f"{1000 * (time.monotonic() - began):,.0f} ms"
+            )
+        return None
+
+
+def _pictures(walks: Sequence[Walk], frame: int) -> Iterator[tuple[str, Tensor]]:
+    """Yield the pictures of walks at a frame, or at their last one, with their names."""
+    for walk in walks:
+        number = min(frame, len(walk) - 1)
+        if walk.pictures is not None:
+            yield f"{walk.name}, frame {walk.numbers[number]}", walk.pictures[number]

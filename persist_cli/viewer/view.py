@@ -1,0 +1,185 @@
+"""``persist view``: a page on which memories, scenes, trajectories and rollouts are looked at and edited."""
+
+from __future__ import annotations
+
+import threading
+import webbrowser
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from persist_cli.api.scene import Scene
+from persist_cli.errors import DataError, PersistError
+from persist_cli.io.files import check_folder
+from persist_cli.memorize.memory_file import load_paths
+from persist_cli.viewer.edit_session import EditSession, default_out
+from persist_cli.viewer.imagine import Imaginer, ImagineSettings
+from persist_cli.viewer.subject import TRUTH, Subject, describe, open_subject
+from persist_cli.viewing.console import busy, print_json, say
+
+
+@dataclass(frozen=True)
+class ViewPlan:
+    """The options of ``persist view``; see its help.
+
+    Args:
+        source: a trajectory of a data set, a memory file, or the folder of a rollout.
+        truth: true frames beside it.
+        start: trajectory from whose frames the world model may begin.
+        imagine: the world model.
+        out: where an edited memory is saved; beside its file by default.
+        most: the greatest number of blocks of a layer.
+        seed: of what is imagined behind a removed thing.
+    """
+
+    source: str
+    truth: str | None = None
+    start: str | None = None
+    imagine: ImagineSettings = field(default_factory=ImagineSettings)
+    out: Path | None = None
+    most: int = 40_000
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the page is.
+
+    Args:
+        host: the address that the server is bound to.
+        port: its port, 0 for any free one.
+        opens: whether a browser is opened.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8090
+    opens: bool = True
+
+
+def run_view(plan: ViewPlan, address: Address, export: Path | None, as_json: bool) -> None:
+    """Show a subject until Ctrl-C, or write it as one HTML file.
+
+    Args:
+        plan: what is shown.
+        address: where.
+        export: HTML file to write instead.
+        as_json: whether JSON is printed instead of text.
+
+    Raises:
+        PersistError: when viser is not installed, something is missing or damaged, or the port is taken.
+    """
+    check_viser()
+    from persist_cli.viewer.page_server import check_address, page_server
+    from persist_cli.viewer.stage import Look, Stage
+
+    if export is not None:
+        _check_export(export)
+    else:
+        check_address(address.host, address.port)
+    with busy("loading what is shown"):
+        subject = open_subject(plan.source, plan.truth, plan.start)
+    session = make_session(plan, subject)
+    look = Look(most=plan.most, layers=first_layers(subject))
+    where = Address("127.0.0.1", 0, False) if export is not None else address
+    with page_server(where.host, where.port) as server:
+        if export is not None:
+            from persist_cli.viewer.export import export_page
+
+            stage = Stage(server, subject, look)
+            moments = export_page(stage, export)
+            _report(subject, {"file": str(export), "moments": moments}, as_json)
+            return
+        from persist_cli.viewer.page import Page
+
+        page = Page(server, subject, look, session, make_imaginer(plan, subject))
+        url = page_url(where.host, server.get_port())
+        _report(subject, {"address": url}, as_json)
+        if address.opens:
+            open_browser(url)
+        _wait(page.lock)
+    if session is not None and session.unsaved:
+        say(f"{len(session.edits)} edits are not saved in {session.out}")
+
+
+def check_viser() -> None:
+    """Raise ``PersistError`` when viser, which draws in the browser, is not installed."""
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise PersistError(f"persist view needs viser ({error}): pip install 'persist-cli[view]'") from error
+
+
+def make_session(plan: ViewPlan, subject: Subject) -> EditSession | None:
+    """Return the edits of the subject's memory, ``None`` without a memory.
+
+    Raises:
+        DataError: when the edited memory would be written over the one that is shown, or there is none to edit.
+    """
+    if subject.memory is None or subject.file is None:
+        if plan.out is not None:
+            raise DataError(f"--out {plan.out}: {plan.source} has no memory that could be edited; leave --out out")
+        return None
+    out = plan.out or default_out(subject.file)
+    check_folder(out.parent)
+    if out.is_dir() or out.suffix != ".safetensors":
+        raise DataError(f"--out {out}: name a memory file to write, as in edited.safetensors")
+    if out.resolve() == subject.file.resolve():
+        raise DataError(f"--out {out}: is the memory that is shown; it stays as it is, name another file")
+    return EditSession(subject.memory, load_paths(subject.file), out, plan.seed)
+
+
+def make_imaginer(plan: ViewPlan, subject: Subject) -> Imaginer | None:
+    """Return what imagines at a placed camera; ``None`` where no true frame of the scene is known."""
+    return None if subject.start is None else Imaginer(plan.imagine, subject.start, subject.file)
+
+
+def first_layers(subject: Subject) -> set[str]:
+    """Return the layers that are shown at first: the first one, and the truth."""
+    return {name for number, name in enumerate(subject.layers) if number == 0 or name == TRUTH}
+
+
+def page_url(host: str, port: int) -> str:
+    """Return the address of the page for a browser on this machine."""
+    name = "127.0.0.1" if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
+    return f"http://{name}:{port}/"
+
+
+def open_browser(url: str) -> None:
+    """Open a page if this machine has a browser with windows; without one nothing happens, the address is printed."""
+    try:
+        browser = webbrowser.get()
+    except webbrowser.Error:
+        return
+    if not isinstance(browser, webbrowser.GenericBrowser) or isinstance(browser, webbrowser.BackgroundBrowser):
+        browser.open(url)
+
+
+def _check_export(path: Path) -> None:
+    check_folder(path.parent)
+    if path.is_dir() or path.suffix.lower() not in (".html", ".htm"):
+        raise DataError(f"--export {path}: name a page to write, as in view.html")
+
+
+def _report(subject: Subject, place: dict[str, Any], as_json: bool) -> None:
+    values = describe(subject) | place
+    if as_json:
+        return print_json(values)
+    for line in subject.notices:
+        say(line)
+    blocks = ", ".join(f"{name} of {count:,} cells" for name, count in values["blocks"].items())
+    walks = ", ".join(f"{walk['name']} of {walk['frames']} frames" for walk in values["walks"])
+    say(f"{subject.scene}: {'; '.join(filter(None, (blocks, walks))) or 'nothing in it'}")
+    if "file" in place:
+        return say(f"page: {place['file']}, {Path(place['file']).stat().st_size / 1e6:.1f} MB")
+    if isinstance(subject.memory, Scene) or subject.memory is not None:
+        say("edits: hold Shift and draw a rectangle, or choose a box")
+    return say(f"look at {place['address']} (Ctrl-C ends it)")
+
+
+def _wait(lock: Any) -> None:
+    """Wait for Ctrl-C or SIGTERM; what is being done is finished first."""
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        with lock:
+            return
