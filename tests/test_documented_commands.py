@@ -51,6 +51,7 @@ SHORTER = {
     "plan": ("--candidates", "5", "--rounds", "1"),
     "eval": ("--clips", "1", "--seeds", "1", "--steps", "1"),
     "collect": ("--workers", "1"),
+    "view": ("--export", "shortened.html"),  # or it would not end
     "learn": (
         "--steps", "1", "--guidance", "1", "--walks", "3", "--actions", "24", "--rounds", "1", "--training-steps", "1",
         "--set", "training.batch=2", "--set", "training.workers=0", "--patience", "1",

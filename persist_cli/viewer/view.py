@@ -106,7 +106,7 @@ def check_viser() -> None:
     try:
         import viser  # noqa: F401
     except ImportError as error:
-        raise PersistError(f"persist view needs viser ({error}): pip install 'persist-cli[view]'") from error
+        raise PersistError("view needs the package viser: pip install 'persist-cli[view]'") from error
 
 
 def make_session(plan: ViewPlan, subject: Subject) -> EditSession | None:

@@ -14,6 +14,7 @@ from tests.support.micro_runs import MICRO_SETTINGS, stage
 
 EXTRAS = (
     "peft", "miniworld", "gymnasium", "pyglet", "bitsandbytes", "deepspeed", "tensorboard", "sentencepiece", "skimage",
+    "viser",
 )  # fmt: skip
 
 # packages that are None cannot be imported or found
@@ -66,7 +67,7 @@ def printed(walks, held_out, stage1, voxel, tmp_path_factory) -> list[str]:
         ["export", stage1, voxel, "--out", out / "export"],
     ]  # fmt: skip
     commands += [stage("stage1", walks, out / name, f"base={stage1}", change) for name, change in NEEDED.items()]
-    commands.append(["collect", "miniworld", "--scenes", "0:1", "--out", out / "houses"])
+    commands += [["view", f"{walks}#0"], ["collect", "miniworld", "--scenes", "0:1", "--out", out / "houses"]]
     return print_without_extras(out / "log", commands)
 
 
@@ -79,7 +80,7 @@ def test_every_command_works_without_extras(printed):
 
 
 def test_a_command_that_needs_an_extra_says_how_to_install_it(printed):
-    for extra, text in zip([*NEEDED, "miniworld"], printed[11:], strict=True):
+    for extra, text in zip([*NEEDED, "view", "miniworld"], printed[11:], strict=True):
         assert text.rstrip().endswith("ended with 1")
         assert f"pip install 'persist-cli[{extra}]'" in text
         assert text.count("\n") == 3  # the command, the error, the exit code

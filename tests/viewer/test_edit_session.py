@@ -1,0 +1,113 @@
+"""Editing by hand, without a page: what is selected, done, taken back and saved."""
+
+import numpy as np
+import pytest
+
+from persist_cli.api.cells import FREE, CellOrigin
+from persist_cli.errors import DataError, PersistError
+from persist_cli.memorize.memory_file import load_memory, load_paths
+from persist_cli.viewer.drawn_cells import cells_of_memory
+from persist_cli.viewer.edit_session import EditSession, default_out
+from tests.support.cell_rooms import TABLE_CELLS, camera_at
+
+
+@pytest.fixture
+def session(room, tmp_path):
+    return EditSession(load_memory(room), load_paths(room), tmp_path / "edited.safetensors")
+
+
+def everything(session):
+    return np.ones(len(cells_of_memory(session.edited)), bool)
+
+
+def test_a_removed_thing_is_gone_and_undo_brings_it_back(session):
+    session.select_thing("table#1")
+    session.remove()
+    assert bool((session.edited.cells.classes[TABLE_CELLS] == FREE).all())
+    assert [thing.name for thing in session.things] == ["box#1"]
+    assert session.undo()
+    assert [thing.name for thing in session.things] == ["table#1", "box#1"]
+    assert session.edited is session.original
+    assert not session.undo()
+
+
+def test_a_rectangle_selects_the_things_that_it_shows(session):
+    view = camera_at(session.original.cells, (11, 11, 6), (4, 6, 1))
+    session.select_rectangle(view, (0, 0), (1, 1), everything(session))
+    assert {one.name for one in session.selection} == {"table#1", "box#1"}
+
+
+def test_a_rectangle_without_a_thing_selects_what_is_visible_there(session):
+    view = camera_at(session.original.cells, (11, 11, 6), (12, 12, 6))
+    session.select_rectangle(view, (0.3, 0.3), (0.7, 0.7), everything(session))
+    assert [one.name for one in session.selection] == [""]
+
+
+def test_a_rectangle_that_shows_nothing_changes_no_selection(session):
+    session.select_thing("box#1")
+    with pytest.raises(DataError, match="nothing is visible in the rectangle"):
+        session.select_rectangle(
+            camera_at(session.original.cells, (11, 11, 6), (4, 6, 1)), (0, 0), (0.01, 0.01),
+            np.zeros(len(cells_of_memory(session.edited)), bool),
+        )  # fmt: skip
+    assert [one.name for one in session.selection] == ["box#1"]
+
+
+def test_what_is_saved_is_to_the_bit_what_persist_edit_writes_with_the_list_beside_it(persist, room, session, tmp_path):
+    session.select_thing("table#1")
+    session.paint((0, 0, 255))
+    session.shift((1.0, 0.0, -0.5))
+    session.select_thing("box#1")
+    session.remove()
+    memory, edits = session.save()
+    again = tmp_path / "again.safetensors"
+    result = persist("edit", room, "--edits", edits, "--out", again)
+    assert result.code == 0, result.err
+    assert again.read_bytes() == memory.read_bytes()
+    assert not session.unsaved
+
+
+def test_the_selection_goes_along_with_what_is_moved(session):
+    session.select_thing("box#1")
+    before = session.selection[0].box
+    session.shift((0.5, 0.0, 0.0), overwrite=True)
+    assert session.selection[0].box.low[0] == pytest.approx(before.low[0] + 0.5)
+
+
+def test_an_edit_that_cannot_be_done_changes_nothing(session):
+    session.select_thing("table#1")
+    session.paint((0, 0, 255))
+    edited = session.edited
+    with pytest.raises(DataError, match=r"edit 2 \(move\): it would reach out of the scene"):
+        session.shift((30.0, 0.0, 0.0))
+    assert session.edited is edited
+    assert len(session.edits) == 1
+
+
+def test_a_thing_is_inserted_on_what_stands_in_the_middle_of_the_selection(session):
+    session.select_thing("table#1")
+    session.insert("box")
+    assert [thing.name for thing in session.things].count("box#2") == 1
+
+
+def test_a_box_of_a_voxel_map_is_painted(voxel_map, tmp_path):
+    memory = load_memory(voxel_map)
+    session = EditSession(memory, {}, tmp_path / "out.safetensors")
+    center = cells_of_memory(memory).centers[0]
+    session.select_box(tuple(center + 0.2), tuple(center - 0.2))
+    assert session.paint((1, 2, 3)).changed > 0
+    assert int((session.edited.points().origins == CellOrigin.EDITED).sum()) == session.outcome.changed
+    assert session.things == []
+
+
+def test_nothing_selected_and_nothing_edited_are_told(session):
+    with pytest.raises(PersistError, match="nothing is selected"):
+        session.remove()
+    with pytest.raises(DataError, match="nothing is edited"):
+        session.save()
+    with pytest.raises(DataError, match="there is no 'tabel#1'; did you mean 'table#1'"):
+        session.select_thing("tabel#1")
+
+
+def test_an_edited_memory_is_saved_beside_its_own_file(room):
+    assert default_out(room).name == "room-edited.safetensors"
