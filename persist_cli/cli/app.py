@@ -43,6 +43,7 @@ from persist_cli.cli.options import (
     split_names,
 )
 from persist_cli.cli.planning import planning_app
+from persist_cli.cli.playing import playing_app
 from persist_cli.cli.scenes import scenes_app
 from persist_cli.cli.viewing import viewing_app
 from persist_cli.cli.weights import weights_app
@@ -58,6 +59,7 @@ app = typer.Typer(
 )
 app.add_typer(weights_app, name="weights")
 app.add_typer(planning_app)
+app.add_typer(playing_app)
 app.add_typer(scenes_app)
 app.add_typer(viewing_app)
 

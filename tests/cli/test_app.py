@@ -13,7 +13,7 @@ from tests.support.micro_runs import MICRO_SETTINGS, stage
 
 COMMANDS = (
     *("collect", "import", "inspect", "finetune", "doctor", "export", "relink", "memorize", "rollout", "eval"),
-    *("weights", "plugins", "recipes", "plan", "bench"),
+    *("weights", "plugins", "recipes", "plan", "bench", "play"),
 )
 
 

@@ -1,0 +1,89 @@
+"""The command with a page to walk in: its signature only, as in ``app``, which takes it up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from persist_cli.api.inference import InferenceOptions
+from persist_cli.cli.options import (
+    BodyOption,
+    DtypeOption,
+    JsonOption,
+    ReferenceArgument,
+    SaveMemoryOption,
+    StepOption,
+    TurnOption,
+    VerifyOption,
+    split_names,
+)
+
+PLAY_PORT = 8420
+
+playing_app = typer.Typer()
+
+
+@playing_app.command()
+def play(
+    checkpoint: ReferenceArgument = None,
+    start: Annotated[
+        str | None, typer.Option(help="DATA#trajectory:frame, a picture or a memory file; else a sample house.")
+    ] = None,
+    memories: Annotated[
+        str, typer.Option(help="Of the checkpoint, with commas, side by side; stage1: no memory; else the default.")
+    ] = "",
+    memory: Annotated[
+        list[str] | None, typer.Option(help="What is remembered at the start: a memory file, or DATA#t:frames; repeat.")
+    ] = None,
+    depth: Annotated[
+        Path | None, typer.Option(help="Of a picture: .npy in metres, or PNG of 16 bits in millimetres.")
+    ] = None,
+    depth_model: Annotated[
+        str | None, typer.Option(help="Of a picture: folder or hub id of a model that estimates depth in metres.")
+    ] = None,
+    fov: Annotated[float | None, typer.Option(help="Of a picture: degrees from its top to its bottom; 75.")] = None,
+    step: StepOption = None,
+    turn: TurnOption = None,
+    body: BodyOption = None,
+    steps: Annotated[int, typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon.")] = 1,
+    guidance: Annotated[float, typer.Option(min=0, max=10, help="Of guidance over memory; 1: none.")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the sampling noise.")] = 0,
+    ahead: Annotated[bool, typer.Option(help="Imagine the likely next actions while no key is held.")] = True,
+    fps: Annotated[float, typer.Option(min=0.1, max=120, help="Most frames a second.")] = 12.0,
+    out: Annotated[Path | None, typer.Option(help="Folder where recordings stay; else they go with the page.")] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: any that is free.")] = PLAY_PORT,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets others in.")] = "127.0.0.1",
+    sessions: Annotated[int, typer.Option(min=1, max=64, help="Most pages at once.")] = 4,
+    browser: Annotated[
+        bool | None, typer.Option("--open/--no-open", help="Open the browser, if there is one; not with --json.")
+    ] = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
+    verify: VerifyOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Walk with the keys through what a model imagines, on a page in the browser, until Ctrl-C.
+
+    persist play
+
+    persist play runs/model --start runs/houses#0:32 --memories voxel,none --memory runs/houses#0:0-33
+    """
+    from persist_cli.api.checkpoint import REFERENCE
+    from persist_cli.memorize.picture import PictureOptions
+    from persist_cli.play.open_play import PlayOptions
+    from persist_cli.play.serve import ServeOptions, run_play
+    from persist_cli.play.sessions import Limits
+    from persist_cli.play.settings import PlaySettings
+    from persist_cli.play.start import SAMPLE_FRAMES, SAMPLE_START, StartOptions
+
+    picture = PictureOptions(depth, depth_model, fov, None)
+    given = (SAMPLE_FRAMES,) if start is None and not memory else tuple(memory or ())
+    begin = StartOptions(start or SAMPLE_START, picture, step, turn, body)
+    options = PlayOptions(
+        checkpoint or REFERENCE, begin, split_names(memories), given,
+        PlaySettings(steps, guidance, seed, ahead), InferenceOptions.of(dtype, save_memory),
+    )  # fmt: skip
+    opens = not json if browser is None else browser
+    run_play(options, ServeOptions(host, port, Limits(sessions, fps), out, opens, json))

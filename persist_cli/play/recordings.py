@@ -1,0 +1,81 @@
+"""Where recordings of ``persist play`` are saved, and which of them a page may fetch."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+ADDRESS: Final = "/recordings/"
+NAME_BYTES: Final = 16  # of randomness in a name: who was not told it cannot guess it
+
+
+@dataclass(frozen=True)
+class Download:
+    """A file that may be fetched, and the name under which a browser saves it."""
+
+    path: Path
+    name: str
+    media_type: str
+
+
+class Recordings:
+    """The recordings of a server.
+
+    Args:
+        folder: where they stay; ``None`` for a temporary folder, which goes with the server.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.stays = folder is not None
+        self._temporary = None if folder else tempfile.TemporaryDirectory(prefix="persist-play-")
+        self.folder = folder or Path(self._temporary.name if self._temporary else "")
+        self._downloads: dict[str, Download] = {}
+
+    def find(self, name: str) -> Download | None:
+        """Return the file that was given a name, ``None`` for any other name; no name is ever read as a path."""
+        return self._downloads.get(name)
+
+    def shelf(self) -> Shelf:
+        """Return a place for the recordings of one session."""
+        return Shelf(self)
+
+    def publish(self, download: Download) -> str:
+        """Let a file be fetched, and return its random name."""
+        name = secrets.token_urlsafe(NAME_BYTES) + download.path.suffix
+        self._downloads[name] = download
+        return name
+
+    def withdraw(self, name: str) -> None:
+        """Let a file not be fetched any more."""
+        self._downloads.pop(name, None)
+
+    def close(self) -> None:
+        """Delete what does not stay."""
+        self._downloads.clear()
+        if self._temporary is not None:
+            self._temporary.cleanup()
+
+
+class Shelf:
+    """The recordings of one session, which may be fetched as long as it lasts."""
+
+    def __init__(self, recordings: Recordings) -> None:
+        self._recordings = recordings
+        self._names: list[str] = []
+        self._folders: list[Path] = []
+
+    def clear(self) -> None:
+        """Let the recordings not be fetched any more, and delete those that do not stay."""
+        for name in self._names:
+            self._recordings.withdraw(name)
+        for folder in [] if self._recordings.stays else self._folders:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _publish(self, download: Download) -> str:
+        name = self._recordings.publish(download)
+        self._names.append(name)
+        return ADDRESS + name

@@ -1,0 +1,153 @@
+"""``persist play``: load a model and a start, and serve a page to walk in it until Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import signal
+import socket
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from persist_cli.play.open_play import PlayOptions, open_walks
+from persist_cli.play.play import Play
+from persist_cli.play.recordings import Recordings
+from persist_cli.play.server import Server, bind, make_app
+from persist_cli.play.sessions import Limits, Sessions
+from persist_cli.play.walking_page import walking_page
+from persist_cli.viewing.console import print_json, say, warn
+
+LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
+EVERYWHERE: Final = ("0.0.0.0", "::")  # hosts that mean every address of this machine
+DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")  # one of these is set where a browser can be shown
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """Where the page is served, and to how many.
+
+    Args:
+        host: name or address to listen on.
+        port: 0 for any that is free.
+        limits: of sessions.
+        recordings: folder in which recordings stay; ``None``: they go with their session.
+        browser: whether a browser is opened, if there is one.
+        json: whether the address is printed as JSON.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    limits: Limits = field(default_factory=Limits)
+    recordings: Path | None = None
+    browser: bool = False
+    json: bool = False
+
+    @property
+    def names(self) -> set[str]:
+        """Names by which the page may be asked for, beside ``localhost``."""
+        return {socket.gethostname(), socket.getfqdn()} if self.host in EVERYWHERE else {self.host}
+
+
+def run_play(options: PlayOptions, serving: ServeOptions) -> None:
+    """Serve a page to walk in a model until Ctrl-C or SIGTERM, which end it without an error.
+
+    Raises:
+        PersistError: one line when the port is taken, or model, start and memories are missing or do not go together.
+    """
+    with StopSignals() as signals:
+        bound = bind(serving.host, serving.port)
+        recordings = Recordings(serving.recordings)
+        try:
+            sessions = Sessions(first_ready(open_walks(options)), serving.limits, recordings)
+            app = make_app(walking_page(), sessions, serving.names, serving.host in EVERYWHERE)
+            server = Server(app, sessions, lambda: announce(bound, options, serving))
+            signals.end(server)
+            server.serve_on(bound)
+        except KeyboardInterrupt:  # before there was a server
+            return
+        finally:
+            bound.close()
+            recordings.close()
+        if not sessions.worker.close(LAST_CALL_SECONDS):
+            leave()
+
+
+def first_ready(walk: Callable[[], Play]) -> Callable[[], Play]:
+    """Return what makes walks like ``walk``, the first of which is made now, so that what is wrong is said at once."""
+    ready = [walk()]
+    return lambda: ready.pop() if ready else walk()
+
+
+class StopSignals:
+    """Lets Ctrl-C and SIGTERM end a server; before there is one they raise ``KeyboardInterrupt``."""
+
+    def __init__(self) -> None:
+        self._server: Server | None = None
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> StopSignals:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._stop)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def end(self, server: Server) -> None:
+        """Let the signals end this server from now on."""
+        self._server = server
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self._server is None:
+            raise KeyboardInterrupt
+        self._server.force_exit = self._server.should_exit
+        self._server.should_exit = True
+
+
+def address_of(bound: socket.socket, host: str) -> str:
+    """Return the address of the page on this machine."""
+    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    port = bound.getsockname()[1]
+    return f"http://[{name}]:{port}/" if ":" in name else f"http://{name}:{port}/"
+
+
+def announce(bound: socket.socket, options: PlayOptions, serving: ServeOptions) -> None:
+    """Print the address of the page, and open a browser there if that is wanted and there is one."""
+    address = address_of(bound, serving.host)
+    if serving.json:
+        print_json({"address": address, "pid": os.getpid()})
+        sys.stdout.flush()
+    else:
+        say(f"walk at {address} (Ctrl-C ends it)")
+    if not is_loopback(bound):
+        warn(f"everybody who reaches {serving.host} can walk there; leave out --host to keep it to this machine")
+    if serving.browser:
+        threading.Thread(target=open_browser, args=(address,), daemon=True).start()
+
+
+def is_loopback(bound: socket.socket) -> bool:
+    """Return whether a socket can be reached from this machine only."""
+    return ipaddress.ip_address(bound.getsockname()[0]).is_loopback
+
+
+def open_browser(address: str) -> None:
+    """Open a page in the browser; without a display or a browser nothing happens."""
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in DISPLAYS):
+        return
+    with contextlib.suppress(webbrowser.Error, OSError):
+        webbrowser.open(address)
+
+
+def leave() -> None:
+    """End the program although the model still works: its thread must not run while Python is taken down."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)

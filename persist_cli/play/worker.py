@@ -1,0 +1,63 @@
+"""The one thread in which the models of all sessions run."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
+
+
+class Worker:
+    """A thread that does one call after the other, in the order in which they were given to it.
+
+    Sessions that wait for each call before they give the next one therefore take turns. One thread for all, since they
+    share one model, of which one adapter at a time is in use, and since torch already spreads a call over the cores.
+
+    The thread is a daemon, so that a call that takes long cannot keep the program from ending.
+    """
+
+    def __init__(self) -> None:
+        self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        self._closed = False
+        self._thread = threading.Thread(target=self._work, name="persist-play", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no call waits to be done; one may be under way."""
+        return self._calls.empty()
+
+    def give(self, call: Callable[[], Result]) -> Future[Result]:
+        """Let the thread do a call, and return its future; one that is cancelled before it begins is left out."""
+        future: Future[Result] = Future()
+        self._calls.put((future, call))
+        return future
+
+    async def run(self, call: Callable[[], Result]) -> Result:
+        """Return what a call returns, without blocking the event loop; its exceptions are raised here."""
+        return await asyncio.wrap_future(self.give(call))
+
+    def close(self, seconds: float) -> bool:
+        """Begin no more calls, and return whether the thread has ended within some seconds."""
+        self._closed = True
+        self._calls.put(None)
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        while (job := self._calls.get()) is not None:
+            future, call = job
+            if self._closed:
+                future.cancel()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                future.set_result(call())
+            except BaseException as error:  # it belongs to the one who waits, and the thread goes on for others
+                future.set_exception(error)
+            del job, future, call  # what they hold is freed before the next call comes

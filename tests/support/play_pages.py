@@ -1,0 +1,93 @@
+"""The server of ``persist play`` in a thread, and pages that speak with it as a browser would."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+
+from persist_cli.play.messages import unpack
+from persist_cli.play.play import Play
+from persist_cli.play.recordings import Recordings
+from persist_cli.play.server import Server, bind, make_app
+from persist_cli.play.sessions import Limits, Sessions
+from persist_cli.play.walking_page import walking_page
+
+PATIENCE = 60.0  # seconds in which a busy machine answers
+
+
+@dataclass
+class Page:
+    """What a page does without drawing: it acknowledges each frame."""
+
+    socket: ClientConnection
+    texts: list[dict[str, Any]] = field(default_factory=list)
+
+    def say(self, kind: str, **values: Any) -> None:
+        """Send a message."""
+        self.socket.send(json.dumps({"type": kind, **values}))
+
+    def next(self) -> tuple[dict[str, Any], list[bytes]]:
+        """The next message, with its images; a frame is acknowledged."""
+        received = self.socket.recv(PATIENCE)
+        if isinstance(received, str):
+            self.texts.append(json.loads(received))
+            return self.texts[-1], []
+        header, images = unpack(received)
+        if header["type"] == "frame":
+            self.say("ack", number=header["number"])
+        return header, images
+
+    def until(self, kind: str) -> tuple[dict[str, Any], list[bytes]]:
+        """The next message of a type."""
+        while (message := self.next())[0]["type"] != kind:
+            pass
+        return message
+
+    def frames(self, count: int) -> list[dict[str, Any]]:
+        """The headers of the next frames."""
+        return [self.until("frame")[0] for _ in range(count)]
+
+
+@dataclass
+class Served:
+    """A server that runs: its address and its sessions."""
+
+    address: str
+    sessions: Sessions
+    server: Server
+
+    def stop(self) -> None:
+        """Let the server end, as Ctrl-C does."""
+        self.server.should_exit = True
+
+    @contextmanager
+    def page(self, **headers: str) -> Iterator[Page]:
+        """Open a page, with other headers than a browser's if they are given."""
+        url = self.address.replace("http", "ws") + "walk"
+        with connect(url, origin=headers.pop("origin", self.address.rstrip("/")), additional_headers=headers) as socket:
+            yield Page(socket)
+
+
+@contextmanager
+def serving(walk: Callable[[], Play], limits: Limits | None = None) -> Iterator[Served]:
+    """Serve walks on a free port of this machine."""
+    recordings, started, bound = Recordings(), threading.Event(), bind("127.0.0.1", 0)
+    sessions = Sessions(walk, limits or Limits(frames_per_second=120), recordings)
+    server = Server(make_app(walking_page(), sessions), sessions, started.set)
+    thread = threading.Thread(target=server.serve_on, args=(bound,))
+    thread.start()
+    assert started.wait(PATIENCE)
+    try:
+        yield Served(f"http://127.0.0.1:{bound.getsockname()[1]}/", sessions, server)
+    finally:
+        server.should_exit = True
+        thread.join(PATIENCE)
+        recordings.close()
+        assert sessions.worker.close(PATIENCE)
+        assert not thread.is_alive()
