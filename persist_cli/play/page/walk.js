@@ -54,13 +54,11 @@ const connection = new Connection({
   error: ({ text }) => controls.say(text, "error"),
   recorded: message => controls.recorded(message),
   lost(wait, taken) {
-    connected = false;
-    held.releaseAll();
+    gone();
     tell(`${taken ? "No free session" : "Connection lost"}; trying again in ${Math.ceil(wait / 1000)} s`);
   },
   ended() {
-    connected = false;
-    held.releaseAll();
+    gone();
     tell("The session has ended");
     const again = make("button", { type: "button", textContent: "begin a new one" });
     again.onclick = () => (again.parentElement.remove(), connection.open());
@@ -68,6 +66,12 @@ const connection = new Connection({
   },
   fault: error => controls.say(`this page failed: ${error.message}; reload it`, "error"),
 });
+
+function gone() {
+  connected = false;
+  held.releaseAll();
+  byId("stage").classList.remove("recording", "blocked"); // the walk and its recording have ended
+}
 
 // What is seen now is the goal; the server takes it at the same moment, when nothing is on the way.
 function keepGoal() {
