@@ -31,9 +31,9 @@ def camera_rays(cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
 
 def transform(matrix: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Move points by rigid transforms; the leading axes of ``matrix`` match the first axes of ``points``."""
-    extra = points.ndim - 1 - (matrix.ndim - 2)
-    matrix = matrix.reshape(*matrix.shape[:-2], *([1] * extra), 4, 4)
-    return (matrix[..., :3, :3] @ points[..., None])[..., 0] + matrix[..., :3, 3]
+    lead = matrix.ndim - 2
+    rows = points.reshape(*points.shape[:lead], -1, 3)  # one product a matrix: many small ones are four times as slow
+    return (rows @ matrix[..., :3, :3].mT + matrix[..., None, :3, 3]).reshape(points.shape)
 
 
 def unproject(depth: Float[Tensor, "*batch height width"], cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
