@@ -1,4 +1,4 @@
-"""The map that grows while one walks: what is remembered, seen from above, with the way and the agent.
+"""The map that grows while one walks: what is remembered, seen from above, with the way.
 
 Unlike the maps of ``viewing.map`` it is drawn in milliseconds, also of a million points, and without axes.
 """
@@ -133,7 +133,7 @@ class Marks:
     """What is drawn over the ground.
 
     Args:
-        agent: where it stands.
+        agent: where it stands. The picture reaches there; the page draws the agent, which moves between two maps.
         home: where it began.
         way: where it was, lines between places that belong together.
         goal: place of the goal; ``None`` without one.
@@ -181,9 +181,6 @@ def _draw_marks(draw: ImageDraw.ImageDraw, marks: Marks, extent: Extent, scale: 
     if marks.goal is not None:
         x, y = _pixel(extent, scale, marks.goal)
         draw.ellipse([x - 6, y - 6, x + 6, y + 6], outline="black", fill=GOAL_COLOR)
-    x, y = _pixel(extent, scale, (marks.agent.x, marks.agent.y))
-    angles = [math.radians(marks.agent.degrees + turn) for turn in (0, 140, 220)]
-    draw.polygon([(x + 9 * math.cos(a), y - 9 * math.sin(a)) for a in angles], outline="white", fill=WAY_COLOR)
 
 
 def _pixel(extent: Extent, scale: float, place: tuple[float, float]) -> tuple[float, float]:

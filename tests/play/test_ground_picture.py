@@ -63,7 +63,7 @@ def test_a_memory_without_points_shows_the_ground():
     assert color_at(picture, 1.75, 1.75) == (90, 90, 90)
 
 
-def test_the_way_and_the_agent_are_in_the_picture():
+def test_the_picture_shows_the_way_and_reaches_to_the_agent():
     picture = draw_ground(None, Marks(GroundPose(4.0, 0.0, 90.0), FAR, [[(-3.0, -3.0), (4.0, 0.0)]]), 200)
     left, bottom, right, top = picture.extent
     assert left < -3 and right > 4 and bottom < -3 and top > 0  # noqa: PT018
