@@ -10,8 +10,8 @@ import torch
 from torch.nn.functional import scaled_dot_product_attention
 from torch.profiler import ProfilerActivity, profile
 
-from persist_backbones.cogvideox import cpu_attention
 from persist_backbones.cogvideox.cogvideox import CogVideoX
+from persist_cli.api import cpu_attention
 from persist_cli.api.stages import MemorySavings
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, trained
 

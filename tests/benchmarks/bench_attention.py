@@ -12,7 +12,7 @@ from functools import partial
 import torch
 from torch.nn.functional import scaled_dot_product_attention
 
-from persist_backbones.cogvideox.cpu_attention import attend
+from persist_cli.api.cpu_attention import attend
 from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 

@@ -3,79 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from contextlib import AbstractContextManager
 
 import torch
-from torch.nn.functional import scaled_dot_product_attention
-from torch.overrides import TorchFunctionMode
 
 from persist_backbones.diffusers_models import CogVideoXTransformer3DModel
 from persist_backbones.tensors import frames_per_token
+from persist_cli.api.cpu_attention import products_for_training
 
-MOST_WEIGHTS = 1 << 27  # of one layer's attention that are kept for the backward pass
 
+def kernel_for_training(model: CogVideoXTransformer3DModel, latents: torch.Tensor) -> AbstractContextManager[None]:
+    """Within the block, attention on a processor is as ``products_for_training`` says.
 
-@contextlib.contextmanager
-def kernel_for_training(model: CogVideoXTransformer3DModel, latents: torch.Tensor) -> Iterator[None]:
-    """Within the block, attention in bfloat16 on a processor is made of matrix products where gradients are wanted.
-
-    The backward pass of PyTorch's fused kernel is slow there (``python tests/benchmarks/bench_attention.py``).
-    Matrix products keep all weights of attention until then, so longer clips have the fused kernel, and so have blocks
-    whose hidden states are computed again, and all other devices.
+    Blocks whose hidden states are computed again keep the fused kernel.
 
     Args:
         model: the transformer.
         latents: ``[batch, frame, channel, height, width]``, its input.
     """
+    if model.gradient_checkpointing:
+        return contextlib.nullcontext()
     config = model.config
     batch, frames, _, height, width = latents.shape
     tokens = config.max_text_seq_length + frames // frames_per_token(config) * height * width // config.patch_size**2
-    fits = batch * config.num_attention_heads * tokens**2 <= MOST_WEIGHTS
-    wanted = torch.is_grad_enabled() and not model.gradient_checkpointing
-    precision = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else latents.dtype
-    if latents.device.type != "cpu" or precision != torch.bfloat16 or not fits or not wanted:
-        yield
-        return
-    with MatrixProducts():
-        yield
-
-
-class MatrixProducts(TorchFunctionMode):
-    """Within the block, attention is made of matrix products in bfloat16.
-
-    PyTorch's own kernel of products looks for rows without any key in all weights, which takes as long as the softmax.
-    """
-
-    def __torch_function__(
-        self,
-        func: Callable[..., Any],
-        types: Sequence[type],
-        args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
-    ) -> Any:
-        """Call any other function as it is."""
-        return (attend if func is scaled_dot_product_attention else func)(*args, **(kwargs or {}))
-
-
-def attend(
-    query: torch.Tensor,
-    key: torch.Tensor,
-    value: torch.Tensor,
-    attn_mask: torch.Tensor | None = None,
-    dropout_p: float = 0.0,
-    is_causal: bool = False,
-) -> torch.Tensor:
-    """Return attention with all its weights at once, in bfloat16; arguments as of PyTorch's function.
-
-    A mask is true where a query sees a key, and each query must see one. There is no dropout and no causal mask.
-    """
-    if dropout_p or is_causal or (attn_mask is not None and attn_mask.dtype != torch.bool):
-        raise NotImplementedError("attention of matrix products has masks of truth values alone, and no dropout")
-    with torch.autocast(query.device.type, enabled=False):
-        query, key, value = (part.to(torch.bfloat16) for part in (query, key, value))
-        weights = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
-        if attn_mask is not None:
-            weights = weights.masked_fill(~attn_mask, -torch.inf)
-        attended: torch.Tensor = weights.softmax(-1) @ value
-    return attended
+    return products_for_training(latents, batch * config.num_attention_heads * tokens**2)

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID
+from persist_cli.api.cpu_attention import products_for_training
 from persist_cli.api.scene_model import SceneForm, SceneModel, SceneSamples
 from persist_cli.api.stages import SCENE_STAGES, ParameterGroup, Stage
 from persist_cli.errors import CheckpointError
@@ -114,7 +115,8 @@ class SceneDiffusion(SceneModel):
         dropped = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         told = self.tell(samples, generators, dropped < self.settings.transformer.drop_view)
         noisy = self._mix(latents, noise, levels, known)
-        velocity = self.transformer(noisy, levels, told.given, told.view, told.action).float()
+        with products_for_training(noisy, self.settings.transformer.heads * levels.numel() * levels.shape[1]):
+            velocity = self.transformer(noisy, levels, told.given, told.view, told.action).float()
         errors = self._tokens(velocity - (noise - latents)).square().mean(-1)
         unknown = (~known).float()
         loss = (errors * unknown).sum() / unknown.sum().clamp_min(1)

@@ -1,0 +1,76 @@
+"""Attention of matrix products, for training in bfloat16 on processors.
+
+The backward pass of PyTorch's fused kernel is slow there (``python tests/benchmarks/bench_attention.py``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch.nn.functional import scaled_dot_product_attention
+from torch.overrides import TorchFunctionMode
+
+MOST_WEIGHTS = 1 << 27  # of one layer's attention that are kept for the backward pass
+
+
+@contextlib.contextmanager
+def products_for_training(inputs: torch.Tensor, weights: int) -> Iterator[None]:
+    """Within the block, attention in bfloat16 on a processor is made of matrix products where gradients are wanted.
+
+    They keep all weights of attention until the backward pass, so where these are many the fused kernel stays, and so
+    it does on all other devices.
+
+    Args:
+        inputs: of the network; their device, and their precision where no autocast is on.
+        weights: number of weights of one layer's attention.
+    """
+    precision = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else inputs.dtype
+    on_processor = inputs.device.type == "cpu" and precision == torch.bfloat16
+    if on_processor and torch.is_grad_enabled() and weights <= MOST_WEIGHTS:
+        with MatrixProducts():
+            yield
+    else:
+        yield
+
+
+class MatrixProducts(TorchFunctionMode):
+    """Within the block, attention is made of matrix products in bfloat16.
+
+    PyTorch's own kernel of products looks for rows without any key in all weights, which takes as long as the softmax.
+    """
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """Call any other function as it is."""
+        return (attend if func is scaled_dot_product_attention else func)(*args, **(kwargs or {}))
+
+
+def attend(
+    query: torch.Tensor,
+    key: torch.Tensor,
+    value: torch.Tensor,
+    attn_mask: torch.Tensor | None = None,
+    dropout_p: float = 0.0,
+    is_causal: bool = False,
+) -> torch.Tensor:
+    """Return attention with all its weights at once, in bfloat16; arguments as of PyTorch's function.
+
+    A mask is true where a query sees a key, and each query must see one. There is no dropout and no causal mask.
+    """
+    if dropout_p or is_causal or (attn_mask is not None and attn_mask.dtype != torch.bool):
+        raise NotImplementedError("attention of matrix products has masks of truth values alone, and no dropout")
+    with torch.autocast(query.device.type, enabled=False):
+        query, key, value = (part.to(torch.bfloat16) for part in (query, key, value))
+        weights = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
+        if attn_mask is not None:
+            weights = weights.masked_fill(~attn_mask, -torch.inf)
+        attended: torch.Tensor = weights.softmax(-1) @ value
+    return attended
