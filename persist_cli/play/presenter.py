@@ -1,9 +1,10 @@
-"""Shows a page its walk: frames under the held actions, what its commands do."""
+"""Shows a page its walk: frames under the held actions, what its commands do, and the map."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
+import time
 from collections.abc import Awaitable, Callable
 from typing import Final
 
@@ -11,7 +12,7 @@ from PIL import Image
 
 from persist_cli.errors import PersistError
 from persist_cli.play import messages
-from persist_cli.play.messages import FrameHeader, ImagePart, Pose, ToPage, pack
+from persist_cli.play.messages import FrameHeader, ImagePart, MapHeader, Pose, ToPage, pack
 from persist_cli.play.play import Play
 from persist_cli.play.recordings import Shelf
 from persist_cli.play.settings import Picture, Shown
@@ -21,6 +22,11 @@ from persist_cli.play.worker import Worker
 Send = Callable[[ToPage | bytes], Awaitable[None]]
 Frame = tuple[Shown, list[bytes]]  # and its images as PNG
 
+MAP_SECONDS: Final = 0.5  # at least, from one map to the next
+MAP_SHARE: Final = 0.1  # of the time, at most, that goes into maps
+MAP_SIZE: Final = 320  # pixels of its longer side
+THINK_SECONDS: Final = 0.01  # after which no other clip is begun ahead, so that a key waits for one at most
+BUSY_SECONDS: Final = 0.2  # after which it is asked again whether nobody walks, so that there is time to think
 PNG_EFFORT: Final = 1  # 0.2 ms and 5.5 kB for 64x64 pixels; WebP is a quarter smaller and takes twice as long, or more
 
 KEYS: Final = {
@@ -59,9 +65,14 @@ class Presenter:
 
     def __init__(self, play: Play, wishes: Wishes, worker: Worker, send: Send, shelf: Shelf) -> None:
         self.play, self.wishes, self.worker, self.send, self.shelf = play, wishes, worker, send, shelf
+        self.may_think: Callable[[], bool] = lambda: not wishes.restless  # the worker is for those who walk first
+        self._map_is_old, self._map_due = True, 0.0
+        self._thinks = True  # whether something may be left to imagine ahead
+        self._told: messages.State | None = None
 
     async def run(self) -> None:
         """Welcome the page, and serve it until this is cancelled."""
+        self._told = self._state()
         await self.send(self._welcome())
         await self._show(await self.worker.run(lambda: encoded(self.play.shown)))
         while True:
@@ -76,13 +87,24 @@ class Presenter:
             await self._obey(wishes.commands.popleft())
         elif wishes.pace.is_open and wishes.restless and not wishes.pace.wait:
             await self._advance()
+        elif self._map_is_old and time.monotonic() >= self._map_due:
+            await self._show_map()
+        elif self._thinks and self.may_think():
+            self._thinks = await self.worker.run(lambda: self.play.think(THINK_SECONDS))
         else:
             return False
         return True
 
     def _rest(self) -> float | None:
         """Seconds until something is due, ``None`` when nothing is before the page says something."""
-        return self.wishes.pace.wait if self.wishes.restless and self.wishes.pace.is_open else None
+        due = []
+        if self.wishes.restless and self.wishes.pace.is_open:
+            due.append(self.wishes.pace.wait)
+        if self._map_is_old:
+            due.append(max(0.0, self._map_due - time.monotonic()))
+        if self._thinks:
+            due.append(BUSY_SECONDS)
+        return min(due, default=None)
 
     async def _advance(self) -> None:
         """Show the next frame under the held actions, if there is one."""
@@ -100,11 +122,17 @@ class Presenter:
     async def _obey(self, command: messages.Command) -> None:
         """Do a command, and say what has changed."""
         try:
-            await self._show(await self.worker.run(lambda: encoded(self._do(command))))
+            if isinstance(command, messages.Record) and not command.on:
+                await self.send(await self.worker.run(lambda: self.shelf.save(self.play)))
+            else:
+                frame = await self.worker.run(lambda: encoded(self._do(command)))
+                if isinstance(command, messages.Undo) and frame is None:
+                    await self.send(messages.Notice(text="nothing is left to undo"))
+                await self._show(frame)
         except PersistError as error:
             await self.send(messages.Error(text=str(error)))
-        self.wishes.restless = True
-        await self.send(self._state())
+        self.wishes.restless = self._thinks = True
+        await self._tell(self._state())
 
     def _do(self, command: messages.Command) -> Shown | None:
         """Do a command, and return the frame that it leads to, if any."""
@@ -114,14 +142,20 @@ class Presenter:
                 play.set(dataclasses.replace(play.settings, **command.changes))
             case messages.Reset():
                 return play.reset(command.seed)
+            case messages.Undo():
+                return play.undo()
             case messages.Home():
                 return play.home()
+            case messages.Jump():
+                return play.jump(command.x, command.y)
+            case messages.Record():
+                play.record(command.on)
             case _:
-                raise PersistError(f"this walk knows no {command.type!r} yet")
+                raise PersistError(f"there is no {command.type!r} here")
         return None
 
     async def _show(self, frame: Frame | None) -> None:
-        """Send a frame, if there is one."""
+        """Send a frame, if there is one, and what else has changed with it; the map is old then."""
         if frame is None:
             return
         (shown, images), pace = frame, self.wishes.pace
@@ -130,7 +164,27 @@ class Presenter:
             milliseconds=shown.milliseconds, frames_per_second=pace.rate,
             images=[ImagePart(memory=name, bytes=len(image)) for name, image in zip(shown.images, images, strict=True)],
         )  # fmt: skip
+        self._map_is_old = self._thinks = True
         await self.send(pack(header, images))
+        if self._state() != self._told:
+            await self._tell(self._state())
+
+    async def _show_map(self) -> None:
+        """Send the map from above. A large one comes less often, so that most of the time is left for frames."""
+        self._map_is_old, begun = False, time.monotonic()
+        image, extent = await self.worker.run(self._draw_map)
+        now = time.monotonic()
+        self._map_due = now + max(MAP_SECONDS, (now - begun) / MAP_SHARE)
+        part = ImagePart(memory=self.play.memories[0], bytes=len(image))
+        await self.send(pack(MapHeader(extent=extent, images=[part]), [image]))
+
+    def _draw_map(self) -> tuple[bytes, tuple[float, float, float, float]]:
+        drawn = self.play.map(MAP_SIZE)
+        return png(drawn.picture), drawn.extent
+
+    async def _tell(self, state: messages.State) -> None:
+        self._told = state
+        await self.send(state)
 
     def _welcome(self) -> messages.Welcome:
         height, width = next(iter(self.play.shown.images.values())).shape[:2]
@@ -140,7 +194,7 @@ class Presenter:
         ]
         return messages.Welcome(
             model=self.play.model, memories=list(self.play.memories), actions=actions, image=(width, height),
-            settings=self._settings(), can=[],
+            settings=self._settings(), can=["undo", "jump", "map", "record"],
             frames_per_second=self.wishes.pace.most,
         )  # fmt: skip
 
@@ -149,4 +203,4 @@ class Presenter:
         return messages.Settings(steps=now.steps, guidance=now.guidance, seed=now.seed, ahead=now.ahead)
 
     def _state(self) -> messages.State:
-        return messages.State(settings=self._settings())
+        return messages.State(settings=self._settings(), recording=self.play.recording)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import shutil
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from persist_cli.errors import PersistError
+from persist_cli.play.messages import Recorded
+from persist_cli.play.play import Play
 
 ADDRESS: Final = "/recordings/"
 NAME_BYTES: Final = 16  # of randomness in a name: who was not told it cannot guess it
@@ -68,8 +74,37 @@ class Shelf:
         self._names: list[str] = []
         self._folders: list[Path] = []
 
-    def clear(self) -> None:
-        """Let the recordings not be fetched any more, and delete those that do not stay."""
+    def save(self, play: Play) -> Recorded:
+        """End a recording and save it: a video, and a data set of its trajectory.
+
+        Raises:
+            PersistError: when nothing is recorded, or it cannot be written; then nothing is left of it in the folder.
+        """
+        play.record(False)
+        folder = self._recordings.folder / f"{time.strftime('walk-%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+        try:
+            saved = play.save_recording(folder)
+            archive = Path(shutil.make_archive(str(folder / "walk"), "zip", saved.data))
+        except (PersistError, OSError) as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, PersistError):
+                raise
+            raise PersistError(f"{folder}: {error.strerror}; make room there, and stop recording once more") from error
+        self._folders.append(folder)
+        video = self._publish(Download(saved.video, "walk.mp4", "video/mp4"))
+        trajectory = self._publish(Download(archive, "walk.zip", "application/zip"))
+        stays = str(folder) if self._recordings.stays else None
+        return Recorded(frames=saved.frames, video=video, trajectory=trajectory, folder=stays)
+
+    def clear(self, play: Play | None) -> None:
+        """Let the recordings not be fetched any more, and delete those that do not stay.
+
+        Args:
+            play: the walk that ends; what it still records is saved, where recordings stay.
+        """
+        if self._recordings.stays and play is not None and play.recording:
+            with contextlib.suppress(PersistError):  # nobody is there any more to whom it could be said
+                self.save(play)
         for name in self._names:
             self._recordings.withdraw(name)
         for folder in [] if self._recordings.stays else self._folders:

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
+from persist_cli.io.files import check_folder
 from persist_cli.play.open_play import PlayOptions, open_walks
 from persist_cli.play.play import Play
 from persist_cli.play.recordings import Recordings
@@ -25,6 +26,7 @@ from persist_cli.play.walking_page import walking_page
 from persist_cli.viewing.console import print_json, say, warn
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
+SAVING_SECONDS: Final = 20.0  # the same, where a recording that is under way is saved
 EVERYWHERE: Final = ("0.0.0.0", "::")  # hosts that mean every address of this machine
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")  # one of these is set where a browser can be shown
 
@@ -62,6 +64,8 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
         PersistError: one line when the port is taken, or model, start and memories are missing or do not go together.
     """
     with StopSignals() as signals:
+        if serving.recordings is not None:
+            check_folder(serving.recordings)
         bound = bind(serving.host, serving.port)
         recordings = Recordings(serving.recordings)
         try:
@@ -70,12 +74,13 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
             server = Server(app, sessions, lambda: announce(bound, options, serving))
             signals.end(server)
             server.serve_on(bound)
+            done = sessions.worker.close(LAST_CALL_SECONDS if serving.recordings is None else SAVING_SECONDS)
         except KeyboardInterrupt:  # before there was a server
             return
         finally:
             bound.close()
             recordings.close()
-        if not sessions.worker.close(LAST_CALL_SECONDS):
+        if not done:
             leave()
 
 

@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
@@ -81,6 +82,11 @@ class Sessions:
         finally:
             self.open.discard(session)
 
+    @property
+    def somebody_walks(self) -> bool:
+        """Whether some page waits for its next frame."""
+        return any(session.wishes.restless for session in self.open)
+
     async def _has_room(self) -> bool:
         """Return whether another session may begin; a tab that is loaded again waits for its old one to end."""
         if len(self.open) >= self.limits.sessions:
@@ -103,6 +109,7 @@ class Session:
         self.socket, self.sessions, self.worker = socket, sessions, sessions.worker
         self.wishes = Wishes(Pace(sessions.limits.frames_per_second))
         self.shelf = sessions.recordings.shelf()
+        self._play: Play | None = None
         self._allowance, self._wrong = Allowance(*MESSAGES), 0
         loop = asyncio.get_running_loop()
         self._stopped: asyncio.Future[None] = loop.create_future()
@@ -126,12 +133,14 @@ class Session:
             for part in parts:
                 part.cancel()
             await asyncio.gather(*parts, return_exceptions=True)
-            self.worker.give(self.shelf.clear)  # after what is under way
+            self.worker.give(partial(self.shelf.clear, self._play))  # after what is under way
             self.over.set_result(None)
 
     async def _walk(self) -> None:
-        play = await self.worker.run(self.sessions.open_play)
-        await Presenter(play, self.wishes, self.worker, self._send, self.shelf).run()
+        self._play = await self.worker.run(self.sessions.open_play)
+        presenter = Presenter(self._play, self.wishes, self.worker, self._send, self.shelf)
+        presenter.may_think = lambda: not self.sessions.somebody_walks
+        await presenter.run()
 
     async def _listen(self) -> None:
         """Take up what the page sends until it goes."""

@@ -23,14 +23,8 @@ class Worker:
 
     def __init__(self) -> None:
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
-        self._closed = False
         self._thread = threading.Thread(target=self._work, name="persist-play", daemon=True)
         self._thread.start()
-
-    @property
-    def is_free(self) -> bool:
-        """Whether no call waits to be done; one may be under way."""
-        return self._calls.empty()
 
     def give(self, call: Callable[[], Result]) -> Future[Result]:
         """Let the thread do a call, and return its future; one that is cancelled before it begins is left out."""
@@ -43,8 +37,7 @@ class Worker:
         return await asyncio.wrap_future(self.give(call))
 
     def close(self, seconds: float) -> bool:
-        """Begin no more calls, and return whether the thread has ended within some seconds."""
-        self._closed = True
+        """Take no more calls, and return whether those it was given are done within some seconds."""
         self._calls.put(None)
         self._thread.join(seconds)
         return not self._thread.is_alive()
@@ -52,8 +45,6 @@ class Worker:
     def _work(self) -> None:
         while (job := self._calls.get()) is not None:
             future, call = job
-            if self._closed:
-                future.cancel()
             if not future.set_running_or_notify_cancel():
                 continue
             try:

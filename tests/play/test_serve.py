@@ -4,46 +4,37 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-from contextlib import contextmanager
 
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from persist_cli.data.store import Store
 from persist_cli.play.serve import ServeOptions, address_of
 from persist_cli.play.server import bind
-from tests.support.micro_runs import PERSIST
-from tests.support.play_pages import PATIENCE, Page
-
-
-@contextmanager
-def command(*arguments):
-    """The command in a process of its own, and the address that it prints."""
-    process = subprocess.Popen(
-        [*PERSIST, "play", *map(str, arguments), "--port", "0", "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        lines = "".join(process.stdout.readline() for _ in range(4))
-        yield process, json.loads(lines)["address"]
-    finally:
-        process.kill()
-        process.communicate()
+from tests.support.play_pages import Page
+from tests.support.processes import start_persist, wait_until
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_ends_the_command_without_an_error_while_somebody_walks(voxel, walks, stop):
-    with command(voxel, "--start", f"{walks}#0:2", "--memories", "voxel,stage1") as (process, address):
-        with connect(f"{address.replace('http', 'ws')}walk", origin=address.rstrip("/")) as socket:
-            page = Page(socket)
-            page.say("keys", held=["left"])
-            page.frames(3)
-            process.send_signal(stop)
-            with pytest.raises(ConnectionClosed):
-                page.frames(100)
-        assert process.wait(PATIENCE) == 0
-        assert process.stderr.read() == ""
+def test_ctrl_c_ends_the_command_without_an_error_while_somebody_walks(voxel, walks, tmp_path, stop):
+    printed, out = tmp_path / "printed", tmp_path / "recordings"
+    process = start_persist(
+        "play", voxel, "--start", f"{walks}#0:2", "--port", 0, "--json", "--out", out, output=printed
+    )  # fmt: skip
+    wait_until(lambda: printed.is_file() and "}" in printed.read_text(), process)
+    address = json.loads(printed.read_text())["address"]
+    with connect(f"{address.replace('http', 'ws')}walk", origin=address.rstrip("/")) as socket:
+        page = Page(socket)
+        page.say("record", on=True)
+        page.say("keys", held=["left"])
+        page.frames(3)
+        process.send(stop)
+        with pytest.raises(ConnectionClosed):
+            page.frames(1000)
+    assert process.wait() == 0
+    assert "Traceback" not in printed.read_text()
+    assert len(Store(next(out.iterdir()) / "data")[0].read()) > 2
 
 
 def test_what_cannot_be_opened_is_said_before_a_page_is_served(persist, voxel, walks):

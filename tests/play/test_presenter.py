@@ -1,0 +1,122 @@
+"""What a page asks for is done with its walk, and shown."""
+
+from __future__ import annotations
+
+import io
+import urllib.request
+import zipfile
+
+import pytest
+from PIL import Image
+
+from persist_cli.data.store import Store
+from tests.support.micro_plays import micro_walks
+from tests.support.play_pages import serving
+
+
+@pytest.fixture(scope="module")
+def server(walks):
+    with serving(micro_walks(walks)) as served:
+        yield served
+
+
+@pytest.fixture
+def page(server):
+    with server.page() as opened:
+        opened.until("frame")
+        yield opened
+
+
+def step(page, action="left"):
+    """The frame after one tap of a key."""
+    page.say("keys", held=[action])
+    page.say("keys", held=[])
+    return page.frames(1)[0]
+
+
+def place(frame):
+    return pytest.approx((frame["pose"]["x"], frame["pose"]["y"], frame["pose"]["degrees"]))
+
+
+def test_the_map_follows_where_the_walker_is(page):
+    header, [image] = page.until("map")
+    left, bottom, right, top = header["extent"]
+    frame = step(page, "forward")
+    assert left < frame["pose"]["x"] < right
+    assert bottom < frame["pose"]["y"] < top
+    assert page.until("map")[1] != [image]
+    assert max(Image.open(io.BytesIO(image)).size) <= 320
+
+
+def test_an_undone_step_is_gone_and_the_first_frame_cannot_be_undone(page):
+    one = step(page)
+    step(page)
+    page.say("undo")
+    assert place(page.frames(1)[0]) == tuple(one["pose"].values())
+    page.say("undo")
+    page.frames(1)
+    page.say("undo")
+    assert page.until("notice")[0]["text"] == "nothing is left to undo"
+
+
+def test_home_is_where_the_walk_began(page):
+    page.say("reset")
+    start = page.frames(1)[0]
+    step(page, "forward")
+    page.say("home")
+    assert place(page.frames(1)[0]) == tuple(start["pose"].values())
+
+
+def test_a_jump_leads_to_the_place_on_the_map(page):
+    page.say("jump", x=0.5, y=0.25)
+    frame = page.frames(1)[0]
+    assert (frame["pose"]["x"], frame["pose"]["y"]) == pytest.approx((0.5, 0.25))
+
+
+def test_settings_are_told_as_they_are_now_and_wrong_ones_change_nothing(page):
+    page.say("settings", steps=3, guidance=1.5, ahead=True)
+    assert page.until("state")[0]["settings"] == {"steps": 3, "guidance": 1.5, "seed": 0, "ahead": True}
+    page.say("settings", guidance=11)
+    assert "guidance" in page.until("error")[0]["text"]
+
+
+def test_a_recording_is_fetched_as_a_video_and_a_data_set_while_its_session_lasts(server, page, tmp_path):
+    page.say("record", on=True)
+    assert page.until("state")[0]["recording"]
+    for action in ("left", "forward", "forward"):
+        step(page, action)
+    page.say("record", on=False)
+    recorded, _ = page.until("recorded")
+    assert (recorded["frames"], recorded["folder"]) == (4, None)
+    with urllib.request.urlopen(server.address + recorded["video"][1:]) as video:
+        assert b"ftyp" in video.read(32)
+    with urllib.request.urlopen(server.address + recorded["trajectory"][1:]) as archive:
+        zipfile.ZipFile(io.BytesIO(archive.read())).extractall(tmp_path)
+    assert [tuple(file.read().actions) for file in Store(tmp_path)] == [("left", "forward", "forward", None)] * 2
+    assert not page.until("state")[0]["recording"]
+
+
+def test_what_was_not_recorded_cannot_be_saved(page):
+    page.say("record", on=False)
+    assert page.until("error")[0]["text"].startswith("nothing was recorded")
+    assert not page.until("state")[0]["recording"]
+    page.say("record", on=True)
+    assert page.until("state")[0]["recording"]
+    page.say("record", on=False)
+    assert page.until("error")[0]["text"].startswith("nothing was walked while recording")
+
+
+def test_what_is_imagined_ahead_is_what_the_key_then_shows(server, page):
+    def images(ahead):
+        page.say("reset")
+        page.say("settings", ahead=ahead)
+        page.until("state")
+        if ahead:
+            page.until("map")
+        page.say("keys", held=["right"])
+        page.say("keys", held=[])
+        while (message := page.until("frame"))[0]["action"] is None:
+            pass
+        return message[1]
+
+    assert images(True) == images(False)

@@ -1,0 +1,61 @@
+"""Recordings lie under names that nobody can guess, and stay where the user says."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from persist_cli.data.store import Store
+from persist_cli.errors import PersistError
+from persist_cli.play.recordings import ADDRESS, Recordings
+from tests.support.micro_plays import micro_walks
+
+
+@pytest.fixture(scope="module")
+def walk(walks):
+    return micro_walks(walks)
+
+
+@pytest.fixture
+def play(walk):
+    """A walk of two steps that is being recorded."""
+    play = walk()
+    play.record(True)
+    for _ in range(2):
+        play.advance({"left"})
+    return play
+
+
+def test_recordings_without_a_folder_go_with_their_session(play):
+    recordings = Recordings()
+    shelf = recordings.shelf()
+    saved = shelf.save(play)
+    name = saved.video.removeprefix(ADDRESS)
+    assert recordings.find(name).path.is_file()
+    shelf.clear(play)
+    assert recordings.find(name) is None
+    assert not [*recordings.folder.iterdir()]
+    recordings.close()
+    assert not recordings.folder.exists()
+
+
+def test_a_walk_that_ends_while_it_is_recorded_is_saved_in_the_folder(play, tmp_path):
+    recordings = Recordings(tmp_path)
+    recordings.shelf().clear(play)
+    recordings.close()
+    [folder] = tmp_path.iterdir()
+    assert len(Store(folder / "data")[0].read()) == 3
+
+
+def test_of_a_recording_that_cannot_be_saved_nothing_is_left(play, tmp_path, monkeypatch):
+    def no_room(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shutil, "make_archive", no_room)
+    shelf = Recordings(tmp_path).shelf()
+    with pytest.raises(PersistError, match="No space left on device; make room there"):
+        shelf.save(play)
+    assert not [*tmp_path.iterdir()]
+    monkeypatch.undo()
+    assert shelf.save(play).frames == 3
