@@ -31,9 +31,9 @@ from persist_cli.viewing.console import print_table, say
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-KEYS = ("a", "w", "d", "d", "s", "a")
+KEYS = ("a", "w", "d", "s", "d", "w")  # no two alike in a row, so that no late frame of one counts for the next
 PAUSES = (300, 900)  # milliseconds between two presses, at least and at most
-STILL = 250  # milliseconds without a frame after which the agent stands
+STILL = 400  # milliseconds without a frame after which the agent stands
 STUCK = 30.0  # seconds after which frames that do not come are given up
 LOOK = 20  # milliseconds between two looks at the page
 
@@ -96,7 +96,9 @@ def press(page: Page, key: str, hold: int) -> float | None:
     page.evaluate("() => { drawn.length = 0; }")
     page.keyboard.down(key)
     waited = 0
-    while page.evaluate("drawn.length") < hold and waited < 1000 * STUCK and not page.locator("#stage.blocked").count():
+    while (drawn := page.evaluate("drawn.length")) < hold and waited < 1000 * STUCK:
+        if drawn and page.locator("#stage.blocked").count():
+            break
         page.wait_for_timeout(LOOK)
         waited += LOOK
     page.keyboard.up(key)
