@@ -168,7 +168,7 @@ class EditPanel:
             return "not edited"
         saved = "not saved" if session.unsaved else f"saved as {session.out.name}"
         last = session.edits[-1].edit
-        return f"{count} edits, the last: {last}; {outcome.changed:,} cells changed; {saved}"
+        return f"{count} edit{'s' * (count > 1)}, the last: {last}; {outcome.changed:,} cells changed; {saved}"
 
     def _show_gizmo(self, boxes: list[Box]) -> None:
         """Put arrows on the first selected box; they move it, or what is in it."""

@@ -111,14 +111,14 @@ class EditSession:
             view: the camera, with a frame axis of one.
             low: column and row of the upper left corner as shares 0…1 of the view.
             high: those of the lower right corner.
-            shown: which cells of ``cells_of_memory`` are drawn.
+            shown: which cells of ``cells_of_memory`` are drawn; others, as a ceiling above the cut, hide nothing.
 
         Raises:
             DataError: when nothing is visible there; then the selection stays as it was.
         """
         cells = cells_of_memory(self.edited)
-        visible, inside = visible_cells(cells, view, low, high)
-        visible, inside = visible & shown, inside & shown
+        visible, inside = np.zeros(len(cells), bool), np.zeros(len(cells), bool)
+        visible[shown], inside[shown] = visible_cells(cells[shown], view, low, high)
         if not inside.any():
             raise DataError("nothing is visible in the rectangle; draw it around something")
         chosen = tuple(Selected(thing.box, thing.name) for thing in self._things_in(cells, visible, inside))

@@ -15,7 +15,7 @@ from torch import Tensor
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cells import CellOrigin
 from persist_cli.errors import PersistError
-from persist_cli.viewer.camera_view import camera_of_view, world_from
+from persist_cli.viewer.camera_view import camera_of_view, pose_of, world_from
 from persist_cli.viewer.drawn_cells import ORIGIN_COLORS, cells_of_memory, class_colors
 from persist_cli.viewer.edit_panel import EditPanel
 from persist_cli.viewer.edit_session import EditSession
@@ -252,15 +252,20 @@ class Page:
     def _add_imagine_panel(self) -> None:
         gui = self.server.gui
         Note(gui, "A camera that you place shows what the world model imagines there. Move it, and it imagines anew.")
-        place = gui.add_button("Camera at this view")
-        place.on_click(self.guarded(self._place))
+        if self.subject.walks:
+            here = gui.add_button("Camera at this frame")
+            here.on_click(self.guarded(lambda event: self._place(self.present_camera(), event)))
+        view = gui.add_button("Camera at this view")
+        view.on_click(self.guarded(lambda event: self._place(camera_of_view(event.client), event)))
         self._imagined_text, self._imagined_picture = Note(gui), Pictures(gui)
 
-    def _place(self, event: Any) -> None:
-        """Place a camera where the view of a tab is, and imagine what it sees."""
-        view = event.client.camera
+    def _place(self, camera: Cameras | None, event: Any) -> None:
+        """Place a camera that can be moved by its arrows and rings, and imagine what it sees."""
+        if camera is None:
+            return
+        wxyz, position = pose_of(camera.world_from_camera[0])
         self._placed = self.server.scene.add_transform_controls(
-            "/placed", scale=0.6, wxyz=view.wxyz, position=view.position, depth_test=False
+            "/placed", scale=0.6, wxyz=wxyz, position=position, depth_test=False
         )
         self._placed.on_update(lambda moved: self._imagine(moved) if moved.phase == "end" else None)
         self._draw_placed(None)

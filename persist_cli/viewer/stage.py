@@ -241,7 +241,7 @@ class Stage:
         """Let a page begin with all in view, from above at an angle."""
         low, high = self.bounds()
         middle, reach = (low + high) / 2, max(float(np.linalg.norm((high - low)[:2])), 1.0)
-        offset = np.array([0.35, -0.75, 0.75]) * reach
+        offset = np.array([0.25, -0.55, 0.6]) * reach
         camera = self.server.initial_camera
         camera.position = _triple((middle + offset) @ self.axes)
         camera.look_at = _triple(middle @ self.axes)

@@ -37,6 +37,18 @@ def test_a_rectangle_selects_the_things_that_it_shows(session):
     assert {one.name for one in session.selection} == {"table#1", "box#1"}
 
 
+def test_what_is_cut_away_hides_nothing_from_a_rectangle(session):
+    grid = session.original.cells
+    view = camera_at(grid, (8, 9, 11), (6, 6, 1))
+    view.world_from_camera[0, :3, 3] += 2 * grid.axes[2]
+    height = cells_of_memory(session.original).local[:, 2]
+    below = height < height.max() - 0.1
+    session.select_rectangle(view, (0, 0), (1, 1), below)
+    assert {one.name for one in session.selection} == {"table#1", "box#1"}
+    session.select_rectangle(view, (0, 0), (1, 1), everything(session))
+    assert [one.name for one in session.selection] == [""]
+
+
 def test_a_rectangle_without_a_thing_selects_what_is_visible_there(session):
     view = camera_at(session.original.cells, (11, 11, 6), (12, 12, 6))
     session.select_rectangle(view, (0.3, 0.3), (0.7, 0.7), everything(session))
