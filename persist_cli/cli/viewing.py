@@ -9,6 +9,8 @@ import typer
 
 from persist_cli.cli.options import JsonOption, VerifyOption
 
+VIEW_PORT = 8421
+
 viewing_app = typer.Typer()
 
 
@@ -27,9 +29,11 @@ def view(
     seed: Annotated[int, typer.Option(min=0, help="Of all that is imagined.")] = 0,
     most: Annotated[int, typer.Option(min=100, help="Most blocks that are drawn of a map.")] = 40_000,
     export: Annotated[Path | None, typer.Option(help="Write one HTML file that needs no server, and end.")] = None,
-    port: Annotated[int, typer.Option(min=0, help="Port of the page; 0 for any free one.")] = 8090,
-    host: Annotated[str, typer.Option(help="Address it is bound to; 127.0.0.1: this machine only.")] = "127.0.0.1",
-    opens: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: any that is free.")] = VIEW_PORT,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets others in.")] = "127.0.0.1",
+    opens: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the browser, if there is one; not with --json.")
+    ] = True,
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import ipaddress
 import os
 import signal
 import socket
 import sys
 import threading
-import webbrowser
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,15 +17,14 @@ from persist_cli.io.files import check_folder
 from persist_cli.play.open_play import PlayOptions, open_walks
 from persist_cli.play.play import Play
 from persist_cli.play.recordings import Recordings
-from persist_cli.play.server import Server, bind, make_app
+from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
 from persist_cli.viewing.console import print_json, say, warn
+from persist_cli.viewing.own_address import EVERYWHERE, address_of, bind, is_loopback, open_browser
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
 SAVING_SECONDS: Final = 20.0  # the same, where a recording that is under way is saved
-EVERYWHERE: Final = ("0.0.0.0", "::")  # hosts that mean every address of this machine
-DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")  # one of these is set where a browser can be shown
 
 
 @dataclass(frozen=True)
@@ -117,16 +113,9 @@ class StopSignals:
         self._server.should_exit = True
 
 
-def address_of(bound: socket.socket, host: str) -> str:
-    """Return the address of the page on this machine."""
-    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    port = bound.getsockname()[1]
-    return f"http://[{name}]:{port}/" if ":" in name else f"http://{name}:{port}/"
-
-
 def announce(bound: socket.socket, options: PlayOptions, serving: ServeOptions) -> None:
     """Print the address of the page, and open a browser there if that is wanted and there is one."""
-    address = address_of(bound, serving.host)
+    address = address_of(serving.host, bound.getsockname()[1])
     if serving.json:
         print_json({"address": address, "pid": os.getpid()})
         sys.stdout.flush()
@@ -136,19 +125,6 @@ def announce(bound: socket.socket, options: PlayOptions, serving: ServeOptions) 
         warn(f"everybody who reaches {serving.host} can walk there; leave out --host to keep it to this machine")
     if serving.browser:
         threading.Thread(target=open_browser, args=(address,), daemon=True).start()
-
-
-def is_loopback(bound: socket.socket) -> bool:
-    """Return whether a socket can be reached from this machine only."""
-    return ipaddress.ip_address(bound.getsockname()[0]).is_loopback
-
-
-def open_browser(address: str) -> None:
-    """Open a page in the browser; without a display or a browser nothing happens."""
-    if sys.platform == "linux" and not any(os.environ.get(name) for name in DISPLAYS):
-        return
-    with contextlib.suppress(webbrowser.Error, OSError):
-        webbrowser.open(address)
 
 
 def leave() -> None:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import socket
 import sys
 import traceback
 from collections.abc import Callable, Collection, Iterator
 from typing import Final
-from urllib.parse import urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
@@ -21,11 +19,11 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from persist_cli.errors import PersistError
 from persist_cli.play.messages import MOST_BYTES
 from persist_cli.play.recordings import ADDRESS
 from persist_cli.play.sessions import Sessions
 from persist_cli.play.walking_page import WalkingPage
+from persist_cli.viewing.own_address import leads_here, same_host
 
 MOST_CONNECTIONS: Final = 64
 PING_SECONDS: Final = 20.0  # after which a page that says nothing is asked whether it is there, and is given up
@@ -70,32 +68,7 @@ class OwnAddress:
 
     def is_own(self, host: str) -> bool:
         """Return whether a Host header names this server."""
-        name = host_name(host)
-        if name is None:
-            return False
-        if name in self.names:
-            return True
-        try:
-            address = ipaddress.ip_address(name)
-        except ValueError:
-            return False
-        return self.anywhere or address.is_loopback
-
-
-def host_name(host: str) -> str | None:
-    """Return the name or address in a Host header in lower case, without brackets and port; ``None`` if it has none."""
-    try:
-        parts = urlsplit(f"//{host}")
-        _ = parts.port  # raises for what is no number
-    except ValueError:
-        return None
-    return None if parts.path or parts.query or parts.fragment or parts.username is not None else parts.hostname
-
-
-def same_host(origin: str, host: str) -> bool:
-    """Return whether an Origin header is that of the page under a Host header."""
-    scheme, _, rest = origin.partition("://")
-    return scheme in ("http", "https") and rest.lower() == host.lower() != ""
+        return leads_here(host, self.names, self.anywhere)
 
 
 async def refuse(scope: Scope, receive: Receive, send: Send, why: str) -> None:
@@ -141,31 +114,6 @@ async def answer_fault(request: Request, error: Exception) -> Response:
     """Say that an answer failed; the traceback is for the terminal alone."""
     traceback.print_exception(error, file=sys.stderr)
     return PlainTextResponse("a fault of persist; the terminal says more", 500, SECURITY)
-
-
-def bind(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to a host and port and does not listen yet.
-
-    Args:
-        host: name or address.
-        port: 0 for any that is free.
-
-    Raises:
-        PersistError: when the port is taken or the host is not one of this machine.
-    """
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        bound = socket.socket(family, kind, protocol)
-    except OSError as error:
-        raise PersistError(f"--host {host}: {error.strerror}; give an address of this machine") from error
-    try:
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(address)
-    except OSError as error:
-        bound.close()
-        advice = "another --port, or --port 0 for any free one, or an address of this machine as --host"
-        raise PersistError(f"cannot serve at {host}:{port}: {error.strerror}; give {advice}") from error
-    return bound
 
 
 class Server(uvicorn.Server):

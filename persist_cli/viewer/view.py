@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 import threading
-import webbrowser
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from persist_cli.api.scene import Scene
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import load_paths
 from persist_cli.viewer.edit_session import EditSession, default_out
 from persist_cli.viewer.imagine import Imaginer, ImagineSettings
 from persist_cli.viewer.subject import TRUTH, Subject, describe, open_subject
-from persist_cli.viewing.console import busy, print_json, say
+from persist_cli.viewing.console import busy, print_json, say, warn
+from persist_cli.viewing.own_address import address_of, bind, is_loopback, open_browser
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Address:
     """
 
     host: str = "127.0.0.1"
-    port: int = 8090
+    port: int = 8421
     opens: bool = True
 
 
@@ -69,36 +69,55 @@ def run_view(plan: ViewPlan, address: Address, export: Path | None, as_json: boo
         PersistError: when viser is not installed, something is missing or damaged, or the port is taken.
     """
     check_viser()
-    from persist_cli.viewer.page_server import check_address, page_server
-    from persist_cli.viewer.stage import Look, Stage
-
     if export is not None:
         _check_export(export)
     else:
-        check_address(address.host, address.port)
+        check_address(address)
     with busy("loading what is shown"):
         subject = open_subject(plan.source, plan.truth, plan.start)
     session = make_session(plan, subject)
-    look = Look(most=plan.most, layers=first_layers(subject))
-    where = Address("127.0.0.1", 0, False) if export is not None else address
-    with page_server(where.host, where.port) as server:
-        if export is not None:
-            from persist_cli.viewer.export import export_page
+    if export is not None:
+        write_page(plan, subject, export, as_json)
+    else:
+        serve_page(plan, subject, session, address, as_json)
 
-            stage = Stage(server, subject, look)
-            moments = export_page(stage, export)
-            _report(subject, {"file": str(export), "moments": moments}, as_json)
-            return
-        from persist_cli.viewer.page import Page
 
+def write_page(plan: ViewPlan, subject: Subject, path: Path, as_json: bool) -> None:
+    """Write a subject as one HTML file, and say so."""
+    from persist_cli.viewer.export import export_page
+    from persist_cli.viewer.page_server import page_server
+    from persist_cli.viewer.stage import Look, Stage
+
+    with page_server(Address.host, 0) as server:
+        stage = Stage(server, subject, Look(most=plan.most, layers=first_layers(subject)))
+        moments = export_page(stage, path)
+    _report(subject, {"file": str(path), "moments": moments}, as_json)
+
+
+def serve_page(plan: ViewPlan, subject: Subject, session: EditSession | None, address: Address, as_json: bool) -> None:
+    """Show a subject on a page until Ctrl-C or SIGTERM."""
+    from persist_cli.viewer.page import Page
+    from persist_cli.viewer.page_server import page_server
+    from persist_cli.viewer.stage import Look
+
+    with page_server(address.host, address.port) as server:
+        look = Look(most=plan.most, layers=first_layers(subject))
         page = Page(server, subject, look, session, make_imaginer(plan, subject))
-        url = page_url(where.host, server.get_port())
+        url = address_of(address.host, server.get_port())
         _report(subject, {"address": url}, as_json)
-        if address.opens:
-            open_browser(url)
+        if address.opens and not as_json:
+            threading.Thread(target=open_browser, args=(url,), daemon=True).start()
         _wait(page.lock)
     if session is not None and session.unsaved:
         say(f"{len(session.edits)} edits are not saved in {session.out}")
+
+
+def check_address(address: Address) -> None:
+    """Raise ``PersistError`` when nothing can listen at an address; warn when others than this machine reach it."""
+    with bind(address.host, address.port) as bound:
+        if not is_loopback(bound):
+            who = f"everybody who reaches {address.host}"
+            warn(f"{who} can look and edit there; leave out --host to keep it to this machine")
 
 
 def check_viser() -> None:
@@ -138,22 +157,6 @@ def first_layers(subject: Subject) -> set[str]:
     return {name for number, name in enumerate(subject.layers) if number == 0 or name == TRUTH}
 
 
-def page_url(host: str, port: int) -> str:
-    """Return the address of the page for a browser on this machine."""
-    name = "127.0.0.1" if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
-    return f"http://{name}:{port}/"
-
-
-def open_browser(url: str) -> None:
-    """Open a page if this machine has a browser with windows; without one nothing happens, the address is printed."""
-    try:
-        browser = webbrowser.get()
-    except webbrowser.Error:
-        return
-    if not isinstance(browser, webbrowser.GenericBrowser) or isinstance(browser, webbrowser.BackgroundBrowser):
-        browser.open(url)
-
-
 def _check_export(path: Path) -> None:
     check_folder(path.parent)
     if path.is_dir() or path.suffix.lower() not in (".html", ".htm"):
@@ -163,17 +166,20 @@ def _check_export(path: Path) -> None:
 def _report(subject: Subject, place: dict[str, Any], as_json: bool) -> None:
     values = describe(subject) | place
     if as_json:
-        return print_json(values)
+        print_json(values)
+        sys.stdout.flush()
+        return
     for line in subject.notices:
         say(line)
-    blocks = ", ".join(f"{name} of {count:,} cells" for name, count in values["blocks"].items())
+    blocks = ", ".join(f"{name} of {count:,} points" for name, count in values["blocks"].items())
     walks = ", ".join(f"{walk['name']} of {walk['frames']} frames" for walk in values["walks"])
     say(f"{subject.scene}: {'; '.join(filter(None, (blocks, walks))) or 'nothing in it'}")
     if "file" in place:
-        return say(f"page: {place['file']}, {Path(place['file']).stat().st_size / 1e6:.1f} MB")
-    if isinstance(subject.memory, Scene) or subject.memory is not None:
-        say("edits: hold Shift and draw a rectangle, or choose a box")
-    return say(f"look at {place['address']} (Ctrl-C ends it)")
+        say(f"page: {place['file']}, {Path(place['file']).stat().st_size / 1e6:.1f} MB")
+        return
+    if subject.memory is not None:
+        say("to edit, hold Shift and draw a rectangle, or give a box")
+    say(f"look at {place['address']} (Ctrl-C ends it)")
 
 
 def _wait(lock: Any) -> None:

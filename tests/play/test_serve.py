@@ -10,8 +10,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from persist_cli.data.store import Store
-from persist_cli.play.serve import ServeOptions, address_of
-from persist_cli.play.server import bind
+from persist_cli.play.serve import ServeOptions
+from persist_cli.viewing.own_address import address_of, bind
 from tests.support.play_pages import Page
 from tests.support.processes import start_persist, wait_until
 
@@ -55,6 +55,6 @@ def test_a_port_that_is_taken_is_said_before_the_model_is_loaded(persist, tmp_pa
 
 def test_the_address_is_one_that_a_browser_of_this_machine_finds():
     with bind("0.0.0.0", 0) as everywhere:
-        assert address_of(everywhere, "0.0.0.0") == f"http://127.0.0.1:{everywhere.getsockname()[1]}/"
+        assert address_of("0.0.0.0", everywhere.getsockname()[1]) == f"http://127.0.0.1:{everywhere.getsockname()[1]}/"
         assert ServeOptions("0.0.0.0").names != {"0.0.0.0"}
     assert ServeOptions("lab.local").names == {"lab.local"}

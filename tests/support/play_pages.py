@@ -14,9 +14,10 @@ from websockets.sync.client import ClientConnection, connect
 from persist_cli.play.messages import unpack
 from persist_cli.play.play import Play
 from persist_cli.play.recordings import Recordings
-from persist_cli.play.server import Server, bind, make_app
+from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
+from persist_cli.viewing.own_address import bind
 
 PATIENCE = 60.0  # seconds in which a busy machine answers
 
