@@ -183,8 +183,8 @@ class SteppedWorld(WorldModel):
         if any(len(way) > 1 for way in ways):
             return super().predict(moving, ways, interactions)
         clips = self.recall(moving, ways, interactions)
-        rgb, depth = self.backbone.generate_frame(clips, self.sampling, [1] * len(ways))
-        frames = zip(rgb.cpu()[:, None], depth.cpu()[:, None], ways, strict=True)
+        rgb, depth = self.denoise_frame(clips, [1] * len(ways))
+        frames = zip(rgb[:, None], depth[:, None], ways, strict=True)
         return [Observations(image, metres, way).with_origin(Origin.IMAGINED) for image, metres, way in frames]
 
 

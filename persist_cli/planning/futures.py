@@ -128,8 +128,8 @@ class WorldFutures:
             agent.write = False  # nothing reads what the last clip would write
         if over == "last":
             inputs = branches.recall(range(len(rest)), rest, [acts[lead:] for acts in interactions])
-            rgb, depth = branches.backbone.generate_frame(inputs, branches.sampling, [len(path) for path in rest])
-            return list(zip(rgb.cpu()[:, None], depth.cpu()[:, None], strict=True))
+            rgb, depth = branches.denoise_frame(inputs, [len(path) for path in rest])
+            return list(zip(rgb[:, None], depth[:, None], strict=True))
         clips += branches.imagine(rest, [acts[lead:] for acts in interactions])
         videos = zip(*clips, strict=True)
         return [

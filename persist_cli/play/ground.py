@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
+from persist_cli.api.actions import rotation_about
 from persist_cli.api.ground import Cover, ground_axes
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.errors import PersistError
+from persist_cli.play.settings import GroundPose
 from persist_cli.play.walkers import Pose
 from persist_cli.rollout.surroundings import Surroundings
 
@@ -17,6 +21,15 @@ def pose_at(pose: Pose, x: float, y: float, info: TrajectoryInfo) -> Pose:
     moved = pose.cpu().double().clone()
     height = axes[2] @ moved[:3, 3]
     moved[:3, 3] = torch.stack([axes.new_tensor(x), axes.new_tensor(y), height]) @ axes
+    return moved
+
+
+def turned(pose: Pose, degrees: float, info: TrajectoryInfo) -> Pose:
+    """Return a camera's pose with another heading, in degrees to the left of the first ground axis; its tilt stays."""
+    now = GroundPose.of(pose, info.world_up).degrees
+    up = torch.tensor(info.world_up, dtype=torch.float64)
+    moved = pose.cpu().double().clone()
+    moved[:3, :3] = rotation_about(up / up.norm(), math.radians(degrees - now)) @ moved[:3, :3]
     return moved
 
 

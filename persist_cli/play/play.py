@@ -10,19 +10,25 @@ import dataclasses
 import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Final
 
 from persist_cli.api.actions import Action
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
+from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
 from persist_cli.play.ground import check_free, pose_at
 from persist_cli.play.ground_picture import GroundPicture
+from persist_cli.play.guide import Guide
 from persist_cli.play.keys import held_actions, walking_keys
 from persist_cli.play.recording import Recording, SavedRecording
 from persist_cli.play.settings import GroundPose, PlaySettings, Shown
 from persist_cli.play.surveyor import Surveyor
 from persist_cli.play.walkers import Ahead, Pose, Walkers
+from persist_cli.plugins import make_cost
 from persist_cli.rollout.world_model import WorldModel
+
+COST: Final = "lpips"  # says how unlike the goal picture a view looks
 
 
 class Play:
@@ -50,6 +56,8 @@ class Play:
         self._done: frozenset[str] = frozenset()  # interactions that are still held and were done
         self._recording: Recording | None = None
         self._records = False
+        self._goal: Goal | None = None
+        self._guide: Guide | None = None
         self.settings = settings
         self.set(settings)
         self._walkers.begin(start.observations, start.info)
@@ -119,8 +127,8 @@ class Play:
         begun = time.monotonic()
         actions = self._next_actions(frozenset(held))
         if not actions:
-            self._ahead, self._blocked = None, 0
-            return None
+            return self._guided(begun)
+        self.stop()
         if actions != self._last:
             self._last, self._blocked = actions, 0
         if self._blocked >= len(actions):
@@ -160,6 +168,20 @@ class Play:
             self._recording.undo()
         return self._show(None, True, begun)
 
+    def _guided(self, begun: float) -> Shown | None:
+        """Return the planner's next frame; ``None`` when it does not walk, or is where it wants to be."""
+        if self._guide is None:
+            self._ahead, self._blocked = None, 0
+            return None
+        if self._ahead is None or not self._ahead.left or self._blocked:
+            self._walkers.remember()
+            actions = self._guide.decide(next(iter(self._walkers.worlds.values())))
+            if not actions:
+                self.stop()
+                return self._guided(begun)
+            self._ahead, self._blocked = self._walkers.imagine(actions, repeat=False), 0
+        return self._take(self._ahead, begun)
+
     def _next_actions(self, held: frozenset[str]) -> tuple[str, ...]:
         """Return the actions to take in turn: an interaction that is newly held, else what moves."""
         moving = held_actions(held, self.info.vocabulary)
@@ -169,6 +191,38 @@ class Play:
         if fresh:
             self._ahead, self._last = None, ()
         return tuple(fresh[:1]) or moving
+
+    @property
+    def goal(self) -> Goal | None:
+        """The picture that the planner looks for, and where it was taken; ``None`` before one is taken."""
+        return self._goal
+
+    def take_goal(self) -> None:
+        """Make the present frame of the first memory the goal."""
+        now = self._walkers.lead.now
+        self._goal = Goal(now.rgb[0].cpu(), now.cameras.centers[0].cpu().double(), self.info.scene)
+
+    @property
+    def planning(self) -> bool:
+        """Whether the planner walks."""
+        return self._guide is not None
+
+    def plan(self) -> None:
+        """Let the planner walk to the goal picture; ``advance`` without held actions shows its steps.
+
+        Each decision takes a second or more, in which nothing else is done. A held action stops the planner.
+
+        Raises:
+            PersistError: when there is no goal, or the weights are missing that compare pictures.
+        """
+        if self._goal is None:
+            raise PersistError("there is no goal picture yet; take one, walk away, and let it be looked for")
+        self._drop()
+        self._guide = Guide(self._goal, make_cost(COST, {}), self.settings.seed)
+
+    def stop(self) -> None:
+        """Let the planner stop."""
+        self._guide = None
 
     def home(self) -> Shown:
         """Stand at the start pose again, and return what is imagined there; nothing is forgotten."""
@@ -198,7 +252,7 @@ class Play:
         """
         if self._ahead is None or not self._ahead.left:
             self._walkers.remember()
-        return self._surveyor.draw(size, None)
+        return self._surveyor.draw(size, self._goal)
 
     @property
     def recording(self) -> bool:
@@ -226,8 +280,9 @@ class Play:
         return tuple(agent.now for agent in self._walkers.agents)
 
     def _drop(self) -> None:
-        """Drop all that is imagined and not shown."""
+        """Drop all that is imagined and not shown, and let the planner stop."""
         self._ahead, self._blocked = None, 0
+        self.stop()
         self._thoughts.clear()
 
     def _next_thought(self) -> tuple[str, ...] | None:

@@ -7,6 +7,7 @@ from collections import deque
 from typing import Final
 
 from persist_cli.api.ground import ground_axes
+from persist_cli.api.policy import Goal
 from persist_cli.play.ground_picture import (
     Backdrop,
     GroundPicture,
@@ -57,12 +58,12 @@ class Surveyor:
         if len(self._way) > 1:
             self._way.pop()
 
-    def draw(self, size: int, goal: tuple[float, float] | None) -> GroundPicture:
+    def draw(self, size: int, goal: Goal | None) -> GroundPicture:
         """Return the map; what is remembered may be drawn as it was some seconds ago, where drawing takes long.
 
         Args:
             size: pixels of its longer side.
-            goal: place of the goal on the ground axes.
+            goal: is marked where it has a place.
         """
         now, walkers = time.monotonic(), self._walkers
         resting = self._seconds < SOON or now - self._drawn >= self._seconds / SHARE
@@ -70,7 +71,14 @@ class Surveyor:
             self._backdrop = self._survey()
             self._version, self._drawn = walkers.version, time.monotonic()
             self._seconds = self._drawn - now
-        return draw_ground(self._backdrop, Marks(self.pose, self.home, self._parts(), goal), size)
+        return draw_ground(self._backdrop, Marks(self.pose, self.home, self._parts(), self._place(goal)), size)
+
+    def _place(self, goal: Goal | None) -> tuple[float, float] | None:
+        """Return where a goal lies on the ground axes."""
+        if goal is None or goal.position is None:
+            return None
+        x, y = (ground_axes(self._walkers.info.world_up)[:2] @ goal.position).tolist()
+        return x, y
 
     def _survey(self) -> Backdrop | None:
         """Return what the first memory holds, or where it has no points what is known of the ground."""

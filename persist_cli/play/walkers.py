@@ -118,17 +118,19 @@ class Walkers:
         self._history = History(Checkpoint.of(self.agents))
         self.version += 1
 
-    def imagine(self, actions: Sequence[str]) -> Ahead:
+    def imagine(self, actions: Sequence[str], repeat: bool = True) -> Ahead:
         """Return a clip of some actions in turn; nothing of it is shown yet.
 
         In a scene an interaction is done here. It is the only action of its clip.
 
         Args:
-            actions: names in the vocabulary, repeated until the clip is full; an interaction is done once.
+            actions: names in the vocabulary; an interaction is done alone, and once.
+            repeat: whether they are repeated until the clip is full.
         """
         self.remember()
         once = self.info.vocabulary[actions[0]].interaction
-        names = tuple(actions[:1]) if once else tuple(itertools.islice(itertools.cycle(actions), self.longest))
+        turns = itertools.cycle(actions) if repeat else actions
+        names = tuple(actions[:1]) if once else tuple(itertools.islice(turns, self.longest))
         walk = self.lead.set_out(names, self.longest)
         plan_walks([walk], [names[len(walk.names) :]], self.longest)
         if once and walk.free[0]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -54,6 +55,12 @@ class RoomWorld(WorldModel):
         seen = room_views(*poses)
         shape = clips.cameras.world_from_camera.shape[:2]
         return seen.rgb.unflatten(0, shape), seen.depth.unflatten(0, shape)
+
+    def denoise_frame(self, clips: Clips, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Ray trace a frame of each clip."""
+        rgb, depth = self.denoise(clips)
+        rows = torch.arange(len(frames))
+        return rgb[rows, list(frames)], depth[rows, list(frames)]
 
 
 def room_world(pose: np.ndarray, body: Body | None = BODY, agent: Agent | None = None) -> RoomWorld:

@@ -1,0 +1,66 @@
+"""The planner finds where a picture was taken, knowing the picture alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from persist_cli.api.policy import Goal
+from persist_cli.errors import PersistError
+from persist_cli.play.guide import Guide
+from persist_cli.play.play import Play
+from persist_cli.play.settings import GroundPose
+from tests.play.test_collisions import FORWARD, LEFT, play_in_room
+from tests.support.pixel_cost import PixelCost
+from tests.support.room_worlds import room_views, room_world
+from tests.support.rooms import UP, look
+
+
+def guided(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the planner walk until it stays."""
+    monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    play.plan()
+    while play.planning:
+        play.advance(frozenset())
+
+
+def test_the_planner_goes_to_where_the_picture_was_taken():
+    picture = room_views(look((1.6, 1.25, -0.6), 60.0, 0.0))
+    world = room_world(look((1.7, 1.25, 1.2), 0.0, 0.0))
+    guide = Guide(Goal(picture.rgb[0], None, "room"), PixelCost(None), seed=0)
+    while actions := guide.decide(world):
+        world.step([list(actions)])
+    goal, here = (
+        GroundPose.of(pose, UP)
+        for pose in (picture.cameras.world_from_camera[0], world.agents[0].now.cameras.world_from_camera[0])
+    )
+    assert ((goal.x - here.x) ** 2 + (goal.y - here.y) ** 2) ** 0.5 < 0.9  # from 1.8 m
+    assert abs(goal.degrees - here.degrees) < 30
+
+
+def test_a_held_key_stops_the_planner(monkeypatch):
+    play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
+    play.take_goal()
+    for held in (FORWARD, LEFT, LEFT):
+        play.advance(held)
+    monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    play.plan()
+    assert play.planning
+    assert play.advance(LEFT).action == "left"
+    assert not play.planning
+    assert play.advance(frozenset()) is None
+
+
+def test_a_walk_to_the_goal_is_shown_step_by_step(monkeypatch):
+    play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
+    play.take_goal()
+    play.advance(LEFT)
+    before = play.shown.number
+    guided(play, monkeypatch)
+    assert play.shown.number > before
+    assert play.advance(frozenset()) is None
+
+
+def test_a_plan_without_a_goal_is_refused():
+    play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
+    with pytest.raises(PersistError, match="there is no goal picture yet"):
+        play.plan()
