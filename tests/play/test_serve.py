@@ -7,12 +7,11 @@ import signal
 
 import pytest
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from persist_cli.data.store import Store
 from persist_cli.play.serve import ServeOptions
 from persist_cli.viewing.own_address import address_of, bind
-from tests.support.play_pages import Page
+from tests.support.play_pages import open_page
 from tests.support.processes import start_persist, wait_until
 
 
@@ -24,8 +23,7 @@ def test_ctrl_c_ends_the_command_without_an_error_while_somebody_walks(voxel, wa
     )  # fmt: skip
     wait_until(lambda: printed.is_file() and "}" in printed.read_text(), process)
     address = json.loads(printed.read_text())["address"]
-    with connect(f"{address.replace('http', 'ws')}walk", origin=address.rstrip("/")) as socket:
-        page = Page(socket)
+    with open_page(address) as page:
         page.say("record", on=True)
         page.say("keys", held=["left"])
         page.frames(3)

@@ -55,6 +55,14 @@ class Page:
         return [self.until("frame")[0] for _ in range(count)]
 
 
+@contextmanager
+def open_page(address: str, **headers: str) -> Iterator[Page]:
+    """Open the WebSocket of the page at an address, with other headers than a browser's if they are given."""
+    url, origin = f"{address.replace('http', 'ws', 1)}walk", headers.pop("origin", address.rstrip("/"))
+    with connect(url, origin=origin, additional_headers=headers) as socket:
+        yield Page(socket)
+
+
 @dataclass
 class Served:
     """A server that runs: its address and its sessions."""
@@ -70,9 +78,8 @@ class Served:
     @contextmanager
     def page(self, **headers: str) -> Iterator[Page]:
         """Open a page, with other headers than a browser's if they are given."""
-        url = self.address.replace("http", "ws") + "walk"
-        with connect(url, origin=headers.pop("origin", self.address.rstrip("/")), additional_headers=headers) as socket:
-            yield Page(socket)
+        with open_page(self.address, **headers) as page:
+            yield page
 
 
 @contextmanager
