@@ -88,6 +88,8 @@ NOT_RUN = {
     "persist bench plan": "walks through houses for minutes; tests/bench runs it small",
     "persist bench collisions": "walks through houses for minutes; tests/bench runs it small",
     "persist bench scene": "the nearest of many houses takes minutes; tests/bench runs it small",
+    "persist play": "serves a page until Ctrl-C; tests/play walk there",
+    "python tests/benchmarks": "measures for minutes; tests/benchmarks says what",
     "persist --install-completion": "changes the files of the shell",
     "sbatch ": "needs Slurm",
     "open ": "opens a window",
