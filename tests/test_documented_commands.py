@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -23,6 +24,7 @@ import typer
 import yaml
 
 from persist_cli.cli.app import app
+from persist_cli.data.reference import sample_data
 from persist_cli.errors import PluginError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.plugins import make_simulator
@@ -124,6 +126,7 @@ def cache_lpips(cache: Path) -> None:
 GIVEN: dict[str, Callable[[Path], object]] = {
     "captures/kitchen": lambda path: write_sequence(path, 48, (48, 64)),  # twice around, so that clips return
     "DATA": write_walks,
+    "runs/walks/walk-1/data": lambda path: shutil.copytree(sample_data(), path),  # what was recorded
     "DIR": lambda path: write_text_encoder(write_twin("5b-i2v", path)),
     "weights fetch lpips-alex\npersist": lambda path: cache_lpips(path.parent / "cache"),
 }

@@ -139,3 +139,5 @@ def test_a_port_that_is_taken_is_said_in_one_line():
 def test_a_host_that_is_not_here_is_said_in_one_line():
     with pytest.raises(PersistError, match=r"cannot serve at 192\.0\.2\.1:0"):
         bind("192.0.2.1", 0)
+    with pytest.raises(PersistError, match=r"--host a\.\.b: no valid name"):
+        bind("a..b", 0)
