@@ -104,10 +104,14 @@ def serve_page(plan: ViewPlan, subject: Subject, session: EditSession | None, ad
         look = Look(most=plan.most, layers=first_layers(subject))
         page = Page(server, subject, look, session, make_imaginer(plan, subject))
         url = address_of(address.host, server.get_port())
-        _report(subject, {"address": url}, as_json)
-        if address.opens and not as_json:
-            threading.Thread(target=open_browser, args=(url,), daemon=True).start()
-        _wait(page.lock)
+        try:
+            _report(subject, {"address": url}, as_json)
+            if address.opens and not as_json:
+                threading.Thread(target=open_browser, args=(url,), daemon=True).start()
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            with page.lock:  # what is being done is finished first
+                pass
     if session is not None and session.unsaved:
         say(f"{len(session.edits)} edits are not saved in {session.out}")
 
@@ -180,12 +184,3 @@ def _report(subject: Subject, place: dict[str, Any], as_json: bool) -> None:
     if subject.memory is not None:
         say("to edit, hold Shift and draw a rectangle, or give a box")
     say(f"look at {place['address']} (Ctrl-C ends it)")
-
-
-def _wait(lock: Any) -> None:
-    """Wait for Ctrl-C or SIGTERM; what is being done is finished first."""
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        with lock:
-            return

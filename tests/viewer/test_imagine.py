@@ -1,0 +1,64 @@
+"""What a world model imagines at a camera that was placed by hand."""
+
+import pytest
+import torch
+
+from persist_cli.api.geometry import pose_differences
+from persist_cli.data.store import Store
+from persist_cli.errors import PersistError
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.viewer.imagine import MOST_CLIPS, STEP, TURN, Imaginer, ImagineSettings, nearest_frame, way_to
+from tests.support.micro_runs import run_persist
+
+
+@pytest.fixture(scope="module")
+def own_map(walks, voxel, tmp_path_factory):
+    file = tmp_path_factory.mktemp("own") / "map.safetensors"
+    run_persist("memorize", f"{walks}#0", "--checkpoint", str(voxel), "--out", str(file))
+    return file
+
+
+def moved(pose, metres):
+    pose = pose.clone()
+    pose[0, 3] += metres
+    return pose
+
+
+def test_the_way_ends_at_the_camera_in_steps_as_small_as_those_of_training(walks):
+    first = Store(walks)[0].poses()[0]
+    last = moved(first, 0.9)
+    way = torch.cat([first[None], way_to(first, last, 8)])
+    metres, degrees = pose_differences(way[:-1], way[1:])
+    assert torch.allclose(way[-1], last)
+    assert len(way) == 9
+    assert float(metres.max()) <= STEP
+    assert float(degrees.max()) <= TURN
+
+
+def test_a_camera_far_off_is_reached_with_a_bounded_number_of_clips(walks):
+    first = Store(walks)[0].poses()[0]
+    assert len(way_to(first, moved(first, 100.0), 8)) == 8 * MOST_CLIPS
+
+
+def test_it_begins_at_the_nearest_true_frame(walks):
+    poses = Store(walks)[0].poses()
+    assert nearest_frame(poses, poses[7]) == 7
+
+
+def test_the_view_depends_on_what_was_edited_and_leaves_the_memory_as_it_is(walks, voxel, own_map):
+    file, memory = Store(walks)[0], load_memory(own_map)
+    imaginer = Imaginer(ImagineSettings(voxel), file, own_map)
+    pose, before = moved(file.poses()[3], 0.1), memory.tensors()
+    view = imaginer.imagine(pose, memory)
+    assert view.picture.shape == (32, 32, 3)
+    assert torch.equal(imaginer.imagine(pose, memory).picture, view.picture)
+    emptied = memory.copy()
+    emptied.clear()
+    assert not torch.equal(imaginer.imagine(pose, emptied).picture, view.picture)
+    assert all(torch.equal(before[name], tensor) for name, tensor in memory.tensors().items())
+
+
+def test_a_model_that_cannot_read_the_memory_is_told(walks, voxel, room):
+    imaginer = Imaginer(ImagineSettings(voxel), Store(walks)[0], room)
+    with pytest.raises(PersistError, match="no adapter of it reads a memory of kind 'scene'"):
+        imaginer.imagine(Store(walks)[0].poses()[0], load_memory(room))
