@@ -29,6 +29,8 @@ THINK_SECONDS: Final = 0.01  # after which no other clip is begun ahead, so that
 BUSY_SECONDS: Final = 0.2  # after which it is asked again whether nobody walks, so that there is time to think
 PNG_EFFORT: Final = 1  # 0.2 ms and 5.5 kB for 64x64 pixels; WebP is a quarter smaller and takes twice as long, or more
 
+PLANNER_ENDED: Final = "the planner has ended: nothing near looks more like the goal, as far as the model knows"
+
 KEYS: Final = {
     "forward": ["KeyW", "ArrowUp"],
     "backward": ["KeyS", "ArrowDown"],
@@ -107,17 +109,21 @@ class Presenter:
         return min(due, default=None)
 
     async def _advance(self) -> None:
-        """Show the next frame under the held actions, if there is one."""
+        """Show the next frame under the held actions or of the planner, if there is one."""
         self.wishes.restless = False  # unless the page says something meanwhile
-        held = self.wishes.keys.take()
+        held, planned = self.wishes.keys.take(), self.play.planning
         try:
             frame = await self.worker.run(lambda: encoded(self.play.advance(held)))
         except PersistError as error:
+            self.play.stop()  # or the planner would fail again and again
             await self.send(messages.Error(text=str(error)))
-            return
+            frame = None
+        if planned and not held and not self.play.planning:
+            await self.send(messages.Notice(text=PLANNER_ENDED))
         if frame is not None:
             self.wishes.restless = True
             await self._show(frame)
+        await self._tell_changes()
 
     async def _obey(self, command: messages.Command) -> None:
         """Do a command, and say what has changed."""
@@ -132,7 +138,7 @@ class Presenter:
         except PersistError as error:
             await self.send(messages.Error(text=str(error)))
         self.wishes.restless = self._thinks = True
-        await self._tell(self._state())
+        await self._tell_changes(anyway=True)
 
     def _do(self, command: messages.Command) -> Shown | None:
         """Do a command, and return the frame that it leads to, if any."""
@@ -150,12 +156,16 @@ class Presenter:
                 return play.jump(command.x, command.y)
             case messages.Record():
                 play.record(command.on)
-            case _:
-                raise PersistError(f"there is no {command.type!r} here")
+            case messages.Goal():
+                play.take_goal()
+            case messages.Plan():
+                play.plan()
+            case messages.Stop():
+                play.stop()
         return None
 
     async def _show(self, frame: Frame | None) -> None:
-        """Send a frame, if there is one, and what else has changed with it; the map is old then."""
+        """Send a frame, if there is one; the map is old then."""
         if frame is None:
             return
         (shown, images), pace = frame, self.wishes.pace
@@ -166,8 +176,6 @@ class Presenter:
         )  # fmt: skip
         self._map_is_old = self._thinks = True
         await self.send(pack(header, images))
-        if self._state() != self._told:
-            await self._tell(self._state())
 
     async def _show_map(self) -> None:
         """Send the map from above. A large one comes less often, so that most of the time is left for frames."""
@@ -182,9 +190,12 @@ class Presenter:
         drawn = self.play.map(MAP_SIZE)
         return png(drawn.picture), drawn.extent
 
-    async def _tell(self, state: messages.State) -> None:
-        self._told = state
-        await self.send(state)
+    async def _tell_changes(self, anyway: bool = False) -> None:
+        """Tell what has changed beside the picture; ``anyway``: also when nothing has."""
+        state = self._state()
+        if anyway or state != self._told:
+            self._told = state
+            await self.send(state)
 
     def _welcome(self) -> messages.Welcome:
         height, width = next(iter(self.play.shown.images.values())).shape[:2]
@@ -194,7 +205,7 @@ class Presenter:
         ]
         return messages.Welcome(
             model=self.play.model, memories=list(self.play.memories), actions=actions, image=(width, height),
-            settings=self._settings(), can=["undo", "jump", "map", "record"],
+            settings=self._settings(), can=["undo", "jump", "map", "record", "goal", "plan"],
             frames_per_second=self.wishes.pace.most,
         )  # fmt: skip
 
@@ -203,4 +214,7 @@ class Presenter:
         return messages.Settings(steps=now.steps, guidance=now.guidance, seed=now.seed, ahead=now.ahead)
 
     def _state(self) -> messages.State:
-        return messages.State(settings=self._settings(), recording=self.play.recording)
+        play = self.play
+        return messages.State(
+            settings=self._settings(), recording=play.recording, goal=play.goal is not None, planning=play.planning
+        )

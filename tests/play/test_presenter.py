@@ -10,8 +10,13 @@ import pytest
 from PIL import Image
 
 from persist_cli.data.store import Store
+from persist_cli.errors import PersistError
+from persist_cli.play.guide import Guide
+from tests.play.test_collisions import play_in_room
 from tests.support.micro_plays import micro_walks
+from tests.support.pixel_cost import PixelCost
 from tests.support.play_pages import serving
+from tests.support.rooms import look
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +125,33 @@ def test_what_is_imagined_ahead_is_what_the_key_then_shows(server, page):
         return message[1]
 
     assert images(True) == images(False)
+
+
+def test_the_planner_walks_to_the_goal_until_nothing_near_looks_more_like_it(monkeypatch):
+    monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    with serving(lambda: play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))) as served, served.page() as page:
+        page.say("plan")
+        assert page.until("error")[0]["text"].startswith("there is no goal picture yet")
+        page.say("goal")
+        while not page.until("state")[0]["goal"]:
+            pass
+        step(page)
+        page.say("plan")
+        assert page.until("state")[0]["planning"]
+        assert page.until("frame")[0]["action"]
+        assert page.until("notice")[0]["text"].startswith("the planner has ended")
+        assert not page.until("state")[0]["planning"]
+
+
+def test_a_planner_that_fails_is_stopped_and_the_walk_goes_on(monkeypatch):
+    def fail(*_):
+        raise PersistError("no way there")
+
+    monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    monkeypatch.setattr(Guide, "decide", fail)
+    with serving(lambda: play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))) as served, served.page() as page:
+        page.say("goal")
+        page.until("state")
+        page.say("plan")
+        assert page.until("error")[0]["text"] == "no way there"
+        assert step(page)["action"] == "left"
