@@ -30,8 +30,9 @@ DEFINITIONS: Final = {
         f"{SIGHT_SHARE:.0%} of what the goal image shows (pixels of a 16×16 grid, by depth)"
     ),
     "walk": (
-        "the given walk begins at the goal, looks once around, and goes to the start by a short way; `keep` are the "
-        "numbers of its frames that are given, evenly spaced"
+        "the given walk begins at the goal and goes to the start by a short way; it looks once around as soon as it is "
+        "`goal_gap` metres away from the goal; `keep` are the numbers of its frames that are given, evenly spaced, of "
+        "those that are as far away"
     ),
 }
 
@@ -100,6 +101,7 @@ class EpisodeSet(EpisodePart):
         settings: its settings.
         split: of the scenes.
         seed: that the episodes were drawn with.
+        goal_gap: metres around the goals from which no frame of the walks is given.
         definitions: what the figures of an episode mean.
         episodes: the episodes, those of one scene together.
     """
@@ -110,6 +112,7 @@ class EpisodeSet(EpisodePart):
     settings: dict[str, Any]
     split: str
     seed: int
+    goal_gap: float = 0.0
     definitions: dict[str, str] = DEFINITIONS
     episodes: list[Episode] = Field(min_length=1)
 

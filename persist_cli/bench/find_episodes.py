@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
@@ -44,6 +45,7 @@ class EpisodeSearch:
         walk_frames: most frames of the given walk.
         seed: seed of starts and goals.
         per_scene: most episodes of each of these kinds in one scene.
+        goal_gap: metres around the goal from which no frame of the walk is given.
     """
 
     bins: Sequence[int] = (8, 16, 32, 64)
@@ -51,6 +53,7 @@ class EpisodeSearch:
     walk_frames: int = 48
     seed: int = 0
     per_scene: int = 1
+    goal_gap: float = 0.0
 
     def check(self) -> None:
         """Raise ``DataError`` for a bin, a number or a seed that cannot be."""
@@ -61,6 +64,8 @@ class EpisodeSearch:
                 f"{self.each} episodes of a kind, {self.per_scene} in a scene, with {self.walk_frames} frames and seed "
                 f"{self.seed}: the first three must be at least 1, the seed not negative"
             )
+        if not 0 <= self.goal_gap < math.inf:
+            raise DataError(f"--goal-gap {self.goal_gap:g}: give metres, 0 for none")
 
     @property
     def kinds(self) -> list[Kind]:
@@ -172,24 +177,39 @@ class SceneSearch:
         )  # fmt: skip
 
     def _walk(self, goal: Stand, start: Stand) -> GivenWalk | None:
-        """The walk from the goal to the start, with a look around first; ``None`` when it does not come near it."""
+        """The walk from the goal to the start, with a look around.
+
+        ``None`` when it does not come near the start, or what is given of it hardly shows what the goal image shows.
+        """
         view = look_from(self.simulator, goal)
-        frames = [self.simulator.observe()]
-        actions = ["left"] * round(360 / self.simulator.info.vocabulary["left"].turn)
-        for action in actions:
-            self.simulator.act(action)
-            frames.append(self.simulator.observe())
-        way = go_to(self.simulator, self.grid, start.ground)
-        for action in _allowed(way, self.simulator):
+        actions, frames, metres = list[str](), [self.simulator.observe()], [0.0]
+        for action in self._leave(goal, start):
             actions.append(action)
             frames.append(self.simulator.observe())
-        if Geodesic(self.simulator, start.ground).metres(self.simulator.agent[0]) > NEAREST_GOAL:
+            metres.append(math.dist(self.simulator.agent[0], goal.ground))
+        far = [number for number, gap in enumerate(metres) if gap >= self.search.goal_gap]
+        if not far or Geodesic(self.simulator, start.ground).metres(self.simulator.agent[0]) > NEAREST_GOAL:
             return None
-        count = min(self.search.walk_frames, len(frames))
-        keep = sorted({round(number) for number in np.linspace(0, len(frames) - 1, count)})
+        count = min(self.search.walk_frames, len(far))
+        keep = sorted({far[round(place)] for place in np.linspace(0, len(far) - 1, count)})
         seen = observations_of([frames[number] for number in keep], self.simulator.info)
         share = seen_share(Observations.concatenate([seen, view]), len(keep), range(len(keep))) or 0.0
+        if self.search.goal_gap and share < SIGHT_SHARE:
+            return None
         return GivenWalk(start=goal, actions=format_actions(actions), keep=keep, goal_seen=round(share, 4))
+
+    def _leave(self, goal: Stand, start: Stand) -> Iterator[str]:
+        """Go from the goal to the start, look around once the gap is behind, and yield the actions."""
+        around = round(360 / self.simulator.info.vocabulary["left"].turn)
+        looked = False
+        for action in itertools.chain([None], _allowed(go_to(self.simulator, self.grid, start.ground), self.simulator)):
+            if action is not None:
+                yield action
+            if not looked and math.dist(self.simulator.agent[0], goal.ground) >= self.search.goal_gap:
+                looked = True
+                for _ in range(around):
+                    self.simulator.act("left")
+                    yield "left"
 
 
 def _allowed(way: Generator[str, bool, int], simulator: Simulator) -> Iterator[str]:

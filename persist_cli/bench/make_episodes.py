@@ -38,8 +38,9 @@ def draw_episodes(scenes: CollectPlan, search: EpisodeSearch) -> EpisodeSet:
         )
     settings = dataclasses.asdict(simulator.settings)
     return EpisodeSet(
-        simulator=scenes.simulator, settings=settings, split=scenes.split, seed=search.seed, episodes=episodes
-    )
+        simulator=scenes.simulator, settings=settings, split=scenes.split, seed=search.seed, goal_gap=search.goal_gap,
+        episodes=episodes,
+    )  # fmt: skip
 
 
 def run_episodes(scenes: CollectPlan, search: EpisodeSearch, out: Path, json: bool) -> None:

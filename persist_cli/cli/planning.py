@@ -159,6 +159,9 @@ def bench_episodes(
     each: Annotated[int, typer.Option(min=1, help="Most of each bin, in sight and hidden.")] = 16,
     per_scene: Annotated[int, typer.Option(min=1, help="Most of each of these in one scene.")] = 1,
     walk_frames: Annotated[int, typer.Option(min=1, help="Most posed images that are given.")] = 48,
+    goal_gap: Annotated[
+        float, typer.Option(min=0, help="Metres around the goal from which none is given, so that it must be imagined.")
+    ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts and goals.")] = 0,
     json: JsonOption = False,
 ) -> None:
@@ -170,7 +173,7 @@ def bench_episodes(
     from persist_cli.bench.make_episodes import run_episodes
     from persist_cli.simulators.collect import CollectPlan
 
-    search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed, per_scene)
+    search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed, per_scene, goal_gap)
     run_episodes(CollectPlan(simulator, scenes, size=size, split=split), search, out, json)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.bench.episodes import SIGHT_SHARE, Episode, EpisodeSet, read_episodes
 from persist_cli.bench.find_episodes import NEAREST_GOAL, find_episodes
 from persist_cli.bench.navigation_metrics import SUCCESS_METRES
 from persist_cli.bench.shortest_actions import ShortestActions
@@ -62,6 +62,18 @@ def test_the_given_walk_shows_the_goal_and_ends_at_the_start(small_world: MiniWo
         assert torch.equal(walk.rgb[0], scene.goal_view.rgb[0])
         assert episode.walk.goal_seen > 0.9
         assert Geodesic(small_world, episode.start.ground).metres(episode.goal.ground) <= episode.metres + 1e-6
+
+
+def test_no_frame_from_near_the_goal_is_given_where_a_gap_is_asked_for_but_what_it_shows_is(
+    small_world: MiniWorld,
+) -> None:
+    search = replace(SEARCH, goal_gap=1.0)
+    found = [episode for scene in find_episodes(small_world, [HOUSE], search) for episode in scene]
+    assert found
+    for episode in found:
+        scene = TrueScene(small_world, episode)
+        assert (scene.walk().cameras.centers - scene.goal_view.cameras.centers).norm(dim=1).min() >= 0.99
+        assert episode.walk.goal_seen >= SIGHT_SHARE
 
 
 def test_fewest_actions_count_turns_and_steps(small_world: MiniWorld) -> None:
@@ -155,6 +167,7 @@ def test_the_command_writes_episodes_that_can_be_read(persist: Persist, tmp_path
         (("--scenes", "5:5"), "write A:B with A less than B"),
         (("--simulator", "miniwrld"), "did you mean 'miniworld'"),
         (("--split", "held-out"), "unknown split"),
+        (("--goal-gap", "inf"), "--goal-gap inf: give metres, 0 for none"),
     ],
 )
 def test_bad_options_of_episodes_are_one_line(
