@@ -21,8 +21,8 @@ from persist_cli.viewing.console import say
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-WALK: Final = "a*4 w*6 d*6 w*4"  # keys, and the frames that each is held for
-COMPARED: Final = ("--memories", "none,voxel")
+WALK: Final = "d*8 w*4 a*12 w*4 d*4"  # keys, and the frames that each is held for
+COMPARED: Final = ("--memories", "voxel,none")
 READY: Final = 300_000  # milliseconds in which the model is loaded
 
 
@@ -44,6 +44,13 @@ def take_picture(address: str, out: Path, walk: str, size: tuple[int, int]) -> N
         page.wait_for_timeout(500)  # the map follows the frames
         with written_aside(out) as aside:
             page.screenshot(path=aside, type="png")
+
+
+def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the arguments before ``--`` and those after it."""
+    own = list(arguments)
+    place = own.index("--") if "--" in own else len(own)
+    return own[:place], own[place + 1 :]
 
 
 def presses(walk: str) -> list[tuple[str, int]]:
@@ -71,10 +78,12 @@ def window_size(text: str) -> tuple[int, int]:
 
 
 def hold(page: Page, key: str, frames: int) -> None:
-    """Hold a key until so many more frames are drawn."""
-    last = frame_number(page) + frames
+    """Hold a key until so many more frames are drawn, or one that says that the way is blocked."""
+    first = frame_number(page)
     page.keyboard.down(key)
-    while frame_number(page) < last:
+    while (number := frame_number(page)) < first + frames:
+        if number > first and page.locator("#stage.blocked").count():
+            break
         page.wait_for_timeout(10)
     page.keyboard.up(key)
 
@@ -90,12 +99,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path, help="PNG file to write")
     parser.add_argument("--walk", default=WALK, help=f"keys, and the frames that each is held for; {WALK!r} by default")
     parser.add_argument("--size", default="1360x800", help="of the window; 1360x800 by default")
-    parser.add_argument("play", nargs="*", default=COMPARED, help="after --: arguments of `persist play`")
-    options = parser.parse_args(arguments)
+    parser.epilog = f"After -- follow arguments of `persist play`; {shlex.join(COMPARED)} by default."
+    own, passed = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    options = parser.parse_args(own)
     try:
         presses(options.walk)  # a mistake is said at once
         size = window_size(options.size)
-        with served_page(shlex.join(["play", *options.play])) as served:
+        with served_page(shlex.join(["play", *(passed or COMPARED)])) as served:
             take_picture(served.address, options.out, options.walk, size)
     except PersistError as error:
         say(f"error: {error}")

@@ -16,6 +16,7 @@ import argparse
 import json
 import random
 import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,7 +26,7 @@ import numpy as np
 import psutil
 
 from persist_cli.reproduce.pages import CHROMIUM, ServedPage, driven_chromium, served_page
-from persist_cli.reproduce.play_picture import READY, frame_number
+from persist_cli.reproduce.play_picture import READY, frame_number, split_arguments
 from persist_cli.viewing.console import print_table, say
 
 if TYPE_CHECKING:
@@ -149,12 +150,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--hold", type=int, default=12, help="frames that each is held for")
     parser.add_argument("--after", type=int, default=0, help="frames to walk before it is measured again")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
-    parser.add_argument("play", nargs="*", help="after --: arguments of `persist play`")
-    options = parser.parse_args(arguments)
+    own, passed = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    options = parser.parse_args(own)
     if CHROMIUM is None:
         say("no Chromium on this machine: nothing was measured")
         return
-    line = shlex.join(["play", *options.play])
+    line = shlex.join(["play", *passed])
     with served_page(line) as served:
         answers = measured(served, options.presses, options.hold, options.after)
     columns = ["after frames", "presses", "ms to picture", "95%", "frames/s", "5%", "processor ms/frame", "MB"]

@@ -8,7 +8,7 @@ from PIL import Image
 
 from persist_cli.errors import PersistError
 from persist_cli.reproduce.pages import CHROMIUM, served_page
-from persist_cli.reproduce.play_picture import main, presses, take_picture
+from persist_cli.reproduce.play_picture import main, presses, split_arguments, take_picture
 from tests.support.scripted_walks import ScriptedWalks, serving
 
 
@@ -25,6 +25,13 @@ def test_a_picture_of_the_page_is_taken_after_a_walk(tmp_path: Path) -> None:
 
 def test_a_walk_is_keys_and_frames() -> None:
     assert presses("a*4 w d*12") == [("a", 4), ("w", 1), ("d", 12)]
+
+
+def test_what_follows_two_dashes_is_for_persist_play() -> None:
+    own, passed = split_arguments(["play.png", "--walk", "a*3", "--", "--memories", "none", "--", "x"])
+    assert own == ["play.png", "--walk", "a*3"]
+    assert passed == ["--memories", "none", "--", "x"]
+    assert split_arguments(["play.png"]) == (["play.png"], [])
 
 
 @pytest.mark.parametrize(("option", "message"), [("--walk=a*b", "as in 'a*4 w'"), ("--size=big", "as in 1360x800")])
