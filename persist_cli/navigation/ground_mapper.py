@@ -19,7 +19,7 @@ from dataclasses import replace
 from enum import IntEnum
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int32, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -104,12 +104,15 @@ class GroundMapper:
         self._anchor: Float[Tensor, " 2"] | None = None  # the place of the corner of square (0, 0)
         self._low = torch.zeros(2, dtype=torch.int64)  # row and column of the first square of ``_votes``
         self._votes = torch.zeros(len(Vote), 0, 0, dtype=torch.int32)
+        self._states = torch.zeros(0, 0, dtype=torch.uint8)  # by the votes, but for those counted since; replaced whole
+        self._counted: list[Int64[Tensor, "2 2"]] = []  # lowest and highest squares of these
         self._map: GroundMap | None = None
 
     def copy(self) -> GroundMapper:
         """Return a mapper that knows the same; adding to one of the two does not change the other."""
         copy = GroundMapper.__new__(GroundMapper)
-        copy.__dict__ |= self.__dict__ | {"_votes": self._votes.clone(), "_low": self._low.clone()}
+        own = {"_votes": self._votes.clone(), "_low": self._low.clone(), "_counted": list(self._counted)}
+        copy.__dict__ |= self.__dict__ | own
         return copy
 
     def add(self, observations: Observations) -> None:
@@ -172,7 +175,7 @@ class GroundMapper:
         votes = (Vote.SCENE_OCCUPIED, Vote.REMEMBERED_FREE, Vote.SCENE_IMAGINED_OCCUPIED, Vote.SCENE_IMAGINED_FREE)
         for vote in (*votes, Vote.REMEMBERED_OCCUPIED):
             self._votes[vote] = 0
-        self._map = None
+        self._all_counted()
         positions = points.positions.cpu().double() @ self.axes.T
         height, origins = positions[:, 2] - floor, points.origins.cpu()
         near = (height - points.rise / 2 <= self.body.height) & (height + points.rise / 2 >= -self.body.step_over)
@@ -190,7 +193,7 @@ class GroundMapper:
         rows, columns = squares[((squares >= 0) & (squares < size)).all(1)].unbind(1)
         for vote in (Vote.OBSERVED_OCCUPIED, Vote.OBSERVED_FREE, Vote.IMAGINED_OCCUPIED, Vote.IMAGINED_FREE):
             self._votes[vote][rows, columns] = 0
-        self._map = None
+        self._all_counted()
 
     def add_collision(self, camera: Cameras, forward: float) -> None:
         """Add that a true agent was stopped: what is right before its body, to half its width, is occupied.
@@ -221,7 +224,30 @@ class GroundMapper:
         return self._map
 
     def _decide(self) -> GroundMap:
-        votes = self._votes
+        self._states = self._decided()
+        self._counted = []
+        if self._anchor is None:
+            return GroundMap(self._states, (0.0, 0.0), self.spacing, self.axes)
+        x, y = (self._anchor + self._low.flip(0) * self.spacing).tolist()
+        return GroundMap(self._states, (x, y), self.spacing, self.axes)
+
+    def _decided(self) -> UInt8[Tensor, "row column"]:
+        """Return what the votes say of all squares, looked at anew only around those that were counted since."""
+        if not self._counted:
+            return self._states
+        box = torch.stack(self._counted)
+        (top, left), (bottom, right) = (
+            (box[:, 0].amin(0) - self._low).tolist(),
+            (box[:, 1].amax(0) - self._low).tolist(),
+        )
+        window = (slice(top, bottom + 1), slice(left, right + 1))
+        states = self._states.clone()
+        states[window] = self._covers(self._votes[:, window[0], window[1]])
+        return states
+
+    @staticmethod
+    def _covers(votes: Int32[Tensor, "vote row column"]) -> UInt8[Tensor, "row column"]:
+        """Return what votes say of squares."""
         imagined = votes[Vote.IMAGINED_OCCUPIED], votes[Vote.IMAGINED_FREE]
         states = torch.full(votes.shape[1:], int(Cover.UNKNOWN), dtype=torch.uint8)
         for occupied, free in (
@@ -234,10 +260,13 @@ class GroundMapper:
             states[occupied] = int(Cover.OCCUPIED)
         states[votes[Vote.SCENE_OCCUPIED] > 0] = int(Cover.OCCUPIED)
         states[votes[Vote.STOOD] > 0] = int(Cover.FREE)
-        if self._anchor is None:
-            return GroundMap(states, (0.0, 0.0), self.spacing, self.axes)
-        x, y = (self._anchor + self._low.flip(0) * self.spacing).tolist()
-        return GroundMap(states, (x, y), self.spacing, self.axes)
+        return states
+
+    def _all_counted(self) -> None:
+        """Let all squares be looked at anew."""
+        self._map = None
+        size = torch.tensor(self._votes.shape[1:])
+        self._counted = [torch.stack([self._low, self._low + size - 1])] if bool(size.prod()) else []
 
     def _add_frame(self, depth: Float[Tensor, "height width"], camera: Cameras, origin: int) -> None:
         """Add one frame."""
@@ -334,7 +363,9 @@ class GroundMapper:
         if not len(squares):
             return
         self._map = None
-        self._grow(squares.amin(0), squares.amax(0))
+        low, high = squares.amin(0), squares.amax(0)
+        self._grow(low, high)
+        self._counted.append(torch.stack([low, high]))
         rows, columns = (squares - self._low).unbind(1)
         layer = self._votes[vote]
         layer[rows, columns] = layer[rows, columns] + 1  # of repeated indices one is kept: each counts once
@@ -350,6 +381,7 @@ class GroundMapper:
         before, after = (torch.where(missing > 0, missing + MARGIN, 0) for missing in (before, after))
         top, left, bottom, right = *before.tolist(), *after.tolist()
         self._votes = functional.pad(self._votes, (left, right, top, bottom))
+        self._states = functional.pad(self._states, (left, right, top, bottom), value=int(Cover.UNKNOWN))
         self._low = self._low - before
 
 

@@ -1,8 +1,10 @@
+import pytest
 import torch
 
 from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Origin
-from persist_memory.grid.occlusion import covered, without_known
+from persist_memory.grid import occlusion
+from persist_memory.grid.occlusion import covered, covered_by_blocks, without_known
 from tests.support.room_views import observe, written_memory
 from tests.support.rooms import look
 
@@ -26,10 +28,24 @@ def test_a_cell_is_drawn_as_large_as_it_is_seen_and_one_behind_the_camera_is_not
     assert not covered(behind[None], 0.2, cameras).any()
 
 
+@pytest.mark.parametrize("at_once", [1, 300])
+def test_blocks_that_are_drawn_nearest_first_cover_what_all_cells_cover(at_once, monkeypatch):
+    monkeypatch.setattr(occlusion, "CELLS_AT_ONCE", at_once)
+    poses = [
+        look((x, 1.4, 0.3), yaw, pitch) for x, yaw, pitch in ((0.0, 40.0, -30.0), (1.8, 100.0, 5.0), (0.7, 10.0, -5.0))
+    ]
+    memory = written_memory("voxel", observe([look((0.0, 1.4, 0.0), yaw) for yaw in (20.0, 150.0)], 24, 32), **FINE)
+    for camera in poses:
+        cameras = observe([camera], 48, 64).cameras
+        every = covered(memory.points().positions, 0.1, cameras)
+        assert torch.equal(covered_by_blocks(memory.known_blocks(cameras), 0.1, cameras), every)
+        assert 0 < every.sum() < every.numel()
+
+
 def test_an_imagined_frame_writes_only_pixels_that_show_no_observed_cell():
     views = observe([look((0.0, 1.4, 0.0), yaw) for yaw in (0.0, 40.0)])
     memory = written_memory("voxel", views[:1], **FINE)
-    left = without_known(views, memory.points().positions, 0.1)
+    left = without_known(views, covered(memory.points().positions, 0.1, views.cameras))
     assert (left.depth[0] > 0).float().mean() < 0.01
     assert 0.3 < (left.depth[1] > 0).float().mean() < 0.8
 

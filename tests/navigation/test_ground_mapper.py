@@ -84,6 +84,19 @@ def test_frames_added_one_by_one_give_the_map_of_all():
     assert torch.equal(mapper.map().at(places), whole.at(places))
 
 
+def test_a_map_that_is_looked_at_between_frames_is_that_of_all_votes():
+    frames, mapper, other = seen(*around()[::4]), GroundMapper(UP, BODY), GroundMapper(UP, BODY)
+    for number in range(len(frames)):
+        part = frames[number : number + 1].with_origin(Origin.IMAGINED if number % 2 else Origin.OBSERVED)
+        mapper.add(part)
+        before = mapper.map()
+        kept = before.states.clone()
+        other.add(part)
+        mapper.copy().add(part)
+    assert torch.equal(mapper.map().states, other.map().states)
+    assert torch.equal(before.states, kept)
+
+
 def test_adding_to_a_copy_does_not_change_the_mapper():
     mapper = GroundMapper(UP, BODY)
     mapper.add(seen(look((0.0, 1.25, 0.0), 0.0, 0.0)))

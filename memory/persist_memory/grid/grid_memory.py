@@ -21,7 +21,7 @@ from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.detail import feature_across
 from persist_memory.grid.editing import MapForm, edit_cells
-from persist_memory.grid.occlusion import with_enough_new, without_edges, without_known
+from persist_memory.grid.occlusion import CellBlocks, covered_by_blocks, with_enough_new, without_edges, without_known
 from persist_memory.grid.pooling import (
     GridSettings,
     Lattice,
@@ -31,8 +31,8 @@ from persist_memory.grid.pooling import (
     sum_pool,
     unpack_colors,
 )
-from persist_memory.grid.storage import LIMIT, SparseGrid, ValueColumn, pack, unpack
-from persist_memory.grid.visibility import Views, cells_in_view, nearest_cells
+from persist_memory.grid.storage import BLOCK, LIMIT, SparseGrid, ValueColumn, pack, unpack
+from persist_memory.grid.visibility import Views, block_distances, nearest_cells, ranges
 from persist_memory.validation import (
     ORIGINS,
     Shape,
@@ -194,15 +194,29 @@ class GridMemory(Memory):
         """Return the edge of a cell, or of what one feature of the encoder shows where this is more."""
         return max(self.lattice.across, feature_across(self.encoder, cameras, distance))
 
+    def known_blocks(self, cameras: Cameras) -> CellBlocks:
+        """Return the cells that imagined frames of some cameras do not change, in blocks of 8 × 8 × 8."""
+        blocks, starts, counts = self.grid.blocks()
+        size = self.lattice.extent.to(self.grid.device)
+        middles = (blocks * BLOCK + 0.5 * (BLOCK - 1)).double() * size
+
+        def cells(chosen: Int64[Tensor, " chosen"]) -> Float[Tensor, "cell 3"]:
+            positions = ranges(starts[chosen], counts[chosen])
+            if self.settings.imagined == "merge":
+                positions = positions[self.grid.values(ORIGINS, positions) >= Origin.OBSERVED]
+            return self._in_world(self._centers(self.grid.keys[positions]))
+
+        radius = 0.5 * (BLOCK - 1) * float(size.norm())
+        distances = block_distances(blocks, self.lattice, self.views(cameras))
+        return CellBlocks(self._in_world(middles), radius, counts, distances, cells)
+
     def _unknown(self, imagined: Observations) -> Observations:
         """Imagined frames without the depth of what is not written: see ``GridSettings``."""
         new = without_edges(imagined, self.settings.edges) if self.settings.edges else imagined
         if len(self.grid) and not self.lattice.flat:
-            cells = cells_in_view(self.grid, self.lattice, self.views(imagined.cameras.to(self.grid.device)))
-            if self.settings.imagined == "merge":
-                cells = cells[self.grid.values(ORIGINS, cells) >= Origin.OBSERVED]
-            centers = self._in_world(self._centers(self.grid.keys[cells])).to(imagined.depth.device)
-            new = without_known(new, centers, self.lattice.across)
+            cameras = imagined.cameras.to(self.grid.device)
+            known = covered_by_blocks(self.known_blocks(cameras), self.lattice.across, cameras)
+            new = without_known(new, known.to(imagined.depth.device))
         return with_enough_new(imagined, new, self.settings.least_new) if self.settings.least_new else new
 
     def _pool(self, observations: Observations, origin: Origin, once: bool) -> None:

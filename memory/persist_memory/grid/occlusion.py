@@ -8,27 +8,98 @@ it, and hide from other cameras what was observed.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import project
 from persist_cli.api.observations import Observations
 
+CELLS_AT_ONCE: Final = 4096  # drawn before it is seen which pixels are left
 
-def without_known(observations: Observations, centers: Float[Tensor, "cell 3"], edge: float) -> Observations:
-    """Frames without the depth of the pixels that show a known cell, however deep, so that these are not written.
+
+@dataclass(frozen=True)
+class CellBlocks:
+    """Cells in blocks, which are looked at block by block.
 
     Args:
-        observations: imagined frames.
-        centers: centres of the known cells, world metres, float64.
-        edge: edge of a cell in metres.
+        centers: middles of the blocks, world metres, float64.
+        radius: metres from the middle of a block within which the centres of its cells lie.
+        counts: number of cells of each.
+        distances: metres from each camera, infinite where a block does not reach into its view.
+        cells: gives the centres of the cells of some blocks, world metres, float64.
     """
-    known = covered(centers, edge, observations.cameras)
+
+    centers: Float[Tensor, "block 3"]
+    radius: float
+    counts: Int64[Tensor, " block"]
+    distances: Float[Tensor, "frame block"]
+    cells: Callable[[Int64[Tensor, " chosen"]], Float[Tensor, "cell 3"]]
+
+
+def without_known(observations: Observations, known: Bool[Tensor, "frame height width"]) -> Observations:
+    """Frames without the depth of the pixels that show a known cell, however deep, so that these are not written."""
     return replace(observations, depth=torch.where(known, 0.0, observations.depth))
+
+
+def covered_by_blocks(blocks: CellBlocks, edge: float, cameras: Cameras) -> Bool[Tensor, "frame height width"]:
+    """Whether a cell lies along the ray of each pixel, as ``covered`` says, in a time that hardly grows with the cells.
+
+    The nearest blocks are drawn first. Walls nearby cover most of an image, and of the blocks behind them only those
+    are drawn that may be seen at a pixel that is left.
+
+    Args:
+        blocks: the cells.
+        edge: edge of a cell in metres.
+        cameras: those of the blocks' distances, on the device of the cells.
+    """
+    parts = zip(blocks.distances, range(len(cameras)), strict=True)
+    return torch.stack([_covered_by_blocks(blocks, away, edge, cameras[n : n + 1]) for away, n in parts])
+
+
+def _covered_by_blocks(
+    blocks: CellBlocks, distances: Float[Tensor, " block"], edge: float, camera: Cameras
+) -> Bool[Tensor, "height width"]:
+    found = torch.zeros(camera.height, camera.width, dtype=torch.bool, device=blocks.centers.device)
+    left = distances.isfinite().nonzero()[:, 0]
+    left = left[distances[left].argsort()]
+    boxes = _boxes(blocks.centers[left], blocks.radius, edge, camera)
+    while len(left):
+        count = int(torch.searchsorted(blocks.counts[left].cumsum(0), CELLS_AT_ONCE)) + 1
+        found |= covered(blocks.cells(left[:count]), edge, camera)[0]
+        seen = _touches(~found, boxes[count:])
+        left, boxes = left[count:][seen], boxes[count:][seen]
+    return found
+
+
+def _boxes(centers: Float[Tensor, "block 3"], radius: float, edge: float, camera: Cameras) -> Int64[Tensor, "block 4"]:
+    """Return the pixels (left, top, right, bottom; the last ones not included) that cells of each block may draw.
+
+    A block at the camera may draw all pixels.
+    """
+    (pixels,), (depth,) = project(centers[None], camera)
+    nearest = depth - radius
+    focal = camera.intrinsics[0].double().diagonal()[:2].amax()
+    reach = focal * (radius + 2 * edge) / nearest.clamp(min=1e-9) + 1  # a cell draws up to twice its size
+    reach = torch.where(nearest > edge, reach, math.inf)
+    # seen at an angle a sphere is wider than its radius over its depth
+    offset = (pixels - camera.intrinsics[0, :2, 2].double()).abs() / focal
+    reach = reach[:, None] * (1 + offset)
+    size = pixels.new_tensor([camera.width, camera.height])
+    ends = [(pixels - reach).floor(), (pixels + reach).ceil()]
+    return torch.cat([end.nan_to_num(0.0).clamp(size * 0, size) for end in ends], dim=1).long()
+
+
+def _touches(pixels: Bool[Tensor, "height width"], boxes: Int64[Tensor, "box 4"]) -> Bool[Tensor, " box"]:
+    """Return whether one of some pixels lies in each box."""
+    sums = torch.nn.functional.pad(pixels.long().cumsum(0).cumsum(1), (1, 0, 1, 0))
+    left, top, right, bottom = boxes.unbind(1)
+    return sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left] > 0
 
 
 def without_edges(observations: Observations, share: float) -> Observations:

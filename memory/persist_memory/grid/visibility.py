@@ -91,13 +91,6 @@ def horizontal_views(cameras: Cameras, lattice: Lattice) -> Views:
     return Views(_flat(_in_grid(cameras.centers.double(), lattice)), torch.where(narrow, normals, 0.0))
 
 
-def cells_in_view(grid: SparseGrid, lattice: Lattice, views: Views) -> Int64[Tensor, " cell"]:
-    """Positions (in the order of keys) of all cells of the blocks that reach into a view."""
-    blocks, starts, counts = grid.blocks()
-    chosen = _block_distances(blocks, lattice, views).isfinite().any(0)
-    return _ranges(starts[chosen], counts[chosen])
-
-
 def nearest_cells(
     grid: SparseGrid, lattice: Lattice, views: Views, groups: Sequence[Tensor], budget: int
 ) -> list[Int64[Tensor, " token"]]:
@@ -117,14 +110,14 @@ def nearest_cells(
     size = lattice.extent.to(grid.device)
     blocks, starts, counts = grid.blocks()
     point = torch.zeros_like(size)
-    block_distances = _block_distances(blocks, lattice, views)
-    nearest = [block_distances[group].amin(0) for group in groups]
+    distances = block_distances(blocks, lattice, views)
+    nearest = [distances[group].amin(0) for group in groups]
     results: dict[int, Tensor] = {}
     wanted = max(FIRST_CELLS, 2 * budget)
     while pending := [number for number in range(len(groups)) if number not in results]:
         near = {number: _nearest_blocks(nearest[number], counts, wanted) for number in pending}
         chosen = torch.stack([block for block, _ in near.values()]).any(0)
-        positions = _ranges(starts[chosen], counts[chosen])
+        positions = ranges(starts[chosen], counts[chosen])
         cells = unpack(grid.keys[positions])
         distances = views.visible_distances(cells.double() * size, 0.5 * size, point)
         for number, (_, complete) in near.items():
@@ -135,7 +128,7 @@ def nearest_cells(
     return [results[number] for number in range(len(groups))]
 
 
-def _block_distances(blocks: Tensor, lattice: Lattice, views: Views) -> Float[Tensor, "view block"]:
+def block_distances(blocks: Tensor, lattice: Lattice, views: Views) -> Float[Tensor, "view block"]:
     """Metres from each apex to each block that reaches into its view, infinite to the others."""
     size = lattice.extent.to(blocks.device)
     half = 0.5 * BLOCK * size
@@ -161,7 +154,7 @@ def _sort_visible(distances: Tensor, cells: Tensor) -> tuple[Int64[Tensor, " cel
     return order, distances[order]
 
 
-def _ranges(starts: Tensor, counts: Tensor) -> Int64[Tensor, " position"]:
+def ranges(starts: Tensor, counts: Tensor) -> Int64[Tensor, " position"]:
     """The positions of all ranges, one range after the other."""
     offsets = starts - (counts.cumsum(0) - counts)
     return torch.arange(int(counts.sum()), device=starts.device) + offsets.repeat_interleave(counts)

@@ -17,7 +17,7 @@ from persist_cli.api.geometry import project, unproject
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
 from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
-from persist_memory.grid.occlusion import without_known
+from persist_memory.grid.occlusion import covered, without_known
 from persist_memory.validation import (
     ORIGINS,
     Shape,
@@ -72,7 +72,8 @@ class PointCloud(Memory):
         for origin, frames in observations.by_origin() if len(observations) else ():
             known = self._of(Origin.OBSERVED)
             if origin == Origin.IMAGINED and known:
-                frames = without_known(frames, known["positions"].to(frames.depth.device), self.settings.spread)
+                positions = known["positions"].to(frames.depth.device)
+                frames = without_known(frames, covered(positions, self.settings.spread, frames.cameras))
             self._absorb(self._points_of(frames, origin))
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
