@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 WALK: Final = "d*8 w*4 a*12 w*4 d*4"  # keys, and the frames that each is held for
 COMPARED: Final = ("--memories", "voxel,none")
+LOOK: Final = 0.01  # seconds between two looks at the page
 READY: Final = 300_000  # milliseconds in which the model is loaded
 
 
@@ -81,11 +82,24 @@ def hold(page: Page, key: str, frames: int) -> None:
     """Hold a key until so many more frames are drawn, or one that says that the way is blocked."""
     first = frame_number(page)
     page.keyboard.down(key)
-    while (number := frame_number(page)) < first + frames:
-        if number > first and page.locator("#stage.blocked").count():
+    for number in range(first + 1, first + frames + 1):
+        wait_for_frame(page, number)
+        if page.locator("#stage.blocked").count():
             break
-        page.wait_for_timeout(10)
     page.keyboard.up(key)
+
+
+def wait_for_frame(page: Page, least: int, seconds: float = 120.0) -> None:
+    """Wait until a frame of this number or a later one is drawn.
+
+    Raises:
+        PersistError: when none comes in so many seconds.
+    """
+    for _ in range(round(seconds / LOOK)):
+        if frame_number(page) >= least:
+            return
+        page.wait_for_timeout(1000 * LOOK)
+    raise PersistError(f"the page has shown no frame {least} in {seconds:g} s; it says: {page.inner_text('#state')}")
 
 
 def frame_number(page: Page) -> int:

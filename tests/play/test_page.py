@@ -14,9 +14,10 @@ from persist_cli.data.store import Store
 from persist_cli.play.play import Play
 from persist_cli.play.sessions import Limits
 from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
-from persist_cli.reproduce.play_picture import frame_number, hold
+from persist_cli.reproduce.play_picture import frame_number, hold, wait_for_frame
 from tests.support.browser import watched
 from tests.support.micro_plays import micro_walks
+from tests.support.pixel_cost import PixelCost
 from tests.support.play_pages import Served, serving
 
 if TYPE_CHECKING:
@@ -153,3 +154,21 @@ def test_a_tab_that_is_closed_frees_its_session_and_another_one_walks(browser: B
         with opened(browser, server) as page:
             hold(page, "a", 1)
             assert frame_number(page) >= 2
+
+
+def test_the_planner_walks_to_a_goal_picture_until_it_is_stopped(
+    browser: Browser, server: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    with opened(browser, server) as page:
+        page.keyboard.press("g")
+        page.wait_for_selector("#goal-picture", state="visible")
+        hold(page, "a", 2)
+        first = frame_number(page)
+        page.click("#plan")
+        page.wait_for_selector("#stop:enabled")
+        wait_for_frame(page, first + 1)
+        page.click("#stop")
+        page.wait_for_selector("#stop:disabled", state="attached")
+        assert KeptPlay.newest.goal is not None
+        assert not KeptPlay.newest.planning

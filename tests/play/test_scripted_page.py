@@ -11,6 +11,7 @@ import pytest
 
 from persist_cli.play.messages import Error, Notice, Recorded
 from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
+from persist_cli.reproduce.play_picture import frame_number, wait_for_frame
 from tests.support.browser import watched
 from tests.support.scripted_walks import ScriptedWalks, serving
 
@@ -55,17 +56,6 @@ def greys(page: Page) -> object:
     )
 
 
-def number(page: Page) -> int:
-    """The number of the frame that is drawn."""
-    return int(page.locator("#stage").get_attribute("data-number") or -1)
-
-
-def wait_for_frame(page: Page, least: int) -> None:
-    """Wait until a frame of this number or a later one is drawn."""
-    while number(page) < least:
-        page.wait_for_timeout(20)
-
-
 def held(walks: ScriptedWalks, least: int = 0) -> list[list[str]]:
     """The sets of held actions that the page told, in order, as soon as there are so many."""
     return [message["held"] for message in walks.messages("keys", least)]
@@ -85,7 +75,7 @@ def test_a_held_key_walks_until_it_is_released_and_is_told_once(browser: Browser
         page.keyboard.up("w")
         page.wait_for_selector("#state:text('Ready')")
         assert held(walks, 2) == [["forward"], []]
-        assert [message["number"] for message in walks.messages("ack", number(page))][:4] == [0, 1, 2, 3]
+        assert [message["number"] for message in walks.messages("ack", frame_number(page))][:4] == [0, 1, 2, 3]
 
 
 def test_two_keys_are_told_together_and_arrows_are_the_same_actions(browser: Browser, walks: ScriptedWalks) -> None:
