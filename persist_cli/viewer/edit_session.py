@@ -124,13 +124,11 @@ class EditSession:
         chosen = tuple(Selected(thing.box, thing.name) for thing in self._things_in(cells, visible, inside))
         self.selection = chosen or (Selected(_box_around(cells, _above_lowest(cells, inside))),)
 
-    def clear_selection(self) -> None:
-        """Select nothing."""
-        self.selection = ()
-
     def remove(self) -> EditOutcome:
-        """Take away what is selected; errors as of ``apply``."""
-        return self.apply([Remove(low=one.box.low, high=one.box.high) for one in self._selected()])
+        """Take away what is selected, and select nothing; errors as of ``apply``."""
+        outcome = self.apply([Remove(low=one.box.low, high=one.box.high) for one in self._selected()])
+        self.selection = ()
+        return outcome
 
     def paint(self, color: Colour) -> EditOutcome:
         """Give what is selected one colour, RGB 0…255; errors as of ``apply``."""

@@ -21,8 +21,8 @@ from persist_cli.viewer.edit_panel import EditPanel
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.imagine import Imaginer
 from persist_cli.viewer.notes import Legend, Note, Pictures
-from persist_cli.viewer.stage import FULL_SIZE, SELECTED_COLOR, Look, Stage
-from persist_cli.viewer.subject import MAP, Subject, Walk
+from persist_cli.viewer.stage import CHANGED, FULL_SIZE, REMOVED, SAME, SELECTED_COLOR, Look, Stage
+from persist_cli.viewer.subject import Subject, Walk
 
 TOKENS: Final = 256  # that a reading draws when nobody says how many
 MOST_TOKENS: Final = 4096
@@ -147,9 +147,9 @@ class Page:
         assert self.session is not None
         before, after = (cells_of_memory(memory) for memory in (self.session.original, self.session.edited))
         if part == "changes":
-            self.stage.draw_changes(before, after)
+            self.stage.set_changes(before, after)
         else:
-            self.stage.layers[MAP] = after if part == "after" else before
+            self.stage.set_map(after if part == "after" else before)
         self.draw()
 
     def _say_drawn(self) -> None:
@@ -164,6 +164,8 @@ class Page:
 
     def _meanings(self) -> list[tuple[str, Any]]:
         """Return what the present colours mean."""
+        if self.stage.shows_changes:
+            return [("changed or new", CHANGED), ("taken away", REMOVED), ("as before", SAME)]
         if self.look.colors == "origin":
             return [(CellOrigin(origin).name.lower(), color) for origin, color in ORIGIN_COLORS.items()]
         kinds: dict[str, Any] = {}

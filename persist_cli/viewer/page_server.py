@@ -37,7 +37,7 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
             _refuse_other_origins(server, host)
             server.__dict__["request_share_url"] = _never_shared  # it would open a tunnel
             server.gui.configure_theme(show_share_button=False, show_logo=False, control_layout="collapsible")
-            server.scene.configure_default_lights(cast_shadow=False)
+            server.scene.configure_environment_map(None)  # blocks have no shading of light, and it would fade in
             yield server
         finally:
             server.stop()

@@ -28,7 +28,7 @@ FRUSTA: Final = 24  # cameras of a walk that are drawn all the time
 TRUTH_COLOR: Final = (0, 121, 107)
 SELECTED_COLOR: Final = (216, 27, 96)
 TOKEN_COLOR: Final = (255, 214, 0)
-CHANGED, REMOVED, SAME = (216, 27, 96), (120, 144, 156), (205, 205, 205)
+CHANGED, REMOVED, SAME = (216, 27, 96), (30, 136, 229), (205, 205, 205)  # of cells, by what an edit did
 FULL_SIZE: Final = 0.35  # metres from the middle to the picture of the present camera
 GAP: Final = 1.0  # metres between what is imagined and the truth beside it
 EDGES: Final = ((0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3), (2, 6), (3, 7), (4, 5), (4, 6), (5, 7), (6, 7))
@@ -68,6 +68,7 @@ class Stage:
         self.server, self.scene, self.subject, self.look = server, server.scene, subject, look
         self.axes: Array = ground_axes(subject.world_up).numpy()
         self.layers = dict(subject.layers)
+        self.shows_changes = False  # of the map, whatever the colours of the other layers
         self.drawn: dict[str, tuple[int, int]] = {}  # blocks, and cells that they stand for
         self._trees: dict[str, tuple[DrawnCells, float, DetailTree]] = {}
         self._frames: list[Any] = []
@@ -121,9 +122,9 @@ class Stage:
         if not parts:
             self._remove(_node(name))
         elif self.look.form == "points":
-            self._draw_points(_node(name), parts)
+            self._draw_points(name, parts)
         else:
-            mesh, middle = block_mesh([(part, painted(part, self.look.colors)) for part in parts])
+            mesh, middle = block_mesh([(part, painted(part, self._colors(name))) for part in parts])
             self.scene.add_glb(_node(name), mesh, position=_triple(middle), cast_shadow=False, receive_shadow=False)
 
     def shown(self, cells: DrawnCells) -> Array:
@@ -131,8 +132,8 @@ class Stage:
         below: Array = cells.local[:, 2] <= self.look.cut
         return below
 
-    def draw_changes(self, before: DrawnCells, after: DrawnCells) -> None:
-        """Draw a map in grey with what an edit changed in one colour and what it took away in another."""
+    def set_changes(self, before: DrawnCells, after: DrawnCells) -> None:
+        """Let the map be grey, with what an edit changed in one colour and what it took away in another."""
         old, new = (_content(cells) for cells in (before, after))
         gone = before[~np.isin(_places(before), _places(after))]
         colors = np.where(np.isin(new, old)[:, None], np.array(SAME), np.array(CHANGED))
@@ -144,8 +145,7 @@ class Stage:
             after.size,
             after.axes,
         )
-        self.layers[MAP] = merged
-        self.draw_layer(MAP)
+        self.layers[MAP], self.shows_changes = merged, True
 
     def draw_walks(self) -> None:
         """Draw each way as a line, and some of its cameras with their pictures."""
@@ -220,12 +220,20 @@ class Stage:
             self._trees[name] = kept
         return kept[2]
 
-    def _draw_points(self, node: str, parts: list[DrawnCells]) -> None:
+    def set_map(self, cells: DrawnCells) -> None:
+        """Let the map be other cells."""
+        self.layers[MAP], self.shows_changes = cells, False
+
+    def _colors(self, layer: str) -> str:
+        return "color" if layer == MAP and self.shows_changes else self.look.colors
+
+    def _draw_points(self, layer: str, parts: list[DrawnCells]) -> None:
+        node = _node(layer)
         self._remove(node)
         for part in parts:
             width = part.size[0]
             self.scene.add_point_cloud(
-                f"{node}/{width:g} m", part.centers, painted(part, self.look.colors), point_size=width,
+                f"{node}/{width:g} m", part.centers, painted(part, self._colors(layer)), point_size=width,
                 precision="float32", point_shading="flat",
             )  # fmt: skip
 
