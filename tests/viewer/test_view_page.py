@@ -15,6 +15,7 @@ from PIL import Image
 
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
+from persist_cli.reproduce.view_picture import SOFTWARE_3D
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.export import export_page
 from persist_cli.viewer.page import Page
@@ -31,14 +32,13 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 
 DESK = {"width": 900, "height": 700}
-SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # 3D without a graphics card
 CANVAS = {"x": 0, "y": 250, "width": 560, "height": 450}  # without the panel and the notice about slow drawing
 PATIENCE = 40.0  # seconds
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with driven_chromium(*SOFTWARE) as browser:
+    with driven_chromium(*SOFTWARE_3D) as browser:
         yield browser
 
 
