@@ -25,7 +25,7 @@ from persist_cli.play.sessions import Sessions
 from persist_cli.play.walking_page import WalkingPage
 from persist_cli.viewing.own_address import leads_here, same_host
 
-MOST_CONNECTIONS: Final = 64
+MORE_CONNECTIONS: Final = 32  # than sessions: for the page, recordings, and those who are refused
 PING_SECONDS: Final = 20.0  # after which a page that says nothing is asked whether it is there, and is given up
 GRACE_SECONDS: Final = 1.0  # for answers that are under way when the server ends
 
@@ -129,7 +129,7 @@ class Server(uvicorn.Server):
         super().__init__(
             uvicorn.Config(
                 app, ws="websockets-sansio", ws_max_size=MOST_BYTES, ws_per_message_deflate=False,
-                ws_ping_interval=PING_SECONDS, ws_ping_timeout=PING_SECONDS, limit_concurrency=MOST_CONNECTIONS,
+                ws_ping_interval=PING_SECONDS, ws_ping_timeout=PING_SECONDS, limit_concurrency=sessions.limits.sessions + MORE_CONNECTIONS,
                 timeout_graceful_shutdown=int(GRACE_SECONDS), lifespan="off", access_log=False, log_level="critical",
                 proxy_headers=False, server_header=False,
             )

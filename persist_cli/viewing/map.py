@@ -238,13 +238,11 @@ def _of_origin(points: MapPoints, origin: CellOrigin) -> Array:
 
 def hatched(image: Array) -> Array:
     """Return RGBA of an image whose fifth channel is the origin of each dot."""
-    from matplotlib.colors import to_rgb
-
     rows, columns = np.indices(image.shape[:2])
     pale = np.where((rows + columns) % STRIPE < STRIPE / 2, *PALE) * (image[..., 4] == CellOrigin.IMAGINED)
     edited = ((columns - rows) % STRIPE < STRIPE / 3) & (image[..., 4] == CellOrigin.EDITED)
     colors = image[..., :3] * (1 - pale[..., None]) + pale[..., None]
-    colors[edited] = to_rgb(EDITED_COLOR)
+    colors[edited] = np.frombuffer(bytes.fromhex(EDITED_COLOR[1:]), np.uint8) / 255
     return np.concatenate([colors, image[..., 3:4]], axis=-1)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import threading
+import weakref
 
 import pytest
 from PIL import Image
@@ -88,18 +90,15 @@ def test_a_key_that_is_let_go_at_once_still_makes_one_step(page):
 
 def test_no_more_than_two_frames_are_sent_before_one_is_drawn(server):
     with server.page() as page:
-        page.next()
-        page.socket.send(json.dumps({"type": "keys", "held": ["forward"]}))
-        numbers = [json.loads(_header(page.socket.recv(60)))["number"] for _ in range(2)]
+        page.draws = False
+        page.say("keys", held=["forward"])
+        assert [frame["number"] for frame in page.frames(2)] == [1, 2]
+        page.say("jump", x=0, y=0)  # waits, too
+        page.until("map")
         with pytest.raises(TimeoutError):
             page.socket.recv(0.5)
         page.say("ack", number=2)
-        assert [*numbers, page.frames(1)[0]["number"]] == [1, 2, 3]
-
-
-def _header(message):
-    length = int.from_bytes(message[:4])
-    return message[4 : 4 + length]
+        assert [frame["number"] for frame in page.frames(2)] == [3, 4]
 
 
 def test_a_reset_with_another_seed_begins_another_walk(page):
@@ -196,10 +195,33 @@ def test_a_hundred_tabs_that_close_at_once_leave_nothing_behind(server):
         with server.page() as page:
             if number % 10 == 0:
                 page.say("keys", held=["forward"])
-    with server.page() as page:
-        page.until("frame")
-    assert len(server.sessions.open) <= 1
+    server.settle()
+    assert not server.sessions.open
     assert threading.active_count() <= threads + 1
+
+
+def test_what_a_walk_holds_is_freed_as_soon_as_its_session_ends(walks):
+    base, held = micro_walks(walks, FragilePlay), []
+
+    def walk():
+        play = base()
+        held.append(weakref.ref(play))
+        return play
+
+    with serving(walk) as served:
+        gc.collect()
+        gc.disable()
+        try:
+            for keys in ([], ["forward"], ["backward"]):  # the last one fails
+                with served.page() as page:
+                    page.until("map")
+                    page.say("keys", held=keys)
+                    page.say("undo")
+                    page.until("notice" if not keys else "frame" if "forward" in keys else "error")
+            served.settle()
+            assert [play() for play in held] == [None] * 3
+        finally:
+            gc.enable()
 
 
 def test_a_walk_that_cannot_be_opened_is_said_in_one_line():

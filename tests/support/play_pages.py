@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,9 +25,10 @@ PATIENCE = 60.0  # seconds in which a busy machine answers
 
 @dataclass
 class Page:
-    """What a page does without drawing: it acknowledges each frame."""
+    """What a page does without a screen: it acknowledges each frame while ``draws``."""
 
     socket: ClientConnection
+    draws: bool = True
     texts: list[dict[str, Any]] = field(default_factory=list)
 
     def say(self, kind: str, **values: Any) -> None:
@@ -40,7 +42,7 @@ class Page:
             self.texts.append(json.loads(received))
             return self.texts[-1], []
         header, images = unpack(received)
-        if header["type"] == "frame":
+        if header["type"] == "frame" and self.draws:
             self.say("ack", number=header["number"])
         return header, images
 
@@ -74,6 +76,13 @@ class Served:
     def stop(self) -> None:
         """Let the server end, as Ctrl-C does."""
         self.server.should_exit = True
+
+    def settle(self) -> None:
+        """Wait until no session is open, and the worker has done what it was given."""
+        deadline = time.monotonic() + PATIENCE
+        while self.sessions.open and time.monotonic() < deadline:
+            time.sleep(0.01)
+        self.sessions.worker.give(lambda: None).result(PATIENCE)
 
     @contextmanager
     def page(self, **headers: str) -> Iterator[Page]:
