@@ -126,10 +126,11 @@ class Server(uvicorn.Server):
     """
 
     def __init__(self, app: ASGIApp, sessions: Sessions, started: Callable[[], None] = lambda: None) -> None:
+        most = sessions.limits.sessions + MORE_CONNECTIONS
         super().__init__(
             uvicorn.Config(
                 app, ws="websockets-sansio", ws_max_size=MOST_BYTES, ws_per_message_deflate=False,
-                ws_ping_interval=PING_SECONDS, ws_ping_timeout=PING_SECONDS, limit_concurrency=sessions.limits.sessions + MORE_CONNECTIONS,
+                ws_ping_interval=PING_SECONDS, ws_ping_timeout=PING_SECONDS, limit_concurrency=most,
                 timeout_graceful_shutdown=int(GRACE_SECONDS), lifespan="off", access_log=False, log_level="critical",
                 proxy_headers=False, server_header=False,
             )
