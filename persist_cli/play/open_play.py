@@ -16,6 +16,7 @@ from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.memorize.memory_file import read_header
 from persist_cli.memorize.sources import Source, find_sources
+from persist_cli.play.memory_start import is_memory_file
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import StartOptions, read_start
@@ -66,10 +67,12 @@ def open_walks(options: PlayOptions) -> Callable[[], Play]:
         PersistError: as ``open_play``; what it returns raises it where the settings are wrong.
     """
     options.placement.device()  # a missing accelerator is an error before anything is loaded
+    if is_memory_file(options.begin.start) and options.begin.start not in options.given:
+        options = replace(options, given=(options.begin.start, *options.given))
     checkpoint = find_checkpoint(Path(options.checkpoint))
     names = chosen_memories(checkpoint, options.memories)
-    size = empty_backbone(checkpoint).image_size
-    start = read_start(options.begin, size)
+    size, scenes = empty_backbone(checkpoint).image_size, checkpoint.training_scenes
+    start = read_start(options.begin, size, None if scenes is None else scenes.fov)
     check_size(start.info, size, options.begin.start)
     with busy("loading the memories"):  # before the model, so that what cannot work fails at once
         memories = {name: _memory(checkpoint, name, options, start) for name in names}

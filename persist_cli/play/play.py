@@ -14,7 +14,7 @@ from typing import Final
 
 from persist_cli.api.actions import Action
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
+from persist_cli.api.observations import Observations, Origin, Trajectory, TrajectoryInfo
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
 from persist_cli.play.ground import check_free, pose_at
@@ -79,6 +79,19 @@ class Play:
         """The actions that may be held."""
         return walking_keys(self.info.vocabulary)
 
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What somebody who walks here should know, a line each."""
+        if all(world.backbone.gives_depth for world in self._walkers.worlds.values()):
+            return ()
+        readers = [
+            name
+            for name, agent in zip(self.memories, self._walkers.agents, strict=True)
+            if agent.memory is not None and agent.memory.reads_depth
+        ]
+        stays = f", and {', '.join(readers)} cannot remember it" if readers else ""
+        return (f"this model imagines no depth: what it imagines stops nobody{stays}",)
+
     def set(self, settings: PlaySettings) -> None:
         """Take other settings from the next clip on; what is imagined and not shown yet is dropped.
 
@@ -107,6 +120,8 @@ class Play:
         begun, self._done = time.monotonic(), frozenset()
         self._drop()
         self._walkers.begin(self._start.observations, self.info)
+        if int(self._start.observations.origins[0]) == Origin.IMAGINED:  # a drawing, which the model sees as a frame
+            self._walkers.stand_at(self._walkers.look_from(self._walkers.pose))
         self._surveyor.begin()
         self._record(None)
         return self._show(None, True, begun)

@@ -12,6 +12,7 @@ from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
+from persist_cli.play.memory_start import is_memory_file, memory_start
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 
 SAMPLE_START = "sample#0:32"  # where a walk begins when nothing is named
@@ -23,7 +24,7 @@ class StartOptions:
     """Where a walk begins, and with which actions.
 
     Args:
-        start: ``DATA#trajectory:frame`` or a picture.
+        start: ``DATA#trajectory:frame``, a picture or a memory file.
         picture: what is known of a picture beside its pixels.
         step: metres of a step, in place of the data set's own.
         turn: degrees of a turn.
@@ -45,12 +46,15 @@ class StartOptions:
         )  # fmt: skip
 
 
-def read_start(options: StartOptions, image_size: tuple[int, int]) -> Trajectory:
+def read_start(
+    options: StartOptions, image_size: tuple[int, int], fov: tuple[float, float] | None = None
+) -> Trajectory:
     """Return the single frame at which a walk begins, with the actions that the keys can have.
 
     Args:
         options: where, and with which actions.
         image_size: height and width in pixels that the model takes; a picture is cropped and resized to it.
+        fov: degrees of view that the model was trained with, which a start in a memory file gets.
 
     Raises:
         DataError: one line when the start is missing, damaged, or a picture without depth.
@@ -58,6 +62,8 @@ def read_start(options: StartOptions, image_size: tuple[int, int]) -> Trajectory
     if is_picture(options.start):
         return _picture_start(options, image_size)
     without_picture(options.picture)
+    if is_memory_file(options.start):
+        return _with_steps(memory_start(Path(options.start), image_size, fov), options)
     if Path(options.start).is_file():
         raise DataError(f"--start {options.start}: neither a data set, a picture nor a memory file; give {_FORMS}")
     reference = parse_reference(options.start)
@@ -79,8 +85,12 @@ def _picture_start(options: StartOptions, image_size: tuple[int, int]) -> Trajec
     with tempfile.TemporaryDirectory() as folder:
         sized = replace(options.picture, size=height)
         start = Store(write_picture(picture, sized, Path(folder)))[0].read()
+    return _with_steps(start, options)
+
+
+def _with_steps(start: Trajectory, options: StartOptions) -> Trajectory:
+    """Return a start with steps and turns of the options' size."""
     if options.step is None and options.turn is None:
         return start
-    return replace(
-        start, info=replace(start.info, vocabulary=start.info.vocabulary.walking(options.step, options.turn))
-    )
+    vocabulary = start.info.vocabulary.walking(options.step, options.turn)
+    return replace(start, info=replace(start.info, vocabulary=vocabulary))

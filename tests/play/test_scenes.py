@@ -1,0 +1,68 @@
+"""Interactions change the scene that is walked in, once for each press of a key, and can be undone."""
+
+from __future__ import annotations
+
+import torch
+
+from persist_cli.api.observations import Trajectory
+from persist_cli.play.play import Play
+from persist_cli.play.settings import PlaySettings
+from tests.support.cell_rooms import BOX_CELLS, camera_at, cell_room
+from tests.support.drawn_scenes import empty_scene
+from tests.support.scene_worlds import scene_world
+
+FORWARD, PICK_UP = frozenset({"forward"}), frozenset({"pick_up"})
+
+
+def play_in_scene() -> Play:
+    """A walk in a room of cells, 1.25 m before a box."""
+    scene = empty_scene()
+    scene.add(cell_room())
+    world = scene_world(scene, camera_at(cell_room(), (4, 4, 5), (9, 4, 5), size=64))
+    agent = world.agents[0]
+    return Play({"scene": world}, Trajectory("room", agent.now, (None,), agent.info), PlaySettings())
+
+
+def box_is_there(play: Play) -> bool:
+    grid = cell_room()
+    return bool(play._walkers.lead.scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any())
+
+
+def test_a_thing_is_picked_up_once_and_the_way_is_free_then():
+    play = play_in_scene()
+    assert [play.advance(FORWARD).free for _ in range(4)] == [True, True, True, False]
+    taken = play.advance(PICK_UP)
+    assert taken.action == "pick_up"
+    assert taken.free
+    assert not box_is_there(play)
+    assert play.advance(PICK_UP) is None  # while the key is still held
+    assert play.advance(FORWARD).free
+
+
+def test_a_thing_that_is_picked_up_is_back_after_undo():
+    play = play_in_scene()
+    play.advance(FORWARD)
+    before = play.shown
+    play.advance(PICK_UP)
+    assert not box_is_there(play)
+    back = play.undo()
+    assert box_is_there(play)
+    assert torch.equal(back.images["scene"], before.images["scene"])
+
+
+def test_thinking_ahead_does_no_interaction():
+    play = play_in_scene()
+    play.advance(PICK_UP | FORWARD)
+    play.undo()
+    assert not play.think(600)
+    assert box_is_there(play)
+
+
+def test_an_interaction_with_nothing_in_reach_is_refused():
+    play = play_in_scene()
+    for _ in range(6):
+        play.advance(frozenset({"right"}))
+    assert not play.advance(frozenset({"toggle"})).free
+    assert play.advance(frozenset({"toggle"})) is None
+    play.advance(frozenset())
+    assert not play.advance(frozenset({"toggle"})).free
