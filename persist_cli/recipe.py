@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 import yaml
 from pydantic import BeforeValidator
 
-from persist_cli.api.stages import SCENE_STAGES, Lora, Stage
+from persist_cli.api.stages import SCENE_STAGES, Distill, Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
 from persist_cli.training_settings import CHANGEABLE, DataSettings, TrainingSettings
@@ -106,6 +106,8 @@ class Recipe:
         adapter_from: run or checkpoint whose adapter is trained on, as ``reference`` or ``reference#voxel``, instead of
             a new one; memory and settings are those of that adapter.
         lora: train a change of low rank instead of all weights of the base, stage 1 only.
+        distill: teach a trained model to sample in one or two denoising steps, stages 1 and 2 only; in stage 2 it is
+            the adapter of ``adapter_from``.
         policy: the policy, stage policy only.
         scene: the model of scenes, stages scene-codec and scene only.
         data: the clips.
@@ -120,6 +122,7 @@ class Recipe:
     adapter: Settings = field(default_factory=dict)
     adapter_from: str | None = None
     lora: Lora | None = None
+    distill: Distill | None = None
     policy: PolicyConfig | None = None
     scene: SceneConfig | None = None
     data: DataSettings = field(default_factory=DataSettings)
@@ -293,6 +296,7 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
     if recipe.lora is not None and recipe.stage != "1":
         problems.append("lora is for stage 1 only; leave it out")
+    problems += _of_distillation(recipe)
     if not recipe.data.strides or 0 in recipe.data.strides:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")
     if training.frozen_precision == "bf16" and training.precision == "no":
@@ -315,6 +319,20 @@ def _of_data(recipe: Recipe) -> list[str]:
         problems.append("data.true_cells is for stage 2 only; leave it out")
     elif data.true_cells and (data.mirror or data.color_jitter):
         problems.append("data.true_cells takes no data.mirror and no data.color_jitter, which change frames, no cells")
+    return problems
+
+
+def _of_distillation(recipe: Recipe) -> list[str]:
+    """Describe why a recipe cannot distil, where it shall."""
+    if recipe.distill is None:
+        return []
+    training, problems = recipe.training, []
+    if recipe.stage not in ("1", "2") or recipe.base is None or recipe.lora is not None:
+        problems.append("distill is for stages 1 and 2, with the base that is distilled and without lora")
+    if recipe.stage == "2" and recipe.adapter_from is None:
+        problems.append("distill in stage 2 needs adapter_from: the adapter that is distilled")
+    if training.ema == 0 or training.ema_device != "model":
+        problems.append("distill learns from averaged weights: set training.ema=0.99 training.ema_device=model")
     return problems
 
 

@@ -15,41 +15,16 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.clip_latents import ClipLatents
 from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.observations import Observations
-from persist_cli.api.stages import Lora, MemorySavings, ParameterGroup, Stage
+from persist_cli.api.stages import Distill, Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.setting_docs import Setting
 from persist_cli.io.settings import NoSettings
 
 Interactions = tuple[str | None, ...]  # for each step between two frames the interaction's name, if there is one
-
-
-@dataclass(frozen=True)
-class ClipLatents:
-    """Latents of clips, as a backbone's codec encodes them.
-
-    Args:
-        video: latents of the whole clips; the frame, height and width axes are those of the codec's latents.
-        image: latents of the first frames, each encoded alone.
-    """
-
-    video: Float[Tensor, "*batch frame channel height width"]
-    image: Float[Tensor, "*batch 1 channel height width"]
-
-    def __getitem__(self, sample: int) -> ClipLatents:
-        return ClipLatents(self.video[sample], self.image[sample])
-
-    def to(self, device: torch.device | str) -> ClipLatents:
-        """Return these latents on ``device``."""
-        return ClipLatents(self.video.to(device), self.image.to(device))
-
-    @staticmethod
-    def stack(samples: Sequence[ClipLatents]) -> ClipLatents:
-        """Return a batch of the latents of single clips."""
-        videos, images = [sample.video for sample in samples], [sample.image for sample in samples]
-        return ClipLatents(torch.stack(videos), torch.stack(images))
 
 
 @dataclass(frozen=True)
@@ -167,7 +142,7 @@ class Sampling:
     @property
     def words(self) -> str:
         """These settings in a few words, as in ``4 steps of unipc with guidance 1.5``."""
-        return f"{self.steps} steps of {self.sampler} with guidance {self.memory_guidance:g}"
+        return f"{self.steps} step{'s' * (self.steps != 1)} of {self.sampler} with guidance {self.memory_guidance:g}"
 
 
 class Backbone(nn.Module, ABC):
@@ -188,6 +163,7 @@ class Backbone(nn.Module, ABC):
     def __init__(self, settings: Any) -> None:
         super().__init__()
         self.settings = settings
+        self.own_sampling: Sampling | None = None  # that its checkpoint asks for, ``None`` for that of all models
         self.on_denoised: Callable[[], None] | None = None  # called in `generate` after a denoising step, for progress
 
     @property
@@ -323,6 +299,19 @@ class Backbone(nn.Module, ABC):
             PersistError: when this backbone cannot.
         """
         raise PersistError(f"backbone {self.name!r} predicts no clips in training; set data.own_writes=0")
+
+    def distill(self, settings: Distill, teacher: Backbone, target: Backbone) -> None:
+        """Let ``forward`` return the loss of a distillation from now on, in the place of the loss of denoising.
+
+        Args:
+            settings: levels, guidance and loss.
+            teacher: the frozen model whose denoising is learned, with its adapter in use.
+            target: this model with the moving average of its trained weights, which follows the training.
+
+        Raises:
+            PersistError: when this backbone cannot be distilled, or not from that teacher.
+        """
+        raise PersistError(f"backbone {self.name!r} cannot be distilled; leave distill out")
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """End a stage by measuring on some clips what training does not learn, such as a scale; nothing by default."""

@@ -155,6 +155,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
     card = read_card(folder)
     base = find_base(folder, card) if card.get("base") else folder
     base_card = read_card(base)
+    inherits = not card.get("sampling") and not card.get("protocol_sampling")
     return Checkpoint(
         folder=folder,
         name=run_folder(folder).name,
@@ -165,7 +166,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
         adapters={path.name: path for path in sorted((folder / "adapters").glob("*")) if path.is_dir()},
         default=base_card.get("default_adapter"),
         sampling=_card_sampling(card, folder / CARD) or _card_sampling(base_card, base / CARD),
-        protocol_sampling=_protocol_sampling(card, folder / CARD) or _protocol_sampling(base_card, base / CARD),
+        protocol_sampling=_protocol_sampling(*(base_card, base / CARD) if inherits else (card, folder / CARD)),
         training_scenes=_training_scenes(card, folder / CARD),
     )
 

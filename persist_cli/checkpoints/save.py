@@ -37,6 +37,7 @@ def save_base(
     backbone.save_base(folder)
     hashes = hash_weights(folder)
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(hashes)}
+    card |= own_sampling(backbone)
     started = {} if base is None else {STARTED_FROM: pointer_to(base.base_folder, base.fingerprint, home or folder)}
     write_card(folder, card | started, scenes)
     write_sums(folder, hashes)
@@ -92,8 +93,14 @@ def save_adapter(
     adapter.mkdir(parents=True)
     backbone.save_adapter(adapter)
     write_json(adapter / "memory.json", dataclasses.asdict(memory))
-    write_card(folder, pointer_to(base.base_folder, base.fingerprint, home), scenes)
+    write_card(folder, pointer_to(base.base_folder, base.fingerprint, home) | own_sampling(backbone), scenes)
     write_sums(folder)
+
+
+def own_sampling(backbone: Backbone) -> dict[str, Any]:
+    """The sampling that a backbone's card asks for, where it has one of its own."""
+    sampling = backbone.own_sampling
+    return {} if sampling is None else {"sampling": dataclasses.asdict(sampling)}
 
 
 def base_files(folder: Path, pattern: str) -> list[Path]:

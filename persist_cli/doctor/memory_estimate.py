@@ -209,7 +209,16 @@ class BackboneEstimator(Estimator):
         """Bytes of parameters and buffers, with FSDP2 those of this process and what it gathers from others at once."""
         never_sharded, sharded = self.parameter_bytes(recipe)
         gathered = self.gathered(recipe) if launch.sharded else 0
-        return never_sharded + self.buffer_bytes() + round(sharded * launch.share) + gathered
+        whole = never_sharded + self.buffer_bytes() + round(sharded * launch.share) + gathered
+        return whole + self.teacher_bytes(recipe)
+
+    def teacher_bytes(self, recipe: Recipe) -> int:
+        """Bytes of a distillation's teacher; its target has the averaged weights, which are counted as such."""
+        if recipe.distill is None:
+            return 0
+        own = self.backbone.trained_parameters(recipe.stage) if recipe.distill.teacher is None else None
+        parameters = self.backbone.parameters() if own is None else own.values()
+        return sum(parameter.numel() * FLOAT32 for parameter in parameters)
 
     def parameter_bytes(self, recipe: Recipe) -> tuple[int, int]:
         """Bytes of the parameters that FSDP2 never shards, and of all others; frozen ones in their own precision."""

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from persist_cli.api.backbone import Backbone, ClipLatents, Clips
+from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.clip_latents import ClipLatents
 from persist_cli.api.scene_model import SceneForm, SceneModel, SceneSamples
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.doctor.tracing import LiveBytes, device_kernels, fake_tensors
@@ -164,6 +165,8 @@ class ShallowCopies(StepCopies):
         with fake_tensors():
             _fill_with_fakes(backbone)
             parameters = backbone.trained_parameters(recipe.stage)
+            if recipe.distill is not None:
+                backbone.distill(recipe.distill, copy.deepcopy(backbone), copy.deepcopy(backbone))
             backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
             if kind.sharded:
                 _halve(backbone)

@@ -28,6 +28,7 @@ from persist_cli.api.checkpoint import (
     read_card,
     step_folders,
 )
+from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.api.stages import SCENE_STAGES
@@ -315,6 +316,8 @@ def report(recipe: Recipe, run: Path, step: int, rate: float) -> None:
     else:
         done = f"trained {step} steps of {recipe.training.batch} samples ({rate:.3g} samples/s)"
         say(f"stage {recipe.stage} {done}; checkpoint in {run}")
+    if recipe.distill is not None:
+        say(f"distilled: its checkpoint asks for {find_checkpoint(run).sampling_with(SamplingOverrides()).words}")
 
 
 def next_command(name: str, recipe: Recipe, run: Path) -> str:
@@ -333,6 +336,8 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
     if recipe.stage == "scene":
         train = " ".join(f"--train {folder}" for folder in recipe.data.path)
         return f"persist bench scene {run} --data HELD_OUT_DATA {train} --out runs/bench-scene"
+    if recipe.distill is not None and recipe.stage == "1":
+        return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN}"
     if recipe.memory is not None:
         return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN},{recipe.memory.name}"
     stage = re.fullmatch(r"(.+)-(?:codec|stage1)(.*)", name)

@@ -20,6 +20,7 @@ from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import Recipe
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
+from persist_cli.train.distillation import Teaching
 from persist_cli.train.distributed import Sharding, uses_zero
 from persist_cli.train.optimizer import requested_savings
 from persist_cli.train.own_writes import OwnWrites
@@ -57,6 +58,9 @@ class Trainer(TrainingLoop[Backbone]):
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         for frames in recipe.data.clip_frames:
             backbone.check_clip_frames(frames)
+        if recipe.distill is not None:
+            check_whole("distill", accelerator)
+        teaching = None if recipe.distill is None else Teaching(recipe.distill, backbone, recipe)
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
         self.scenes = scenes_of(clips)
@@ -66,11 +70,13 @@ class Trainer(TrainingLoop[Backbone]):
             self.dataset = CachedClips(clips, self.encoder.cache)
         self.own_writes: OwnWrites | None = None
         if recipe.data.own_writes and self.encoder is not None:
-            check_own_writes(accelerator)
+            check_whole("data.own_writes", accelerator)
             self.own_writes = OwnWrites(self.encoder, WritingNoise.of(recipe.data))
         if recipe.base is None:
             backbone.begin_stage(recipe.stage, self.first_batches(START_BATCHES))
         self.prepare(backbone, parameters)
+        if teaching is not None:
+            teaching.begin(self.state.averages(), accelerator.device)
 
     def make_sharding(self) -> Sharding | None:
         """What prepares the backbone for FSDP2, ``None`` where nothing is sharded."""
@@ -174,9 +180,7 @@ def augmentation_of(data: DataSettings) -> Augmentation:
     return Augmentation(data.crop, data.mirror, data.color_jitter)
 
 
-def check_own_writes(accelerator: Accelerator) -> None:
+def check_whole(setting: str, accelerator: Accelerator) -> None:
     """Raise ``RecipeError`` where a process does not have the whole model, with which it could predict by itself."""
     if accelerator.is_fsdp2 or uses_zero(accelerator):
-        raise RecipeError(
-            "data.own_writes needs the whole model in each process; launch with --multi_gpu, or set it to 0"
-        )
+        raise RecipeError(f"{setting} needs the whole model in each process; launch with --multi_gpu, or leave it out")

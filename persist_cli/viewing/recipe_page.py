@@ -29,7 +29,13 @@ from persist_cli.viewing.console import busy, print_json, say
 
 WIDTH: Final = 80  # columns of a comment
 
-STAGES_OF: Final[dict[str, tuple[Stage, ...]]] = {"memory": ("2",), "adapter": ("2",), "lora": ("1",), **ALONE}
+STAGES_OF: Final[dict[str, tuple[Stage, ...]]] = {
+    "memory": ("2",),
+    "adapter": ("2",),
+    "lora": ("1",),
+    "distill": ("1", "2"),
+    **ALONE,
+}
 
 NOT_ALONE: Final = {"backbone", "adapter_from"}  # settings of the stages of a backbone
 

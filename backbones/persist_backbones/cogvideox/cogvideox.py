@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -23,7 +23,10 @@ from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.cpu_attention import kernel_for_training
 from persist_backbones.cogvideox.diffusion import (
     SAMPLERS,
+    NoisedClips,
+    NoisedPrediction,
     SamplingSchedule,
+    SamplingStep,
     draw_timesteps,
     loss_weights,
     noise_level,
@@ -35,10 +38,10 @@ from persist_backbones.cogvideox.inputs import (
     ClipShape,
     camera_latents,
     camera_tokens,
+    check_clip_frames,
     check_fit,
     clip_shape,
     fit_positions,
-    frame_step,
     interaction_rows,
     model_input,
     rotary_grid,
@@ -59,45 +62,11 @@ from persist_backbones.cogvideox.parts import (
 )
 from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_backbones.noise_levels import add_level, draw_levels
-from persist_cli.api.backbone import ClipLatents, Clips, Sampling
+from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.checkpoint import lora_base
+from persist_cli.api.clip_latents import ClipLatents
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.errors import CheckpointError, PersistError
-
-
-@dataclass
-class SamplingStep:
-    """The result of one denoising step; ``on_step`` may change ``latents`` and ``guidance``, or stop the sampling.
-
-    Args:
-        number: number of the step, from 0.
-        timestep: timestep at which the step began.
-        latents: latents with which the next step begins; after the last step the clean prediction.
-        guidance: weight of guidance over memory in the next step; 1 predicts without guidance.
-        stop: true to make no further step.
-    """
-
-    number: int
-    timestep: Tensor
-    latents: Tensor
-    guidance: float
-    stop: bool = False
-
-
-class NoisedPrediction(NamedTuple):
-    """A prediction of training.
-
-    Args:
-        predicted: the prediction.
-        target: what it should be.
-        noisy: the latents for which it was made.
-        timesteps: their noise levels.
-    """
-
-    predicted: Tensor
-    target: Tensor
-    noisy: Tensor
-    timesteps: Tensor
 
 
 class CogVideoX(AdaptedBackbone):
@@ -149,6 +118,20 @@ class CogVideoX(AdaptedBackbone):
 
     def predict_noised(self, clips: Clips, generators: list[torch.Generator]) -> NoisedPrediction:
         """Predict from the clips' latents with noise of a random level, each sample's from its own generator."""
+        noised = self.add_noise(clips, generators, partial(draw_timesteps, self.scheduler))
+        target = prediction_target(self.scheduler, noised.clean, noised.noise, noised.timesteps)
+        # condition
+        memory = self.memory_condition(clips, generators)
+        conditions = self.conditions(clips, noised.timesteps, memory, noised.image_noise)
+        # predict
+        with kernel_for_training(self.transformer.base, noised.noisy):
+            predicted = self.predict(noised.noisy.to(noised.image.dtype), noised.image, conditions)
+        return NoisedPrediction(predicted, target, noised.noisy, noised.timesteps)
+
+    def add_noise(
+        self, clips: Clips, generators: list[torch.Generator], draw: Callable[[list[torch.Generator]], Tensor]
+    ) -> NoisedClips:
+        """Add noise to the clips' latents, each sample's from its own generator; ``draw`` draws the timesteps."""
         # encode
         latents = clips.latents or self.encode(clips)
         image_noise = draw_levels(generators, self.settings.image_noise)
@@ -157,16 +140,10 @@ class CogVideoX(AdaptedBackbone):
         image = self.image_condition(given, shape)
         clean = shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
         # noise
-        timesteps = draw_timesteps(self.scheduler, generators).to(self.device)
+        timesteps = draw(generators).to(self.device)
         noise = noise_like(clean, generators)
-        target = prediction_target(self.scheduler, clean, noise, timesteps)
         noisy = self.scheduler.add_noise(clean, noise, timesteps)
-        # condition
-        conditions = self.conditions(clips, timesteps, self.memory_condition(clips, generators), image_noise)
-        # predict
-        with kernel_for_training(self.transformer.base, noisy):
-            predicted = self.predict(noisy.to(image.dtype), image, conditions)
-        return NoisedPrediction(predicted, target, noisy, timesteps)
+        return NoisedClips(clean, noise, noisy, timesteps, image, image_noise)
 
     @torch.no_grad()
     def predict_once(self, clips: Clips) -> tuple[Tensor, Tensor]:
@@ -337,13 +314,7 @@ class CogVideoX(AdaptedBackbone):
 
     def check_clip_frames(self, frames: int) -> None:
         """Raise ``PersistError`` for clips that are longer than trained, or that the codec cannot code."""
-        longest, step = self.settings.frames, frame_step(self.codec.temporal)
-        if 2 <= frames <= longest and (frames - 1) % step == 0:
-            return
-        lengths = f"2 to {longest}" if step == 1 else ", ".join(map(str, range(1 + step, longest + 1, step)))
-        raise PersistError(
-            f"clips of {frames} frames, the given one included; this model makes clips of {lengths} frames"
-        )
+        check_clip_frames(frames, self.settings.frames, self.codec.temporal)
 
     @property
     def image_size(self) -> tuple[int, int]:

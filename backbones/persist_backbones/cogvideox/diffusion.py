@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -27,6 +28,61 @@ Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
 COGVIDEOX: dict[str, Any] = {"ddim": CogVideoXDDIMScheduler, "dpm": CogVideoXDPMScheduler}
 MULTISTEP: dict[str, Any] = {"unipc": UniPCMultistepScheduler, "dpm++": DPMSolverMultistepScheduler}
 SAMPLERS = COGVIDEOX | MULTISTEP
+
+
+@dataclass
+class SamplingStep:
+    """The result of one denoising step; ``on_step`` may change ``latents`` and ``guidance``, or stop the sampling.
+
+    Args:
+        number: number of the step, from 0.
+        timestep: timestep at which the step began.
+        latents: latents with which the next step begins; after the last step the clean prediction.
+        guidance: weight of guidance over memory in the next step; 1 predicts without guidance.
+        stop: true to make no further step.
+    """
+
+    number: int
+    timestep: Tensor
+    latents: Tensor
+    guidance: float
+    stop: bool = False
+
+
+class NoisedClips(NamedTuple):
+    """Latents of clips with noise.
+
+    Args:
+        clean: the latents, padded.
+        noise: the noise.
+        noisy: the latents with it.
+        timesteps: their noise levels.
+        image: the image condition.
+        image_noise: noise level of each sample's given frame.
+    """
+
+    clean: Tensor
+    noise: Tensor
+    noisy: Tensor
+    timesteps: Tensor
+    image: Tensor
+    image_noise: Tensor
+
+
+class NoisedPrediction(NamedTuple):
+    """A prediction of training.
+
+    Args:
+        predicted: the prediction.
+        target: what it should be.
+        noisy: the latents for which it was made.
+        timesteps: their noise levels.
+    """
+
+    predicted: Tensor
+    target: Tensor
+    noisy: Tensor
+    timesteps: Tensor
 
 
 def sample_generators(seeds: Sequence[int]) -> list[torch.Generator]:

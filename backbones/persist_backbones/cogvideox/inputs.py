@@ -28,7 +28,7 @@ from persist_backbones.tensors import fold_frames, frames_per_token, tokens_of
 from persist_cli.api.backbone import Clips, Interactions
 from persist_cli.api.cameras import Cameras, invert_rigid
 from persist_cli.api.geometry import plucker
-from persist_cli.errors import CheckpointError, DataError
+from persist_cli.errors import CheckpointError, DataError, PersistError
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,21 @@ def check_frames(temporal: int, settings: CogVideoXSettings) -> None:
         raise CheckpointError(f"frames must be {rule}at least 2, not {settings.frames}")
     if window < 1 or (window - 1) % step:
         raise CheckpointError(f"codec_window's frames must be {rule}at least 1, not {window}")
+
+
+def check_clip_frames(frames: int, longest: int, temporal: int) -> None:
+    """Raise ``PersistError`` for clips that are longer than trained, or that the codec cannot code.
+
+    Args:
+        frames: frames of a clip, the given one included.
+        longest: frames of a clip in training.
+        temporal: the codec's compression in time.
+    """
+    step = frame_step(temporal)
+    if 2 <= frames <= longest and (frames - 1) % step == 0:
+        return
+    lengths = f"2 to {longest}" if step == 1 else ", ".join(map(str, range(1 + step, longest + 1, step)))
+    raise PersistError(f"clips of {frames} frames, the given one included; this model makes clips of {lengths} frames")
 
 
 def clip_shape(transformer: Any, vae: Any, settings: CogVideoXSettings) -> ClipShape:

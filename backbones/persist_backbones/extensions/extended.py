@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from persist_backbones.cogvideox.cogvideox import CogVideoX, SamplingStep
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.cogvideox.diffusion import SamplingStep
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
+from persist_backbones.extensions.distillation import Distillation, check_teacher, consistency_loss
 from persist_backbones.extensions.inference import bring_when_run, prepare_inference
 from persist_backbones.extensions.lora import add_lora, save_lora, train_lora
 from persist_backbones.extensions.savings import FrozenWeights, apply_memory_savings
-from persist_cli.api.backbone import Clips, Sampling
+from persist_cli.api.backbone import Backbone, Clips, Sampling
 from persist_cli.api.inference import InferenceOptions
-from persist_cli.api.stages import Lora, MemorySavings, Stage
+from persist_cli.api.stages import Distill, Lora, MemorySavings, Stage
+from persist_cli.errors import CheckpointError
 
 if TYPE_CHECKING:
     from persist_backbones.extensions.caches import ClipCaches
@@ -37,11 +40,25 @@ class ExtendedCogVideoX(CogVideoX):
         self.frozen = FrozenWeights(self, None)
         self.offloaded: OffloadedParts | None = None
         self.caches: ClipCaches | None = None  # while a clip is sampled
+        self.distillation: Distillation | None = None
 
     def set_parts(self, parts: DiffusersParts) -> None:
         """Build the model from diffusers' parts, which may be offloaded."""
         super().set_parts(parts)
         bring_when_run(self.transformer)
+
+    def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
+        """Return the training loss: of a distillation, where there is one, else that of ``CogVideoX``."""
+        if self.distillation is None:
+            return super().forward(clips, stage)
+        return consistency_loss(self, clips, self.distillation)
+
+    def distill(self, settings: Distill, teacher: Backbone, target: Backbone) -> None:
+        """Let ``forward`` return the loss of consistency distillation; see ``distillation``."""
+        if not isinstance(teacher, CogVideoX) or not isinstance(target, CogVideoX):
+            raise CheckpointError(f"distill.teacher: a model of backbone {teacher.name!r} cannot teach {self.name!r}")
+        check_teacher(self, teacher)
+        self.distillation, self.own_sampling = Distillation(settings, teacher, target), Sampling(settings.steps)
 
     def sample(
         self,

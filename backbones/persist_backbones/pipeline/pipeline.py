@@ -15,9 +15,8 @@ from diffusers.video_processor import VideoProcessor
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.cogvideox.cogvideox import SamplingStep
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.diffusion import SAMPLERS
+from persist_backbones.cogvideox.diffusion import SAMPLERS, SamplingStep
 from persist_backbones.cogvideox.parts import DiffusersParts
 from persist_backbones.extensions.extended import ExtendedCogVideoX
 from persist_backbones.extensions.offload import OffloadingPipeline

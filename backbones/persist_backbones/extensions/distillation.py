@@ -1,0 +1,159 @@
+"""Consistency distillation: a student learns to say in one step what its teacher comes to in many.
+
+The student f says for noisy latents of any level which clean clip they lead to (Song et al., 2303.01469). It is the
+model's own clean prediction, and at the level without noise the identity: f(x, 0) = x, the boundary that keeps it from
+saying the same of everything. The loss is the distance between f(x_t, t) and the target's f(x_s, s), where x_s is the
+teacher's Euler step from x_t to the next level s (algorithm 2). ``consistency_loss`` puts this together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from persist_backbones.adapters.base import NoiseLevel
+from persist_backbones.cogvideox.cogvideox import CogVideoX
+from persist_backbones.cogvideox.cpu_attention import kernel_for_training
+from persist_backbones.cogvideox.diffusion import NoisedClips, noise_level, sample_generators
+from persist_cli.api.backbone import Clips
+from persist_cli.api.stages import Distill
+from persist_cli.errors import CheckpointError
+
+HUBER = 1e-3  # below such an error the loss is squared, as in latent consistency models (2310.04378)
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Noise levels between which the teacher steps: timesteps evenly spaced, the last of training first.
+
+    Args:
+        count: number of levels; after the last of them nothing is left of the noise.
+        trained: number of timesteps of training.
+    """
+
+    count: int
+    trained: int
+
+    @property
+    def timesteps(self) -> Int[Tensor, " level"]:
+        """The timestep of each level, falling; those of samplers with 1, 2, 3 or 4 steps are among 48."""
+        return torch.tensor([round(self.trained * (1 - number / self.count)) - 1 for number in range(self.count)])
+
+    def draw(self, generators: list[torch.Generator]) -> Int[Tensor, " batch"]:
+        """Draw the timesteps of uniform levels, each sample from its own generator."""
+        numbers = [torch.randint(0, self.count, (1,), generator=generator) for generator in generators]
+        return self.timesteps.to(numbers[0].device)[torch.cat(numbers)]
+
+    def following(self, timesteps: Int[Tensor, " batch"]) -> tuple[Int[Tensor, " batch"], Bool[Tensor, " batch"]]:
+        """Return the next timestep of each sample, and whether there is none: its step leads to the clean clip."""
+        known = self.timesteps.to(timesteps.device)
+        numbers = (known[None] == timesteps[:, None]).long().argmax(dim=1) + 1
+        return known[numbers.clamp(max=self.count - 1)], numbers == self.count
+
+
+def euler_step(clean: Tensor, noisy: Tensor, level: NoiseLevel, following: NoiseLevel) -> Tensor:
+    """Return the latents of the following noise level on the straight way from ``noisy`` to ``clean`` (DDIM, eq. 12).
+
+    Args:
+        clean: the clean latents as predicted.
+        noisy: latents of ``level``.
+        level: their noise level.
+        following: a lower noise level.
+    """
+    noise = (noisy - level.signal * clean) / level.noise
+    return following.signal * clean + following.noise * noise
+
+
+def distance(
+    predicted: Float[Tensor, "batch frame channel height width"],
+    target: Float[Tensor, "batch frame channel height width"],
+    loss: Literal["huber", "squared"],
+) -> Float[Tensor, "batch frame channel height width"]:
+    """Return how far two latents are from each other, for each value."""
+    squared = (predicted - target).square()
+    return squared if loss == "squared" else (squared + HUBER**2).sqrt() - HUBER
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """What a model is distilled with.
+
+    Args:
+        settings: levels, guidance and loss.
+        teacher: the frozen model whose denoising is learned.
+        target: the model that is trained, with averaged weights.
+    """
+
+    settings: Distill
+    teacher: CogVideoX
+    target: CogVideoX
+
+    @property
+    def levels(self) -> Levels:
+        """The noise levels."""
+        return Levels(self.settings.levels, self.teacher.scheduler.config.num_train_timesteps)
+
+
+def consistency_loss(model: CogVideoX, clips: Clips, distillation: Distillation) -> dict[str, Tensor]:
+    """Return the loss of consistency distillation of a batch, and its parts of RGB and depth."""
+    generators, clips, levels = sample_generators(clips.seeds), clips.to(model.device), distillation.levels
+    noised = model.add_noise(clips, generators, levels.draw)
+    draws = [generator.get_state() for generator in generators]  # all three models see the same memory
+    with torch.no_grad():
+        target = consistency_target(clips, noised, draws, distillation)
+    error = distance(predict_clean(model, clips, noised, draws), target, distillation.settings.loss)
+    color, depth = error.chunk(2, dim=2)
+    if not model.settings.depth:
+        return {"loss": color.mean(), "rgb": color.mean()}
+    return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+
+
+def consistency_target(
+    clips: Clips, noised: NoisedClips, draws: Sequence[Tensor], distillation: Distillation
+) -> Tensor:
+    """Return the clean latents that the target says after the teacher's step; arguments as of ``predict_clean``."""
+    teacher, guidance = distillation.teacher, distillation.settings.guidance
+    guided = predict_clean(teacher, clips, noised, draws, guidance)
+    following, last = distillation.levels.following(noised.timesteps)
+    here, there = (noise_level(teacher.scheduler, timesteps) for timesteps in (noised.timesteps, following))
+    nearer = noised._replace(noisy=euler_step(guided, noised.noisy, here, there), timesteps=following)
+    said = predict_clean(distillation.target, clips, nearer, draws)
+    return torch.where(last[:, None, None, None, None], guided, said)  # the boundary: f(x, 0) = x
+
+
+def predict_clean(
+    model: CogVideoX, clips: Clips, noised: NoisedClips, draws: Sequence[Tensor], guidance: float = 1.0
+) -> Float[Tensor, "batch frame channel height width"]:
+    """Return the clean latents as a model predicts them from noisy ones, float32.
+
+    Args:
+        model: the model.
+        clips: the clips, with memory tokens.
+        noised: their latents with noise.
+        draws: for each sample the state of the generator that draws whether it sees no memory.
+        guidance: weight of guidance over memory.
+    """
+    memory = model.memory_condition(clips, [torch.Generator().set_state(state) for state in draws])
+    conditions = model.conditions(clips, noised.timesteps, memory, noised.image_noise)
+    with kernel_for_training(model.transformer.base, noised.noisy):
+        predicted = model.predict_guided(noised.noisy, noised.image, conditions, guidance)
+    return conditions.level.clean(predicted.float(), noised.noisy.float())
+
+
+def check_teacher(student: CogVideoX, teacher: CogVideoX) -> None:
+    """Raise ``CheckpointError`` unless a teacher's latents, noise levels and memory mean the same to a student."""
+    adapters = [None if model.adapter is None else model.adapter.settings for model in (student, teacher)]
+    differences = {
+        "codec": student.encoding() != teacher.encoding(),
+        "number of frames": student.settings.frames != teacher.settings.frames,
+        "noise levels": not torch.equal(student.scheduler.alphas_cumprod, teacher.scheduler.alphas_cumprod),
+        "memory adapter": adapters[0] != adapters[1],
+    }
+    differs = [name for name, other in differences.items() if other]
+    if differs:
+        raise CheckpointError(f"distill.teacher: its {' and '.join(differs)} differ from those of the model to train")

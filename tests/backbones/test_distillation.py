@@ -1,0 +1,141 @@
+"""Consistency distillation: levels, the teacher's step, the boundary, and what a perfect teacher leaves to learn."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+
+from persist_backbones.cogvideox.diffusion import make_scheduler, noise_level, sample_generators
+from persist_backbones.extensions.distillation import (
+    Distillation,
+    Levels,
+    consistency_loss,
+    consistency_target,
+    distance,
+    euler_step,
+    predict_clean,
+)
+from persist_cli.api.stages import Distill
+from persist_cli.errors import CheckpointError
+from tests.support.micro_model import FRAMEWISE, micro, random_clips, random_tokens, shaken, trained
+
+PREDICTIONS = ["v_prediction", "sample"]
+
+
+def shaken_micro(prediction="sample"):
+    backbone = micro(prediction=prediction, **FRAMEWISE)
+    shaken(backbone)
+    return backbone
+
+
+def distilled(student, teacher=None, **settings):
+    return Distillation(Distill(**settings), copy.deepcopy(teacher or student), copy.deepcopy(student))
+
+
+def test_timesteps_of_one_to_four_sampling_steps_are_levels_of_the_distillation():
+    config, levels = micro().scheduler.config, set(Levels(48, 1000).timesteps.tolist())
+    for steps in (1, 2, 3, 4):
+        assert set(make_scheduler(config, "ddim", steps).timesteps.tolist()) <= levels
+
+
+def test_each_level_is_followed_by_the_next_and_the_last_by_the_clean_clip():
+    levels = Levels(4, 1000)
+    following, last = levels.following(levels.timesteps)
+    assert following[:3].tolist() == levels.timesteps[1:].tolist()
+    assert last.tolist() == [False, False, False, True]
+
+
+def test_the_teachers_step_to_the_true_clip_stays_on_the_straight_way_to_it():
+    scheduler, draw = micro().scheduler, torch.Generator().manual_seed(0)
+    clean, noise = torch.randn(2, 3, 4, 2, 2, generator=draw), torch.randn(2, 3, 4, 2, 2, generator=draw)
+    high, low = torch.tensor([999, 600]), torch.tensor([700, 20])
+    noisy, expected = (scheduler.add_noise(clean, noise, timesteps) for timesteps in (high, low))
+    stepped = euler_step(clean, noisy, noise_level(scheduler, high), noise_level(scheduler, low))
+    assert torch.allclose(stepped, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_without_noise_the_target_is_the_teachers_clip_itself(prediction):
+    student, teacher = shaken_micro(prediction), shaken_micro(prediction)
+    shaken(teacher)
+    clips, distillation = random_clips(2), distilled(student, teacher)
+    last = distillation.levels.timesteps[-1]
+    noised = student.add_noise(clips, sample_generators(clips.seeds), lambda _: last.repeat(2))
+    draws = [generator.get_state() for generator in sample_generators(clips.seeds)]
+    with torch.no_grad():
+        target = consistency_target(clips, noised, draws, distillation)
+        assert torch.equal(target, predict_clean(distillation.teacher, clips, noised, draws))
+        assert not torch.allclose(target, predict_clean(distillation.target, clips, noised, draws))
+
+
+def test_a_consistent_teacher_is_a_fixed_point():
+    student = micro(prediction="sample", **FRAMEWISE)  # its output layers are zero but for a bias: it says one clip
+    shaken(student.codec)
+    for layer in (student.transformer.base.proj_out, student.transformer.extra_out):
+        torch.nn.init.zeros_(layer.weight)
+    student.trained_parameters("1")
+    losses = consistency_loss(student, random_clips(3), distilled(student, levels=6))
+    losses["loss"].backward()
+    assert losses["loss"] == losses["rgb"] == losses["depth"] == 0
+    gradients = [p.grad.abs().max() for p in student.transformer.parameters() if p.grad is not None]
+    assert max(gradients) == 0
+
+
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_an_inconsistent_teacher_is_learned_from(prediction):
+    student = shaken_micro(prediction)
+    student.trained_parameters("1")
+    distillation = distilled(student)
+    losses = consistency_loss(student, random_clips(2), distillation)
+    losses["loss"].backward()
+    assert losses["loss"] > 0
+    assert student.transformer.base.proj_out.weight.grad.abs().max() > 0
+    assert all(p.grad is None for model in (distillation.teacher, distillation.target) for p in model.parameters())
+
+
+def test_the_student_learns_what_guidance_over_memory_does():
+    backbone = trained("canvas", prediction="sample", **FRAMEWISE)
+    clips = random_clips(2, random_tokens(2, 9))
+    draws = [generator.get_state() for generator in sample_generators(clips.seeds)]
+    noised = backbone.add_noise(clips, sample_generators(clips.seeds), lambda _: torch.tensor([999, 999]))
+    plain, guided = (distilled(backbone, guidance=guidance) for guidance in (1.0, 3.0))
+    with torch.no_grad():
+        targets = [consistency_target(clips, noised, draws, one) for one in (plain, guided)]
+    assert not torch.allclose(*targets)
+
+
+def test_the_distances_are_zero_for_equal_latents_and_nearly_absolute_for_others():
+    one, other = torch.zeros(1, 1, 1, 1, 2), torch.tensor([0.0, 3.0]).reshape(1, 1, 1, 1, 2)
+    assert distance(one, other, "huber").flatten().tolist() == pytest.approx([0.0, 2.999])
+    assert distance(one, other, "squared").flatten().tolist() == [0.0, 9.0]
+
+
+def test_a_distilled_model_asks_for_few_steps_without_guidance():
+    student = shaken_micro()
+    student.distill(Distill(steps=2, guidance=1.5), copy.deepcopy(student), copy.deepcopy(student))
+    assert (student.own_sampling.steps, student.own_sampling.memory_guidance) == (2, 1.0)
+    assert student(random_clips(2), "1")["loss"] > 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [({"frames": 5, **FRAMEWISE}, "number of frames"), ({"frames": 17}, "codec and number of frames")],
+)
+def test_a_teacher_of_other_latents_is_refused(changes, what):
+    student, teacher = micro(**FRAMEWISE), micro(**changes)
+    with pytest.raises(CheckpointError, match=f"^distill.teacher: its {what} differ"):
+        student.distill(Distill(), teacher, copy.deepcopy(student))
+
+
+def test_a_teacher_with_another_adapter_is_refused():
+    student, teacher = trained("canvas", **FRAMEWISE), trained("cross", **FRAMEWISE)
+    teacher.codec.load_state_dict(student.codec.state_dict())
+    with pytest.raises(CheckpointError, match="its memory adapter differ from those of the model"):
+        student.distill(Distill(), teacher, copy.deepcopy(student))
+
+
+def test_the_loss_is_that_of_short_clips_too():
+    student = shaken_micro()
+    short = dataclasses.replace(random_clips(2)).shortened(3)
+    assert consistency_loss(student, short, distilled(student))["loss"] > 0

@@ -1,0 +1,107 @@
+"""Runs that distil a model: what they start from, what they save, and that they can be resumed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from accelerate import Accelerator
+
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.inference import SamplingOverrides
+from persist_cli.checkpoints.load import load_backbone
+from persist_cli.errors import RecipeError
+from persist_cli.recipe import make_recipe
+from persist_cli.train.trainer import Trainer
+from tests.support.micro_model import micro, shaken
+from tests.support.micro_runs import equal_runs, losses, stage
+
+DISTILL = ["distill.levels=6", "training.ema=0.99"]
+
+
+def trainer(walks) -> Trainer:
+    """A trainer that distils a micro model."""
+    values = {
+        "stage": "1",
+        "base": "elsewhere",
+        "distill": {"levels": 6},
+        "data": {"path": str(walks)},
+        "training": {"workers": 0, "batch": 2, "ema": 0.9, "warmup": 0, "precision": "no", "steps": 3},
+    }
+    backbone = micro()
+    shaken(backbone)
+    return Trainer(make_recipe(values, "mine"), backbone, None, Accelerator(cpu=True))
+
+
+def test_the_teacher_stays_as_it_was_and_the_target_follows_the_average(walks):
+    training = trainer(walks)
+    teacher, target = training.backbone.distillation.teacher, training.backbone.distillation.target
+    before = {name: parameter.clone() for name, parameter in teacher.named_parameters()}
+    for _ in training.steps():
+        pass
+    assert all(torch.equal(before[name], parameter) for name, parameter in teacher.named_parameters())
+    parameters = dict(target.named_parameters())
+    for name, average in training.state.averages().items():
+        assert parameters[name].data_ptr() == average.data_ptr()
+    changed = [name for name, average in training.state.averages().items() if not torch.equal(before[name], average)]
+    assert changed
+
+
+def test_what_is_not_trained_is_held_once(walks):
+    training = trainer(walks)
+    teacher = training.backbone.distillation.teacher
+    assert teacher.codec.vae.decoder.conv_in.conv.weight is training.backbone.codec.vae.decoder.conv_in.conv.weight
+    assert teacher.transformer.extra_out.weight is not training.backbone.transformer.extra_out.weight
+
+
+def test_a_resumed_distillation_equals_an_uninterrupted_one(persist, walks, stage1, tmp_path):
+    changes = [f"base={stage1}", *DISTILL]
+    assert persist(*stage("stage1", walks, tmp_path / "whole", *changes)).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "halves", *changes, "training.steps=2")).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "halves", "--resume", *changes)).code == 0
+    assert equal_runs(tmp_path / "whole", tmp_path / "halves")
+
+
+def test_a_distilled_model_samples_in_one_step_without_being_told(persist, walks, stage1, tmp_path):
+    run = tmp_path / "distilled"
+    result = persist(*stage("stage1", walks, run, f"base={stage1}", *DISTILL))
+    assert result.code == 0
+    assert "its checkpoint asks for 1 step of ddim with guidance 1" in result.out
+    checkpoint = find_checkpoint(run)
+    assert checkpoint.sampling_with(SamplingOverrides()).steps == 1
+    assert find_checkpoint(stage1).sampling_with(SamplingOverrides()).steps == 50
+    base, own = (load_backbone(find_checkpoint(folder)).state_dict() for folder in (stage1, run))
+    assert any(not torch.equal(base[name], own[name]) for name in base if name.startswith("transformer"))
+    assert all(torch.equal(base[name], own[name]) for name in base if name.startswith("codec"))
+    assert len(losses(run)) == 4
+
+
+def test_an_adapter_is_distilled_on_the_base_that_it_stands_on(persist, walks, voxel, stage1, tmp_path):
+    run = tmp_path / "distilled"
+    changes = [f"base={stage1}", f"adapter_from={voxel}", "memory=null", "adapter={}", "distill.guidance=1.5", *DISTILL]
+    assert persist(*stage("stage2-voxel", walks, run, *changes)).code == 0
+    checkpoint = find_checkpoint(run)
+    assert checkpoint.base_folder == find_checkpoint(stage1).folder
+    assert checkpoint.sampling_with(SamplingOverrides(), "revisit").steps == 1
+
+
+def test_another_checkpoint_may_teach(persist, walks, voxel, stage1, tmp_path):
+    changes = ["memory=null", "adapter={}", f"adapter_from={voxel}", f"distill.teacher={voxel}", *DISTILL]
+    assert persist(*stage("stage2-voxel", walks, tmp_path / "run", f"base={stage1}", *changes)).code == 0
+    missing = [f"base={stage1}", f"distill.teacher={tmp_path / 'none'}", *DISTILL]
+    failed = persist(*stage("stage1", walks, tmp_path / "other", *missing))
+    assert (failed.code, len(failed.err.strip().splitlines())) == (1, 1)
+    assert "no checkpoint there" in failed.err
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stage": "codec"}, "distill is for stages 1 and 2"),
+        ({"stage": "1"}, "with the base that is distilled"),
+        ({"stage": "2", "base": "x", "memory": {}}, "distill in stage 2 needs adapter_from"),
+        ({"stage": "1", "base": "x", "training": {"ema": 0}}, "set training.ema=0.99"),
+    ],
+)
+def test_a_recipe_that_cannot_distil_says_why(changes, message):
+    with pytest.raises(RecipeError, match=message):
+        make_recipe({"distill": {}} | changes, "mine")
