@@ -166,7 +166,7 @@ class ShallowCopies(StepCopies):
             _fill_with_fakes(backbone)
             parameters = backbone.trained_parameters(recipe.stage)
             if recipe.distill is not None:
-                backbone.distill(recipe.distill, copy.deepcopy(backbone), copy.deepcopy(backbone))
+                backbone.distill(recipe.distill, backbone, backbone)  # whose copies would compute the same
             backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
             if kind.sharded:
                 _halve(backbone)
