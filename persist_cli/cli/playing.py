@@ -50,6 +50,9 @@ def play(
     steps: Annotated[int, typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon.")] = 1,
     guidance: Annotated[float, typer.Option(min=0, max=10, help="Of guidance over memory; 1: none.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the sampling noise.")] = 0,
+    clip_frames: Annotated[
+        int | None, typer.Option(min=2, help="Of a clip, the present one included; few answer a key soon. The model's.")
+    ] = None,
     ahead: Annotated[bool, typer.Option(help="Imagine the likely next actions while no key is held.")] = True,
     fps: Annotated[float, typer.Option(min=0.1, max=120, help="Most frames a second.")] = 12.0,
     out: Annotated[Path | None, typer.Option(help="Folder where recordings stay; else they go with the page.")] = None,
@@ -83,7 +86,7 @@ def play(
     begin = StartOptions(start or SAMPLE_START, picture, step, turn, body)
     options = PlayOptions(
         checkpoint or REFERENCE, begin, split_names(memories), given,
-        PlaySettings(steps, guidance, seed, ahead), InferenceOptions.of(dtype, save_memory),
+        PlaySettings(steps, guidance, seed, ahead, clip_frames), InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     opens = not json if browser is None else browser
     run_play(options, ServeOptions(host, port, Limits(sessions, fps), out, opens, json))
