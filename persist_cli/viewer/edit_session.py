@@ -60,7 +60,7 @@ class EditSession:
         self.edits: list[Edit] = []
         self.selection: tuple[Selected, ...] = ()
         self.outcome = EditOutcome(0)
-        self.saved = 0  # edits in the file
+        self._saved: list[Edit] = []  # those in the file
         self._things: tuple[Memory, list[Thing]] | None = None
 
     @property
@@ -82,7 +82,7 @@ class EditSession:
     @property
     def unsaved(self) -> bool:
         """Whether there are edits that the file does not have."""
-        return len(self.edits) != self.saved
+        return self.edits != self._saved
 
     def select_box(self, first: Point, second: Point) -> None:
         """Select the box between two opposite corners in world metres, given in any order."""
@@ -187,7 +187,7 @@ class EditSession:
         listed = self.out.with_suffix(".edits.json")
         self.edited.save(self.out, self.paths)
         write_edits(listed, self.edits)
-        self.saved = len(self.edits)
+        self._saved = list(self.edits)
         return self.out, listed
 
     def _redo(self, edits: list[Edit]) -> None:

@@ -58,7 +58,7 @@ class Page:
         self.focus: np.ndarray[Any, Any] | None = None
         self._drawn_at = 0.0
         self._placed: Any = None  # the gizmo of the camera that was placed by hand
-        self._imagining, self._wanted = False, False
+        self._imagining, self._wanted, self._plays = False, False, False
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Look"):
             self._add_map_panel()
@@ -145,11 +145,11 @@ class Page:
     def show_memory(self, part: str) -> None:
         """Draw the memory ``before`` the edits, ``after`` them, or the ``changes``."""
         assert self.session is not None
-        before, after = (cells_of_memory(memory) for memory in (self.session.original, self.session.edited))
+        original, edited = self.session.original, self.session.edited
         if part == "changes":
-            self.stage.set_changes(before, after)
+            self.stage.set_changes(cells_of_memory(original), cells_of_memory(edited))
         else:
-            self.stage.set_map(after if part == "after" else before)
+            self.stage.set_map(cells_of_memory(edited if part == "after" else original))
         self.draw()
 
     def _say_drawn(self) -> None:
@@ -212,11 +212,16 @@ class Page:
     def _play(self, box: Any) -> None:
         """Go on frame by frame until the box is no longer checked or nobody looks."""
         last = int(self.frame.max)
+        with self.lock:
+            if self._plays:  # the loop of an earlier press goes on
+                return
+            self._plays = True
         while box.value and self.server.get_clients():
             with self.lock:
                 self.frame.value = 0 if self.frame.value >= last else int(self.frame.value) + 1
                 self._show_frame()
             time.sleep(1 / FRAMES_A_SECOND)
+        self._plays = False
 
     def present_camera(self) -> Cameras | None:
         """Return the camera of the first walk at the present frame, with a frame axis of one; ``None`` without one."""
@@ -259,6 +264,8 @@ class Page:
             here.on_click(self.guarded(lambda event: self._place(self.present_camera(), event)))
         view = gui.add_button("Camera at this view")
         view.on_click(self.guarded(lambda event: self._place(camera_of_view(event.client), event)))
+        away = gui.add_button("Take the camera away")
+        away.on_click(self.guarded(lambda event: self.server.scene.remove_by_name("/placed")))
         self._imagined_text, self._imagined_picture = Note(gui), Pictures(gui)
 
     def _place(self, camera: Cameras | None, event: Any) -> None:
@@ -306,6 +313,8 @@ class Page:
             self._imagined_text.say(str(error))
             return self.tell(str(error), event)
         with self.lock:
+            if self.server.scene.get_handle_by_name("/placed") is None:  # taken away in the meantime
+                return None
             self._draw_placed(view.picture.numpy())
             self._imagined_picture.show([("imagined", view.picture)])
             self._imagined_text.say(

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
 from persist_cli.api.cells import FREE, CellOrigin
+from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.viewer.drawn_cells import cells_of_memory
@@ -110,6 +112,26 @@ def test_a_box_of_a_voxel_map_is_painted(voxel_map, tmp_path):
     assert session.paint((1, 2, 3)).changed > 0
     assert int((session.edited.points().origins == CellOrigin.EDITED).sum()) == session.outcome.changed
     assert session.things == []
+
+
+def test_a_rectangle_over_a_map_leaves_out_the_lowest_layer_around_what_stands_there(walks, voxel_map, tmp_path):
+    memory = load_memory(voxel_map)
+    session = EditSession(memory, {}, tmp_path / "out.safetensors")
+    cells, cameras = cells_of_memory(memory), Store(walks)[0].cameras([0])
+    session.select_rectangle(cameras, (0, 0), (1, 1), np.ones(len(cells), bool))
+    inside = session.selection[0].box.contains(torch.from_numpy(cells.centers)).numpy()
+    assert inside.any()
+    assert cells.numbers[inside, 2].min() > cells.numbers[:, 2].min()
+
+
+def test_another_edit_in_the_place_of_a_saved_one_is_not_saved(session):
+    session.select_thing("box#1")
+    session.paint((1, 2, 3))
+    session.save()
+    session.undo()
+    session.select_thing("box#1")
+    session.paint((3, 2, 1))
+    assert session.unsaved
 
 
 def test_nothing_selected_and_nothing_edited_are_told(session):

@@ -7,6 +7,7 @@ from persist_cli.api.geometry import pose_differences
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
 from persist_cli.memorize.memory_file import load_memory
+from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.imagine import MOST_CLIPS, STEP, TURN, Imaginer, ImagineSettings, nearest_frame, way_to
 from tests.support.micro_runs import run_persist
 
@@ -56,6 +57,17 @@ def test_the_view_depends_on_what_was_edited_and_leaves_the_memory_as_it_is(walk
     emptied.clear()
     assert not torch.equal(imaginer.imagine(pose, emptied).picture, view.picture)
     assert all(torch.equal(before[name], tensor) for name, tensor in memory.tensors().items())
+
+
+def test_a_rollout_goes_through_a_map_that_was_edited_by_hand(persist, walks, voxel, own_map, tmp_path):
+    memory = load_memory(own_map)
+    session = EditSession(memory, {}, tmp_path / "edited.safetensors")
+    session.select_box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
+    session.paint((200, 30, 30))
+    edited, _ = session.save()
+    options = ("--start", f"{walks}#0:2", "--actions", "left", "--steps", 1, "--memory", edited)
+    result = persist("rollout", voxel, *options, "--out", tmp_path / "rollout")
+    assert result.code == 0, result.err
 
 
 def test_a_model_that_cannot_read_the_memory_is_told(walks, voxel, room):

@@ -1,0 +1,77 @@
+"""The page without a browser: what it draws when the view moves, when time goes on, and when layers are chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import viser
+
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.viewer.edit_session import EditSession
+from persist_cli.viewer.page import Page
+from persist_cli.viewer.page_server import page_server
+from persist_cli.viewer.stage import Look
+from persist_cli.viewer.subject import MAP, TRUTH, open_subject
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    with page_server("127.0.0.1", 0) as server:
+        yield server
+
+
+def page_of(server: viser.ViserServer, file: Path, most: int) -> Page:
+    server.scene.reset()
+    server.gui.reset()
+    session = EditSession(load_memory(file), {}, file.with_name("edited.safetensors"))
+    return Page(server, open_subject(str(file)), Look(most=most, layers={MAP}), session, None)
+
+
+def test_a_large_map_is_drawn_in_more_detail_when_the_view_comes_near(server, room):
+    page = page_of(server, room, 300)
+    far, cells = page.stage.drawn[MAP]
+    assert far < 300 < cells
+    corner = page.subject.layers[MAP].centers[0]
+    page._on_moved(corner)
+    near, _ = page.stage.drawn[MAP]
+    sizes = [part.size[0] for part in page.stage._tree(MAP).select(300, corner)]
+    assert far < near <= 300
+    assert len(sizes) > 1
+    assert sizes[0] == page.subject.layers[MAP].size[0]
+
+
+def test_a_small_map_is_not_drawn_anew_when_the_view_moves(server, room):
+    page = page_of(server, room, 40_000)
+    page._on_moved(np.zeros(3))
+    assert page.focus is None
+
+
+def test_what_is_above_the_cameras_is_cut_away_at_first(server, room):
+    page = page_of(server, room, 40_000)
+    heights = page.subject.layers[MAP].local[:, 2]
+    assert page.look.cut < heights.max()
+    assert page.stage.drawn[MAP][0] == int((heights <= page.look.cut).sum())
+
+
+def test_changes_are_shown_in_colours_of_their_own(server, room):
+    page = page_of(server, room, 40_000)
+    page.session.select_thing("box#1")
+    page.session.remove()
+    page.show_memory("changes")
+    kinds = {tuple(color) for color in page.stage.layers[MAP].colors.tolist()}
+    assert kinds == {(205, 205, 205), (30, 136, 229)}
+    page.show_memory("before")
+    assert len(page.stage.layers[MAP]) == len(page.subject.layers[MAP])
+
+
+def test_the_truth_stands_beside_what_was_imagined_or_in_its_place(server, rollout):
+    server.scene.reset()
+    server.gui.reset()
+    page = Page(server, open_subject(str(rollout)), Look(layers={MAP, TRUTH}), None, None)
+    low, high = page.stage.bounds()
+    assert np.linalg.norm(page.stage.truth_offset()) > (high - low)[0]
+    page._set(beside=False)
+    assert page.stage.truth_offset() == (0.0, 0.0, 0.0)
