@@ -44,7 +44,7 @@ PlanSettingsOption = Annotated[
 StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
 
 SamplerOption = Annotated[
-    str | None, typer.Option("--sampler", help="ddim, dpm, unipc or dpm++; the checkpoint's, else ddim.")
+    str | None, typer.Option("--sampler", help="ddim, dpm, unipc, dpm++ or consistency; the checkpoint's, else ddim.")
 ]
 
 GuidanceOption = Annotated[

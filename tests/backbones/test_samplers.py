@@ -10,6 +10,7 @@ from torch import Tensor
 
 from persist_backbones.cogvideox.config import PRESETS
 from persist_backbones.cogvideox.diffusion import (
+    CONSISTENCY,
     MULTISTEP,
     SAMPLERS,
     SamplingSchedule,
@@ -181,3 +182,16 @@ def distance_from_flow(spread: float, config: dict, sampler: str, steps: int) ->
 
     denoise(predict, noise, config, sampler, steps, generators)
     return distances[-1]
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_the_sampler_of_distilled_models_adds_fresh_noise_to_each_clean_prediction(steps):
+    generators, draw = sample_generators([3, 4, 5]), torch.Generator().manual_seed(1)
+    clean, latents = torch.randn(3, *SHAPE, generator=draw), torch.randn(3, *SHAPE, generator=draw)
+    schedule, predict = SamplingSchedule(UNSHIFTED, CONSISTENCY, steps, generators), perfect_denoiser(clean, UNSHIFTED)
+    for timestep, following in zip(schedule.timesteps, [*schedule.timesteps[1:], None], strict=True):
+        latents = schedule.step(predict(latents, timestep.expand(3)), timestep, latents)
+        if following is not None:
+            signal, noise = signal_and_noise(UNSHIFTED, following.expand(3))
+            assert ((latents - signal * clean) / noise).std() == pytest.approx(1, abs=0.15)
+    assert torch.allclose(latents, clean, atol=1e-4)

@@ -3,10 +3,12 @@ import json
 import pytest
 from PIL import Image
 
-from persist_backbones.cogvideox.diffusion import SAMPLERS
+from persist_backbones.cogvideox.diffusion import CONSISTENCY, SAMPLERS
 from persist_cli.errors import CheckpointError
 from tests.benchmarks.bench_sampling import fresh_model, main
 from tests.support.micro_runs import MICRO
+
+NAMES = [*SAMPLERS, CONSISTENCY]
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +22,11 @@ def test_samplers_and_memories_are_compared_on_clips_that_return(model, held_out
     main(["--checkpoint", *map(str, model), "--data", str(held_out), *sizes, "--out", str(tmp_path)])
     results = json.loads((tmp_path / "sampling.json").read_text())
     samplers, memories = results["samplers"], results["memories"]
-    assert [(row["sampler"], row["steps"]) for row in samplers] == [(name, n) for name in SAMPLERS for n in (3, 1)]
+    assert [(row["sampler"], row["steps"]) for row in samplers] == [(name, n) for name in NAMES for n in (3, 1)]
     assert {row["memory_guidance"] for row in samplers} == {1.5}
     assert samplers[0]["ratio"] == 1.0
     single = [row["psnr"] for row in samplers if row["steps"] == 1]
-    assert single == pytest.approx([single[0]] * len(SAMPLERS), abs=0.01)  # one step is one prediction for all of them
+    assert single == pytest.approx([single[0]] * len(NAMES), abs=0.01)  # one step is one prediction for all of them
     assert [row["memory"] for row in memories] == ["stage1", "none", "voxel"]
     assert memories[1]["ratio"] == 1.0
     assert len(results["clips"]) == 2

@@ -65,7 +65,7 @@ def test_a_distilled_model_samples_in_one_step_without_being_told(persist, walks
     run = tmp_path / "distilled"
     result = persist(*stage("stage1", walks, run, f"base={stage1}", *DISTILL))
     assert result.code == 0
-    assert "its checkpoint asks for 1 step of ddim with guidance 1" in result.out
+    assert "its checkpoint asks for 1 step of consistency with guidance 1" in result.out
     checkpoint = find_checkpoint(run)
     assert checkpoint.sampling_with(SamplingOverrides()).steps == 1
     assert find_checkpoint(stage1).sampling_with(SamplingOverrides()).steps == 50

@@ -22,6 +22,7 @@ from persist_backbones.cogvideox.codec_start import start_as_components
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.cpu_attention import kernel_for_training
 from persist_backbones.cogvideox.diffusion import (
+    CONSISTENCY,
     SAMPLERS,
     NoisedClips,
     NoisedPrediction,
@@ -323,8 +324,8 @@ class CogVideoX(AdaptedBackbone):
 
     @property
     def samplers(self) -> tuple[str, ...]:
-        """Names of the diffusers samplers that use the noise levels of training."""
-        return tuple(SAMPLERS)
+        """Names of the diffusers samplers that use the noise levels of training, and of that of distilled models."""
+        return (*SAMPLERS, CONSISTENCY)
 
     def check_sampling(self, sampling: Sampling) -> None:
         """Raise ``PersistError`` for an unknown sampler, bad guidance, or more steps than training has noise levels."""

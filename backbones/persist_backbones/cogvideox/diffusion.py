@@ -28,6 +28,7 @@ Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
 COGVIDEOX: dict[str, Any] = {"ddim": CogVideoXDDIMScheduler, "dpm": CogVideoXDPMScheduler}
 MULTISTEP: dict[str, Any] = {"unipc": UniPCMultistepScheduler, "dpm++": DPMSolverMultistepScheduler}
 SAMPLERS = COGVIDEOX | MULTISTEP
+CONSISTENCY = "consistency"  # the sampler of distilled models, which is none of diffusers'
 
 
 @dataclass
@@ -143,13 +144,14 @@ class SamplingSchedule:
 
     Args:
         config: configuration of the CogVideoX scheduler that the model was trained with.
-        sampler: a key of ``SAMPLERS``.
+        sampler: a key of ``SAMPLERS``, or ``CONSISTENCY``.
         steps: number of denoising steps, each with one prediction, at most the noise levels of training.
         generators: one generator a sample, for samplers that add noise.
     """
 
     def __init__(self, config: Any, sampler: str, steps: int, generators: list[torch.Generator]) -> None:
-        self.scheduler = make_scheduler(config, sampler, steps)
+        self.renoises = sampler == CONSISTENCY
+        self.scheduler = make_scheduler(config, "ddim" if self.renoises else sampler, steps)
         self.generators = generators
         self.timesteps: Int[Tensor, " step"] = self.scheduler.timesteps
         self.previous: tuple[Tensor | None, Tensor | None] = (None, None)  # last clean prediction and its timestep
@@ -162,6 +164,8 @@ class SamplingSchedule:
             timestep: the next of ``timesteps``.
             latents: latents at the noise level of ``timestep``.
         """
+        if self.renoises:
+            return self.renoised(predicted, timestep, latents)
         if isinstance(self.scheduler, CogVideoXDPMScheduler):
             clean, before = self.previous
             stepped, *clean_now = self.scheduler.step(
@@ -174,6 +178,15 @@ class SamplingSchedule:
         # CogVideoX's schedulers leave noise when the steps do not divide the levels of training
         latents = clean_now[0] if last and clean_now else stepped
         return latents
+
+    def renoised(self, predicted: Tensor, timestep: Tensor, latents: Tensor) -> Tensor:
+        """Return the clean prediction with fresh noise of the next level (Song et al., 2303.01469, algorithm 1)."""
+        level = noise_level(self.scheduler, timestep[None].to(latents.device))
+        clean, later = level.clean(predicted, latents), self.timesteps[self.timesteps < timestep]
+        if not len(later):
+            return clean
+        following = noise_level(self.scheduler, later[:1].to(latents.device))
+        return following.signal * clean + following.noise * noise_like(clean, self.generators)
 
 
 def make_scheduler(config: Any, sampler: str, steps: int) -> Any:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.diffusion import SamplingStep
+from persist_backbones.cogvideox.diffusion import CONSISTENCY, SamplingStep
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
 from persist_backbones.extensions.distillation import Distillation, check_teacher, consistency_loss
@@ -58,7 +58,8 @@ class ExtendedCogVideoX(CogVideoX):
         if not isinstance(teacher, CogVideoX) or not isinstance(target, CogVideoX):
             raise CheckpointError(f"distill.teacher: a model of backbone {teacher.name!r} cannot teach {self.name!r}")
         check_teacher(self, teacher)
-        self.distillation, self.own_sampling = Distillation(settings, teacher, target), Sampling(settings.steps)
+        self.distillation = Distillation(settings, teacher, target)
+        self.own_sampling = Sampling(settings.steps, CONSISTENCY)
 
     def sample(
         self,
