@@ -76,6 +76,8 @@ class Presenter:
         """Welcome the page, and serve it until this is cancelled."""
         self._told = self._state()
         await self.send(self._welcome())
+        for notice in self.play.notices:
+            await self.send(messages.Notice(text=notice))
         await self._show(await self.worker.run(lambda: encoded(self.play.shown)))
         while True:
             self.wishes.changed.clear()

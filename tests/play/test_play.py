@@ -14,9 +14,9 @@ from persist_cli.errors import DataError, PersistError
 from persist_cli.play import surveyor
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
-from persist_cli.play.walkers import AdaptedWorld
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.world_model import Agent, WorldModel
+from tests.support.micro_plays import micro_walks
 from tests.support.micro_worlds import remembering_model
 
 FORWARD, LEFT = frozenset({"forward"}), frozenset({"left"})
@@ -33,12 +33,9 @@ def voxels() -> Memory:
 
 def play_on(backbone, walks: Path, **settings) -> Play:
     """A walk from the ninth frame of the first trajectory, with a voxel memory and without one."""
-    start = Store(walks)[0].read([8])
-    worlds = {
-        "voxel": AdaptedWorld(backbone, [Agent(voxels())], Sampling(), "voxel"),
-        "stage1": AdaptedWorld(backbone, [Agent(None)], Sampling(), None),
-    }
-    return Play(worlds, start, PlaySettings(steps=2, **settings))
+    play = micro_walks(walks, backbone=backbone)()
+    play.set(PlaySettings(steps=2, **settings))
+    return play
 
 
 def rollout_world(backbone, walks: Path) -> WorldModel:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.data.store import Store
@@ -16,9 +17,9 @@ from persist_cli.rollout.world_model import Agent
 from tests.support.micro_worlds import remembering_model
 
 
-def micro_walks(walks: Path, kind: type[Play] = Play) -> Callable[[], Play]:
+def micro_walks(walks: Path, kind: type[Play] = Play, backbone: CogVideoX | None = None) -> Callable[[], Play]:
     """What makes walks of a class that share a model, with a voxel memory and without one."""
-    backbone, start = remembering_model(), Store(walks)[0].read([8])
+    backbone, start = backbone or remembering_model(), Store(walks)[0].read([8])
     reference = FrameOfReference(start.info.scene, start.info.world_up)
 
     def walk() -> Play:
