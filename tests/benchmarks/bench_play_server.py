@@ -58,8 +58,8 @@ class Load:
     memory: float
 
 
-def walk(address: str, number: int, presses: int, hold: int) -> tuple[list[float], list[float]]:
-    """Press keys on one page; the latencies in milliseconds, and the frames a second of each press."""
+def walk(address: str, number: int, presses: int, hold: int) -> tuple[list[float], list[float], list[int]]:
+    """Press keys on one page; the latencies in milliseconds, the frames a second of each press, and all its frames."""
     chance, latencies, rates = random.Random(number), [], []
     with open_page(address) as page:
         page.until("frame")
@@ -69,7 +69,9 @@ def walk(address: str, number: int, presses: int, hold: int) -> tuple[list[float
             if press:  # the first clip prepares
                 latencies.append(latency)
                 rates.append(rate)
-    return latencies, rates
+        page.say("undo")
+        page.until("state")
+    return latencies, rates, [page.last]
 
 
 def press_key(page: Page, key: str, hold: int) -> tuple[float, float]:
@@ -91,8 +93,9 @@ def measured(served: ServedPage, sessions: int, presses: int, hold: int) -> Load
     with ThreadPoolExecutor(sessions) as pool:
         walks = [pool.submit(walk, served.address, number, presses, hold) for number in range(sessions)]
         results = [one.result() for one in walks]
-    seconds, frames = time.perf_counter() - began, sessions * (presses + 1) * hold
-    latencies, rates = (np.concatenate(values) for values in zip(*results, strict=True))
+    seconds = time.perf_counter() - began
+    latencies, rates, counts = (np.concatenate(values) for values in zip(*results, strict=True))
+    frames = int(counts.sum())
     return Load(
         sessions, frames, *np.percentile(latencies, (50, 95)).round(1), *np.percentile(rates, (50, 5)).round(2),
         round(frames / seconds, 2), round(1000 * (processor_seconds(server) - before) / frames, 1),

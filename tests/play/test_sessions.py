@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import io
 import json
@@ -151,6 +152,20 @@ def test_what_the_walk_refuses_is_said_and_the_walk_goes_on(page):
 def test_a_message_that_is_too_long_closes_the_session(page):
     page.socket.send(json.dumps({"type": "keys", "held": ["forward"] * 2000}))
     assert closed(page) == 1009
+
+
+def test_a_long_message_in_short_pieces_closes_the_session(page):
+    with contextlib.suppress(ConnectionClosed):
+        page.socket.send((b"[" * 1000 for _ in range(50)), text=True)
+    assert closed(page) == 1009
+
+
+def test_text_that_is_no_text_closes_the_session_without_a_traceback(server, page, capfd):
+    page.socket.send(b"\xff\xfe", text=True)
+    assert closed(page) == 1007
+    assert capfd.readouterr().err == ""
+    with server.page() as other:
+        other.until("frame")
 
 
 def test_too_many_messages_close_the_session(page):

@@ -29,6 +29,7 @@ class Page:
 
     socket: ClientConnection
     draws: bool = True
+    last: int = 0  # number of the last frame
     texts: list[dict[str, Any]] = field(default_factory=list)
 
     def say(self, kind: str, **values: Any) -> None:
@@ -42,8 +43,10 @@ class Page:
             self.texts.append(json.loads(received))
             return self.texts[-1], []
         header, images = unpack(received)
-        if header["type"] == "frame" and self.draws:
-            self.say("ack", number=header["number"])
+        if header["type"] == "frame":
+            self.last = header["number"]
+            if self.draws:
+                self.say("ack", number=self.last)
         return header, images
 
     def until(self, kind: str) -> tuple[dict[str, Any], list[bytes]]:
