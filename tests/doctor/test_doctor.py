@@ -82,6 +82,17 @@ def test_lora_has_fewer_gradients():
     assert with_lora.gradients < estimate().gradients
 
 
+def test_a_distillation_holds_the_weights_of_its_teacher_too():
+    plain, own, other = (
+        estimate("base=elsewhere", *more) for more in ((), ("distill.levels=8",), ("distill.teacher=elsewhere",))
+    )
+    trained = sum(parameter.nbytes for parameter in estimator().backbone.trained_parameters("1").values())
+    assert own.weights - plain.weights == trained
+    assert other.weights - plain.weights == sum(parameter.nbytes for parameter in estimator().backbone.parameters())
+    assert own.activations > plain.activations / 2
+    assert own.average == plain.average  # which the target has
+
+
 def test_fsdp_divides_what_is_trained_by_the_number_of_processes():
     whole, shared = estimate(), estimate(launch=Launch(8, True, sharded=True))
     for name in ("optimizer", "gradients", "average"):
