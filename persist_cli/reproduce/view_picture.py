@@ -56,9 +56,7 @@ def take_picture(address: str, out: Path, presses: Sequence[str], size: tuple[in
 
 def close_notices(page: Page) -> None:
     """Close what the page says at its start, such as that it draws without a graphics card."""
-    while (button := page.locator(".mantine-Notification-closeButton")).count():
-        button.first.click()
-        page.wait_for_timeout(STEADY)
+    page.evaluate("document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())")
 
 
 def press(page: Page, name: str) -> None:

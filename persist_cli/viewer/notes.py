@@ -19,7 +19,7 @@ class Note:
 
     Args:
         gui: the panel, at the place where the text shall stand.
-        text: the first text; empty for none yet.
+        text: what it shows; empty for nothing yet.
     """
 
     def __init__(self, gui: viser.GuiApi, text: str = "") -> None:
@@ -28,6 +28,7 @@ class Note:
 
     def say(self, *lines: str) -> None:
         """Show some lines in place of those before."""
+        self.text = "\n".join(lines)
         text = "<br>".join(html.escape(line) for line in lines if line)
         self._handle.content = f'<div style="{BOX}">{text}</div>' if text else ""
 

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import viser
 
+from persist_cli.data.store import Store
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.viewer.edit_session import EditSession
+from persist_cli.viewer.imagine import Imaginer, ImagineSettings
 from persist_cli.viewer.page import Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look
-from persist_cli.viewer.subject import MAP, TRUTH, open_subject
+from persist_cli.viewer.subject import MAP, POINTS, TRUTH, open_subject
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[viser.ViserServer]:
     with page_server("127.0.0.1", 0) as server:
         yield server
+
+
+def until(happened: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def page_of(server: viser.ViserServer, file: Path, most: int) -> Page:
@@ -65,6 +75,18 @@ def test_changes_are_shown_in_colours_of_their_own(server, room):
     assert kinds == {(205, 205, 205), (30, 136, 229)}
     page.show_memory("before")
     assert len(page.stage.layers[MAP]) == len(page.subject.layers[MAP])
+
+
+def test_a_camera_that_is_placed_shows_what_the_model_imagines_until_it_is_taken_away(server, walks, voxel):
+    server.scene.reset()
+    server.gui.reset()
+    imaginer = Imaginer(ImagineSettings(voxel), Store(walks)[0], None)
+    page = Page(server, open_subject(f"{walks}#0:0-6"), Look(layers={POINTS}), None, imaginer)
+    page.frame.value = 5
+    page._place(page.present_camera(), None)
+    until(lambda: "frames on from frame 5" in page._imagined_text.text)
+    assert np.allclose(page._placed.position, page.subject.walks[0].cameras.centers[5].numpy())
+    assert server.scene.get_handle_by_name("/placed/camera").image is not None
 
 
 def test_the_truth_stands_beside_what_was_imagined_or_in_its_place(server, rollout):
