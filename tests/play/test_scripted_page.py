@@ -227,8 +227,7 @@ def test_a_session_that_failed_is_begun_again_by_hand(browser: Browser, walks: S
         assert len(walks.sockets) == 2
 
 
-@pytest.mark.parametrize("width", [360, 1600])
-@pytest.mark.parametrize("scheme", ["dark", "light"])
+@pytest.mark.parametrize(("width", "scheme"), [(360, "dark"), (1600, "light")])
 def test_the_page_fits_its_window(browser: Browser, walks: ScriptedWalks, width: int, scheme: str) -> None:
     with opened(browser, walks, color_scheme=scheme) as page:
         page.set_viewport_size({"width": width, "height": 800})
