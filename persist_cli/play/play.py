@@ -257,7 +257,7 @@ class Play:
         return self._jump(pose_at(self._walkers.pose, x, y, self.info))
 
     def map(self, size: int = 512) -> GroundPicture:
-        """Return the map of what the first memory holds, seen from above, with the way, the start and the agent.
+        """Return the map of what the first memory holds, seen from above, with the way and the start.
 
         What is imagined is pale with stripes. A memory without places shows the ground as far as it is known. What was
         shown last may be missing until the next clip begins.
