@@ -78,6 +78,16 @@ def test_a_recording_is_found_by_its_random_name_alone(server, tmp_path):
     assert ask(server, f"/recordings/{name}")[0] == 404
 
 
+def test_a_fault_of_an_answer_is_told_to_the_terminal_alone(server, monkeypatch, capfd):
+    def fail(name):
+        raise ZeroDivisionError("secret")
+
+    monkeypatch.setattr(server.sessions.recordings, "find", fail)
+    status, _, body = ask(server, "/recordings/x.mp4")
+    assert (status, b"secret" in body) == (500, False)
+    assert capfd.readouterr().err.count("ZeroDivisionError: secret") == 1
+
+
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "a@127.0.0.1", "x/127.0.0.1", ""]
 )
