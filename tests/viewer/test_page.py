@@ -77,6 +77,25 @@ def test_changes_are_shown_in_colours_of_their_own(server, room):
     assert len(page.stage.layers[MAP]) == len(page.subject.layers[MAP])
 
 
+def test_what_a_camera_reads_of_a_map_is_drawn_as_points(server, room):
+    page = page_of(server, room, 40_000)
+    page._read(page.present_camera())
+    expected = page.session.edited.read(page.present_camera(), 256)
+    drawn = server.scene.get_handle_by_name("/reading/tokens")
+    assert np.allclose(drawn.points, expected.positions.numpy(), atol=1e-5)
+    assert page._read_text.text.startswith(f"{len(expected)} tokens")
+    page.stage.draw_tokens(None)
+    assert server.scene.get_handle_by_name("/reading/tokens") is None
+
+
+def test_what_a_camera_reads_of_images_is_drawn_as_their_cameras(server, persist, walks, tmp_path):
+    file = tmp_path / "images.safetensors"
+    persist("memorize", f"{walks}#0:0-4", "--memory", "context", "--encoder", "patches", "--out", file)
+    page = page_of(server, file, 40_000)
+    page._read(page.present_camera())
+    assert server.scene.get_handle_by_name("/reading/0").image is not None
+
+
 def test_a_camera_that_is_placed_shows_what_the_model_imagines_until_it_is_taken_away(server, walks, voxel):
     server.scene.reset()
     server.gui.reset()
