@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from persist_cli.api.actions import Action
-from persist_cli.api.backbone import Sampling
+from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.observations import Observations, Origin, Trajectory, TrajectoryInfo
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
@@ -22,12 +22,13 @@ from persist_cli.play.ground_picture import GroundPicture
 from persist_cli.play.guide import Guide
 from persist_cli.play.keys import held_actions, walking_keys
 from persist_cli.play.recording import Recording, SavedRecording
-from persist_cli.play.settings import GroundPose, PlaySettings, Shown
+from persist_cli.play.settings import GROWTH, GroundPose, PlaySettings, Shown
 from persist_cli.play.surveyor import Surveyor
 from persist_cli.play.walkers import Ahead, Pose, Walkers
 from persist_cli.plugins import make_cost
 from persist_cli.rollout.world_model import WorldModel
 
+THOUGHT: Final = 1  # number of the clip as long as which those are that are imagined ahead: short, and not one frame
 COST: Final = "lpips"  # says how unlike the goal picture a view looks
 
 
@@ -53,6 +54,7 @@ class Play:
         self._thoughts: dict[tuple[str, ...], Ahead] = {}  # clips from the present state, by their actions
         self._last: tuple[str, ...] = ()  # actions that were held last
         self._blocked = 0  # of these, one after the other
+        self._clips = 0  # that were shown under these
         self._done: frozenset[str] = frozenset()  # interactions that are still held and were done
         self._recording: Recording | None = None
         self._records = False
@@ -102,9 +104,8 @@ class Play:
         samplings = [self._sampling(world, settings) for world in worlds]
         for world, sampling in zip(worlds, samplings, strict=True):
             world.backbone.check_sampling(sampling)
-        frames = settings.clip_frames
+        self._lengths = self._clip_lengths(settings)
         for world, sampling in zip(worlds, samplings, strict=True):
-            world.clip_frames = world.backbone.frames_per_clip if frames is None else frames  # refused by the first
             world.sampling, world.agents[0].seed = sampling, settings.seed
         self.settings = settings
         self._drop()
@@ -120,6 +121,7 @@ class Play:
         begun, self._done = time.monotonic(), frozenset()
         self._drop()
         self._walkers.begin(self._start.observations, self.info)
+        self._walkers.set_clip_frames(self._lengths[-1])
         if int(self._start.observations.origins[0]) == Origin.IMAGINED:  # a drawing, which the model sees as a frame
             self._walkers.stand_at(self._walkers.look_from(self._walkers.pose))
         self._surveyor.begin()
@@ -145,12 +147,13 @@ class Play:
             return self._guided(begun)
         self.stop()
         if actions != self._last:
-            self._last, self._blocked = actions, 0
+            self._last, self._blocked, self._clips = actions, 0, 0
         if self._blocked >= len(actions):
             return None
         ahead = self._ahead
         if ahead is None or ahead.actions != actions or not ahead.left:
-            ahead = self._ahead = self._thoughts.pop(actions, None) or self._walkers.imagine(actions)
+            ahead = self._ahead = self._thoughts.pop(actions, None) or self._imagine(actions, self._clips)
+            self._clips += 1
         return self._take(ahead, begun)
 
     def think(self, seconds: float) -> bool:
@@ -166,7 +169,7 @@ class Play:
         while (actions := self._next_thought()) is not None:
             if time.monotonic() - begun >= seconds:
                 return True
-            self._thoughts[actions] = self._walkers.imagine(actions)
+            self._thoughts[actions] = self._imagine(actions, THOUGHT)
         return False
 
     def undo(self) -> Shown | None:
@@ -186,10 +189,11 @@ class Play:
     def _guided(self, begun: float) -> Shown | None:
         """Return the planner's next frame; ``None`` when it does not walk, or is where it wants to be."""
         if self._guide is None:
-            self._ahead, self._blocked = None, 0
+            self._ahead, self._blocked, self._clips = None, 0, 0
             return None
         if self._ahead is None or not self._ahead.left or self._blocked:
             self._walkers.remember()
+            self._walkers.set_clip_frames(self._lengths[-1])
             actions = self._guide.decide(next(iter(self._walkers.worlds.values())))
             if not actions:
                 self.stop()
@@ -296,7 +300,7 @@ class Play:
 
     def _drop(self) -> None:
         """Drop all that is imagined and not shown, and let the planner stop."""
-        self._ahead, self._blocked = None, 0
+        self._ahead, self._blocked, self._clips = None, 0, 0
         self.stop()
         self._thoughts.clear()
 
@@ -309,6 +313,24 @@ class Play:
         singles = [(action.name,) for action in moves]
         before = [self._last] if self._last and all((name,) in singles for name in self._last) else []
         return next((one for one in [*before, *singles] if one not in self._thoughts), None)
+
+    def _imagine(self, actions: tuple[str, ...], number: int) -> Ahead:
+        """Return the clip of a number under held actions, counted from 0."""
+        self._walkers.set_clip_frames(self._lengths[min(number, len(self._lengths) - 1)])
+        return self._walkers.imagine(actions)
+
+    def _clip_lengths(self, settings: PlaySettings) -> tuple[int, ...]:
+        """Return the frames of the clips under newly held keys, one after the other; later ones are as the last.
+
+        Raises:
+            PersistError: when the model cannot make clips of the settings' length.
+        """
+        backbone = next(iter(self._walkers.worlds.values())).backbone
+        longest = settings.clip_frames or backbone.frames_per_clip
+        if longest != backbone.frames_per_clip:
+            backbone.check_clip_frames(longest)
+        shorter = [frames for frames in GROWTH if frames < longest and _can_make(backbone, frames)]
+        return (*shorter * settings.growing, longest)
 
     def _take(self, ahead: Ahead, begun: float) -> Shown:
         """Show the next action of a clip."""
@@ -324,6 +346,7 @@ class Play:
     def _jump(self, pose: Pose) -> Shown:
         begun = time.monotonic()
         self._drop()
+        self._walkers.set_clip_frames(self._lengths[-1])
         self._walkers.stand_at(self._walkers.look_from(pose))
         self._surveyor.went(jumped=True)
         self._record(None)
@@ -345,3 +368,12 @@ class Play:
     @staticmethod
     def _sampling(world: WorldModel, settings: PlaySettings) -> Sampling:
         return dataclasses.replace(world.sampling, steps=settings.steps, memory_guidance=settings.guidance)
+
+
+def _can_make(backbone: Backbone, frames: int) -> bool:
+    """Return whether a model can make clips of so many frames."""
+    try:
+        backbone.check_clip_frames(frames)
+    except PersistError:
+        return False
+    return True

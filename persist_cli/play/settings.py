@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -13,6 +14,9 @@ from persist_cli.api.ground import ground_axes
 from persist_cli.errors import PersistError
 
 Picture = UInt8[Tensor, "height width 3"]
+
+
+GROWTH: Final = (2, 3, 5)  # frames of the first clips under newly held keys, the present one included
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,8 @@ class PlaySettings:
         ahead: whether the likely next actions are imagined while no key is held.
         clip_frames: frames of a clip, the present one included; ``None`` for as many as in training. Short clips answer
             a key sooner and take more time a frame.
+        growing: whether the first clips under newly held keys are shorter, as ``GROWTH`` says, where the model can make
+            such clips. A key is then answered sooner, and those after it show as many frames for their time as before.
     """
 
     steps: int = 1
@@ -36,6 +42,7 @@ class PlaySettings:
     seed: int = 0
     ahead: bool = True
     clip_frames: int | None = None
+    growing: bool = True
 
     def __post_init__(self) -> None:
         if self.steps < 1:

@@ -118,6 +118,15 @@ class Walkers:
         self._history = History(Checkpoint.of(self.agents))
         self.version += 1
 
+    def set_clip_frames(self, frames: int) -> None:
+        """Let the next clips have so many frames, the present one included.
+
+        Raises:
+            PersistError: when the model cannot make such clips; then they stay as they were.
+        """
+        for world in self.worlds.values():
+            world.clip_frames = frames  # all share one model, so that none or the first one refuses
+
     def imagine(self, actions: Sequence[str], repeat: bool = True) -> Ahead:
         """Return a clip of some actions in turn; nothing of it is shown yet.
 

@@ -16,6 +16,7 @@ from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.world_model import Agent, WorldModel
+from tests.support.micro_model import FRAMEWISE
 from tests.support.micro_plays import micro_walks
 from tests.support.micro_worlds import remembering_model
 
@@ -59,6 +60,18 @@ def test_held_keys_show_the_frames_of_a_rollout(backbone, walks):
     assert torch.equal(torch.stack([one.images["voxel"] for one in shown]), truth.seen.rgb)
     assert [one.number for one in shown] == list(range(1, 17))
     assert not torch.equal(shown[-1].images["stage1"], shown[-1].images["voxel"])
+
+
+def test_clips_under_newly_held_keys_begin_short_and_grow(walks):
+    play = micro_walks(walks, backbone=remembering_model(**FRAMEWISE))()
+    worlds, lengths = play._walkers.worlds.values(), []
+    for held in (FORWARD,) * 9 + (LEFT,) * 2:
+        play.advance(held)
+        lengths.append(next(iter(worlds)).clip_frames)
+    assert lengths == [2, 3, 3, 5, 5, 5, 5, 9, 9, 2, 3]
+    play.set(PlaySettings(growing=False))
+    play.advance(LEFT)
+    assert {world.clip_frames for world in worlds} == {9}
 
 
 def test_frames_of_keys_that_are_let_go_are_dropped_and_not_remembered(backbone, walks):
