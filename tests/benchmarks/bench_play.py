@@ -30,6 +30,7 @@ from persist_cli.viewing.console import print_json, print_table, say
 
 KEYS: Final = ("forward", "left", "right", "backward")
 WEIGHTS: Final = (5, 2, 2, 1)
+BLOCK: Final = 8  # cells along the edge of a block of a map
 HELD: Final = (3, 12)  # frames for which a key is held, at least and at most
 
 
@@ -94,7 +95,8 @@ def enlarge(memory: Memory, cells: int) -> None:
     """Let copies of what a map holds stand beside each other on the ground until it has so many cells."""
     tensors = memory.tensors()
     grid = tensors["cells"].long()
-    span, copies = grid.amax(0) - grid.amin(0) + 1, -(-cells // len(grid))
+    span = (grid.amax(0) - grid.amin(0)) // BLOCK * BLOCK + BLOCK  # by whole blocks, so that the order of cells stays
+    copies = -(-cells // len(grid))
     side = int(copies**0.5) + 1
     shifts = torch.tensor([[n % side - side // 2, 0, n // side - side // 2] for n in range(copies)]) * span
     memories = []

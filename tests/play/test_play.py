@@ -115,6 +115,14 @@ def test_home_is_the_start_pose_as_it_is_imagined(backbone, walks):
     assert not torch.equal(shown.images["voxel"], start.images["voxel"])
 
 
+def test_what_a_model_without_depth_lacks_is_told_in_a_line(backbone, walks):
+    assert play_on(backbone, walks).notices == ()
+    play = micro_walks(walks, backbone=remembering_model(depth=False))()
+    (notice,) = play.notices
+    assert notice == "this model imagines no depth: what it imagines stops nobody, and voxel cannot remember it"
+    assert play.advance(FORWARD).free
+
+
 def test_an_unknown_action_changes_nothing(backbone, walks):
     play = play_on(backbone, walks)
     first = walked(play, FORWARD, 1)[0]
