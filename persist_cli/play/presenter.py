@@ -58,7 +58,7 @@ class Presenter:
     """Does what a page wishes with its walk, and sends what is to be seen.
 
     Args:
-        play: the walk; it is touched in the worker only.
+        play: the walk; all that takes time is done with it in the worker.
         wishes: what the page wants.
         worker: imagines and encodes.
         send: sends a message to the page.

@@ -123,10 +123,11 @@ class Session:
 
     async def run(self) -> None:
         """Serve the page until something ends the session; what ends it stays in it."""
-        await self.socket.accept()
-        work = [] if self._stopped.done() else [self._listen(), self._walk()]
-        parts = [self._stopped, *map(asyncio.ensure_future, work)]
+        parts: list[asyncio.Future[None]] = [self._stopped]
         try:
+            await self.socket.accept()
+            if not self._stopped.done():
+                parts += map(asyncio.ensure_future, (self._listen(), self._walk()))
             done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
             await self._say_why(part.exception() for part in done)
         finally:
