@@ -130,7 +130,8 @@ class Walkers:
     def imagine(self, actions: Sequence[str], repeat: bool = True) -> Ahead:
         """Return a clip of some actions in turn; nothing of it is shown yet.
 
-        In a scene an interaction is done here. It is the only action of its clip.
+        In a scene an interaction is done here. It is the only action of its clip. A scene also imagines here the cells
+        that the clip will see, and keeps them where the clip is dropped: they are what its seed makes of them.
 
         Args:
             actions: names in the vocabulary; an interaction is done alone, and once.
