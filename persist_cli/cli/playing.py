@@ -25,24 +25,37 @@ PLAY_PORT = 8420
 playing_app = typer.Typer()
 
 
+StartingOption = Annotated[
+    str | None, typer.Option(help="DATA#trajectory:frame, a picture or a memory file; else a sample house.")
+]
+MemoriesOption = Annotated[
+    str, typer.Option(help="Of the checkpoint, with commas, side by side; stage1: no memory; else the default.")
+]
+RememberedOption = Annotated[
+    list[str] | None, typer.Option(help="What is remembered at the start: a memory file, or DATA#t:frames; repeat.")
+]
+DepthOption = Annotated[
+    Path | None, typer.Option(help="Of a picture: .npy in metres, or PNG of 16 bits in millimetres.")
+]
+DepthModelOption = Annotated[
+    str | None, typer.Option(help="Of a picture: folder or hub id of a model that estimates depth in metres.")
+]
+ClipFramesOption = Annotated[
+    int | None, typer.Option(min=2, help="Of a clip, the present one included; few answer a key soon. The model's.")
+]
+OpenOption = Annotated[
+    bool | None, typer.Option("--open/--no-open", help="Open the browser, if there is one; not with --json.")
+]
+
+
 @playing_app.command()
 def play(
     checkpoint: ReferenceArgument = None,
-    start: Annotated[
-        str | None, typer.Option(help="DATA#trajectory:frame, a picture or a memory file; else a sample house.")
-    ] = None,
-    memories: Annotated[
-        str, typer.Option(help="Of the checkpoint, with commas, side by side; stage1: no memory; else the default.")
-    ] = "",
-    memory: Annotated[
-        list[str] | None, typer.Option(help="What is remembered at the start: a memory file, or DATA#t:frames; repeat.")
-    ] = None,
-    depth: Annotated[
-        Path | None, typer.Option(help="Of a picture: .npy in metres, or PNG of 16 bits in millimetres.")
-    ] = None,
-    depth_model: Annotated[
-        str | None, typer.Option(help="Of a picture: folder or hub id of a model that estimates depth in metres.")
-    ] = None,
+    start: StartingOption = None,
+    memories: MemoriesOption = "",
+    memory: RememberedOption = None,
+    depth: DepthOption = None,
+    depth_model: DepthModelOption = None,
     fov: Annotated[float | None, typer.Option(help="Of a picture: degrees from its top to its bottom; 75.")] = None,
     step: StepOption = None,
     turn: TurnOption = None,
@@ -50,18 +63,14 @@ def play(
     steps: Annotated[int, typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon.")] = 1,
     guidance: Annotated[float, typer.Option(min=0, max=10, help="Of guidance over memory; 1: none.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the sampling noise.")] = 0,
-    clip_frames: Annotated[
-        int | None, typer.Option(min=2, help="Of a clip, the present one included; few answer a key soon. The model's.")
-    ] = None,
+    clip_frames: ClipFramesOption = None,
     ahead: Annotated[bool, typer.Option(help="Imagine the likely next actions while no key is held.")] = True,
     fps: Annotated[float, typer.Option(min=0.1, max=120, help="Most frames a second.")] = 12.0,
     out: Annotated[Path | None, typer.Option(help="Folder where recordings stay; else they go with the page.")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: any that is free.")] = PLAY_PORT,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets others in.")] = "127.0.0.1",
     sessions: Annotated[int, typer.Option(min=1, max=64, help="Most pages at once.")] = 4,
-    browser: Annotated[
-        bool | None, typer.Option("--open/--no-open", help="Open the browser, if there is one; not with --json.")
-    ] = None,
+    browser: OpenOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
