@@ -65,7 +65,7 @@ def play(
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the sampling noise.")] = 0,
     clip_frames: ClipFramesOption = None,
     ahead: Annotated[bool, typer.Option(help="Imagine the likely next actions while no key is held.")] = True,
-    fps: Annotated[float, typer.Option(min=0.1, max=120, help="Most frames a second.")] = 12.0,
+    fps: Annotated[float, typer.Option(min=0.1, max=120, help="Most frames a second.")] = 15.0,
     out: Annotated[Path | None, typer.Option(help="Folder where recordings stay; else they go with the page.")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: any that is free.")] = PLAY_PORT,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets others in.")] = "127.0.0.1",
