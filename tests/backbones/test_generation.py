@@ -131,7 +131,7 @@ def test_rays_as_printed_in_the_paper_change_the_model_input():
 @pytest.mark.parametrize(
     ("sampling", "cause"),
     [
-        (Sampling(4, "euler"), r"^unknown sampler 'euler'; known: ddim, dpm, unipc, dpm\+\+$"),
+        (Sampling(4, "euler"), r"^unknown sampler 'euler'; known: ddim, dpm, unipc, dpm\+\+, consistency$"),
         (Sampling(0), "^0 denoising steps; it must be at least 1$"),
         (Sampling(memory_guidance=-1.0), "^guidance over memory of -1.0; it must be a number of at least 0$"),
         (Sampling(memory_guidance=float("inf")), "^guidance over memory of inf; it must be"),
