@@ -23,7 +23,7 @@ Send = Callable[[ToPage | bytes], Awaitable[None]]
 Frame = tuple[Shown, list[bytes]]  # and its images as PNG
 
 MAP_SECONDS: Final = 0.5  # at least, from one map to the next
-MAP_SHARE: Final = 0.1  # of the time, at most, that goes into maps
+MAP_SHARE: Final = 0.03  # of the time, at most, that goes into maps
 MAP_SIZE: Final = 320  # pixels of its longer side
 THINK_SECONDS: Final = 0.01  # after which no other clip is begun ahead, so that a key waits for one at most
 BUSY_SECONDS: Final = 0.2  # after which it is asked again whether nobody walks, so that there is time to think
