@@ -20,7 +20,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import project
 from persist_cli.api.observations import Observations
 
-CELLS_AT_ONCE: Final = 4096  # drawn before it is seen which pixels are left
+CELLS_AT_ONCE: Final = 16_384  # drawn before it is seen which pixels are left
 
 
 @dataclass(frozen=True)
