@@ -13,6 +13,7 @@ import pytest
 from persist_cli.data.store import Store
 from persist_cli.play.play import Play
 from persist_cli.play.sessions import Limits
+from persist_cli.play.settings import Shown
 from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
 from persist_cli.reproduce.play_picture import frame_number, hold, wait_for_frame
 from tests.support.browser import watched
@@ -30,9 +31,14 @@ PIXELS = """[...document.querySelectorAll('#panes canvas')]
 
 
 class KeptPlay(Play):
-    """Is found again by the test."""
+    """Is found again by the test, and keeps the place to which it was asked to jump."""
 
-    newest: Play
+    newest: KeptPlay
+    asked: tuple[float, float]
+
+    def jump(self, x: float, y: float) -> Shown:
+        self.asked = x, y
+        return super().jump(x, y)
 
     def __init__(self, *arguments, **settings):
         super().__init__(*arguments, **settings)
@@ -120,15 +126,13 @@ def test_a_clicked_place_of_the_map_is_reached(browser: Browser, server: Served)
     with opened(browser, server) as page:
         hold(page, "w", 1)
         page.wait_for_selector("#agent:not([hidden])", state="attached")
-        agent, ground = page.locator("#agent").bounding_box(), page.locator("#map").bounding_box()
+        agent, start = page.locator("#agent").bounding_box(), place(page)
         assert agent is not None
-        assert ground is not None
-        start = place(page)
         page.mouse.click(agent["x"] + 4, agent["y"] + 4)
         page.wait_for_selector(f"#place:not(:text-is('{start}'))")
-        moved = page.locator("#agent").bounding_box()
-        assert moved is not None
-        assert (moved["x"], moved["y"]) == pytest.approx((agent["x"] + 4, agent["y"] + 4), abs=2)
+        pose = KeptPlay.newest.shown.pose
+        assert (pose.x, pose.y) == pytest.approx(KeptPlay.newest.asked, abs=1e-6)
+        assert place(page).startswith(f"{pose.x:.2f}, {pose.y:.2f}")
 
 
 def test_a_recording_is_a_video_and_a_trajectory_of_our_store(browser: Browser, server: Served, tmp_path: Path) -> None:
