@@ -169,15 +169,17 @@ def test_text_that_is_no_text_closes_the_session_without_a_traceback(server, pag
 
 
 def test_too_many_messages_close_the_session(page):
-    for _ in range(400):
-        page.say("ack", number=1)
+    with contextlib.suppress(ConnectionClosed):  # of which the server may be rid before the last one is sent
+        for _ in range(400):
+            page.say("ack", number=1)
     assert closed(page) == 1008
     assert page.texts[-1]["ended"]
 
 
 def test_messages_that_cannot_be_read_close_the_session_in_the_end(page):
-    for _ in range(30):
-        page.socket.send("{")
+    with contextlib.suppress(ConnectionClosed):
+        for _ in range(30):
+            page.socket.send("{")
     assert closed(page) == 1008
 
 
