@@ -130,7 +130,7 @@ class DataSettings:
         true_cells: share of the clips whose memory, a scene, holds the data's own cells, all of them known, in the
             place of what the context's frames show.
         clip_frames: lengths of the clips of stages 1 and 2 in frames with the given one, such as 2, 3, 5 and 9; one is
-            drawn for each batch. Without any all clips have the model's. Shorter ones cost less, and a model that knows
+            drawn for each step. Without any all clips have the model's. Shorter ones cost less, and a model that knows
             them can be walked in step by step.
     """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from random import Random
 from typing import Any, Final
 
 import torch
@@ -150,18 +151,17 @@ class Trainer(TrainingLoop[Backbone]):
                 if self.own_writes is not None:
                     encoded = self.own_writes.written(encoded)
                 clips = [self.encoder.with_tokens(sample) for sample in encoded]
-        return self.shortened(Clips.stack(clips)).to(self.accelerator.device)
+        return Clips.stack(clips).to(self.accelerator.device)
 
     def shortened(self, clips: Clips) -> Clips:
-        """The clips, cut to one of the lengths of ``data.clip_frames``, which the first sample's seed draws."""
-        lengths = self.recipe.data.clip_frames
-        if not lengths:
-            return clips
-        generator = torch.Generator().manual_seed(clips.seeds[0])
-        return clips.shortened(lengths[int(torch.randint(len(lengths), (), generator=generator))])
+        """The clips, cut to one of the lengths of ``data.clip_frames``: one for all micro-batches of a step."""
+        lengths, seed = self.recipe.data.clip_frames, self.recipe.training.seed
+        # a text as the seed: no other random numbers of the training begin like these
+        return clips.shortened(Random(f"clip_frames {seed} {self.state.step}").choice(lengths)) if lengths else clips
 
     def encoded(self, clips: Clips) -> Clips:
-        """The clips; when times are taken with their latents, which the model would else make in its forward pass."""
+        """The clips, at the step's length; when times are taken, with latents that the forward pass would else make."""
+        clips = self.shortened(clips)
         if not self.times.enabled or clips.latents is not None or not self.backbone.encodes(self.recipe.stage):
             return clips
         with self.times.part("encode"), torch.no_grad(), self.accelerator.autocast():

@@ -113,7 +113,7 @@ class TrainingLoop(ABC, Generic[Model]):
         return {}
 
     def encoded(self, batch: Any) -> Any:
-        """The batch as the model takes it; a subclass may measure a part of the work here."""
+        """The batch as the model takes it in this step; a subclass may measure a part of the work here."""
         return batch
 
     def loader(self) -> Iterator[Any]:

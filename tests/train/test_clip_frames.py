@@ -1,17 +1,21 @@
-"""Training on clips of several lengths: one is drawn for each batch, and runs stay reproducible."""
+"""Training on clips of several lengths: one is drawn for each step, and runs stay reproducible."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from accelerate import Accelerator
 
+from persist_backbones.cogvideox.diffusion import sample_generators
+from persist_backbones.extensions.distillation import Levels
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.recipe import make_recipe
 from persist_cli.train.trainer import Trainer
 from tests.support.micro_model import FRAMEWISE, micro
-from tests.support.micro_runs import MICRO_SETTINGS, equal_runs, run_persist, stage
+from tests.support.micro_runs import MICRO_SETTINGS, equal_runs, losses, run_persist, stage
+from tests.support.two_processes import job, run_in_two
 
 LENGTHS = "data.clip_frames=[2,5,9]"
 
@@ -24,23 +28,61 @@ def framewise_codec(walks, tmp_path_factory):
     return run
 
 
-def trainer(walks, stage: str = "1", frames: tuple[int, ...] = (2, 5, 9)) -> Trainer:
+def trainer(walks, frames: tuple[int, ...] = (2, 5, 9), seed: int = 0) -> Trainer:
     values = {
-        "stage": stage,
+        "stage": "1",
         "base": "elsewhere",
         "data": {"path": str(walks), "clip_frames": frames},
-        "training": {"workers": 0, "batch": 2},
+        "training": {"workers": 0, "batch": 2, "seed": seed},
     }
     return Trainer(make_recipe(values, "mine"), micro(**FRAMEWISE), None, Accelerator(cpu=True))
 
 
+def lengths_of(training: Trainer, steps: int) -> list[int]:
+    """The frames of the clips of each step."""
+    frames, batch = [], next(training.loader())
+    for training.state.step in range(steps):
+        frames.append(training.encoded(batch).rgb.shape[1])
+    return frames
+
+
 def test_each_batch_has_one_of_the_lengths_with_cameras_and_interactions_of_as_many_frames(walks):
-    batches = [batch for _, batch in zip(range(12), trainer(walks).loader(), strict=False)]
-    assert {batch.rgb.shape[1] for batch in batches} == {2, 5, 9}
-    for batch in batches:
+    training, seen = trainer(walks), set()
+    for step, clips in zip(range(12), training.loader(), strict=False):
+        training.state.step = step
+        batch = training.encoded(clips)
         frames = batch.rgb.shape[1]
+        seen.add(frames)
         assert batch.cameras.world_from_camera.shape[1] == batch.depth.shape[1] == frames
         assert {len(names) for names in batch.interactions} == {frames - 1}
+    assert seen == {2, 5, 9}
+
+
+def test_all_micro_batches_of_a_step_have_one_length_which_the_seed_draws(walks):
+    training = trainer(walks)
+    batches = [batch for _, batch in zip(range(8), training.loader(), strict=False)]
+    assert len({training.encoded(batch).rgb.shape[1] for batch in batches}) == 1
+    first, same, other = (lengths_of(trainer(walks, seed=seed), 12) for seed in (0, 0, 1))
+    assert first == same != other
+
+
+def test_the_noisiest_level_meets_every_length_in_micro_batches_of_one(walks):
+    """A first draw of the same number for both met one of four lengths, for 48 levels are a multiple of four."""
+    training, levels, met = trainer(walks, frames=(2, 3, 5, 9)), Levels(48, 1000), set()
+    batch = next(training.loader())
+    for training.state.step in range(1000):
+        seed = training.dataset.choose(training.state.step).seed
+        if levels.draw(sample_generators([seed])) == levels.timesteps[0]:
+            met.add(training.encoded(replace(batch, seeds=[seed])).rgb.shape[1])
+    assert met == {2, 3, 5, 9}
+
+
+def test_two_processes_and_micro_batches_train_on_the_lengths_of_one(walks, framewise_codec, tmp_path):
+    changes = [f"base={framewise_codec}", LENGTHS, "training.batch=4"]
+    run_persist(*stage("stage1", walks, tmp_path / "one", *changes))
+    ended = run_in_two(tmp_path, job(*stage("stage1", walks, tmp_path / "two", *changes, "training.accumulation=2")))
+    assert [code for code, _ in ended] == [0], ended
+    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "one"), rel=1e-5)
 
 
 def test_a_resumed_run_on_clips_of_several_lengths_equals_an_uninterrupted_one(
