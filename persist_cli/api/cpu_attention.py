@@ -13,23 +13,22 @@ import torch
 from torch.nn.functional import scaled_dot_product_attention
 from torch.overrides import TorchFunctionMode
 
-MOST_WEIGHTS = 1 << 27  # of one layer's attention that are kept for the backward pass
+MOST_WEIGHTS = 1 << 27  # of one attention that are kept for the backward pass
 
 
 @contextlib.contextmanager
-def products_for_training(inputs: torch.Tensor, weights: int) -> Iterator[None]:
+def products_for_training(inputs: torch.Tensor) -> Iterator[None]:
     """Within the block, attention in bfloat16 on a processor is made of matrix products where gradients are wanted.
 
-    They keep all weights of attention until the backward pass, so where these are many the fused kernel stays, and so
-    it does on all other devices.
+    They keep all weights of attention until the backward pass, so attention of more than ``MOST_WEIGHTS`` keeps the
+    fused kernel, and so do all other devices.
 
     Args:
         inputs: of the network; their device, and their precision where no autocast is on.
-        weights: number of weights of one layer's attention.
     """
     precision = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else inputs.dtype
     on_processor = inputs.device.type == "cpu" and precision == torch.bfloat16
-    if on_processor and torch.is_grad_enabled() and weights <= MOST_WEIGHTS:
+    if on_processor and torch.is_grad_enabled():
         with MatrixProducts():
             yield
     else:
@@ -37,7 +36,7 @@ def products_for_training(inputs: torch.Tensor, weights: int) -> Iterator[None]:
 
 
 class MatrixProducts(TorchFunctionMode):
-    """Within the block, attention is made of matrix products in bfloat16.
+    """Within the block, attention of at most ``MOST_WEIGHTS`` weights is made of matrix products in bfloat16.
 
     PyTorch's own kernel of products looks for rows without any key in all weights, which takes as long as the softmax.
     """
@@ -50,7 +49,15 @@ class MatrixProducts(TorchFunctionMode):
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
         """Call any other function as it is."""
-        return (attend if func is scaled_dot_product_attention else func)(*args, **(kwargs or {}))
+        kwargs = kwargs or {}
+        if func is scaled_dot_product_attention and count_weights(*args, **kwargs) <= MOST_WEIGHTS:
+            return attend(*args, **kwargs)
+        return func(*args, **kwargs)
+
+
+def count_weights(query: torch.Tensor, key: torch.Tensor, *_: Any, **__: Any) -> int:
+    """Return the number of weights of an attention, one for each query and key; arguments as of PyTorch's function."""
+    return query.shape[:-1].numel() * key.shape[-2]
 
 
 def attend(

@@ -56,6 +56,16 @@ def test_more_weights_than_fit_keep_the_fused_kernel(monkeypatch: pytest.MonkeyP
     assert uses_fused(lambda: loss(model(), torch.bfloat16))
 
 
+def test_attention_to_many_tokens_keeps_the_fused_kernel_beside_that_of_the_video(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cpu_attention, "MOST_WEIGHTS", 2 * 3 * 4 * 4)
+    video, memory = (torch.randn(2, 3, count, 8, dtype=torch.bfloat16, requires_grad=True) for count in (4, 5))
+    with cpu_attention.products_for_training(video):
+        assert not uses_fused(lambda: scaled_dot_product_attention(video, video, video))
+        assert uses_fused(lambda: scaled_dot_product_attention(video, memory, memory))
+
+
 def test_losses_and_gradients_are_those_of_the_fused_kernel_up_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     by_products, fused = model(), model()
     values = [loss(by_products, torch.bfloat16)]

@@ -20,7 +20,6 @@ from persist_backbones.cogvideox.adapted import AdaptedBackbone
 from persist_backbones.cogvideox.codec import Codec, frames_to_batch, to_uint8
 from persist_backbones.cogvideox.codec_start import start_as_components
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.cpu_attention import kernel_for_training
 from persist_backbones.cogvideox.diffusion import (
     CONSISTENCY,
     SAMPLERS,
@@ -125,7 +124,7 @@ class CogVideoX(AdaptedBackbone):
         memory = self.memory_condition(clips, generators)
         conditions = self.conditions(clips, noised.timesteps, memory, noised.image_noise)
         # predict
-        with kernel_for_training(self.transformer.base, noised.noisy):
+        with self.transformer.kernel_for_training(noised.noisy):
             predicted = self.predict(noised.noisy.to(noised.image.dtype), noised.image, conditions)
         return NoisedPrediction(predicted, target, noised.noisy, noised.timesteps)
 

@@ -7,6 +7,8 @@ embedding. Because exact zeros are added, the widened model equals the original 
 
 from __future__ import annotations
 
+import contextlib
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +21,7 @@ from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
 from persist_backbones.diffusers_models import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 from persist_backbones.noise_levels import LevelEmbedding
 from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches, zero_init
+from persist_cli.api.cpu_attention import products_for_training
 
 OFFSET = 2.0  # the value of ``ofs`` in the training of CogVideoX 1.5 image-to-video
 NO_MEMORY = MemoryCondition()
@@ -122,6 +125,10 @@ class WorldTransformer(nn.Module):
         outputs = (self.base.proj_out(video), self.extra_out(video))
         predicted = torch.cat([self.unpatchify(tokens, latents) for tokens in outputs], dim=2)
         return conditions.memory.correct(predicted, latents, time, conditions.level)
+
+    def kernel_for_training(self, inputs: Tensor) -> AbstractContextManager[None]:
+        """Within the block, attention is as ``products_for_training`` says; blocks that are computed again are not."""
+        return contextlib.nullcontext() if self.base.gradient_checkpointing else products_for_training(inputs)
 
     def embed_time(self, conditions: Conditions, dtype: torch.dtype) -> Float[Tensor, "batch time"]:
         """Return the sum of the embeddings of time, ``ofs`` (CogVideoX 1.5 image-to-video), interactions and noise."""

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from persist_backbones.adapters.base import NoiseLevel
 from persist_backbones.cogvideox.cogvideox import CogVideoX
-from persist_backbones.cogvideox.cpu_attention import kernel_for_training
 from persist_backbones.cogvideox.diffusion import NoisedClips, noise_level, sample_generators
 from persist_cli.api.backbone import Clips
 from persist_cli.api.stages import Distill
@@ -140,7 +139,7 @@ def predict_clean(
     """
     memory = model.memory_condition(clips, [torch.Generator().set_state(state) for state in draws])
     conditions = model.conditions(clips, noised.timesteps, memory, noised.image_noise)
-    with kernel_for_training(model.transformer.base, noised.noisy):
+    with model.transformer.kernel_for_training(noised.noisy):
         predicted = model.predict_guided(noised.noisy, noised.image, conditions, guidance)
     return conditions.level.clean(predicted.float(), noised.noisy.float())
 

@@ -115,7 +115,7 @@ class SceneDiffusion(SceneModel):
         dropped = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         told = self.tell(samples, generators, dropped < self.settings.transformer.drop_view)
         noisy = self._mix(latents, noise, levels, known)
-        with products_for_training(noisy, self.settings.transformer.heads * levels.numel() * levels.shape[1]):
+        with products_for_training(noisy):
             velocity = self.transformer(noisy, levels, told.given, told.view, told.action).float()
         errors = self._tokens(velocity - (noise - latents)).square().mean(-1)
         unknown = (~known).float()
