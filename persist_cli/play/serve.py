@@ -21,7 +21,7 @@ from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
 from persist_cli.viewing.console import print_json, say, warn
-from persist_cli.viewing.own_address import EVERYWHERE, address_of, bind, is_loopback, open_browser
+from persist_cli.viewing.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, open_browser
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
 SAVING_SECONDS: Final = 20.0  # the same, where a recording that is under way is saved
@@ -125,10 +125,3 @@ def announce(bound: socket.socket, options: PlayOptions, serving: ServeOptions) 
         warn(f"everybody who reaches {serving.host} can walk there; leave out --host to keep it to this machine")
     if serving.browser:
         threading.Thread(target=open_browser, args=(address,), daemon=True).start()
-
-
-def leave() -> None:
-    """End the program although the model still works: its thread must not run while Python is taken down."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(0)

@@ -13,7 +13,7 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
-from persist_cli.checkpoints.load import adapter_memory, load_backbone
+from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
@@ -74,8 +74,26 @@ def assemble_world(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPla
     with busy("loading the memory"):  # before the model, which takes longer, so that what cannot work fails at once
         memory = open_memory(checkpoint, adapter, plan, info)
     with busy("loading the model"):
-        backbone = load_backbone(checkpoint, adapter=adapter)
-    check_size(info, backbone.image_size, plan.start)
+        return world_with(memory, checkpoint, adapter, plan, info)
+
+
+def world_with(
+    memory: Memory | None, checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo
+) -> WorldModel:
+    """Return a world model whose one agent has a memory that is loaded already, and show no progress.
+
+    Args:
+        memory: what the agent remembers; it is moved to the model's device.
+        checkpoint: the checkpoint.
+        adapter: name of its adapter, ``None`` for the model without one.
+        plan: start, seed, sampling and placement.
+        info: scene, up axis and image size of the start frame's trajectory.
+
+    Raises:
+        PersistError: when model, sampling and data do not go together.
+    """
+    check_size(info, empty_backbone(checkpoint).image_size, plan.start)
+    backbone = load_backbone(checkpoint, adapter=adapter)
     sampling = checkpoint.sampling_with(plan.sampling)
     backbone.check_sampling(sampling)
     backbone.prepare_inference(plan.placement)
@@ -91,18 +109,23 @@ def body_for(plan: RolloutPlan, info: TrajectoryInfo) -> Body | None:
 
 def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
     """Return the memory of the plan's file, else an empty one of the adapter's kind, ``None`` without an adapter."""
-    if adapter is None:
-        if plan.memory is not None:
-            without = f"--adapter {PLAIN} is the model" if plan.adapter else f"{checkpoint.folder}: is a model"
-            raise CheckpointError(f"{without} without a memory adapter, which cannot read {plan.memory}")
-        return None
-    empty = MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
-    if plan.memory is None:
+    empty = empty_memory(checkpoint, adapter, plan, info)
+    if empty is None or plan.memory is None:
         return empty
     check_memory(read_header(plan.memory), empty, checkpoint, plan.memory)
     memory = load_memory(plan.memory)
     check_cells(memory, empty, plan.memory)
     return memory
+
+
+def empty_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
+    """Return an empty memory of the adapter's kind, ``None`` without an adapter, which reads no file."""
+    if adapter is not None:
+        return MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
+    if plan.memory is not None:
+        without = f"--adapter {PLAIN} is the model" if plan.adapter else f"{checkpoint.folder}: is a model"
+        raise CheckpointError(f"{without} without a memory adapter, which cannot read {plan.memory}")
+    return None
 
 
 def check_cells(memory: Memory, wanted: Memory, path: Path) -> None:

@@ -10,6 +10,7 @@ import viser
 
 from persist_cli.api.cells import Box
 from persist_cli.api.scene_edits import EditOutcome, Point
+from persist_cli.errors import DataError
 from persist_cli.viewer.camera_view import camera_of_view
 from persist_cli.viewer.drawn_cells import cells_of_memory
 from persist_cli.viewer.edit_session import EditSession
@@ -36,6 +37,9 @@ class EditedPage(Protocol):
 
     def show_memory(self, part: str) -> None:
         """Draw the memory ``before`` the edits, ``after`` them, or the ``changes``."""
+
+    def memory_changed(self) -> None:
+        """Show what depends on what the memory holds now."""
 
 
 class EditPanel:
@@ -110,6 +114,7 @@ class EditPanel:
         self._part.value = PARTS[0]
         self.page.show_memory(PARTS[0])
         self.show(outcome)
+        self.page.memory_changed()
 
     def _undo(self, event: Any) -> None:
         if not self.session.undo():
@@ -117,7 +122,11 @@ class EditPanel:
         return self._done(self.session.outcome)
 
     def _save(self, event: Any) -> None:
-        memory, edits = self.session.save()
+        try:
+            memory, edits = self.session.save()
+        except OSError as error:
+            place = error.filename or self.session.out
+            raise DataError(f"{place}: {error.strerror}; make room there, or give another --out") from error
         self.show()
         self.page.tell(f"{memory} and its edits {edits.name}", event, "Saved")
 

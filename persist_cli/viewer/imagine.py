@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -14,7 +15,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
+from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
@@ -22,8 +23,9 @@ from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import PersistError
+from persist_cli.memorize.memory_file import read_header
 from persist_cli.rollout.camera_path import RolloutPlan
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.open_world import check_cells, check_memory, empty_memory, world_with
 from persist_cli.rollout.world_model import WorldModel
 
 STEP: Final = 0.25  # metres from frame to frame on the way to the camera
@@ -49,35 +51,64 @@ class ImagineSettings:
 
 @dataclass(frozen=True)
 class ImaginedView:
-    """A picture of a camera that was placed by hand.
+    """A picture on the way to a camera that was placed by hand.
 
     Args:
-        picture: what the model imagines there.
-        began: number of the true frame from which it went there.
-        frames: frames that it imagined on the way, this one included.
+        picture: what is seen there.
+        began: number of the true frame from which the way goes.
+        frames: how many frames were imagined up to this one; 0 for the true frame itself.
+        arrived: whether this is what is seen at the camera.
     """
 
     picture: UInt8[Tensor, "height width 3"]
     began: int
-    frames: int
+    frames: int = 0
+    arrived: bool = False
 
 
 class Imaginer:
-    """Imagines views; the model is loaded at the first one and stays.
+    """Imagines views, one at a time; the model is loaded once, by ``load`` or at the first view.
 
     Args:
         settings: the world model.
         start: a trajectory of the scene; what is imagined begins at that of its true frames that is nearest.
-        file: the memory's file, ``None`` to imagine with a memory of the true frame alone.
+        file: the memory's file, ``None`` to imagine with what is remembered on each way alone.
     """
 
     def __init__(self, settings: ImagineSettings, start: TrajectoryFile, file: Path | None) -> None:
         self.settings, self.start, self.file = settings, start, file
         self._world: WorldModel | None = None
+        self._empty: Memory | None = None  # what the adapter reads, on the model's device
         self._lock = threading.Lock()  # one view at a time
 
-    def imagine(self, pose: Float[Tensor, "4 4"], memory: Memory | None) -> ImaginedView:
-        """Return what the model imagines at a pose.
+    @property
+    def loaded(self) -> bool:
+        """Whether the model is there."""
+        return self._world is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether the model is being loaded, or imagines."""
+        return self._lock.locked()
+
+    def find(self) -> Checkpoint:
+        """Return the checkpoint, without loading it.
+
+        Raises:
+            CheckpointError: when it is not there, or has no adapter of the name.
+        """
+        checkpoint = find_checkpoint(self.settings.checkpoint or reference_checkpoint())
+        if self.settings.adapter not in (None, PLAIN):
+            checkpoint.adapter_folder(self.settings.adapter)
+        return checkpoint
+
+    def load(self, memory: Memory | None) -> None:
+        """Load the model that reads a memory, so that the first view need not wait; errors as of ``imagine``."""
+        with self._lock:
+            self._opened(memory)
+
+    def imagine(self, pose: Float[Tensor, "4 4"], memory: Memory | None) -> Generator[ImaginedView, None, None]:
+        """Yield the nearest true frame, then the last frame of each clip on the way to a pose.
 
         Args:
             pose: world_from_camera.
@@ -85,32 +116,45 @@ class Imaginer:
 
         Raises:
             PersistError: when model, memory and data do not go together.
+            OSError: when a file cannot be read.
         """
+        number = nearest_frame(self.start.poses(), pose)
+        part = self.start.read([number])
+        yield ImaginedView(part.observations.rgb[0], number)
         with self._lock:
             world = self._opened(memory)
-            number = nearest_frame(self.start.poses(), pose)
-            part = self.start.read([number])
-            agent = world.agents[0]
-            if memory is not None and agent.memory is not None:
-                agent.memory = memory.copy().to(world.backbone.device)
-            agent.write = memory is None
+            self._remember(world, memory)
             world.reset([part.observations], [part.info])
-            cameras = part.observations.cameras.at(
-                way_to(part.observations.cameras.world_from_camera[0], pose, world.backbone.frames_per_clip - 1)
-            )
-            none = interactions_of((None,) * len(cameras), part.info.vocabulary)
-            seen = [clip for [clip] in world.imagine([cameras], [none])]
-            return ImaginedView(seen[-1].rgb[-1], number, len(cameras))
+            first = part.observations.cameras
+            cameras = first.at(way_to(first.world_from_camera[0], pose, world.backbone.frames_per_clip - 1))
+            none, frames = interactions_of((None,) * len(cameras), part.info.vocabulary), 0
+            for [clip] in world.imagine([cameras], [none]):
+                frames += len(clip)
+                yield ImaginedView(clip.rgb[-1], number, frames, frames == len(cameras))
+
+    def _remember(self, world: WorldModel, memory: Memory | None) -> None:
+        """Give the agent a copy of a memory, which it leaves as it is, or an empty one, which it writes."""
+        agent = world.agents[0]
+        agent.write = memory is None
+        if self._empty is not None:
+            agent.memory = (self._empty if memory is None else memory).copy()
+            agent.memory.encoder = self._empty.encoder  # that of the page's memory stays where it is
+            agent.memory.to(world.backbone.device)
 
     def _opened(self, memory: Memory | None) -> WorldModel:
         if self._world is None:
-            checkpoint = find_checkpoint(self.settings.checkpoint or reference_checkpoint())
+            checkpoint, info = self.find(), self.start.info
             adapter = self._adapter(checkpoint, memory)
             plan = RolloutPlan(
-                self.start.path.name, (), True, 0, self.file, adapter, False, self.settings.seed,
+                self.start.path.name, (), True, 0, self.file, self.settings.adapter, False, self.settings.seed,
                 SamplingOverrides(), InferenceOptions(),
             )  # fmt: skip
-            self._world = assemble_world(checkpoint, adapter, plan, self.start.info)
+            empty = empty_memory(checkpoint, adapter, plan, info)
+            if memory is not None and empty is not None and self.file is not None:
+                check_memory(read_header(self.file), empty, checkpoint, self.file)
+                check_cells(memory, empty, self.file)
+            self._world = world_with(empty, checkpoint, adapter, plan, info)
+            self._empty = self._world.agents[0].memory
         return self._world
 
     def _adapter(self, checkpoint: Checkpoint, memory: Memory | None) -> str | None:

@@ -9,9 +9,15 @@ import viser
 from jaxtyping import UInt8
 from torch import Tensor
 
+from persist_cli.errors import PersistError
 from persist_cli.viewing.data_uri import data_uri
 
 BOX = "padding:0 .75em .6em;font-size:.85em;line-height:1.4;overflow-wrap:anywhere"
+
+
+def error_line(error: PersistError | OSError) -> str:
+    """Return one line about an error that the user can mend."""
+    return f"{error.filename or 'a file'}: {error.strerror or error}" if isinstance(error, OSError) else str(error)
 
 
 class Note:

@@ -14,14 +14,16 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cells import CellOrigin
+from persist_cli.api.memory import Memory
 from persist_cli.errors import PersistError
-from persist_cli.viewer.camera_view import camera_of_view, pose_of, world_from
+from persist_cli.viewer.camera_view import camera_of_view
 from persist_cli.viewer.drawn_cells import ORIGIN_COLORS, cells_of_memory, class_colors
 from persist_cli.viewer.edit_panel import EditPanel
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.imagine import Imaginer
-from persist_cli.viewer.notes import Legend, Note, Pictures
-from persist_cli.viewer.stage import CHANGED, FULL_SIZE, REMOVED, SAME, SELECTED_COLOR, Look, Stage
+from persist_cli.viewer.imagine_panel import ImaginePanel
+from persist_cli.viewer.notes import Legend, Note, Pictures, error_line
+from persist_cli.viewer.stage import CHANGED, REMOVED, SAME, Look, Stage
 from persist_cli.viewer.subject import Subject, Walk
 
 TOKENS: Final = 256  # that a reading draws when nobody says how many
@@ -52,13 +54,14 @@ class Page:
         imaginer: Imaginer | None,
     ) -> None:
         self.server, self.subject, self.look = server, subject, look
-        self.session, self.imaginer = session, imaginer
+        self.session = session
         self.lock = threading.RLock()  # viser calls back in many threads
         self.stage = Stage(server, subject, look)
         self.focus: np.ndarray[Any, Any] | None = None
         self._drawn_at = 0.0
-        self._placed: Any = None  # the gizmo of the camera that was placed by hand
-        self._imagining, self._wanted, self._plays = False, False, False
+        self._plays = False
+        self.edit_panel: EditPanel | None = None
+        self.imagine_panel: ImaginePanel | None = None
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Look"):
             self._add_map_panel()
@@ -71,7 +74,7 @@ class Page:
                 self._add_reading_panel()
         if imaginer is not None:
             with tabs.add_tab("Imagine"):
-                self._add_imagine_panel()
+                self.imagine_panel = ImaginePanel(self, imaginer)
         server.on_client_connect(self._follow_view)
 
     # what every button does around its work
@@ -83,10 +86,8 @@ class Page:
             with self.lock:
                 try:
                     work(event)
-                except PersistError as error:
-                    self.tell(str(error), event)
-                except OSError as error:
-                    self.tell(f"{error.filename}: {error.strerror}; make room there, or give another --out", event)
+                except (PersistError, OSError) as error:
+                    self.tell(error_line(error), event)
 
         return callback
 
@@ -141,6 +142,16 @@ class Page:
         self.stage.draw(self.focus)
         self._drawn_at = time.monotonic()
         self._say_drawn()
+
+    @property
+    def memory(self) -> Memory | None:
+        """The memory as it is edited now, ``None`` without one."""
+        return None if self.session is None else self.session.edited
+
+    def memory_changed(self) -> None:
+        """Let the camera that is placed, if one is, show what the model imagines with the memory as it is now."""
+        if self.imagine_panel is not None:
+            self.imagine_panel.renew()
 
     def show_memory(self, part: str) -> None:
         """Draw the memory ``before`` the edits, ``after`` them, or the ``changes``."""
@@ -253,75 +264,6 @@ class Page:
         self.stage.draw_tokens(tokens)
         imagined = int((tokens.origins == CellOrigin.IMAGINED).sum())
         self._read_text.say(f"{len(tokens):,} tokens, {imagined:,} of them imagined, {tokens.bytes:,} bytes")
-
-    # what the model imagines
-
-    def _add_imagine_panel(self) -> None:
-        gui = self.server.gui
-        Note(gui, "A camera that you place shows what the world model imagines there. Move it, and it imagines anew.")
-        if self.subject.walks:
-            here = gui.add_button("Camera at this frame")
-            here.on_click(self.guarded(lambda event: self._place(self.present_camera(), event)))
-        view = gui.add_button("Camera at this view")
-        view.on_click(self.guarded(lambda event: self._place(camera_of_view(event.client), event)))
-        away = gui.add_button("Take the camera away")
-        away.on_click(self.guarded(lambda event: self.server.scene.remove_by_name("/placed")))
-        self._imagined_text, self._imagined_picture = Note(gui), Pictures(gui)
-
-    def _place(self, camera: Cameras | None, event: Any) -> None:
-        """Place a camera that can be moved by its arrows and rings, and imagine what it sees."""
-        if camera is None:
-            return
-        wxyz, position = pose_of(camera.world_from_camera[0])
-        self._placed = self.server.scene.add_transform_controls(
-            "/placed", scale=0.6, wxyz=wxyz, position=position, depth_test=False
-        )
-        self._placed.on_update(lambda moved: self._imagine(moved) if moved.phase == "end" else None)
-        self._draw_placed(None)
-        threading.Thread(target=self._imagine, args=(event,), daemon=True).start()
-
-    def _draw_placed(self, picture: np.ndarray[Any, Any] | None) -> None:
-        assert self.imaginer is not None
-        camera = self.imaginer.start.cameras([0])
-        identity = camera.at(world_from(np.array([1.0, 0, 0, 0]), np.zeros(3))[None])
-        self.stage.draw_frustum("/placed/camera", identity, picture, FULL_SIZE, SELECTED_COLOR)
-
-    def _imagine(self, event: Any) -> None:
-        """Imagine at the placed camera; while that goes on, the newest place that is asked for waits."""
-        with self.lock:
-            self._wanted = True
-            if self._imagining:
-                return
-            self._imagining = True
-        try:
-            while self._wanted:
-                self._imagine_once(event)
-        finally:
-            self._imagining = False
-
-    def _imagine_once(self, event: Any) -> None:
-        assert self.imaginer is not None
-        with self.lock:
-            self._wanted = False
-            pose: Tensor = world_from(self._placed.wxyz, self._placed.position)
-            memory = None if self.session is None else self.session.edited
-            self._imagined_text.say("imagining … the first time the model is loaded")
-        began = time.monotonic()
-        try:
-            view = self.imaginer.imagine(pose, memory)
-        except PersistError as error:
-            self._imagined_text.say(str(error))
-            return self.tell(str(error), event)
-        with self.lock:
-            if self.server.scene.get_handle_by_name("/placed") is None:  # taken away in the meantime
-                return None
-            self._draw_placed(view.picture.numpy())
-            self._imagined_picture.show([("imagined", view.picture)])
-            self._imagined_text.say(
-                f"{view.frames} frames on from frame {view.began} of {self.imaginer.start.name}, "
-                f"{1000 * (time.monotonic() - began):,.0f} ms"
-            )
-        return None
 
 
 def _pictures(walks: Sequence[Walk], frame: int) -> Iterator[tuple[str, Tensor]]:

@@ -15,7 +15,7 @@ from persist_cli.viewer.edit_session import EditSession, default_out
 from persist_cli.viewer.imagine import Imaginer, ImagineSettings
 from persist_cli.viewer.subject import TRUTH, Subject, describe, open_subject
 from persist_cli.viewing.console import busy, print_json, say, warn
-from persist_cli.viewing.own_address import address_of, bind, is_loopback, open_browser
+from persist_cli.viewing.own_address import address_of, bind, is_loopback, leave, open_browser
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,12 @@ def serve_page(plan: ViewPlan, subject: Subject, session: EditSession | None, ad
     from persist_cli.viewer.page_server import page_server
     from persist_cli.viewer.stage import Look
 
+    imaginer = make_imaginer(plan, subject)
     with page_server(address.host, address.port) as server:
         look = Look(most=plan.most, layers=first_layers(subject))
-        page = Page(server, subject, look, session, make_imaginer(plan, subject))
+        page = Page(server, subject, look, session, imaginer)
+        if page.imagine_panel is not None:
+            server.on_client_connect(page.imagine_panel.load_ahead)
         url = address_of(address.host, server.get_port())
         try:
             _report(subject, {"address": url}, as_json)
@@ -114,6 +117,8 @@ def serve_page(plan: ViewPlan, subject: Subject, session: EditSession | None, ad
                 pass
     if session is not None and session.unsaved:
         say(f"{len(session.edits)} edits are not saved in {session.out}")
+    if imaginer is not None and imaginer.busy:
+        leave()
 
 
 def check_address(address: Address) -> None:
@@ -152,8 +157,20 @@ def make_session(plan: ViewPlan, subject: Subject) -> EditSession | None:
 
 
 def make_imaginer(plan: ViewPlan, subject: Subject) -> Imaginer | None:
-    """Return what imagines at a placed camera; ``None`` where no true frame of the scene is known."""
-    return None if subject.start is None else Imaginer(plan.imagine, subject.start, subject.file)
+    """Return what imagines at a placed camera; ``None`` where no true frame of the scene is known.
+
+    Raises:
+        PersistError: when a model or adapter is named that is not there, or could not begin.
+    """
+    named = [f"--{name}" for name in ("checkpoint", "adapter") if getattr(plan.imagine, name) is not None]
+    if subject.start is None:
+        if named:
+            raise DataError(f"{named[0]}: {plan.source} has no true frame to begin at; add --start DATA#trajectory")
+        return None
+    imaginer = Imaginer(plan.imagine, subject.start, subject.file)
+    if named:
+        imaginer.find()
+    return imaginer
 
 
 def first_layers(subject: Subject) -> set[str]:

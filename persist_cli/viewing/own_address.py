@@ -1,4 +1,4 @@
-"""Pages that a command serves on this machine: their address, who may ask for them, and the browser that opens them."""
+"""Pages that a command serves on this machine: their address, who may ask for them, how they are opened and ended."""
 
 from __future__ import annotations
 
@@ -97,3 +97,10 @@ def open_browser(address: str) -> None:
         return
     with contextlib.suppress(webbrowser.Error, OSError):
         webbrowser.open(address)
+
+
+def leave() -> None:
+    """End the program although a model still works: its thread must not run while Python is taken down."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)

@@ -1,5 +1,7 @@
 """What a world model imagines at a camera that was placed by hand."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -46,17 +48,70 @@ def test_it_begins_at_the_nearest_true_frame(walks):
     assert nearest_frame(poses, poses[7]) == 7
 
 
+def last_view(imaginer, pose, memory):
+    *_, view = imaginer.imagine(pose, memory)
+    return view
+
+
 def test_the_view_depends_on_what_was_edited_and_leaves_the_memory_as_it_is(walks, voxel, own_map):
     file, memory = Store(walks)[0], load_memory(own_map)
     imaginer = Imaginer(ImagineSettings(voxel), file, own_map)
     pose, before = moved(file.poses()[3], 0.1), memory.tensors()
-    view = imaginer.imagine(pose, memory)
+    view = last_view(imaginer, pose, memory)
     assert view.picture.shape == (32, 32, 3)
-    assert torch.equal(imaginer.imagine(pose, memory).picture, view.picture)
+    assert torch.equal(last_view(imaginer, pose, memory).picture, view.picture)
     emptied = memory.copy()
     emptied.clear()
-    assert not torch.equal(imaginer.imagine(pose, emptied).picture, view.picture)
+    assert not torch.equal(last_view(imaginer, pose, emptied).picture, view.picture)
     assert all(torch.equal(before[name], tensor) for name, tensor in memory.tensors().items())
+
+
+def test_without_a_memory_no_view_depends_on_those_before_it(walks, voxel):
+    file = Store(walks)[0]
+    imaginer = Imaginer(ImagineSettings(voxel), file, None)
+    pose = moved(file.poses()[3], 0.1)
+    alone = last_view(imaginer, pose, None)
+    last_view(imaginer, file.poses()[9], None)
+    assert torch.equal(last_view(imaginer, pose, None).picture, alone.picture)
+
+
+def test_the_true_frame_comes_first_and_then_the_way_clip_by_clip(walks, voxel):
+    file = Store(walks)[0]
+    imaginer = Imaginer(ImagineSettings(voxel), file, None)
+    views = imaginer.imagine(moved(file.poses()[0], 4.0), None)
+    first = next(views)
+    assert torch.equal(first.picture, file.read([first.began]).observations.rgb[0])
+    assert not imaginer.loaded
+    frames = [view.frames for view in views]
+    assert frames == sorted(set(frames))
+    assert len(frames) > 1
+
+
+def test_a_view_that_is_given_up_leaves_the_model_free(walks, voxel):
+    file = Store(walks)[0]
+    imaginer = Imaginer(ImagineSettings(voxel), file, None)
+    imaginer.load(None)
+    assert imaginer.loaded
+    views = imaginer.imagine(moved(file.poses()[0], 4.0), None)
+    assert [next(views).arrived, next(views).arrived] == [False, False]
+    assert imaginer.busy
+    views.close()
+    assert not imaginer.busy
+
+
+def test_a_model_of_another_image_size_is_told_before_it_is_loaded(walks, voxel):
+    file = Store(walks)[0]
+    file.info = replace(file.info, height=64, width=64)
+    imaginer = Imaginer(ImagineSettings(voxel), file, None)
+    with pytest.raises(PersistError, match="images are 64x64, the model takes 32x32"):
+        imaginer.load(None)
+    assert not imaginer.busy
+
+
+def test_the_model_without_an_adapter_cannot_read_a_memory(walks, voxel, own_map):
+    imaginer = Imaginer(ImagineSettings(voxel, "stage1"), Store(walks)[0], own_map)
+    with pytest.raises(PersistError, match="--adapter stage1 is the model without a memory adapter"):
+        imaginer.load(load_memory(own_map))
 
 
 def test_a_rollout_goes_through_a_map_that_was_edited_by_hand(persist, walks, voxel, own_map, tmp_path):
@@ -73,4 +128,4 @@ def test_a_rollout_goes_through_a_map_that_was_edited_by_hand(persist, walks, vo
 def test_a_model_that_cannot_read_the_memory_is_told(walks, voxel, room):
     imaginer = Imaginer(ImagineSettings(voxel), Store(walks)[0], room)
     with pytest.raises(PersistError, match="no adapter of it reads a memory of kind 'scene'"):
-        imaginer.imagine(Store(walks)[0].poses()[0], load_memory(room))
+        imaginer.load(load_memory(room))

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import viser
 
-from persist_cli.data.store import Store
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.imagine import Imaginer, ImagineSettings
@@ -96,16 +95,43 @@ def test_what_a_camera_reads_of_images_is_drawn_as_their_cameras(server, persist
     assert server.scene.get_handle_by_name("/reading/0").image is not None
 
 
-def test_a_camera_that_is_placed_shows_what_the_model_imagines_until_it_is_taken_away(server, walks, voxel):
+def imagining_page(server: viser.ViserServer, source: str, settings: ImagineSettings) -> Page:
     server.scene.reset()
     server.gui.reset()
-    imaginer = Imaginer(ImagineSettings(voxel), Store(walks)[0], None)
-    page = Page(server, open_subject(f"{walks}#0:0-6"), Look(layers={POINTS}), None, imaginer)
+    subject = open_subject(source)
+    assert subject.start is not None
+    return Page(server, subject, Look(layers={POINTS}), None, Imaginer(settings, subject.start, None))
+
+
+def test_a_camera_that_is_placed_shows_what_the_model_imagines_until_it_is_taken_away(server, walks, voxel):
+    page = imagining_page(server, f"{walks}#0:0-6", ImagineSettings(voxel))
+    panel = page.imagine_panel
     page.frame.value = 5
-    page._place(page.present_camera(), None)
-    until(lambda: "frames on from frame 5" in page._imagined_text.text)
-    assert np.allclose(page._placed.position, page.subject.walks[0].cameras.centers[5].numpy())
+    panel.place(page.present_camera())
+    assert np.allclose(panel._camera.position, page.subject.walks[0].cameras.centers[5].numpy())
+    until(lambda: "8 frames on from frame 5" in panel.text.text and "ms" in panel.text.text)
     assert server.scene.get_handle_by_name("/placed/camera").image is not None
+    panel.remove()
+    assert server.scene.get_handle_by_name("/placed/camera") is None
+    assert panel.text.text == ""
+
+
+def test_a_camera_that_moves_on_is_imagined_where_it_is_last(server, walks, voxel):
+    page = imagining_page(server, f"{walks}#0:0-6", ImagineSettings(voxel))
+    panel = page.imagine_panel
+    for frame in (0, 1, 4):
+        page.frame.value = frame
+        panel.place(page.present_camera())
+    until(lambda: "on from frame 4" in panel.text.text and "ms" in panel.text.text)
+
+
+def test_a_model_that_cannot_be_loaded_is_told_in_the_tab(server, walks, tmp_path):
+    panel = imagining_page(server, f"{walks}#0:0-6", ImagineSettings(tmp_path / "gone")).imagine_panel
+    panel.load_ahead()
+    until(lambda: "gone" in panel.text.text)
+    panel.place(panel.page.present_camera())
+    until(lambda: not panel._works)
+    assert "gone" in panel.text.text
 
 
 def test_the_truth_stands_beside_what_was_imagined_or_in_its_place(server, rollout):
