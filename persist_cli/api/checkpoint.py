@@ -235,12 +235,12 @@ def find_base(folder: Path, pointer: Mapping[str, Any]) -> Path:
 
 def find_weights(place: Path, fingerprint: str) -> Path | None:
     """Return the folder of the base with this fingerprint: the place itself, or among the checkpoints of its run."""
-    return next((folder for folder in _model_folders(place) if _fingerprint(folder) == fingerprint), None)
+    return next((folder for folder in model_folders(place) if _fingerprint(folder) == fingerprint), None)
 
 
 def fingerprints(place: Path) -> list[str]:
     """Return the fingerprints of the bases that ``find_weights`` looks through, the place's own or newest first."""
-    return [found for found in map(_fingerprint, _model_folders(place)) if found]
+    return [found for found in map(_fingerprint, model_folders(place)) if found]
 
 
 def lora_base(folder: Path) -> Path | dict[str, Any] | None:
@@ -358,7 +358,7 @@ def name_ranges(names: Iterable[str]) -> list[str | list[str]]:
     return [run[0] if len(run) == 1 else [run[0], run[-1]] for run in runs]
 
 
-def _model_folders(place: Path) -> list[Path]:
+def model_folders(place: Path) -> list[Path]:
     """Return the place, if it is a checkpoint's folder, and the checkpoints of its run, the newest first."""
     own = _own_folder(place)
     steps = [step / "model" for step in reversed(step_folders(run_folder(own or place)))]

@@ -15,7 +15,7 @@ import torch
 import yaml
 
 from persist_cli import __version__
-from persist_cli.api.checkpoint import CARD, PLAIN, Checkpoint, find_checkpoint, lora_base
+from persist_cli.api.checkpoint import CARD, PLAIN, STEP, Checkpoint, find_checkpoint, lora_base
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.lineage import (
     ADAPTERS,
@@ -330,7 +330,8 @@ def _without_absolute_paths(text: str, where: str) -> str:
     values = parse_yaml_mapping(text, where)
     data: dict[str, Any] = values.get("data") or {}
     settings: dict[str, Any] = (values.get("backbone") or {}).get("settings") or {}
-    for owner, key in ((values, "base"), (data, "path"), (settings, "pretrained"), (settings, "prompt_embedding")):
+    places = [(values, "base"), (values, "adapter_from"), (values.get("distill") or {}, "teacher"), (data, "path")]
+    for owner, key in (*places, (settings, "pretrained"), (settings, "prompt_embedding")):
         if key in owner:
             owner[key] = _last_part(owner[key])
     return yaml.safe_dump(values, sort_keys=False)
@@ -339,7 +340,10 @@ def _without_absolute_paths(text: str, where: str) -> str:
 def _last_part(value: Any) -> Any:
     if isinstance(value, list):
         return [_last_part(path) for path in value]
-    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+    if not isinstance(value, str) or not Path(value).is_absolute():
+        return value
+    path = Path(value)
+    return path.parent.name if path.name.startswith(STEP) else path.name  # that of its run
 
 
 def _print_files(out: Path, card: dict[str, Any], files: dict[str, dict[str, Any]], json: bool) -> None:

@@ -41,28 +41,31 @@ class KeptCheckpoint:
         return f"{name} ({', '.join(self.reasons)})" if self.reasons else name
 
 
-def mark_in_use(base: Checkpoint, run: Path) -> None:
-    """Leave a file beside the base's checkpoint which says that a run stands on it, where the base is part of a run.
+def mark_in_use(checkpoint: Checkpoint, run: Path) -> None:
+    """Leave a file beside a checkpoint which says that a run stands on it, where it is part of a run, and so its base.
 
     Where no file can be written, as on read-only media, a line on standard error says what to do.
     """
-    step, user, path = base.base_folder.resolve().parent, run.resolve(), _mark_of(base, run)
-    if not step.name.startswith(STEP) or path.is_file():
-        return
-    try:
-        write_json(path, {"checkpoint": step.name, "run": os.path.relpath(user, step.parent)})
-    except OSError as error:
-        if not ended_recipe(step):
-            warn(
-                f"{path.parent}: cannot be written ({error.strerror}), so nothing says there that {run} stands on "
-                f"{step.name}; before that base is trained further, copy {step} and run: persist relink {run} THE_COPY"
-            )
+    user = run.resolve()
+    for path, step in _marks_of(checkpoint, run).items():
+        if path.is_file():
+            continue
+        try:
+            write_json(path, {"checkpoint": step.name, "run": os.path.relpath(user, step.parent)})
+        except OSError as error:
+            if not ended_recipe(step):
+                warn(
+                    f"{path.parent}: cannot be written ({error.strerror}), so nothing says there that {run} stands on "
+                    f"{step.name}; before that base is trained further, copy {step} and run: "
+                    f"persist relink {run} THE_COPY"
+                )
 
 
-def unmark_in_use(base: Checkpoint, run: Path) -> None:
-    """Remove the file that ``mark_in_use`` left, for a run that came to nothing."""
-    with contextlib.suppress(OSError):
-        _mark_of(base, run).unlink(missing_ok=True)
+def unmark_in_use(checkpoint: Checkpoint, run: Path) -> None:
+    """Remove the files that ``mark_in_use`` left, for a run that came to nothing."""
+    for path in _marks_of(checkpoint, run):
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def kept_checkpoints(run: Path, newest: int) -> list[KeptCheckpoint]:
@@ -113,10 +116,13 @@ def _reasons(step: Path, last: bool) -> list[str]:
     return [*ended, f"{' and '.join(users)} {'stands' if len(users) == 1 else 'stand'} on it"] if users else ended
 
 
-def _mark_of(base: Checkpoint, run: Path) -> Path:
-    step, user = base.base_folder.resolve().parent, run.resolve()
+def _marks_of(checkpoint: Checkpoint, run: Path) -> dict[Path, Path]:
+    """The files that say that a run stands on a checkpoint and on its base, and the folders ``step-…`` of these."""
+    user = run.resolve()
     own = hashlib.sha256(bytes(user)).hexdigest()[:8]  # several machines may write marks at once
-    return step.parent / USERS / f"{step.name}.{user.name}-{own}.json"
+    steps = {folder.resolve().parent for folder in (checkpoint.folder, checkpoint.base_folder)}
+    marked = sorted(step for step in steps if step.name.startswith(STEP))
+    return {step.parent / USERS / f"{step.name}.{user.name}-{own}.json": step for step in marked}
 
 
 def _marks(step: Path) -> list[Path]:

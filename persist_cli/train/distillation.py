@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.stages import Distill
-from persist_cli.checkpoints.load import load_backbone, named_adapter
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.recipe import Recipe
+from persist_cli.train.sources import named_model
 
 
 class Teaching:
@@ -36,7 +35,9 @@ class Teaching:
     def __init__(self, settings: Distill, backbone: Backbone, recipe: Recipe) -> None:
         trained = backbone.trained_parameters(recipe.stage)
         self.target = copy_with_own(backbone, trained)
-        self.teacher = copy_with_own(backbone, trained) if settings.teacher is None else load_teacher(settings, recipe)
+        self.teacher = (
+            copy_with_own(backbone, trained) if settings.teacher is None else load_teacher(settings.teacher, recipe)
+        )
         for model in (self.teacher, self.target):
             model.requires_grad_(False).eval()
         backbone.distill(settings, self.teacher, self.target)
@@ -56,10 +57,7 @@ def copy_with_own(backbone: Backbone, own: Mapping[str, nn.Parameter]) -> Backbo
     return copy.deepcopy(backbone, {id(p): p for p in backbone.parameters() if id(p) not in changed})
 
 
-def load_teacher(settings: Distill, recipe: Recipe) -> Backbone:
+def load_teacher(text: str, recipe: Recipe) -> Backbone:
     """Load the checkpoint that ``distill.teacher`` names, in stage 2 with its adapter."""
-    text = str(settings.teacher)
-    if recipe.stage == "1":
-        return load_backbone(find_checkpoint(Path(text)))
-    checkpoint, adapter = named_adapter(text)
+    checkpoint, adapter = named_model(text, recipe.stage)
     return load_backbone(checkpoint, adapter=adapter)

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from accelerate import Accelerator, PartialState
-from accelerate.utils import InitProcessGroupKwargs, broadcast_object_list, set_seed
+from accelerate import Accelerator
+from accelerate.utils import InitProcessGroupKwargs, set_seed
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import (
@@ -33,8 +33,7 @@ from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.api.stages import SCENE_STAGES
 from persist_cli.checkpoints.load import add_adapter, start_backbone, starts_from_random_codec, with_adapter
-from persist_cli.checkpoints.relink import run_base, weights_at
-from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
+from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
@@ -62,6 +61,7 @@ from persist_cli.train.distributed import (
 from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.run_folder import AnyTrainer, RunFolder
 from persist_cli.train.scene_trainer import SceneTrainer
+from persist_cli.train.sources import distilled, held_sources, known_hashes
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
@@ -119,8 +119,8 @@ def limited_threads(threads: int) -> Iterator[None]:
 def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     """Raise ``PersistError`` when no run can be written there, or when this is not the run in the folder to go on with.
 
-    Settings that ``changeable_on_resume`` names may be others than those of the run in the folder, and the base may be
-    at another place.
+    Settings that ``changeable_on_resume`` names may be others than those of the run in the folder, and the base and
+    what is distilled may be at another place.
     """
     check_folder(run)
     steps = step_folders(run)
@@ -131,7 +131,9 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     path = run / "recipe.yaml"
     values = parse_yaml_mapping(path.read_text(encoding="utf-8"), str(path))
     before = to_plain(make_recipe(values, str(path)))  # settings that the run's version did not have get their defaults
-    changeable = changeable_on_resume()
+    changeable = changeable_on_resume() | (
+        known_hashes(run).keys() & distilled(recipe).keys()
+    )  # found by their weights
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]
     pointer = base_pointer(read_card(steps[-1] / "model")) if network_of(recipe) is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
@@ -153,7 +155,7 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
         The signal that ended the run before its last step, ``None`` when it reached that.
     """
     accelerator = make_accelerator(recipe, run)
-    with held_base(recipe.base if network_of(recipe) is None else None, run) as base:
+    with held_sources(recipe, run) as (recipe, base):
         with busy("loading model and data"):
             trainer = prepare_trainer(recipe, run, base, accelerator, plan)
             folder = prepare_run(trainer, run, base, plan)
@@ -170,36 +172,6 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
     accelerator.wait_for_everyone()  # as soon as one has ended by a signal, a launcher ends the others
     accelerator.end_training()
     return ended_by
-
-
-@contextlib.contextmanager
-def held_base(base: str | None, run: Path) -> Iterator[Checkpoint | None]:
-    """The checkpoint that all processes start from, marked in its own run, so that this one does not delete it.
-
-    Args:
-        base: the recipe's base.
-        run: the run that starts; when it has no checkpoint at the end of the block, the mark is removed.
-
-    Raises:
-        CheckpointError: when the base is not there.
-    """
-    if base is None:
-        yield None
-        return
-    main, held = PartialState().is_main_process, None
-    while held is None:
-        found = run_base(base, run)  # by every process, so that each ends when there is none
-        chosen = [str(found.folder)]  # a base that still trains may have a newer one by now
-        if main:
-            mark_in_use(found, run)
-            chosen = [str(found.folder) if found.base_folder.is_dir() else ""]  # "": deleted before it was marked
-        broadcast_object_list(chosen)
-        held = find_checkpoint(Path(chosen[0])) if chosen[0] else None
-    try:
-        yield held
-    finally:
-        if main and not step_folders(run):
-            unmark_in_use(held, run)
 
 
 def prepare_trainer(

@@ -12,7 +12,6 @@ from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, step_folders
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
-from persist_cli.checkpoints.load import named_adapter
 from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept_checkpoints, remove_superseded
 from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.checkpoints.scene_models import save_scene_model
@@ -24,6 +23,7 @@ from persist_cli.recipe import Recipe, to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
 from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.scene_trainer import SceneTrainer
+from persist_cli.train.sources import named_model, write_hashes
 from persist_cli.train.state import save_state
 from persist_cli.train.trainer import Trainer
 
@@ -33,9 +33,13 @@ CODEC_BATCHES: Final = 4  # for measuring the scale of the codec's latents at th
 AnyTrainer = Trainer | PolicyTrainer | SceneTrainer
 
 
-def adapter_scenes(recipe: Recipe) -> TrainingScenes:
-    """The scenes that the adapter of ``adapter_from`` was trained on; none without one."""
-    return training_scenes(named_adapter(recipe.adapter_from)[0]) if recipe.adapter_from else TrainingScenes()
+def source_scenes(recipe: Recipe) -> TrainingScenes:
+    """The scenes of the adapter that is trained on and of the teacher, which the model learns of too; none without."""
+    teacher = recipe.distill.teacher if recipe.distill else None
+    scenes = TrainingScenes()
+    for text in filter(None, (recipe.adapter_from, teacher)):
+        scenes |= training_scenes(named_model(text, recipe.stage)[0])
+    return scenes
 
 
 class RunFolder:
@@ -55,10 +59,11 @@ class RunFolder:
         if trainer.accelerator.is_main_process:
             remove_leftovers(path)
             if base is not None:
-                self.scenes |= training_scenes(base) | adapter_scenes(trainer.recipe)
+                self.scenes |= training_scenes(base) | source_scenes(trainer.recipe)
                 self.recipes = stage_recipes(base.base_folder) if trainer.recipe.memory is None else {}
             path.mkdir(parents=True, exist_ok=True)
             write_text(path / RECIPE, to_yaml(trainer.recipe))
+            write_hashes(trainer.recipe, path)
         with trainer.accelerator.main_process_first():  # it makes the folder
             self.log = StepLog(path / "log.jsonl", self.saved)
         self.speed = SpeedLog(path / "speed.jsonl", self.saved, trainer.recipe.training.batch)

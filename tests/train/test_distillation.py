@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from accelerate import Accelerator
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import SamplingOverrides
+from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.errors import RecipeError
 from persist_cli.recipe import make_recipe
+from persist_cli.train.run_folder import source_scenes
 from persist_cli.train.trainer import Trainer
 from tests.support.micro_model import micro, shaken
 from tests.support.micro_runs import equal_runs, losses, stage
@@ -59,6 +63,37 @@ def test_a_resumed_distillation_equals_an_uninterrupted_one(persist, walks, stag
     assert persist(*stage("stage1", walks, tmp_path / "halves", *changes, "training.steps=2")).code == 0
     assert persist(*stage("stage1", walks, tmp_path / "halves", "--resume", *changes)).code == 0
     assert equal_runs(tmp_path / "whole", tmp_path / "halves")
+
+
+def test_a_resumed_distillation_keeps_the_teacher_that_it_began_with(persist, walks, codec, stage1, tmp_path):
+    teacher = shutil.copytree(stage1, tmp_path / "teacher")
+    changes = [f"base={stage1}", f"distill.teacher={teacher}", *DISTILL]
+    assert persist(*stage("stage1", walks, tmp_path / "whole", *changes, "training.steps=2")).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "halves", *changes, "training.steps=1")).code == 0
+    longer = stage("stage1", walks, teacher, f"base={codec}", "training.steps=5", "--resume")
+    assert persist(*longer).code == 0
+    assert persist(*stage("stage1", walks, tmp_path / "halves", "--resume", *changes, "training.steps=2")).code == 0
+    assert equal_runs(tmp_path / "whole", tmp_path / "halves")
+    shutil.rmtree(teacher / "step-00000004")
+    failed = persist(*stage("stage1", walks, tmp_path / "halves", "--resume", *changes, "training.steps=3"))
+    assert (failed.code, len(failed.err.strip().splitlines())) == (1, 1)
+    assert f"{teacher}: the weights that the run began to distil" in failed.err
+
+
+def test_a_resumed_distillation_of_an_adapter_equals_an_uninterrupted_one(persist, walks, voxel, stage1, tmp_path):
+    changes = [f"base={stage1}", f"adapter_from={voxel}", "memory=null", "adapter={}", *DISTILL]
+    assert persist(*stage("stage2-voxel", walks, tmp_path / "whole", *changes, "training.steps=2")).code == 0
+    halves = stage("stage2-voxel", walks, tmp_path / "halves", *changes)
+    assert persist(*halves, "training.steps=1").code == 0
+    ended = persist(*halves, "training.steps=2", "--resume")
+    assert ended.code == 0, ended.err
+    assert equal_runs(tmp_path / "whole", tmp_path / "halves")
+
+
+def test_the_scenes_of_a_teacher_are_scenes_of_the_training(stage1):
+    values = {"stage": "1", "base": "elsewhere", "distill": {"teacher": str(stage1)}, "training": {"ema": 0.9}}
+    names = source_scenes(make_recipe(values, "mine")).names
+    assert names == training_scenes(find_checkpoint(stage1)).names != frozenset()
 
 
 def test_a_distilled_model_samples_in_one_step_without_being_told(persist, walks, stage1, tmp_path):

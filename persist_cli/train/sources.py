@@ -1,0 +1,153 @@
+"""The checkpoints that a run starts from: held in their own runs, and the very same again when the run goes on.
+
+A run's base is known by the cards of its checkpoints. What a distillation reads besides, its teacher and the adapter
+that is distilled, is known by the hashes of their weights in a file of the run's folder: a teacher's run may train on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from accelerate import PartialState
+from accelerate.utils import broadcast_object_list
+
+from persist_cli.api.checkpoint import (
+    SHOWN,
+    STEP,
+    Checkpoint,
+    checkpoint_folder,
+    find_checkpoint,
+    model_folders,
+    step_folders,
+)
+from persist_cli.api.stages import Stage
+from persist_cli.checkpoints.load import named_adapter
+from persist_cli.checkpoints.relink import run_base
+from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
+from persist_cli.checkpoints.save import fingerprint
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_json, write_json
+from persist_cli.io.sha256sums import hash_files
+from persist_cli.recipe import Recipe, network_of
+
+DISTILLED: Final = "distilled.json"  # in a run's folder: hashes of what it distils, by the recipe's keys
+
+
+def distilled(recipe: Recipe) -> dict[str, str]:
+    """What a distillation reads besides its base, as the recipe names it, by the recipe's keys; empty for others."""
+    if recipe.distill is None:
+        return {}
+    named = {"adapter_from": recipe.adapter_from, "distill.teacher": recipe.distill.teacher}
+    return {key: text for key, text in named.items() if text}
+
+
+def known_hashes(run: Path) -> dict[str, str]:
+    """The hashes of what a run distils, which ``write_hashes`` wrote; empty for a run that has not begun."""
+    path = run / DISTILLED
+    return dict(read_json(path)) if step_folders(run) and path.is_file() else {}
+
+
+def write_hashes(recipe: Recipe, run: Path) -> None:
+    """Write the hashes of what a run distils into its folder.
+
+    Args:
+        recipe: the recipe that ``held_sources`` returned.
+        run: the run's folder.
+    """
+    hashes = {key: weights_hash(*named_model(text, recipe.stage)) for key, text in distilled(recipe).items()}
+    if hashes:
+        write_json(run / DISTILLED, hashes)
+
+
+def named_model(text: str, stage: Stage) -> tuple[Checkpoint, str | None]:
+    """The checkpoint that a recipe of this stage names, and in stage 2 its adapter."""
+    return (find_checkpoint(Path(text)), None) if stage == "1" else named_adapter(text)
+
+
+def weights_hash(checkpoint: Checkpoint, adapter: str | None) -> str:
+    """SHA-256 over the weights of a checkpoint's base, and of its adapter where one is named."""
+    if adapter is None:
+        return checkpoint.fingerprint
+    folder = checkpoint.adapter_folder(adapter)
+    names = sorted(path.name for path in folder.glob("*.safetensors"))
+    return fingerprint({"base": checkpoint.fingerprint, **hash_files(folder, names)})
+
+
+@contextlib.contextmanager
+def held_sources(recipe: Recipe, run: Path) -> Iterator[tuple[Recipe, Checkpoint | None]]:
+    """The recipe with the very checkpoints that its run distils, and the checkpoint of its base.
+
+    Each is one for all processes, and marked in its own run, so that this one does not delete it. When the run that
+    starts has no checkpoint at the end of the block, the marks are removed.
+
+    Args:
+        recipe: the recipe.
+        run: the run's folder; one that goes on gets the checkpoints that it began with.
+
+    Raises:
+        CheckpointError: when one is not there.
+    """
+    held: list[Checkpoint] = []
+    try:
+        base = None
+        if recipe.base is not None and network_of(recipe) is None:
+            base = hold(partial(run_base, recipe.base, run), run, held)
+        for key, text in distilled(recipe).items():
+            find = partial(find_model, text, recipe.stage, known_hashes(run).get(key))
+            recipe = _with_place(recipe, key, text, hold(find, run, held))
+        yield recipe, base
+    finally:
+        if PartialState().is_main_process and not step_folders(run):
+            for checkpoint in held:
+                unmark_in_use(checkpoint, run)
+
+
+def hold(find: Callable[[], Checkpoint], run: Path, held: list[Checkpoint]) -> Checkpoint:
+    """The checkpoint that is found, one for all processes, marked as in use by a run, and added to ``held``."""
+    while True:
+        found = find()  # by every process, so that each ends when there is none
+        chosen = [str(found.folder)]  # where it still trains, others may have found a newer one by now
+        if PartialState().is_main_process:
+            mark_in_use(found, run)
+            there = found.folder.is_dir() and found.base_folder.is_dir()
+            chosen = [str(found.folder) if there else ""]  # "": deleted before it was marked
+        broadcast_object_list(chosen)
+        if chosen[0]:
+            held.append(find_checkpoint(Path(chosen[0])))
+            return held[-1]
+
+
+def find_model(text: str, stage: Stage, wanted: str | None) -> Checkpoint:
+    """The checkpoint that a recipe names, or where a hash is wanted the one with these weights in the same run.
+
+    Raises:
+        CheckpointError: when there is none.
+    """
+    if wanted is None:
+        return named_model(text, stage)[0]
+    place, *name = text.split("#")
+    for folder in model_folders(checkpoint_folder(Path(place))):
+        with contextlib.suppress(CheckpointError):
+            checkpoint, adapter = named_model("#".join([str(folder), *name]), stage)
+            if weights_hash(checkpoint, adapter) == wanted:
+                return checkpoint
+    raise CheckpointError(
+        f"{text}: the weights that the run began to distil ({wanted[:SHOWN]}) are not there any more; bring them back, "
+        "or begin a new run"
+    )
+
+
+def _with_place(recipe: Recipe, key: str, text: str, checkpoint: Checkpoint) -> Recipe:
+    """The recipe with a checkpoint of a run in the place of that run."""
+    step, name = checkpoint.folder.parent, text.partition("#")[2]
+    if not step.name.startswith(STEP) or recipe.distill is None:
+        return recipe
+    place = f"{step}#{name}" if name else str(step)
+    if key == "adapter_from":
+        return replace(recipe, adapter_from=place)
+    return replace(recipe, distill=replace(recipe.distill, teacher=place))
