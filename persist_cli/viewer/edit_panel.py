@@ -9,8 +9,8 @@ import numpy as np
 import viser
 
 from persist_cli.api.cells import Box
-from persist_cli.api.scene_edits import EditOutcome, Point
-from persist_cli.errors import DataError
+from persist_cli.api.scene_edits import Point
+from persist_cli.errors import DataError, PersistError
 from persist_cli.viewer.camera_view import camera_of_view
 from persist_cli.viewer.drawn_cells import cells_of_memory
 from persist_cli.viewer.edit_session import EditSession
@@ -53,7 +53,7 @@ class EditPanel:
     def __init__(self, page: EditedPage, session: EditSession) -> None:
         self.page, self.session, self.gui = page, session, page.server.gui
         self._gizmo: Any = None
-        self._gizmo_from: np.ndarray[Any, Any] = np.zeros(3)
+        self._armed: Any = None  # the callback that takes the next rectangle
         with self.gui.add_folder("Select"):
             self._add_selecting()
         with self.gui.add_folder("Edit"):
@@ -66,7 +66,7 @@ class EditPanel:
         self._selected = Note(gui, NOTHING)
         once = gui.add_button("Rectangle", hint="Then draw it over the map. Or hold Shift and draw at any time.")
         once.on_click(guarded(lambda event: self._arm()))
-        self._thing = gui.add_dropdown("Thing", [CHOOSE], visible=False)
+        self._thing: Any = gui.add_dropdown("Thing", [CHOOSE], visible=False)
         self._thing.on_update(guarded(lambda event: self._select_thing(event.target.value)))
         low, high = self._extent()
         self._low: Any = gui.add_vector3("Box from", low, step=0.05)
@@ -99,7 +99,8 @@ class EditPanel:
         """Add a button for an edit."""
 
         def click(event: Any) -> None:
-            self._done(work())
+            work()
+            self._done()
 
         self.gui.add_button(label).on_click(self.page.guarded(click))
 
@@ -107,19 +108,21 @@ class EditPanel:
     def _over(self) -> bool:
         return bool(self._overwrite.value)
 
-    def _shift(self, copies: bool) -> EditOutcome:
-        return self.session.shift(_point(self._by.value), copies, self._over)
+    def _shift(self, copies: bool) -> None:
+        self.session.shift(_point(self._by.value), copies, self._over)
 
-    def _done(self, outcome: EditOutcome) -> None:
+    def _done(self) -> None:
+        """Show the memory after what was done, which draws it once."""
+        if self._part.value == PARTS[0]:
+            self.page.show_memory(PARTS[0])
         self._part.value = PARTS[0]
-        self.page.show_memory(PARTS[0])
-        self.show(outcome)
+        self.show()
         self.page.memory_changed()
 
     def _undo(self, event: Any) -> None:
         if not self.session.undo():
             return self.page.tell("there is no edit to take back", event, "Nothing to undo")
-        return self._done(self.session.outcome)
+        return self._done()
 
     def _save(self, event: Any) -> None:
         try:
@@ -128,17 +131,22 @@ class EditPanel:
             place = error.filename or self.session.out
             raise DataError(f"{place}: {error.strerror}; make room there, or give another --out") from error
         self.show()
-        self.page.tell(f"{memory} and its edits {edits.name}", event, "Saved")
+        seed = f"; give `persist edit` --seed {self.session.seed} with them" if self.session.seed else ""
+        self.page.tell(f"{memory} and its edits {edits.name}{seed}", event, "Saved")
 
     def _arm(self) -> None:
-        """Take the next rectangle without a key."""
-        scene = self.page.server.scene
+        """Take the next rectangle without a key, or no longer where that is so already."""
+        scene, armed = self.page.server.scene, self._armed
+        if armed is not None:
+            self._armed = None
+            return scene.remove_rect_select_callback(armed)
 
         def once(event: Any) -> None:
-            scene.remove_rect_select_callback(handler)
+            self._arm()
             self._select_rectangle(event)
 
-        handler = scene.on_rect_select()(self.page.guarded(once))
+        self._armed = scene.on_rect_select()(self.page.guarded(once))
+        return None
 
     def _select_rectangle(self, event: Any) -> None:
         view = camera_of_view(event.client)
@@ -155,7 +163,7 @@ class EditPanel:
         self.session.select_box(_point(low), _point(high))
         self.show()
 
-    def show(self, outcome: EditOutcome | None = None) -> None:
+    def show(self) -> None:
         """Show what is selected, the edits, and what became of them."""
         selection = self.session.selection
         boxes = [one.box for one in selection]
@@ -169,15 +177,16 @@ class EditPanel:
         self._thing.visible = len(things) > 1
         if tuple(self._thing.options) != tuple(things):
             self._thing.options = things
-        self._state.say(self._state_text(outcome or self.session.outcome))
+        self._thing.value = CHOOSE  # so that the same one can be chosen again
+        self._state.say(self._state_text())
 
-    def _state_text(self, outcome: EditOutcome) -> str:
+    def _state_text(self) -> str:
         session, count = self.session, len(self.session.edits)
         if not count:
-            return "not edited"
+            return "the saved edits were undone, and the file still has them" if session.unsaved else "not edited"
         saved = "not saved" if session.unsaved else f"saved as {session.out.name}"
         last = session.edits[-1].edit
-        return f"{count} edit{'s' * (count > 1)}, the last: {last}; {outcome.changed:,} cells changed; {saved}"
+        return f"{count} edit{'s' * (count > 1)}, the last: {last}; {session.outcome.changed:,} cells changed; {saved}"
 
     def _show_gizmo(self, boxes: list[Box]) -> None:
         """Put arrows on the first selected box; they move it, or what is in it."""
@@ -186,25 +195,27 @@ class EditPanel:
             self._gizmo = None
         if not boxes:
             return
-        self._gizmo_from = (np.array(boxes[0].low) + np.array(boxes[0].high)) / 2
+        start = (np.array(boxes[0].low) + np.array(boxes[0].high)) / 2
         self._gizmo = self.page.server.scene.add_transform_controls(
-            "/move", scale=0.5, position=self._gizmo_from, disable_rotations=True, depth_test=False
+            "/move", scale=0.5, position=start, disable_rotations=True, depth_test=False
         )
-        dragged = self.page.guarded(self._dragged)
+        dragged = self.page.guarded(lambda event: self._dragged(event.target, boxes[0], start))
         self._gizmo.on_update(lambda event: dragged(event) if event.phase == "end" else None)
 
-    def _dragged(self, event: Any) -> None:
-        by = _point(np.round(np.asarray(event.target.position) - self._gizmo_from, 2))
-        box = self.session.selection[0].box
+    def _dragged(self, gizmo: Any, box: Box, start: np.ndarray[Any, Any]) -> None:
+        """Move a box, or what is selected, as far as its arrows were dragged; those of an earlier box do nothing."""
+        if gizmo is not self._gizmo:
+            return
+        by = _point(np.round(np.asarray(gizmo.position) - start, 2))
         if self._hold.value == HOLD[0]:
             ends = ([a + b for a, b in zip(end, by, strict=True)] for end in (box.low, box.high))
             return self._select_box(*ends)
         try:
-            self._done(self.session.shift(by, False, self._over))
-        except Exception:
+            self.session.shift(by, False, self._over)
+        except PersistError:
             self.show()  # the arrows go back
             raise
-        return None
+        return self._done()
 
     def _extent(self) -> tuple[Point, Point]:
         low, high = self.page.stage.bounds()

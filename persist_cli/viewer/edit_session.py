@@ -19,12 +19,15 @@ from persist_cli.api.scene import Scene
 from persist_cli.api.scene_edits import Colour, Copy, Edit, EditOutcome, Insert, Move, Paint, Point, Remove
 from persist_cli.editing.notation import write_edits
 from persist_cli.errors import DataError, PersistError, hint
+from persist_cli.io.files import remove_leftovers
 from persist_cli.viewer.drawn_cells import DrawnCells, cells_of_memory
+from persist_cli.viewer.edit_order import highest_first, middle_of, moves, outermost
 from persist_cli.viewer.rectangle import visible_cells
 
 Array = np.ndarray[Any, Any]
 
 DECIMALS: Final = 4  # of metres in the corners of boxes
+KEPT: Final = 8  # memories that are kept, so that undoing so many steps takes no time
 HALF: Final = 0.5  # share of a thing's visible cells that a rectangle must hold to select it
 
 
@@ -41,11 +44,26 @@ class Selected:
     name: str = ""
 
 
+@dataclass
+class _Step:
+    """What there was before a step.
+
+    Args:
+        edits: all edits.
+        outcome: what became of them.
+        edited: the edited memory; ``None`` where it is made anew.
+    """
+
+    edits: list[Edit]
+    outcome: EditOutcome
+    edited: Memory | None
+
+
 class EditSession:
     """A memory that is edited step by step; each step can be undone.
 
     All edits are done anew from the unchanged memory at each step, so that what is saved is to the bit what
-    ``persist edit`` writes with the same list of edits.
+    ``persist edit`` writes with the same list of edits and the same seed.
 
     Args:
         memory: the memory, which stays as it is.
@@ -61,6 +79,7 @@ class EditSession:
         self.selection: tuple[Selected, ...] = ()
         self.outcome = EditOutcome(0)
         self._saved: list[Edit] = []  # those in the file
+        self._steps: list[_Step] = []
         self._things: tuple[Memory, list[Thing]] | None = None
 
     @property
@@ -126,13 +145,14 @@ class EditSession:
 
     def remove(self) -> EditOutcome:
         """Take away what is selected, and select nothing; errors as of ``apply``."""
-        outcome = self.apply([Remove(low=one.box.low, high=one.box.high) for one in self._selected()])
+        boxes = highest_first(outermost(self._selected()), self.original.reference.world_up)
+        outcome = self.apply([Remove(low=box.low, high=box.high) for box in boxes])
         self.selection = ()
         return outcome
 
     def paint(self, color: Colour) -> EditOutcome:
         """Give what is selected one colour, RGB 0…255; errors as of ``apply``."""
-        return self.apply([Paint(low=one.box.low, high=one.box.high, color=color) for one in self._selected()])
+        return self.apply([Paint(low=box.low, high=box.high, color=color) for box in self._selected()])
 
     def shift(self, by: Point, copies: bool = False, overwrite: bool = False) -> EditOutcome:
         """Move what is selected by a vector in metres, or put it there too; the selection goes along.
@@ -142,19 +162,25 @@ class EditSession:
             copies: whether it also stays where it is.
             overwrite: whether it may take the place of something.
         """
-        kind, boxes = Copy if copies else Move, self._selected()
-        by = _rounded(by)
-        outcome = self.apply([kind(low=one.box.low, high=one.box.high, by=by, overwrite=overwrite) for one in boxes])
-        self.selection = tuple(Selected(_shifted(one.box, by)) for one in boxes)
+        boxes, by, edits = self._selected(), _rounded(by), list[Edit]()
+        if copies:
+            edits += [Copy(low=box.low, high=box.high, by=by, overwrite=overwrite) for box in outermost(boxes)]
+        elif len(boxes) > 1 and isinstance(self.edited, Scene):
+            edits += moves(self.edited, boxes, by, overwrite, self.seed)
+        else:
+            edits += [Move(low=box.low, high=box.high, by=by, overwrite=overwrite) for box in boxes]
+        outcome = self.apply(edits)
+        names = {thing.box: thing.name for thing in self.things}
+        shifted = [_shifted(box, by) for box in boxes]
+        self.selection = tuple(Selected(box, names.get(box, "")) for box in shifted)
         return outcome
 
     def insert(self, kind: str, color: Colour | None = None, overwrite: bool = False) -> EditOutcome:
         """Put a thing of a class on what stands in the middle of the selection; errors as of ``apply``."""
         edits: list[Edit] = []
         up = int(np.abs(self.original.reference.world_up).argmax())
-        for one in self._selected():
-            middle = [(low + high) / 2 for low, high in zip(one.box.low, one.box.high, strict=True)]
-            x, y, z = (None if axis == up else round(value, DECIMALS) for axis, value in enumerate(middle))
+        for box in self._selected():
+            x, y, z = (None if axis == up else round(value, DECIMALS) for axis, value in enumerate(middle_of(box)))
             edits.append(Insert(kind=kind, at=(x, y, z), color=color, overwrite=overwrite))
         return self.apply(edits)
 
@@ -164,14 +190,22 @@ class EditSession:
         Raises:
             PersistError: when one of them cannot be done, or the memory cannot be edited; then nothing changes.
         """
+        before = _Step(self.edits, self.outcome, self.edited)
         self._redo([*self.edits, *edits])
+        self._steps.append(before)
+        for step in self._steps[1:-KEPT]:  # the first one has the unchanged memory
+            step.edited = None
         return self.outcome
 
     def undo(self) -> bool:
-        """Take back the last edit; returns whether there was one."""
-        if not self.edits:
+        """Take back the last step, which may be several edits; returns whether there was one."""
+        if not self._steps:
             return False
-        self._redo(self.edits[:-1])
+        step = self._steps.pop()
+        if step.edited is None:
+            self._redo(step.edits)
+        else:
+            self.edits, self.outcome, self.edited = step.edits, step.outcome, step.edited
         self.selection = ()
         return True
 
@@ -179,12 +213,14 @@ class EditSession:
         """Write the edited memory, and its edits as JSON beside it for ``persist edit --edits``; return both files.
 
         Raises:
-            DataError: when nothing is edited.
+            DataError: when nothing is edited, and no edit was saved.
             OSError: when a file cannot be written.
         """
-        if not self.edits:
+        if not self.edits and not self._saved:
             raise DataError("nothing is edited, so there is nothing to save")
         listed = self.out.with_suffix(".edits.json")
+        for path in (self.out, listed):
+            remove_leftovers(path.parent, path.name)
         self.edited.save(self.out, self.paths)
         write_edits(listed, self.edits)
         self._saved = list(self.edits)
@@ -197,10 +233,10 @@ class EditSession:
             outcome = edited.edit(edits, self.seed)
         self.edited, self.outcome, self.edits = edited, outcome, edits
 
-    def _selected(self) -> tuple[Selected, ...]:
+    def _selected(self) -> list[Box]:
         if not self.selection:
             raise PersistError("nothing is selected; draw a rectangle, or choose a thing or a box first")
-        return self.selection
+        return [one.box for one in self.selection]
 
     def _things_in(self, cells: DrawnCells, visible: Array, inside: Array) -> list[Thing]:
         """Return the things at least half of whose visible cells are inside a rectangle."""
@@ -217,7 +253,7 @@ class EditSession:
 
 def default_out(file: Path) -> Path:
     """Return where an edited memory is saved when nobody says: beside its file."""
-    return file.with_name(f"{file.stem}-edited{file.suffix}")
+    return file.with_name(f"{file.stem}-edited.safetensors")
 
 
 def _above_lowest(cells: DrawnCells, chosen: Array) -> Array:

@@ -71,7 +71,7 @@ class Stage:
         self.shows_changes = False  # of the map, whatever the colours of the other layers
         self.drawn: dict[str, tuple[int, int]] = {}  # blocks, and cells that they stand for
         self._trees: dict[str, tuple[DrawnCells, float, DetailTree]] = {}
-        self._frames: list[Any] = []
+        self._forms: dict[str, str] = {}  # in which each layer was drawn last
         self.scene.set_up_direction(subject.world_up)
         self._truth = self.scene.add_frame(f"/{TRUTH}", show_axes=False, position=self.truth_offset())
         look.cut = min(look.cut, self.default_cut())
@@ -116,6 +116,11 @@ class Stage:
 
     def draw_layer(self, name: str, focus: Array | None = None) -> None:
         """Draw the blocks of a layer; arguments as of ``draw``."""
+        if self._forms.get(name) != self.look.form:  # viser keeps what is below a node that is drawn anew
+            self._remove(_node(name))
+            self._forms[name] = self.look.form
+        if name == TRUTH and focus is not None:
+            focus = focus - np.asarray(self._truth.position)
         tree = self._tree(name)
         parts = [part for part in tree.select(self.look.most, focus) if len(part)]
         self.drawn[name] = sum(map(len, parts)), tree.count

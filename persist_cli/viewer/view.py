@@ -75,11 +75,10 @@ def run_view(plan: ViewPlan, address: Address, export: Path | None, as_json: boo
         check_address(address)
     with busy("loading what is shown"):
         subject = open_subject(plan.source, plan.truth, plan.start)
-    session = make_session(plan, subject)
     if export is not None:
         write_page(plan, subject, export, as_json)
     else:
-        serve_page(plan, subject, session, address, as_json)
+        serve_page(plan, subject, address, as_json)
 
 
 def write_page(plan: ViewPlan, subject: Subject, path: Path, as_json: bool) -> None:
@@ -94,13 +93,13 @@ def write_page(plan: ViewPlan, subject: Subject, path: Path, as_json: bool) -> N
     _report(subject, {"file": str(path), "moments": moments}, as_json)
 
 
-def serve_page(plan: ViewPlan, subject: Subject, session: EditSession | None, address: Address, as_json: bool) -> None:
+def serve_page(plan: ViewPlan, subject: Subject, address: Address, as_json: bool) -> None:
     """Show a subject on a page until Ctrl-C or SIGTERM."""
     from persist_cli.viewer.page import Page
     from persist_cli.viewer.page_server import page_server
     from persist_cli.viewer.stage import Look
 
-    imaginer = make_imaginer(plan, subject)
+    session, imaginer = make_session(plan, subject), make_imaginer(plan, subject)
     with page_server(address.host, address.port) as server:
         look = Look(most=plan.most, layers=first_layers(subject))
         page = Page(server, subject, look, session, imaginer)
@@ -109,6 +108,8 @@ def serve_page(plan: ViewPlan, subject: Subject, session: EditSession | None, ad
         url = address_of(address.host, server.get_port())
         try:
             _report(subject, {"address": url}, as_json)
+            if session is not None and session.out.exists() and not as_json:
+                say(f"Save replaces {session.out}; --out names another file")
             if address.opens and not as_json:
                 threading.Thread(target=open_browser, args=(url,), daemon=True).start()
             threading.Event().wait()
@@ -116,7 +117,8 @@ def serve_page(plan: ViewPlan, subject: Subject, session: EditSession | None, ad
             with page.lock:  # what is being done is finished first
                 pass
     if session is not None and session.unsaved:
-        say(f"{len(session.edits)} edits are not saved in {session.out}")
+        count = len(session.edits)
+        say(f"{count} edits are not saved in {session.out}" if count else f"{session.out} has edits that were undone")
     if imaginer is not None and imaginer.busy:
         leave()
 

@@ -6,25 +6,39 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
+from persist_cli.api.cells import CellGrid
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.plugins import make_encoder, make_memory
 from tests.support.cell_rooms import UP, camera_at, cell_room
 from tests.support.micro_runs import run_persist
 
 
-@pytest.fixture(scope="session")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file of a scene with a table and a box, and a path from which both are seen."""
-    grid = cell_room()
+def saved(grid: CellGrid, file: Path, paths: dict[str, Tensor]) -> Path:
+    """Write the scene of a grid, and return its file."""
     memory = make_memory(
         "scene", {"palette": list(grid.form.palette)}, make_encoder("classes", {}), FrameOfReference("room", UP)
     )
     memory.add(grid)  # type: ignore[attr-defined]
-    poses = torch.cat([camera_at(grid, (11, 11, 6), toward).world_from_camera for toward in ((12, 12, 6), (4, 6, 1))])
-    file = tmp_path_factory.mktemp("scene") / "room.safetensors"
-    memory.save(file, {"walk": poses})
+    memory.save(file, paths)
     return file
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a scene with a table and a box, and a path from which both are seen."""
+    grid = cell_room()
+    poses = torch.cat([camera_at(grid, (11, 11, 6), toward).world_from_camera for toward in ((12, 12, 6), (4, 6, 1))])
+    return saved(grid, tmp_path_factory.mktemp("scene") / "room.safetensors", {"walk": poses})
+
+
+@pytest.fixture(scope="session")
+def laden_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of the same scene with a barrel on the table, and a second barrel that touches the box."""
+    grid = cell_room()
+    grid.classes[4:6, 7:8, 4:5] = grid.classes[10:11, 4:5, 1:2] = grid.form.palette.index("barrel")
+    return saved(grid, tmp_path_factory.mktemp("scene") / "laden.safetensors", {})
 
 
 @pytest.fixture(scope="session")

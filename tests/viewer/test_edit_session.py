@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from persist_cli.api.cells import FREE, CellOrigin
+from persist_cli.api.cells import FREE, Box, CellOrigin
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.viewer.drawn_cells import cells_of_memory
-from persist_cli.viewer.edit_session import EditSession, default_out
+from persist_cli.viewer.edit_session import EditSession, Selected, default_out
 from tests.support.cell_rooms import TABLE_CELLS, camera_at
 
 
@@ -81,6 +81,89 @@ def test_what_is_saved_is_to_the_bit_what_persist_edit_writes_with_the_list_besi
     assert not session.unsaved
 
 
+@pytest.fixture
+def laden(laden_room, tmp_path):
+    return EditSession(load_memory(laden_room), {}, tmp_path / "edited.safetensors")
+
+
+def select(session, *names):
+    boxes = {thing.name: thing.box for thing in session.things}
+    session.selection = tuple(Selected(boxes[name], name) for name in names)
+
+
+def names_at(session, shift=(0.0, 0.0, 0.0)):
+    """The things by the lowest corners of their boxes, less a shift."""
+    corners = [[round(low - by, 2) for low, by in zip(thing.box.low, shift, strict=True)] for thing in session.things]
+    return {(thing.kind, *corner) for thing, corner in zip(session.things, corners, strict=True)}
+
+
+def along(session, metres):
+    return tuple((session.original.cells.axes[0] * metres).tolist())
+
+
+@pytest.mark.parametrize("names", [("table#1", "barrel#1"), ("barrel#1", "table#1")])
+def test_a_table_is_removed_with_what_stands_on_it_and_one_undo_brings_both_back(laden, names):
+    select(laden, *names)
+    laden.remove()
+    assert [thing.name for thing in laden.things] == ["box#1", "barrel#1"]
+    assert laden.undo()
+    assert len(laden.things) == 4
+    assert not laden.undo()
+
+
+@pytest.mark.parametrize("metres", [-0.25, 0.25, 1.0])
+def test_a_table_is_moved_with_what_stands_on_it_once(laden, metres):
+    by, before = along(laden, metres), names_at(laden)
+    select(laden, "barrel#1", "table#1")
+    laden.shift(by)
+    kept = {thing for thing in before if thing in names_at(laden)}
+    assert names_at(laden, by) & before == before - kept
+    assert len(before - kept) == 2
+
+
+@pytest.mark.parametrize("metres", [-0.25, 0.25])
+def test_a_row_of_things_that_touch_is_moved(laden, metres):
+    by = along(laden, metres)
+    select(laden, "box#1", "barrel#2")
+    before = names_at(laden)
+    laden.shift(by)
+    assert len(names_at(laden, by) & before) == 2
+    assert [one.name for one in laden.selection] == ["box#1", "barrel#2"]
+
+
+def test_a_thing_that_is_partly_in_another_ones_box_is_not_cut_in_two(laden):
+    select(laden, "table#1", "barrel#1")
+    table, barrel = laden.selection
+    half = np.where(along(laden, 1.0), np.mean([table.box.low, table.box.high], axis=0), barrel.box.high)
+    laden.selection = (Selected(Box(table.box.low, tuple(np.maximum(half, table.box.low)))), barrel)
+    with pytest.raises(DataError, match="the boxes of these things overlap"):
+        laden.shift(along(laden, -0.25))
+    assert laden.edits == []
+
+
+def test_many_steps_are_undone_to_the_bit(session):
+    session.select_thing("box#1")
+    states = []
+    for shade in range(12):
+        states.append({name: tensor.clone() for name, tensor in session.edited.tensors().items()})
+        session.paint((shade, 0, 0))
+    for state in reversed(states):
+        assert session.undo()
+        assert all(torch.equal(tensor, state[name]) for name, tensor in session.edited.tensors().items())
+    assert session.edited is session.original
+
+
+def test_saved_edits_that_were_undone_can_be_taken_back_in_the_file(session):
+    session.select_thing("box#1")
+    session.remove()
+    session.save()
+    session.undo()
+    assert session.unsaved
+    memory, edits = session.save()
+    assert edits.read_text().strip() == "[]"
+    assert torch.equal(load_memory(memory).cells.classes, session.original.cells.classes)
+
+
 def test_the_selection_goes_along_with_what_is_moved(session):
     session.select_thing("box#1")
     before = session.selection[0].box
@@ -145,3 +228,4 @@ def test_nothing_selected_and_nothing_edited_are_told(session):
 
 def test_an_edited_memory_is_saved_beside_its_own_file(room):
     assert default_out(room).name == "room-edited.safetensors"
+    assert default_out(room.with_suffix(".bin")).name == "room-edited.safetensors"
