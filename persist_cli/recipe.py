@@ -331,6 +331,8 @@ def _of_distillation(recipe: Recipe) -> list[str]:
         problems.append("distill is for stages 1 and 2, with the base that is distilled and without lora")
     if recipe.stage == "2" and recipe.adapter_from is None:
         problems.append("distill in stage 2 needs adapter_from: the adapter that is distilled")
+    if recipe.stage == "1" and recipe.distill.guidance != 1:
+        problems.append("distill.guidance is over memory, which stage 1 has none of; leave it out")
     if training.ema == 0 or training.ema_device != "model":
         problems.append("distill learns from averaged weights: set training.ema=0.99 training.ema_device=model")
     return problems

@@ -80,6 +80,7 @@ class InferenceOptions:
         return torch.device("cpu")
 
 
+CONSISTENCY = "consistency"  # the sampler of distilled models
 PROTOCOLS = ("revisit", "later", "return", "long", "unseen")  # of evaluation; a card may have a sampling for each
 
 

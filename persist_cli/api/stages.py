@@ -52,16 +52,17 @@ class Distill:
     """The distillation of a trained model to one or two denoising steps, in stages 1 and 2.
 
     Consistency distillation (Song et al., 2303.01469): between two neighbouring noise levels the teacher makes one
-    step, and the student learns to say the same clean clip on both sides of it.
+    step, and the student learns to predict the same clean clip on both sides of it.
 
     Args:
         teacher: checkpoint whose denoising is learned, such as ``reference`` or ``reference#voxel``; null for the
             weights that the run starts from.
-        levels: number of noise levels, the steps that the teacher would need from noise to a clip.
-        guidance: weight of guidance over memory with which the teacher predicts. The student learns its result, and
-            needs one prediction a step where the teacher needs two.
+        levels: number of noise levels, the steps that the teacher would need from noise to a clip; at most as many as
+            the model was trained with.
+        guidance: weight of guidance over memory with which the teacher predicts, in stage 2. The student learns its
+            result, and needs one prediction a step where the teacher needs two.
         loss: how far two clips are from each other: ``huber``, near the absolute error, or ``squared``.
-        steps: number of denoising steps that the checkpoint asks for when it is sampled.
+        steps: number of denoising steps that the checkpoint asks for when it is sampled, a divisor of ``levels``.
     """
 
     teacher: str | None = None

@@ -20,7 +20,7 @@ from persist_cli.recipe import Recipe
 from persist_cli.train.sources import named_model
 
 
-class Teaching:
+class Distiller:
     """The teacher and the target of a backbone, made before its training changes it.
 
     Args:

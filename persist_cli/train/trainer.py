@@ -21,7 +21,7 @@ from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.recipe import Recipe
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
-from persist_cli.train.distillation import Teaching
+from persist_cli.train.distillation import Distiller
 from persist_cli.train.distributed import Sharding, uses_zero
 from persist_cli.train.optimizer import requested_savings
 from persist_cli.train.own_writes import OwnWrites
@@ -61,7 +61,7 @@ class Trainer(TrainingLoop[Backbone]):
             backbone.check_clip_frames(frames)
         if recipe.distill is not None:
             check_whole("distill", accelerator)
-        teaching = None if recipe.distill is None else Teaching(recipe.distill, backbone, recipe)
+        distiller = None if recipe.distill is None else Distiller(recipe.distill, backbone, recipe)
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
         self.scenes = scenes_of(clips)
@@ -76,8 +76,8 @@ class Trainer(TrainingLoop[Backbone]):
         if recipe.base is None:
             backbone.begin_stage(recipe.stage, self.first_batches(START_BATCHES))
         self.prepare(backbone, parameters)
-        if teaching is not None:
-            teaching.begin(self.state.averages(), accelerator.device)
+        if distiller is not None:
+            distiller.begin(self.state.averages(), accelerator.device)
 
     def make_sharding(self) -> Sharding | None:
         """What prepares the backbone for FSDP2, ``None`` where nothing is sharded."""

@@ -177,6 +177,19 @@ def test_a_vae_that_cannot_work_is_refused(change: dict, cause: str) -> None:
     assert "\n" not in str(error.value)
 
 
+def test_the_scale_is_that_of_weights_that_were_replaced_in_place(framewise: CogVideoX) -> None:
+    clips = random_clips(1)
+    with torch.no_grad():
+        framewise.codec.encode(clips.rgb, clips.depth)  # keeps sums of the weights
+    for parameter in framewise.codec.parameters():
+        parameter.data.mul_(1.5)
+    framewise.codec.take_scale([(clips.rgb, clips.depth)])
+    fresh = micro(**FRAMEWISE).codec
+    fresh.load_state_dict(framewise.codec.state_dict())
+    fresh.take_scale([(clips.rgb, clips.depth)])
+    assert framewise.codec.vae.config.scaling_factor == fresh.vae.config.scaling_factor
+
+
 @pytest.mark.parametrize("frames", [2, 3, 4, 9])
 def test_a_framewise_codec_takes_clips_of_any_number_of_frames(frames: int) -> None:
     framewise = micro(**FRAMEWISE, frames=frames, codec_window=[frames - 1, 32, 32])

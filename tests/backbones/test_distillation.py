@@ -12,13 +12,13 @@ from persist_backbones.extensions.distillation import (
     Levels,
     consistency_loss,
     consistency_target,
+    ddim_step,
     distance,
-    euler_step,
     predict_clean,
 )
 from persist_cli.api.stages import Distill
-from persist_cli.errors import CheckpointError
-from tests.support.micro_model import FRAMEWISE, micro, random_clips, random_tokens, shaken, trained
+from persist_cli.errors import CheckpointError, RecipeError
+from tests.support.micro_model import FRAMEWISE, micro, random_clips, random_tokens, shaken, trained, with_adapter
 
 PREDICTIONS = ["v_prediction", "sample"]
 
@@ -46,12 +46,12 @@ def test_each_level_is_followed_by_the_next_and_the_last_by_the_clean_clip():
     assert last.tolist() == [False, False, False, True]
 
 
-def test_the_teachers_step_to_the_true_clip_stays_on_the_straight_way_to_it():
+def test_the_teachers_step_to_the_true_clip_leaves_its_noise_as_it_is():
     scheduler, draw = micro().scheduler, torch.Generator().manual_seed(0)
     clean, noise = torch.randn(2, 3, 4, 2, 2, generator=draw), torch.randn(2, 3, 4, 2, 2, generator=draw)
     high, low = torch.tensor([999, 600]), torch.tensor([700, 20])
     noisy, expected = (scheduler.add_noise(clean, noise, timesteps) for timesteps in (high, low))
-    stepped = euler_step(clean, noisy, noise_level(scheduler, high), noise_level(scheduler, low))
+    stepped = ddim_step(clean, noisy, noise_level(scheduler, high), noise_level(scheduler, low))
     assert torch.allclose(stepped, expected, atol=1e-4)
 
 
@@ -62,15 +62,15 @@ def test_without_noise_the_target_is_the_teachers_clip_itself(prediction):
     clips, distillation = random_clips(2), distilled(student, teacher)
     last = distillation.levels.timesteps[-1]
     noised = student.add_noise(clips, sample_generators(clips.seeds), lambda _: last.repeat(2))
-    draws = [generator.get_state() for generator in sample_generators(clips.seeds)]
+    states = [generator.get_state() for generator in sample_generators(clips.seeds)]
     with torch.no_grad():
-        target = consistency_target(clips, noised, draws, distillation)
-        assert torch.equal(target, predict_clean(distillation.teacher, clips, noised, draws))
-        assert not torch.allclose(target, predict_clean(distillation.target, clips, noised, draws))
+        target = consistency_target(clips, noised, states, distillation)
+        assert torch.equal(target, predict_clean(distillation.teacher, clips, noised, states))
+        assert not torch.allclose(target, predict_clean(distillation.target, clips, noised, states))
 
 
 def test_a_consistent_teacher_is_a_fixed_point():
-    student = micro(prediction="sample", **FRAMEWISE)  # its output layers are zero but for a bias: it says one clip
+    student = micro(prediction="sample", **FRAMEWISE)  # its output layers are zero but for a bias: it predicts one clip
     shaken(student.codec)
     for layer in (student.transformer.base.proj_out, student.transformer.extra_out):
         torch.nn.init.zeros_(layer.weight)
@@ -94,15 +94,63 @@ def test_an_inconsistent_teacher_is_learned_from(prediction):
     assert all(p.grad is None for model in (distillation.teacher, distillation.target) for p in model.parameters())
 
 
-def test_the_student_learns_what_guidance_over_memory_does():
+def test_the_target_is_another_where_the_teacher_has_guidance_over_memory():
     backbone = trained("canvas", prediction="sample", **FRAMEWISE)
     clips = random_clips(2, random_tokens(2, 9))
-    draws = [generator.get_state() for generator in sample_generators(clips.seeds)]
+    states = [generator.get_state() for generator in sample_generators(clips.seeds)]
     noised = backbone.add_noise(clips, sample_generators(clips.seeds), lambda _: torch.tensor([999, 999]))
     plain, guided = (distilled(backbone, guidance=guidance) for guidance in (1.0, 3.0))
     with torch.no_grad():
-        targets = [consistency_target(clips, noised, draws, one) for one in (plain, guided)]
+        targets = [consistency_target(clips, noised, states, one) for one in (plain, guided)]
     assert not torch.allclose(*targets)
+
+
+def with_dropout():
+    """A model whose adapter hides and disturbs memory in training, and clips of which some lose theirs."""
+    backbone = with_adapter(
+        micro(prediction="sample", **FRAMEWISE), form="canvas", head_width=8, dropout=0.5, noise=0.5
+    )
+    shaken(backbone)
+    return backbone, random_clips(6, random_tokens(6, 9))
+
+
+def test_student_and_teacher_see_the_same_memory():
+    """At the last level the target is the teacher's clip, which a student of its weights predicts too."""
+    backbone, clips = with_dropout()
+    levels = Levels(2, 1000)
+    last = [seed for seed in range(40) if levels.draw(sample_generators([seed])) == levels.timesteps[-1]]
+    clips = dataclasses.replace(clips, seeds=last[:6])
+    plain, guided = (distilled(backbone, levels=2, guidance=guidance) for guidance in (1.0, 3.0))
+    assert consistency_loss(backbone, clips, plain)["loss"] == 0
+    assert consistency_loss(backbone, clips, guided)["loss"] > 0
+
+
+def test_teacher_and_target_see_the_same_memory():
+    backbone, clips = with_dropout()
+    distillation, high = distilled(backbone, levels=2), torch.full((6,), 999)
+    noised = backbone.add_noise(clips, sample_generators(clips.seeds), lambda _: high)
+    states = [generator.get_state() for generator in sample_generators(clips.seeds)]
+    levels = (noise_level(backbone.scheduler, timesteps) for timesteps in (high, torch.full((6,), 499)))
+    with torch.no_grad():
+        stepped = ddim_step(predict_clean(backbone, clips, noised, states), noised.noisy, *levels)
+        nearer = noised._replace(noisy=stepped, timesteps=torch.full((6,), 499))
+        target = consistency_target(clips, noised, states, distillation)
+        assert torch.equal(target, predict_clean(backbone, clips, nearer, states))
+        assert not torch.allclose(target, predict_clean(backbone, clips, nearer, states[::-1]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"levels": 2000}, "distill.levels=2000: this model was trained with 1000 noise levels"),
+        ({"levels": 4, "steps": 5}, "distill.steps=5: a sampler has at most a step for each of 4 levels"),
+        ({"steps": 5}, "distill.steps=5: its noise levels are not among 48; set distill.levels=50"),
+    ],
+)
+def test_levels_that_the_model_or_the_sampler_does_not_have_are_refused(settings, message):
+    student = micro(**FRAMEWISE)
+    with pytest.raises(RecipeError, match=f"^{message}$"):
+        student.distill(Distill(**settings), copy.deepcopy(student), copy.deepcopy(student))
 
 
 def test_the_distances_are_zero_for_equal_latents_and_nearly_absolute_for_others():
@@ -137,5 +185,5 @@ def test_a_teacher_with_another_adapter_is_refused():
 
 def test_the_loss_is_that_of_short_clips_too():
     student = shaken_micro()
-    short = dataclasses.replace(random_clips(2)).shortened(3)
+    short = random_clips(2).shortened(3)
     assert consistency_loss(student, short, distilled(student))["loss"] > 0

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from persist_backbones.cogvideox.config import PRESETS
 from persist_backbones.cogvideox.diffusion import (
-    CONSISTENCY,
     MULTISTEP,
     SAMPLERS,
     SamplingSchedule,
@@ -18,6 +17,7 @@ from persist_backbones.cogvideox.diffusion import (
     noise_like,
     sample_generators,
 )
+from persist_cli.api.inference import CONSISTENCY
 
 UNSHIFTED, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3
 CONFIGS = pytest.mark.parametrize("config", [UNSHIFTED, SHIFTED], ids=["shift 1", "shift 3"])

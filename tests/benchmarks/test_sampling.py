@@ -3,7 +3,8 @@ import json
 import pytest
 from PIL import Image
 
-from persist_backbones.cogvideox.diffusion import CONSISTENCY, SAMPLERS
+from persist_backbones.cogvideox.diffusion import SAMPLERS
+from persist_cli.api.inference import CONSISTENCY
 from persist_cli.errors import CheckpointError
 from tests.benchmarks.bench_sampling import fresh_model, main
 from tests.support.micro_runs import MICRO

@@ -89,7 +89,9 @@ def test_a_distillation_holds_the_weights_of_its_teacher_too():
     trained = sum(parameter.nbytes for parameter in estimator().backbone.trained_parameters("1").values())
     assert own.weights - plain.weights == trained
     assert other.weights - plain.weights == sum(parameter.nbytes for parameter in estimator().backbone.parameters())
-    assert own.activations > plain.activations / 2
+    assert (
+        plain.activations < own.activations < 1.2 * plain.activations
+    )  # of the student alone, beside the target's clips
     assert own.average == plain.average  # which the target has
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import pytest
@@ -108,6 +109,9 @@ def test_a_distilled_model_samples_in_one_step_without_being_told(persist, walks
     assert any(not torch.equal(base[name], own[name]) for name in base if name.startswith("transformer"))
     assert all(torch.equal(base[name], own[name]) for name in base if name.startswith("codec"))
     assert len(losses(run)) == 4
+    walk = ["--start", f"{walks}#0", "--actions", "left", "--out", tmp_path / "walk", "--json"]
+    sampling = json.loads(persist("rollout", run, *walk).out)["plan"]["sampling"]
+    assert (sampling["steps"], sampling["sampler"]) == (1, "consistency")
 
 
 def test_an_adapter_is_distilled_on_the_base_that_it_stands_on(persist, walks, voxel, stage1, tmp_path):
@@ -135,6 +139,10 @@ def test_another_checkpoint_may_teach(persist, walks, voxel, stage1, tmp_path):
         ({"stage": "1"}, "with the base that is distilled"),
         ({"stage": "2", "base": "x", "memory": {}}, "distill in stage 2 needs adapter_from"),
         ({"stage": "1", "base": "x", "training": {"ema": 0}}, "set training.ema=0.99"),
+        (
+            {"stage": "1", "base": "x", "distill": {"guidance": 1.5}},
+            "distill.guidance is over memory, which",
+        ),
     ],
 )
 def test_a_recipe_that_cannot_distil_says_why(changes, message):

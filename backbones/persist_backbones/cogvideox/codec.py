@@ -339,5 +339,8 @@ class Codec(nn.Module):
 
     def take_scale(self, clips: Iterable[tuple[Tensor, Tensor]]) -> None:
         """Set the scaling factor to the mean of ``measure_scale`` over batches of RGB and depth."""
+        for module in self.vae.modules():
+            if isinstance(module, SingleFrameConv):
+                module._flat = None  # averaged weights are written through `.data`, which it cannot notice
         scales = [self.measure_scale(rgb, depth) for rgb, depth in clips]
         self.vae.register_to_config(scaling_factor=sum(scales) / len(scales))

@@ -21,13 +21,13 @@ from persist_backbones.cogvideox.codec import Codec, frames_to_batch, to_uint8
 from persist_backbones.cogvideox.codec_start import start_as_components
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import (
-    CONSISTENCY,
     SAMPLERS,
     NoisedClips,
     NoisedPrediction,
     SamplingSchedule,
     SamplingStep,
     draw_timesteps,
+    loss_parts,
     loss_weights,
     noise_level,
     noise_like,
@@ -65,6 +65,7 @@ from persist_backbones.noise_levels import add_level, draw_levels
 from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.errors import CheckpointError, PersistError
 
@@ -111,10 +112,7 @@ class CogVideoX(AdaptedBackbone):
         # weigh
         weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
         error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
-        color, depth = error.chunk(2, dim=2)
-        if not self.settings.depth:
-            return {"loss": color.mean(), "rgb": color.mean()}
-        return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+        return loss_parts(error, self.settings.depth)
 
     def predict_noised(self, clips: Clips, generators: list[torch.Generator]) -> NoisedPrediction:
         """Predict from the clips' latents with noise of a random level, each sample's from its own generator."""

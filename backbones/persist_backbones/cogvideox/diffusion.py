@@ -21,6 +21,7 @@ from persist_backbones.diffusers_models import (
     DPMSolverMultistepScheduler,
     UniPCMultistepScheduler,
 )
+from persist_cli.api.inference import CONSISTENCY
 
 Prediction = Literal["v_prediction", "sample"]
 Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
@@ -28,7 +29,6 @@ Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
 COGVIDEOX: dict[str, Any] = {"ddim": CogVideoXDDIMScheduler, "dpm": CogVideoXDPMScheduler}
 MULTISTEP: dict[str, Any] = {"unipc": UniPCMultistepScheduler, "dpm++": DPMSolverMultistepScheduler}
 SAMPLERS = COGVIDEOX | MULTISTEP
-CONSISTENCY = "consistency"  # the sampler of distilled models, which is none of diffusers'
 
 
 @dataclass
@@ -137,6 +137,12 @@ def loss_weights(
     clean = {"uniform": snr + 1, "min-snr": snr.clamp_max(gamma), "min-snr-plus-one": (snr + 1).clamp_max(gamma)}
     weights: Tensor = clean[weighting]
     return weights if scheduler.config.prediction_type == "sample" else weights / (snr + 1)
+
+
+def loss_parts(error: Float[Tensor, "batch frame channel height width"], depth: bool) -> dict[str, Tensor]:
+    """Return the mean error of latents as the loss, and its parts of RGB and, for a model with depth, of depth."""
+    color, metres = (part.mean() for part in error.chunk(2, dim=2))
+    return {"loss": error.mean(), "rgb": color, "depth": metres} if depth else {"loss": color, "rgb": color}
 
 
 class SamplingSchedule:

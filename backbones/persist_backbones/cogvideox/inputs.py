@@ -336,6 +336,7 @@ def fit_positions(transformer: CogVideoXTransformer3DModel, size: tuple[int, int
     """
     table = transformer.patch_embed
     if table.use_positional_embeddings or table.use_learned_positional_embeddings:
+        # diffusers has built it by now and filled it with weights; the subclass only replaces a method
         table.__class__ = ShorterClipsPatchEmbed
     sample_size = dict(zip(("sample_frames", "sample_height", "sample_width"), size, strict=True))
     sample_size["sample_frames"] = (size[0] - 1) * table.temporal_compression_ratio + 1

@@ -1,9 +1,9 @@
-"""Consistency distillation: a student learns to say in one step what its teacher comes to in many.
+"""Consistency distillation: a student learns to predict in one step what its teacher comes to in many.
 
-The student f says for noisy latents of any level which clean clip they lead to (Song et al., 2303.01469). It is the
-model's own clean prediction, and at the level without noise the identity: f(x, 0) = x, the boundary that keeps it from
-saying the same of everything. The loss is the distance between f(x_t, t) and the target's f(x_s, s), where x_s is the
-teacher's Euler step from x_t to the next level s (algorithm 2). ``consistency_loss`` puts this together.
+The student f predicts from noisy latents of any level the clean clip that they lead to (Song et al., 2303.01469). It is
+the model's own clean prediction, and at the level without noise the identity: f(x, 0) = x, the boundary that keeps it
+from predicting the same for everything. The loss is the distance between f(x_t, t) and the target's f(x_s, s), where
+x_s is the teacher's DDIM step from x_t to the next level s (algorithm 2). ``consistency_loss`` puts this together.
 """
 
 from __future__ import annotations
@@ -18,10 +18,17 @@ from torch import Tensor
 
 from persist_backbones.adapters.base import NoiseLevel
 from persist_backbones.cogvideox.cogvideox import CogVideoX
-from persist_backbones.cogvideox.diffusion import NoisedClips, noise_level, sample_generators
+from persist_backbones.cogvideox.diffusion import (
+    NoisedClips,
+    loss_parts,
+    make_scheduler,
+    noise_level,
+    sample_generators,
+)
+from persist_backbones.diffusers_models import CogVideoXDDIMScheduler
 from persist_cli.api.backbone import Clips
 from persist_cli.api.stages import Distill
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, RecipeError
 
 HUBER = 1e-3  # below such an error the loss is squared, as in latent consistency models (2310.04378)
 
@@ -55,8 +62,8 @@ class Levels:
         return known[numbers.clamp(max=self.count - 1)], numbers == self.count
 
 
-def euler_step(clean: Tensor, noisy: Tensor, level: NoiseLevel, following: NoiseLevel) -> Tensor:
-    """Return the latents of the following noise level on the straight way from ``noisy`` to ``clean`` (DDIM, eq. 12).
+def ddim_step(clean: Tensor, noisy: Tensor, level: NoiseLevel, following: NoiseLevel) -> Tensor:
+    """Return the latents of the following noise level with the same clean latents and noise (DDIM, eq. 12, σ = 0).
 
     Args:
         clean: the clean latents as predicted.
@@ -102,31 +109,28 @@ def consistency_loss(model: CogVideoX, clips: Clips, distillation: Distillation)
     """Return the loss of consistency distillation of a batch, and its parts of RGB and depth."""
     generators, clips, levels = sample_generators(clips.seeds), clips.to(model.device), distillation.levels
     noised = model.add_noise(clips, generators, levels.draw)
-    draws = [generator.get_state() for generator in generators]  # all three models see the same memory
+    states = [generator.get_state() for generator in generators]  # all three models see the same memory
     with torch.no_grad():
-        target = consistency_target(clips, noised, draws, distillation)
-    error = distance(predict_clean(model, clips, noised, draws), target, distillation.settings.loss)
-    color, depth = error.chunk(2, dim=2)
-    if not model.settings.depth:
-        return {"loss": color.mean(), "rgb": color.mean()}
-    return {"loss": error.mean(), "rgb": color.mean(), "depth": depth.mean()}
+        target = consistency_target(clips, noised, states, distillation)
+    error = distance(predict_clean(model, clips, noised, states), target, distillation.settings.loss)
+    return loss_parts(error, model.settings.depth)
 
 
 def consistency_target(
-    clips: Clips, noised: NoisedClips, draws: Sequence[Tensor], distillation: Distillation
+    clips: Clips, noised: NoisedClips, generator_states: Sequence[Tensor], distillation: Distillation
 ) -> Tensor:
-    """Return the clean latents that the target says after the teacher's step; arguments as of ``predict_clean``."""
+    """Return the clean latents that the target predicts after the teacher's step; arguments as of ``predict_clean``."""
     teacher, guidance = distillation.teacher, distillation.settings.guidance
-    guided = predict_clean(teacher, clips, noised, draws, guidance)
+    guided = predict_clean(teacher, clips, noised, generator_states, guidance)
     following, last = distillation.levels.following(noised.timesteps)
     here, there = (noise_level(teacher.scheduler, timesteps) for timesteps in (noised.timesteps, following))
-    nearer = noised._replace(noisy=euler_step(guided, noised.noisy, here, there), timesteps=following)
-    said = predict_clean(distillation.target, clips, nearer, draws)
-    return torch.where(last[:, None, None, None, None], guided, said)  # the boundary: f(x, 0) = x
+    nearer = noised._replace(noisy=ddim_step(guided, noised.noisy, here, there), timesteps=following)
+    predicted = predict_clean(distillation.target, clips, nearer, generator_states)
+    return torch.where(last[:, None, None, None, None], guided, predicted)  # the boundary: f(x, 0) = x
 
 
 def predict_clean(
-    model: CogVideoX, clips: Clips, noised: NoisedClips, draws: Sequence[Tensor], guidance: float = 1.0
+    model: CogVideoX, clips: Clips, noised: NoisedClips, generator_states: Sequence[Tensor], guidance: float = 1.0
 ) -> Float[Tensor, "batch frame channel height width"]:
     """Return the clean latents as a model predicts them from noisy ones, float32.
 
@@ -134,10 +138,10 @@ def predict_clean(
         model: the model.
         clips: the clips, with memory tokens.
         noised: their latents with noise.
-        draws: for each sample the state of the generator that draws whether it sees no memory.
+        generator_states: for each sample the state of the generator that draws whether it sees no memory.
         guidance: weight of guidance over memory.
     """
-    memory = model.memory_condition(clips, [torch.Generator().set_state(state) for state in draws])
+    memory = model.memory_condition(clips, [torch.Generator().set_state(state) for state in generator_states])
     conditions = model.conditions(clips, noised.timesteps, memory, noised.image_noise)
     with model.transformer.kernel_for_training(noised.noisy):
         predicted = model.predict_guided(noised.noisy, noised.image, conditions, guidance)
@@ -146,8 +150,6 @@ def predict_clean(
 
 def check_teacher(student: CogVideoX, teacher: CogVideoX) -> None:
     """Raise ``CheckpointError`` unless a teacher's latents, noise levels and memory mean the same to a student."""
-    if teacher is student:
-        return  # as where memory is estimated, and weights have no values
     adapters = [None if model.adapter is None else model.adapter.settings for model in (student, teacher)]
     differences = {
         "codec": student.encoding() != teacher.encoding(),
@@ -158,3 +160,19 @@ def check_teacher(student: CogVideoX, teacher: CogVideoX) -> None:
     differs = [name for name, other in differences.items() if other]
     if differs:
         raise CheckpointError(f"distill.teacher: its {' and '.join(differs)} differ from those of the model to train")
+
+
+def check_levels(settings: Distill, scheduler: CogVideoXDDIMScheduler) -> None:
+    """Raise ``RecipeError`` for more levels than the model was trained with, or for sampling steps at other levels."""
+    trained, steps = scheduler.config.num_train_timesteps, settings.steps
+    if settings.levels > trained:
+        raise RecipeError(f"distill.levels={settings.levels}: this model was trained with {trained} noise levels")
+    if steps > settings.levels:
+        raise RecipeError(f"distill.steps={steps}: a sampler has at most a step for each of {settings.levels} levels")
+    sampled = set(make_scheduler(scheduler.config, "ddim", steps).timesteps.tolist())
+    counts = range(settings.levels, trained + 1)
+    fitting = next(count for count in counts if sampled <= set(Levels(count, trained).timesteps.tolist()))
+    if fitting != settings.levels:
+        raise RecipeError(
+            f"distill.steps={steps}: its noise levels are not among {settings.levels}; set distill.levels={fitting}"
+        )

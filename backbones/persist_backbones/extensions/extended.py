@@ -11,15 +11,20 @@ from torch import Tensor, nn
 
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.diffusion import CONSISTENCY, SamplingStep
+from persist_backbones.cogvideox.diffusion import SamplingStep
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
-from persist_backbones.extensions.distillation import Distillation, check_teacher, consistency_loss
+from persist_backbones.extensions.distillation import (
+    Distillation,
+    check_levels,
+    check_teacher,
+    consistency_loss,
+)
 from persist_backbones.extensions.inference import bring_when_run, prepare_inference
 from persist_backbones.extensions.lora import add_lora, save_lora, train_lora
 from persist_backbones.extensions.savings import FrozenWeights, apply_memory_savings
 from persist_cli.api.backbone import Backbone, Clips, Sampling
-from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.inference import CONSISTENCY, InferenceOptions
 from persist_cli.api.stages import Distill, Lora, MemorySavings, Stage
 from persist_cli.errors import CheckpointError
 
@@ -57,7 +62,9 @@ class ExtendedCogVideoX(CogVideoX):
         """Let ``forward`` return the loss of consistency distillation; see ``distillation``."""
         if not isinstance(teacher, CogVideoX) or not isinstance(target, CogVideoX):
             raise CheckpointError(f"distill.teacher: a model of backbone {teacher.name!r} cannot teach {self.name!r}")
-        check_teacher(self, teacher)
+        if teacher is not self:  # as where memory is estimated, and tensors have no values
+            check_teacher(self, teacher)
+            check_levels(settings, self.scheduler)
         self.distillation = Distillation(settings, teacher, target)
         self.own_sampling = Sampling(settings.steps, CONSISTENCY)
 
