@@ -21,7 +21,7 @@ from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
 from persist_cli.viewing.console import print_json, say, warn
-from persist_cli.viewing.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, open_browser
+from persist_cli.viewing.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, names_of, open_browser
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
 SAVING_SECONDS: Final = 20.0  # the same, where a recording that is under way is saved
@@ -47,11 +47,6 @@ class ServeOptions:
     browser: bool = False
     json: bool = False
 
-    @property
-    def names(self) -> set[str]:
-        """Names by which the page may be asked for, beside ``localhost``."""
-        return {socket.gethostname(), socket.getfqdn()} if self.host in EVERYWHERE else {self.host}
-
 
 def run_play(options: PlayOptions, serving: ServeOptions) -> None:
     """Serve a page to walk in a model until Ctrl-C or SIGTERM, which end it without an error.
@@ -66,7 +61,7 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
         recordings = Recordings(serving.recordings)
         try:
             sessions = Sessions(first_ready(open_walks(options)), serving.limits, recordings)
-            app = make_app(walking_page(), sessions, serving.names, serving.host in EVERYWHERE)
+            app = make_app(walking_page(), sessions, names_of(serving.host), serving.host in EVERYWHERE)
             server = Server(app, sessions, lambda: announce(bound, options, serving))
             signals.end(server)
             server.serve_on(bound)

@@ -58,7 +58,8 @@ class Page:
         self.lock = threading.RLock()  # viser calls back in many threads
         self.stage = Stage(server, subject, look)
         self.focus: np.ndarray[Any, Any] | None = None
-        self._drawn_at = 0.0
+        self._viewed_from, self._drawn_at = np.zeros(3), 0.0
+        self._is_coarse, self._comes_near = False, False  # whether blocks stand for several cells; whether more come
         self._plays = False
         self.edit_panel: EditPanel | None = None
         self.imagine_panel: ImaginePanel | None = None
@@ -91,6 +92,26 @@ class Page:
 
         return callback
 
+    def newest(self, work: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return a callback as ``guarded`` does, which works once for all events that wait for their turn.
+
+        The work must look at what holds now. So a slider that is dragged over a large map does not draw every step.
+        """
+        waits = threading.Event()
+
+        def once(event: Any) -> None:
+            if waits.is_set():
+                waits.clear()
+                work(event)
+
+        guarded = self.guarded(once)
+
+        def callback(event: Any) -> None:
+            waits.set()
+            guarded(event)
+
+        return callback
+
     def tell(self, text: str, event: Any, title: str = "That did not work") -> None:
         """Show a line in the tab where something happened, or in all tabs."""
         clients = [event.client] if getattr(event, "client", None) is not None else self.server.get_clients().values()
@@ -104,16 +125,16 @@ class Page:
         with gui.add_folder("Map"):
             for name in self.stage.layers:
                 box = gui.add_checkbox(name, name in look.layers)
-                box.on_update(self.guarded(partial(self._toggle, name)))
+                box.on_update(self.newest(partial(self._toggle, name)))
             named = any(cells.palette for cells in self.stage.layers.values())
             colors = gui.add_dropdown("Colour", [text for text in COLORINGS if named or text != "class"])
-            colors.on_update(self.guarded(lambda event: self._set(colors=COLORINGS[event.target.value])))
+            colors.on_update(self.newest(lambda event: self._set(colors=COLORINGS[event.target.value])))
             form = gui.add_dropdown("Draw as", ["cubes", "points"], initial_value=look.form)
-            form.on_update(self.guarded(lambda event: self._set(form=event.target.value)))
+            form.on_update(self.newest(lambda event: self._set(form=event.target.value)))
             self._add_cut()
             if len(self.stage.layers) > 1:
                 beside = gui.add_checkbox("Truth beside", look.beside)
-                beside.on_update(self.guarded(lambda event: self._set(beside=event.target.value)))
+                beside.on_update(self.newest(lambda event: self._set(beside=event.target.value)))
             self._legend, self._drawn_text = Legend(gui), Note(gui)
         self._say_drawn()
 
@@ -126,7 +147,7 @@ class Page:
             "Cut at (m)", round(low, 2), round(high + 0.1, 2), 0.05, round(first, 2),
             hint="Height above which nothing is drawn, so that one looks into rooms.",
         )  # fmt: skip
-        cut.on_update(self.guarded(lambda event: self._set(cut=event.target.value)))
+        cut.on_update(self.newest(lambda event: self._set(cut=event.target.value)))
 
     def _toggle(self, layer: str, event: Any) -> None:
         (self.look.layers.add if event.target.value else self.look.layers.discard)(layer)
@@ -168,7 +189,8 @@ class Page:
             f"{name}: {blocks:,} blocks" + (f" stand for {cells:,} cells" if blocks < cells else "")
             for name, (blocks, cells) in self.stage.drawn.items()
         ]
-        if any(blocks < cells for blocks, cells in self.stage.drawn.values()):
+        self._is_coarse = any(blocks < cells for blocks, cells in self.stage.drawn.values())
+        if self._is_coarse:
             lines.append("Come nearer for smaller blocks; --most allows more of them.")
         self._drawn_text.say(*self.subject.notices, *lines)
         self._legend.show(self._meanings())
@@ -191,16 +213,24 @@ class Page:
         client.camera.on_update(lambda camera: self._on_moved(np.asarray(camera.position)))
 
     def _on_moved(self, position: np.ndarray[Any, Any]) -> None:
-        """Draw maps that are too large for single cells in more detail near the view, at most twice a second."""
-        if all(blocks == cells for blocks, cells in self.stage.drawn.values()):
-            return
-        moved = self.focus is None or float(np.linalg.norm(position - self.focus)) > NEARER
-        if moved and time.monotonic() - self._drawn_at > QUIET and self.lock.acquire(blocking=False):
-            try:
+        """Draw maps that are too large for single cells in more detail near the view, soon and at most twice a second.
+
+        Of the places in between the last one counts.
+        """
+        self._viewed_from = position
+        if self._is_coarse and not self._comes_near:
+            self._comes_near = True
+            timer = threading.Timer(max(0.0, self._drawn_at + QUIET - time.monotonic()), self._draw_near)
+            timer.daemon = True
+            timer.start()
+
+    def _draw_near(self) -> None:
+        with self.lock:
+            self._comes_near = False
+            position = self._viewed_from
+            if self._is_coarse and (self.focus is None or float(np.linalg.norm(position - self.focus)) > NEARER):
                 self.focus = position
                 self.draw()
-            finally:
-                self.lock.release()
 
     # time
 
@@ -208,10 +238,10 @@ class Page:
         gui, length = self.server.gui, max(map(len, self.subject.walks))
         with gui.add_folder("Time"):
             self.frame: Any = gui.add_slider("Frame", 0, max(length - 1, 1), 1, 0)
-            self.frame.on_update(self.guarded(lambda event: self._show_frame()))
+            self.frame.on_update(self.newest(lambda event: self._show_frame()))
             if length > 1:
-                play = gui.add_checkbox("Play", False)
-                play.on_update(lambda event: self._play(event.target))
+                self.play = gui.add_checkbox("Play", False)
+                self.play.on_update(lambda event: self._play(event.target))
             self._pictures = Pictures(gui)
         self._show_frame()
 
@@ -227,12 +257,15 @@ class Page:
             if self._plays:  # the loop of an earlier press goes on
                 return
             self._plays = True
-        while box.value and self.server.get_clients():
+        try:
+            while box.value and self.server.get_clients():
+                with self.lock:
+                    self.frame.value = 0 if self.frame.value >= last else int(self.frame.value) + 1  # draws it
+                time.sleep(1 / FRAMES_A_SECOND)
+        finally:
             with self.lock:
-                self.frame.value = 0 if self.frame.value >= last else int(self.frame.value) + 1
-                self._show_frame()
-            time.sleep(1 / FRAMES_A_SECOND)
-        self._plays = False
+                box.value = False  # also when nobody looks any more
+                self._plays = False
 
     def present_camera(self) -> Cameras | None:
         """Return the camera of the first walk at the present frame, with a frame axis of one; ``None`` without one."""

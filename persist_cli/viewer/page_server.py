@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import rich
 import viser
+from websockets.exceptions import ConnectionClosed
 
 from persist_cli.errors import PersistError
-from persist_cli.viewing.own_address import EVERYWHERE, bind, leads_here, same_host
+from persist_cli.viewing.own_address import EVERYWHERE, bind, leads_here, names_of, same_host
 
-REFUSED = 1008  # code of WebSocket: a policy is violated
+REFUSED: Final = 1008  # code of WebSocket: a policy is violated
+MOST_BYTES: Final = 1 << 20  # of a message that a page sends
 
 
 @contextlib.contextmanager
@@ -29,6 +32,8 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
     bind(host, port).close()  # viser would take the next free port, or wait for ever
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True  # viser prints on it
+    log, one_line = logging.getLogger("websockets.server"), _OneLine()
+    log.addFilter(one_line)
     try:
         server = viser.ViserServer(host=host, port=port, label="persist view", verbose=False)
         try:
@@ -43,6 +48,7 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
             server.stop()
     finally:
         console.quiet = quiet
+        log.removeFilter(one_line)
 
 
 def _refuse_other_origins(server: viser.ViserServer, host: str) -> None:
@@ -50,19 +56,34 @@ def _refuse_other_origins(server: viser.ViserServer, host: str) -> None:
 
     viser has no setting for this, so that the connections of its WebSocket server are looked at here.
     """
-    pages, names = server._websock_server, {"localhost", host.lower()}
+    pages, names = server._websock_server, names_of(host)
 
     async def check(client: Any) -> None:
         connection = pages._live_connections.get(client.client_id)
         if connection is None or connection.request is None:
             return
+        connection.protocol.max_message_size = MOST_BYTES
         asked = connection.request.headers.get("Host", "")
         is_own_page = same_host(connection.request.headers.get("Origin", ""), asked)
         if not (is_own_page and leads_here(asked, names, host in EVERYWHERE)):
             await connection.close(REFUSED, "another origin")
+            with contextlib.suppress(ConnectionClosed):
+                while True:  # what it has sent by now is dropped
+                    await connection.recv()
 
     pages._client_connect_cb.insert(0, check)
     pages.disconnect_all_clients()  # nobody can have seen anything yet; pages connect again by themselves
+
+
+class _OneLine(logging.Filter):
+    """Lets a connection that fails, as by a message that cannot be read, be told without a traceback."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Shorten a record."""
+        if record.exc_info and record.exc_info[1] is not None:
+            record.msg, record.args = f"{record.getMessage()}, and is closed: {record.exc_info[1]!r}", ()
+            record.exc_info = None
+        return True
 
 
 def _never_shared(verbose: bool = True) -> str | None:

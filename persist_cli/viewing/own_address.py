@@ -55,6 +55,12 @@ def is_loopback(bound: socket.socket) -> bool:
     return ipaddress.ip_address(bound.getsockname()[0]).is_loopback
 
 
+def names_of(host: str) -> set[str]:
+    """Return the names in lower case by which a page may be asked for that is served on a host."""
+    names = {socket.gethostname(), socket.getfqdn()} if host in EVERYWHERE else {host}
+    return {"localhost", *(name.lower() for name in names)}
+
+
 def leads_here(host: str, names: Collection[str], anywhere: bool = False) -> bool:
     """Return whether a Host header names this server, and not one that somebody else lets lead here (DNS rebinding).
 

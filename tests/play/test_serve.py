@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 
 import pytest
 from websockets.exceptions import ConnectionClosed
 
 from persist_cli.data.store import Store
-from persist_cli.play.serve import ServeOptions
-from persist_cli.viewing.own_address import address_of, bind
+from persist_cli.viewing.own_address import address_of, bind, names_of
 from tests.support.play_pages import open_page
 from tests.support.processes import start_persist, wait_until
 
@@ -54,5 +54,8 @@ def test_a_port_that_is_taken_is_said_before_the_model_is_loaded(persist, tmp_pa
 def test_the_address_is_one_that_a_browser_of_this_machine_finds():
     with bind("0.0.0.0", 0) as everywhere:
         assert address_of("0.0.0.0", everywhere.getsockname()[1]) == f"http://127.0.0.1:{everywhere.getsockname()[1]}/"
-        assert ServeOptions("0.0.0.0").names != {"0.0.0.0"}
-    assert ServeOptions("lab.local").names == {"lab.local"}
+
+
+def test_a_page_for_everybody_is_found_by_the_name_of_this_machine():
+    assert socket.gethostname().lower() in names_of("0.0.0.0")
+    assert names_of("Lab.local") == {"localhost", "lab.local"}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +18,13 @@ from persist_cli.viewer.page import Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look
 from persist_cli.viewer.subject import MAP, POINTS, TRUTH, open_subject
+from tests.support.view_tabs import open_tab, until
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[viser.ViserServer]:
     with page_server("127.0.0.1", 0) as server:
         yield server
-
-
-def until(happened: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not happened():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def page_of(server: viser.ViserServer, file: Path, most: int) -> Page:
@@ -44,7 +39,9 @@ def test_a_large_map_is_drawn_in_more_detail_when_the_view_comes_near(server, ro
     far, cells = page.stage.drawn[MAP]
     assert far < 300 < cells
     corner = page.subject.layers[MAP].centers[0]
+    page._on_moved(page.subject.layers[MAP].centers[-1])
     page._on_moved(corner)
+    until(lambda: page.focus is corner and page.stage.drawn[MAP][0] > far)
     near, _ = page.stage.drawn[MAP]
     sizes = [part.size[0] for part in page.stage._tree(MAP).select(300, corner)]
     assert far < near <= 300
@@ -63,6 +60,39 @@ def test_what_is_above_the_cameras_is_cut_away_at_first(server, room):
     heights = page.subject.layers[MAP].local[:, 2]
     assert page.look.cut < heights.max()
     assert page.stage.drawn[MAP][0] == int((heights <= page.look.cut).sum())
+
+
+def test_points_give_way_to_cubes_and_cubes_to_points(server, room):
+    page = page_of(server, room, 40_000)
+    for form, left in (("points", False), ("cubes", True), ("points", False)):
+        page._set(form=form)
+        names = [name for name in server.scene._handle_from_node_name if name.startswith("/layers/map/")]
+        assert (names == []) is left
+
+
+def test_of_the_changes_that_wait_the_last_one_is_drawn(server, room):
+    page = page_of(server, room, 40_000)
+    drawn = []
+    draw = page.newest(lambda event: drawn.append(event))
+    with page.lock:
+        waiting = [threading.Thread(target=draw, args=(number,)) for number in range(5)]
+        for thread in waiting:
+            thread.start()
+        time.sleep(0.1)
+    for thread in waiting:
+        thread.join()
+    assert len(drawn) == 1
+
+
+def test_the_time_goes_on_until_nobody_looks(walks):
+    with page_server("127.0.0.1", 0) as server:
+        page = Page(server, open_subject(f"{walks}#0:0-3"), Look(layers={POINTS}), None, None)
+        with open_tab(server) as tab:
+            tab.set(page.frame, 2)
+            until(lambda: page.frame.value == 2)
+            tab.set(page.play, True)
+            until(lambda: page.frame.value == 1)
+        until(lambda: not page.play.value and not page._plays)
 
 
 def test_changes_are_shown_in_colours_of_their_own(server, room):
@@ -132,6 +162,18 @@ def test_a_model_that_cannot_be_loaded_is_told_in_the_tab(server, walks, tmp_pat
     panel.place(panel.page.present_camera())
     until(lambda: not panel._works)
     assert "gone" in panel.text.text
+
+
+def test_the_truth_is_drawn_in_detail_where_one_looks(server, rollout):
+    server.scene.reset()
+    server.gui.reset()
+    page = Page(server, open_subject(str(rollout)), Look(most=300, layers={TRUTH}), None, None)
+    corner = page.stage.layers[TRUTH].centers[0]
+    looked = []
+    select = page.stage._tree(TRUTH).select
+    page.stage._tree(TRUTH).select = lambda most, focus: looked.append(focus) or select(most, focus)
+    page.stage.draw(corner + np.array(page.stage.truth_offset()))
+    assert np.allclose(looked, corner)
 
 
 def test_the_truth_stands_beside_what_was_imagined_or_in_its_place(server, rollout):

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 
 import pytest
 import viser
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.typing import Origin, Subprotocol
 
-from persist_cli.viewer.page_server import REFUSED, page_server
-
-PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
+from persist_cli.viewer.page_server import MOST_BYTES, REFUSED, page_server
+from tests.support.view_tabs import Tab, open_socket, open_tab, until
 
 
 @pytest.fixture(scope="module")
@@ -22,14 +20,15 @@ def server() -> Iterator[viser.ViserServer]:
         yield server
 
 
-def received(server: viser.ViserServer, origin: str | None) -> bytes | int:
+def address(server: viser.ViserServer) -> str:
+    return f"http://127.0.0.1:{server.get_port()}/"
+
+
+def received(server: viser.ViserServer, origin: str | None, host: str = "") -> bytes | int:
     """The first message that a page of an origin gets, or the code with which it is closed."""
-    port = server.get_port()
-    address = f"ws://127.0.0.1:{port}/"
-    kept = None if origin is None else Origin(origin.format(port=port))
     try:
-        with connect(address, origin=kept, subprotocols=[PROTOCOL]) as socket:
-            message = socket.recv(timeout=20)
+        with open_socket(address(server), origin, host) as page:
+            message = page.recv(timeout=20)
             assert isinstance(message, bytes)
             return message
     except ConnectionClosed as closed:
@@ -37,12 +36,45 @@ def received(server: viser.ViserServer, origin: str | None) -> bytes | int:
 
 
 def test_the_own_page_is_served(server):
-    assert len(received(server, "http://127.0.0.1:{port}")) > 20
+    assert len(received(server, "")) > 20
 
 
 @pytest.mark.parametrize("origin", ["http://elsewhere.example", "http://127.0.0.1:1", "null", None])
 def test_a_page_of_another_origin_gets_nothing(server, origin):
     assert received(server, origin) == REFUSED
+
+
+def test_a_name_that_somebody_else_lets_lead_here_gets_nothing(server):
+    assert received(server, "http://elsewhere.example", "elsewhere.example") == REFUSED
+
+
+def test_what_another_page_sends_before_it_is_closed_is_not_done(server):
+    gizmo = server.scene.add_transform_controls("/move")
+    with open_socket(address(server), "http://elsewhere.example") as page, contextlib.suppress(ConnectionClosed):
+        Tab(page).drag("/move", (9.0, 9.0, 9.0))
+        page.recv(timeout=20)
+    with open_tab(server) as tab:
+        assert tuple(gizmo.position) == (0.0, 0.0, 0.0)
+        tab.drag("/move", (1.0, 0.0, 0.0))
+        until(lambda: tuple(gizmo.position) == (1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("message", [b"\xff\x00 garbage", "words", b"0" * (MOST_BYTES + 1)])
+def test_a_message_that_cannot_be_read_closes_its_connection_in_one_line(server, caplog, message):
+    with open_socket(address(server)) as page, open_socket(address(server)) as other:
+        with contextlib.suppress(ConnectionClosed):
+            page.send(message)
+            while True:
+                page.recv(timeout=20)
+        assert len(other.recv(timeout=20)) > 20
+    assert all(record.exc_info is None for record in caplog.records)
+
+
+def test_a_page_may_come_again_a_hundred_times(server):
+    for _ in range(100):
+        with open_socket(address(server)) as page:
+            assert len(page.recv(timeout=20)) > 20
+    until(lambda: not server._websock_server._live_connections)
 
 
 def test_it_never_opens_a_tunnel_to_another_machine(server):
