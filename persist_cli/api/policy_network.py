@@ -46,6 +46,7 @@ class PolicySample:
         goal: what is seen at the goal.
         waypoints: places to come.
         distance: spacings of frames to the goal.
+        goal_place: metres ahead and to the left to the goal, and the heading there; zeros where they are unknown.
         leads_to_goal: whether the waypoints lead to the goal.
         seed: seed of all random numbers of the sample.
     """
@@ -54,6 +55,7 @@ class PolicySample:
     goal: UInt8[Tensor, "height width 3"]
     waypoints: Float[Tensor, "waypoint 2"]
     distance: float
+    goal_place: Float[Tensor, " 4"]
     leads_to_goal: bool
     seed: int
 
@@ -68,6 +70,8 @@ class PolicySamples:
         waypoints: metres ahead and to the left of the present camera, float32; of a trajectory that ends before, its
             end.
         distance: spacings of frames to the goal, float32.
+        goal_place: metres from the present camera to the goal, ahead and to the left, and the heading there as a unit
+            vector in these axes, float32; zeros for a goal of another trajectory.
         leads_to_goal: whether the waypoints lead to the goal: it is of the same trajectory, and neither near nor far.
         seeds: for each sample the seed of all its random numbers.
     """
@@ -76,6 +80,7 @@ class PolicySamples:
     goal: UInt8[Tensor, "batch height width 3"]
     waypoints: Float[Tensor, "batch waypoint 2"]
     distance: Float[Tensor, " batch"]
+    goal_place: Float[Tensor, "batch 4"]
     leads_to_goal: Bool[Tensor, " batch"]
     seeds: Sequence[int]
 
@@ -87,6 +92,7 @@ class PolicySamples:
             goal=torch.stack([sample.goal for sample in samples]),
             waypoints=torch.stack([sample.waypoints for sample in samples]),
             distance=torch.tensor([sample.distance for sample in samples], dtype=torch.float32),
+            goal_place=torch.stack([sample.goal_place for sample in samples]),
             leads_to_goal=torch.tensor([sample.leads_to_goal for sample in samples]),
             seeds=[sample.seed for sample in samples],
         )
@@ -99,6 +105,7 @@ class PolicySamples:
             goal=self.goal.to(device),
             waypoints=self.waypoints.to(device),
             distance=self.distance.to(device),
+            goal_place=self.goal_place.to(device),
             leads_to_goal=self.leads_to_goal.to(device),
         )
 

@@ -125,18 +125,26 @@ class PolicySampleDataset(Dataset[PolicySample]):
         rgb = file.rgb([*frames, choice.goal] if own else frames)
         goal = rgb[-1] if own else self.files[choice.goal_file].rgb([choice.goal])[0]
         seen = rgb[: len(frames)]
-        waypoints = self._waypoints(choice)
+        waypoints, place = self._waypoints(choice), self._goal_place(choice) if own else torch.zeros(4)
         if choice.mirrored:
             seen, goal, waypoints = seen.flip(2), goal.flip(1), waypoints * torch.tensor([1.0, -1.0])
+            place = place * torch.tensor([1.0, -1.0, 1.0, -1.0])
         distance = (choice.goal - choice.present) // form.spacing if own else form.farthest
         leads = own and form.nearest < distance < form.farthest
-        return PolicySample(seen, goal, waypoints, float(distance), leads, choice.seed)
+        return PolicySample(seen, goal, waypoints, float(distance), place, leads, choice.seed)
 
     def _waypoints(self, choice: SampleFrames) -> Float[Tensor, "waypoint 2"]:
         """Metres ahead and to the left of the present camera, float32."""
         path, first = self._path(choice.file), choice.present + self.form.spacing
         later = path.places[first : first + self.form.waypoints * self.form.spacing : self.form.spacing]
         return local_places(later, path.places[choice.present], path.headings[choice.present]).float()
+
+    def _goal_place(self, choice: SampleFrames) -> Float[Tensor, " 4"]:
+        """Metres ahead and to the left of the present camera, and the heading at the goal as a unit vector there."""
+        path, present = self._path(choice.file), choice.present
+        place = local_places(path.places[choice.goal], path.places[present], path.headings[present])
+        heading = local_places(path.headings[choice.goal], torch.zeros(2).double(), path.headings[present])
+        return torch.cat([place, heading]).float()
 
     def _path(self, number: int) -> GroundPath:
         """The path of a trajectory, which is read once."""

@@ -76,9 +76,18 @@ def test_goals_are_later_frames_of_the_walk_or_frames_of_another_that_are_far(wa
         own = choice.goal_file == choice.file
         assert sample.distance == ((choice.goal - choice.present) / 2 if own else 6)
         assert sample.leads_to_goal == (own and 2 < sample.distance < 6)
+        assert bool(sample.goal_place.any()) == own
         assert torch.equal(sample.goal, Store(walks)[choice.goal_file].read([choice.goal]).observations.rgb[0])
         seen.add((own, sample.distance))
     assert seen == {(True, distance) for distance in (1, 2, 3, 4, 5, 6)} | {(False, 6)}
+
+
+def test_the_place_of_a_goal_is_told_in_the_axes_of_the_present_camera(tmp_path):
+    samples = PolicySampleDataset([write_actions(tmp_path, "ffff" + "l" * 6 + "ffffff")], FORM, 0)
+    choice = dataclasses.replace(samples.choose(0), present=0, goal_file=0, file=0, goal=14, mirrored=False)
+    assert samples.read(choice).goal_place.tolist() == pytest.approx([1.0, 1.0, 0.0, 1.0], abs=1e-4)
+    mirrored = samples.read(dataclasses.replace(choice, mirrored=True))
+    assert mirrored.goal_place.tolist() == pytest.approx([1.0, -1.0, 0.0, -1.0], abs=1e-4)
 
 
 def test_frames_before_the_first_are_the_first_again(walks):

@@ -37,6 +37,7 @@ def random_samples(batch: int = 4, size: int = 32) -> PolicySamples:
         goal=torch.randint(0, 256, (batch, size, size, 3), generator=draw, dtype=torch.uint8),
         waypoints=ahead.expand(batch, 4, 2).clone(),
         distance=torch.arange(batch).float(),
+        goal_place=torch.tensor([1.2, 0.4, 1.0, 0.0]).repeat(batch, 1),
         leads_to_goal=torch.ones(batch, dtype=torch.bool),
         seeds=[*range(batch)],
     )

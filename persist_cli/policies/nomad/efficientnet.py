@@ -109,13 +109,19 @@ class EfficientNet(nn.Module):
             inputs = stage[1]
         self.blocks = nn.ModuleList(blocks)
         self.head, self.head_norm = Convolution(inputs, settings.head, 1), group_norm(settings.head)
+        self.width = settings.head
 
     def forward(self, image: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch head"]:
         """Return the feature of each image."""
+        return functional.silu(self.map(image)).mean((2, 3))
+
+    def map(self, image: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch head row column"]:
+        """Return what the last convolution makes of each place of the image, normalised."""
         state = functional.silu(self.stem_norm(self.stem(image)))
         for block in self.blocks:
             state = block(state)
-        return functional.silu(self.head_norm(self.head(state))).mean((2, 3))
+        places: Tensor = self.head_norm(self.head(state))
+        return places
 
 
 def group_norm(channels: int) -> nn.GroupNorm:

@@ -22,6 +22,7 @@ from persist_cli.api.policy_network import PolicyNetwork, PolicySamples, SampleF
 from persist_cli.api.stages import ParameterGroup
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
 from persist_cli.policies.nomad.efficientnet import EfficientNet, EncoderSettings
+from persist_cli.policies.nomad.matcher import Matcher
 from persist_cli.policies.nomad.unet import ConditionalUnet
 
 if TYPE_CHECKING:
@@ -58,7 +59,10 @@ class NomadNetworkSettings:
         still: metres; waypoints that end nearer than this are not learned. A place cannot tell a turn on the spot.
         masked: share of the samples whose goal is masked.
         distance_weight: weight of the distance's squared error; that of the noise has the rest.
+        place_weight: weight of the error of where the goal lies, which nothing but training reads; 0 as published.
         encoder: both encoders of images.
+        matcher: encoder whose maps of the present frame and the goal are compared place by place; ``None`` as
+            published, where ``encoder`` sees both on top of each other.
         tokens: width of a token.
         layers: layers of the transformer.
         heads: heads of its attention.
@@ -82,7 +86,9 @@ class NomadNetworkSettings:
     still: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     masked: Share = 0.5
     distance_weight: Share = 1e-4
+    place_weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
+    matcher: EncoderSettings | None = None
     tokens: Positive = 256
     layers: Positive = 4
     heads: Positive = 4
@@ -114,8 +120,8 @@ class NomadNetwork(PolicyNetwork):
         super().__init__(settings)
         tokens, head = settings.tokens, settings.encoder.head
         self.seen_encoder = EfficientNet(settings.encoder, 3, settings.drop_blocks)
-        self.goal_encoder = EfficientNet(settings.encoder, 6, settings.drop_blocks)
-        self.seen_token, self.goal_token = nn.Linear(head, tokens), nn.Linear(head, tokens)
+        self.goal_encoder = goal_encoder(settings)
+        self.seen_token, self.goal_token = nn.Linear(head, tokens), nn.Linear(self.goal_encoder.width, tokens)
         layer = nn.TransformerEncoderLayer(
             tokens, settings.heads, 4 * tokens, activation="gelu", batch_first=True, norm_first=True
         )
@@ -125,6 +131,8 @@ class NomadNetwork(PolicyNetwork):
             nn.Linear(tokens, tokens // 4), nn.ReLU(), nn.Linear(tokens // 4, tokens // 16), nn.ReLU(),
             nn.Linear(tokens // 16, 1),
         )  # fmt: skip
+        place = nn.Sequential(nn.Linear(tokens, tokens), nn.ReLU(), nn.Linear(tokens, 4))
+        self.place = place if settings.place_weight else None
 
     @property
     def sample_form(self) -> SampleForm:
@@ -141,12 +149,9 @@ class NomadNetwork(PolicyNetwork):
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """Return the parameters by the parts of the network."""
-        parts = ("seen_encoder", "goal_encoder", "seen_token", "goal_token", "transformer", "noise", "distance")
         return [
-            ParameterGroup(
-                part, {f"{part}.{name}": value for name, value in self.get_submodule(part).named_parameters()}
-            )
-            for part in parts
+            ParameterGroup(part, {f"{part}.{name}": value for name, value in module.named_parameters()})
+            for part, module in self.named_children()
         ]
 
     def forward(self, samples: PolicySamples, stage: str) -> dict[str, Tensor]:
@@ -156,13 +161,19 @@ class NomadNetwork(PolicyNetwork):
         condition = self.condition(samples.seen, samples.goal, masked)
         motions = self.normalised(samples.waypoints)
         noisy = self.scheduler.add_noise(motions, noise, steps)
-        errors = (self.noise(noisy, steps, condition).float() - noise).square().mean((1, 2))
+        noise_errors = (self.noise(noisy, steps, condition).float() - noise).square().mean((1, 2))
         moving = samples.waypoints.norm(dim=-1).amax(1) >= settings.still
-        action = _mean_where(errors, samples.leads_to_goal & moving)
+        action = _mean_where(noise_errors, samples.leads_to_goal & moving)
         apart = (self.distance(condition).float()[:, 0] - samples.distance).square()
         distance = _mean_where(apart, ~masked)
         loss = settings.distance_weight * distance + (1 - settings.distance_weight) * action
-        return {"loss": loss, "noise_error": action, "distance_error": distance}
+        errors = {"noise_error": action, "distance_error": distance}
+        if self.place is not None:
+            known = samples.goal_place[:, 2:].any(1) & ~masked
+            away = (self.place(condition).float() - squashed(samples.goal_place)).square().mean(1)
+            errors["place_error"] = _mean_where(away, known)
+            loss = loss + settings.place_weight * errors["place_error"]
+        return {"loss": loss, **errors}
 
     def condition(
         self,
@@ -256,6 +267,19 @@ class NomadNetwork(PolicyNetwork):
 
     def _dropped(self, features: Tensor) -> Tensor:
         return functional.dropout(features, self.settings.dropout, self.training)
+
+
+def goal_encoder(settings: NomadNetworkSettings) -> EfficientNet | Matcher:
+    """The encoder of the present frame together with the goal."""
+    if settings.matcher is None:
+        return EfficientNet(settings.encoder, 6, settings.drop_blocks)
+    return Matcher(settings.matcher, (settings.height, settings.width))
+
+
+def squashed(place: Float[Tensor, "batch 4"]) -> Float[Tensor, "batch 4"]:
+    """The places of goals with their metres r as r / (1 + r), so that far goals count no more than near ones."""
+    metres = place[:, :2].norm(dim=1, keepdim=True)
+    return torch.cat([place[:, :2] / (1 + metres), place[:, 2:]], dim=1)
 
 
 def sinusoids_interleaved(places: int, width: int) -> Float[Tensor, "place width"]:

@@ -12,6 +12,8 @@ from persist_cli.api.meta_device import without_weights
 from persist_cli.api.policy_network import PolicySamples
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.settings import parse_settings
+from persist_cli.policies.nomad.efficientnet import EncoderSettings
+from persist_cli.policies.nomad.matcher import Matcher
 from persist_cli.policies.nomad.network import NomadNetwork, NomadNetworkSettings
 from tests.support.micro_policies import micro_network, random_samples
 
@@ -67,6 +69,38 @@ def test_the_loss_weighs_the_distance_by_one_in_ten_thousand():
     assert torch.isclose(losses["loss"], 1e-4 * losses["distance_error"] + (1 - 1e-4) * losses["noise_error"])
 
 
+MATCHER = {"stem": 8, "stages": [[1, 8, 1, 2, 3]], "head": 16}
+
+
+def test_the_error_of_the_goals_place_is_learned_where_the_goal_is_seen_and_its_place_known():
+    network, samples = micro_network(place_weight=0.5, masked=0.0, matcher=MATCHER), random_samples()
+    losses = network(samples, "policy")
+    rest = 1e-4 * losses["distance_error"] + (1 - 1e-4) * losses["noise_error"]
+    assert torch.isclose(losses["loss"], rest + 0.5 * losses["place_error"])
+    unknown = samples.goal_place.clone()
+    unknown[0] = 0
+    moved = unknown.clone()
+    moved[0, 0] = 100.0  # metres of no goal
+    errors = [
+        network(dataclasses.replace(samples, goal_place=one), "policy")["place_error"] for one in (unknown, moved)
+    ]
+    assert errors[0] == errors[1]
+    assert errors[0] != losses["place_error"]
+    assert "place_error" not in micro_network()(samples, "policy")
+
+
+def test_a_matcher_finds_each_place_of_an_image_where_it_has_gone_in_another():
+    torch.manual_seed(0)
+    matcher = Matcher(parse_settings(EncoderSettings, MATCHER, "the matcher"), (32, 32))
+    image = torch.randn(1, 3, 32, 32)
+    gone = image.roll(4, dims=3)  # a place is four pixels wide
+    first, second = (matcher.encoder.map(one).flatten(2).transpose(1, 2) for one in (image, gone))
+    place = matcher.found(first, second)[0].argmax(1).view(8, 8)
+    columns = place[1:-1, 1:-2] % 8  # the border is padded
+    assert torch.equal(columns, torch.arange(2, 7).expand(6, 5))
+    assert matcher(torch.cat([image, gone], dim=1)).shape == (1, matcher.width)
+
+
 def test_waypoints_that_do_not_lead_to_the_goal_or_stand_still_are_not_learned():
     network, samples = micro_network(still=0.5), random_samples()
     moved = samples.waypoints.clone()
@@ -111,9 +145,10 @@ def test_a_network_that_overfits_one_sample_gives_its_waypoints():
 
 def repeated(sample: PolicySamples, count: int, step: int) -> PolicySamples:
     """A batch of one sample so often, each with noise of its own."""
-    parts = (sample.seen, sample.goal, sample.waypoints, sample.distance, sample.leads_to_goal)
-    seen, goal, waypoints, distance, leads = (part.expand(count, *part.shape[1:]) for part in parts)
-    return PolicySamples(seen, goal, waypoints, distance, leads, range(step * count, (step + 1) * count))
+    names = ("seen", "goal", "waypoints", "distance", "goal_place", "leads_to_goal")
+    parts = {name: getattr(sample, name) for name in names}
+    many = {name: part.expand(count, *part.shape[1:]) for name, part in parts.items()}
+    return PolicySamples(**many, seeds=range(step * count, (step + 1) * count))
 
 
 def test_saved_weights_give_the_same_samples_to_the_bit(tmp_path):
