@@ -25,7 +25,7 @@ from persist_cli.checkpoints.lineage import (
     stage_recipes,
     training_scenes,
 )
-from persist_cli.checkpoints.load import empty_backbone, load_backbone
+from persist_cli.checkpoints.load import empty_backbone, load_backbone, warn_of_plain
 from persist_cli.checkpoints.save import base_files, fingerprint, hash_weights, write_card
 from persist_cli.checkpoints.scene_models import find_scene_model, is_scene_model, write_scene_card
 from persist_cli.errors import CheckpointError, PersistError, hint
@@ -102,6 +102,7 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         return
     base = find_checkpoint(plan.checkpoint)
     adapters = _find_adapters(base, plan.runs)
+    base = _sampled_as(adapters, base, plan.sampling)
     defaults = {
         "dtype": plan.dtype,
         "default_adapter": _default_adapter(base, adapters, plan.default),
@@ -216,6 +217,25 @@ def _default_adapter(base: Checkpoint, adapters: dict[str, AdapterSource], reque
     if requested not in adapters:
         raise CheckpointError(f"no adapter {requested!r} to be the default; {hint(requested, adapters, 'there are')}")
     return requested
+
+
+def _sampled_as(adapters: Mapping[str, AdapterSource], base: Checkpoint, requested: SamplingOverrides) -> Checkpoint:
+    """The base with the sampling that its adapters ask for: a distilled one has its own, on any base.
+
+    Raises:
+        CheckpointError: when they ask for several and the options leave it open.
+    """
+    samplings = {name: adapter.checkpoint.sampling_with(requested) for name, adapter in adapters.items()}
+    if len(set(samplings.values())) > 1:
+        words = ", ".join(f"{name} {sampling.words}" for name, sampling in samplings.items())
+        raise CheckpointError(
+            f"an export has one sampling, its adapters ask for several: {words}; give --steps, --sampler and --guidance"
+        )
+    if not adapters:
+        return base
+    warn_of_plain(base, next(iter(samplings.values())))
+    asked = next(iter(adapters.values())).checkpoint
+    return dataclasses.replace(base, sampling=asked.sampling, protocol_sampling=asked.protocol_sampling)
 
 
 def _default_sampling(base: Checkpoint, requested: SamplingOverrides) -> dict[str, Any] | None:

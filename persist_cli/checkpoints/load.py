@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
+from persist_cli.api.inference import CONSISTENCY
 from persist_cli.checkpoints.lineage import RECIPE
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
+from persist_cli.viewing.console import warn
 
 if TYPE_CHECKING:
-    from persist_cli.api.backbone import Backbone
+    from persist_cli.api.backbone import Backbone, Sampling
 
 
 def load_backbone(
@@ -183,6 +185,18 @@ def is_own_codec(base: Checkpoint) -> bool:
         return False
     values = yaml.safe_load(recipe.read_text())
     return values["stage"] == "codec" and not values["base"] and not values["backbone"]["settings"].get("pretrained")
+
+
+def is_distilled(checkpoint: Checkpoint) -> bool:
+    """Whether a checkpoint's base, without its adapters, asks to be sampled as a distilled model."""
+    sampling = find_checkpoint(checkpoint.base_folder).sampling
+    return sampling is not None and sampling.sampler == CONSISTENCY
+
+
+def warn_of_plain(checkpoint: Checkpoint, sampling: Sampling) -> None:
+    """Say in a line where a base that is not distilled is sampled as its distilled adapters are."""
+    if sampling.sampler == CONSISTENCY and not is_distilled(checkpoint):
+        warn(f"{PLAIN}: the model without an adapter is not distilled, and is sampled in {sampling.words} all the same")
 
 
 def starts_from_random_codec(recipe: Recipe, backbone: Backbone) -> bool:

@@ -43,6 +43,10 @@ DepthModelOption = Annotated[
 ClipFramesOption = Annotated[
     int | None, typer.Option(min=2, help="Of a clip, the present one included; few answer a key soon. The model's.")
 ]
+PlayStepsOption = Annotated[
+    int | None,
+    typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon. A distilled model's own, else 1."),
+]
 OpenOption = Annotated[
     bool | None, typer.Option("--open/--no-open", help="Open the browser, if there is one; not with --json.")
 ]
@@ -60,7 +64,7 @@ def play(
     step: StepOption = None,
     turn: TurnOption = None,
     body: BodyOption = None,
-    steps: Annotated[int, typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon.")] = 1,
+    steps: PlayStepsOption = None,
     guidance: Annotated[float, typer.Option(min=0, max=10, help="Of guidance over memory; 1: none.")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the sampling noise.")] = 0,
     clip_frames: ClipFramesOption = None,
@@ -95,7 +99,8 @@ def play(
     begin = StartOptions(start or SAMPLE_START, picture, step, turn, body)
     options = PlayOptions(
         checkpoint or REFERENCE, begin, split_names(memories), given,
-        PlaySettings(steps, guidance, seed, ahead, clip_frames), InferenceOptions.of(dtype, save_memory),
+        PlaySettings(steps or 1, guidance, seed, ahead, clip_frames), InferenceOptions.of(dtype, save_memory),
+        own_steps=steps is None,
     )  # fmt: skip
     opens = not json if browser is None else browser
     run_play(options, ServeOptions(host, port, Limits(sessions, fps), out, opens, json))

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkpoint
-from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.inference import CONSISTENCY, InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Trajectory
-from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter, load_backbone
+from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter, load_backbone, warn_of_plain
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.memorize.memory_file import read_header
@@ -39,6 +39,8 @@ class PlayOptions:
             as in ``runs/houses#0:0-33``, for all.
         settings: how frames are imagined.
         placement: precision and memory savings.
+        own_steps: whether a distilled model takes as many denoising steps as its checkpoint asks for, in the place of
+            those of the settings.
     """
 
     checkpoint: Path | str = REFERENCE
@@ -47,6 +49,7 @@ class PlayOptions:
     given: tuple[str, ...] = ()
     settings: PlaySettings = field(default_factory=PlaySettings)
     placement: InferenceOptions = field(default_factory=InferenceOptions)
+    own_steps: bool = False
 
 
 def open_play(options: PlayOptions) -> Play:
@@ -82,13 +85,18 @@ def open_walks(options: PlayOptions) -> Callable[[], Play]:
     backbone.prepare_inference(options.placement)
     placed = {name: memory and memory.to(backbone.device) for name, memory in memories.items()}
     sampling, body = checkpoint.sampling_with(SamplingOverrides()), body_for(options.begin.plan, start.info)
+    settings = options.settings
+    if options.own_steps and sampling.sampler == CONSISTENCY:
+        settings = replace(settings, steps=sampling.steps)
+    if PLAIN in names:
+        warn_of_plain(checkpoint, sampling)
 
     def walk() -> Play:
         worlds: dict[str, AdaptedWorld] = {}
         for name, memory in placed.items():  # each walk writes into copies
             agent = Agent(memory, body=None if worlds else body)
             worlds[name] = AdaptedWorld(backbone, [agent], sampling, None if name == PLAIN else name)
-        return Play(worlds, start, options.settings, checkpoint.name)
+        return Play(worlds, start, settings, checkpoint.name)
 
     return walk
 

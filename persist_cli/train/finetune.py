@@ -32,7 +32,13 @@ from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.api.stages import SCENE_STAGES
-from persist_cli.checkpoints.load import add_adapter, start_backbone, starts_from_random_codec, with_adapter
+from persist_cli.checkpoints.load import (
+    add_adapter,
+    is_distilled,
+    start_backbone,
+    starts_from_random_codec,
+    with_adapter,
+)
 from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.errors import PersistError, RecipeError
@@ -73,6 +79,11 @@ LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, 
 RANDOM_CODEC: Final = (
     "begins with random weights, those of the codec too; give backbone.settings.pretrained=DIR for a pretrained model, "
     "or base=RUN for a codec trained here"
+)
+
+DISTILLED_BASE: Final = (
+    "stands on a distilled base and is not distilled itself, but will be sampled in as few steps; set distill too, as "
+    "houses-64-distill-voxel does, or give base=RUN of the model that was distilled"
 )
 
 
@@ -186,6 +197,8 @@ def prepare_trainer(
     backbone = prepare_backbone(recipe, base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
         warn(f"{run}: {RANDOM_CODEC}")
+    if accelerator.is_main_process and base and factory and recipe.distill is None and is_distilled(base):
+        warn(f"{run}: {DISTILLED_BASE}")
     return Trainer(recipe, backbone, factory, accelerator, plan.cache)
 
 

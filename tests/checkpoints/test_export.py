@@ -125,6 +125,29 @@ def test_a_protocol_may_have_a_sampling_of_its_own_which_options_still_override(
     assert find_checkpoint(tmp_path / "again").sampling_with(SamplingOverrides(), "return") == Sampling(20, "ddim", 1.5)
 
 
+@pytest.fixture
+def fast(runs, tmp_path):
+    """The run of an adapter that was distilled, on a base that was not."""
+    backbone = load_backbone(find_checkpoint(runs / "stage1"))
+    backbone.own_sampling = Sampling(1, "consistency")
+    return write_adapter(backbone, runs / "stage1", tmp_path / "fast", "map2d")
+
+
+def test_a_distilled_adapter_is_exported_with_its_own_sampling(persist, runs, fast, tmp_path):
+    ended = persist("export", runs / "stage1", fast, "--out", tmp_path / "m")
+    assert find_checkpoint(tmp_path / "m").sampling == Sampling(1, "consistency")
+    assert "stage1: the model without an adapter is not distilled, and is sampled in 1 step of" in ended.err
+
+
+def test_adapters_that_are_sampled_in_other_ways_need_options_that_say_how(persist, runs, fast, tmp_path):
+    both = ["export", runs / "stage1", runs / "voxel", fast, "--out", tmp_path / "m"]
+    failed = persist(*both)
+    assert (failed.code, len(failed.err.strip().splitlines())) == (1, 1)
+    assert "voxel 50 steps of ddim with guidance 1, map2d 1 step of consistency with guidance 1; give" in failed.err
+    assert persist(*both, "--steps", 4, "--sampler", "unipc").code == 0
+    assert find_checkpoint(tmp_path / "m").sampling == Sampling(4, "unipc")
+
+
 @pytest.mark.parametrize(
     ("text", "cause"),
     [

@@ -13,7 +13,7 @@ from persist_cli.memorize.picture import PictureOptions
 from persist_cli.play.open_play import PlayOptions, open_play, open_walks
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import StartOptions
-from tests.support.micro_runs import SIZE
+from tests.support.micro_runs import SIZE, run_persist, stage
 
 FAST = PlaySettings(steps=1)
 FORWARD = frozenset({"forward"})
@@ -30,6 +30,27 @@ def test_a_walk_begins_at_a_frame_of_data_in_each_memory(voxel, walks):
     truth = Store(walks)[0].read([2]).observations.rgb[0]
     assert all(torch.equal(image, truth) for image in play.shown.images.values())
     assert play.advance(FORWARD).action == "forward"
+
+
+@pytest.fixture(scope="module")
+def distilled(walks, voxel, stage1, tmp_path_factory):
+    """An adapter that is distilled to two steps, on a base that is not."""
+    run = tmp_path_factory.mktemp("distilled") / "run"
+    changes = [f"base={stage1}", f"adapter_from={voxel}", "memory=null", "adapter={}", "training.ema=0.99"]
+    run_persist(*stage("stage2-voxel", walks, run, *changes, "distill.steps=2", "training.steps=1"))
+    return run
+
+
+@pytest.mark.parametrize(("own", "steps"), [(True, 2), (False, 1)])
+def test_a_distilled_model_is_walked_in_by_its_own_sampler_and_steps(distilled, walks, own, steps):
+    play = opened(distilled, f"{walks}#0:2", own_steps=own)
+    sampling = play._walkers.worlds["voxel"].sampling
+    assert (sampling.sampler, sampling.steps) == ("consistency", steps)
+
+
+def test_a_view_without_adapter_that_is_not_distilled_itself_is_said_in_a_line(distilled, walks, capsys):
+    opened(distilled, f"{walks}#0:2", memories=("voxel", "stage1"))
+    assert "stage1: the model without an adapter is not distilled" in capsys.readouterr().err
 
 
 def test_what_is_given_is_remembered_at_the_start(persist, voxel, walks, tmp_path):

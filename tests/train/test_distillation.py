@@ -123,6 +123,13 @@ def test_an_adapter_is_distilled_on_the_base_that_it_stands_on(persist, walks, v
     assert checkpoint.sampling_with(SamplingOverrides(), "revisit").steps == 1
 
 
+def test_an_adapter_that_is_not_distilled_on_a_base_that_is_gets_a_warning(persist, walks, stage1, tmp_path):
+    run = stage("stage1", walks, tmp_path / "base", f"base={stage1}", *DISTILL, "training.steps=1")
+    assert persist(*run).code == 0
+    ended = persist(*stage("stage2-voxel", walks, tmp_path / "run", f"base={tmp_path / 'base'}", "training.steps=1"))
+    assert (ended.code, "stands on a distilled base and is not distilled itself" in ended.err) == (0, True), ended.err
+
+
 def test_another_checkpoint_may_teach(persist, walks, voxel, stage1, tmp_path):
     changes = ["memory=null", "adapter={}", f"adapter_from={voxel}", f"distill.teacher={voxel}", *DISTILL]
     assert persist(*stage("stage2-voxel", walks, tmp_path / "run", f"base={stage1}", *changes)).code == 0

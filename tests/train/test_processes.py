@@ -90,6 +90,8 @@ def runs(walks, codec, stage1, tmp_path_factory):
     run_persist(*of("stage1", "one-lora", *low_rank))
     run_persist(*of("stage2-voxel", "one-few", FEW))
     run_persist(*of("stage2-voxel", "one-own", *OWN))
+    distil = [f"base={stage1}", "distill.levels=6", "training.ema=0.99"]
+    run_persist(*of("stage1", "one-distilled", *distil))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
@@ -100,6 +102,7 @@ def runs(walks, codec, stage1, tmp_path_factory):
     cached = [FEW, "--cache", str(folder / "cache")]
     first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
     first.append(job(*of("stage2-voxel", "ddp-own", *OWN)))
+    first.append(job(*of("stage1", "ddp-distilled", *distil, "training.accumulation=2")))
     wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
     ended = run_in_two(folder, *first, job(*of("stage2-voxel", "fsdp-own", *OWN), **FSDP), wrong)
     assert [code for code, _ in ended[:-2]] == [0] * len(first), ended
@@ -127,6 +130,11 @@ def test_two_processes_train_to_the_losses_and_weights_of_one(runs, kind, number
 
 def test_two_processes_write_their_own_predictions_as_one_does(runs):
     assert losses(runs / "ddp-own") == pytest.approx(losses(runs / "one-own"), rel=1e-4)
+
+
+def test_two_processes_distil_as_one_does(runs):
+    assert losses(runs / "ddp-distilled") == pytest.approx(losses(runs / "one-distilled"), rel=1e-4)
+    assert largest_difference(saved_model(runs / "one-distilled"), saved_model(runs / "ddp-distilled")) < NEAR
 
 
 @pytest.mark.parametrize("kind", KINDS)
