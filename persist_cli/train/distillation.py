@@ -44,11 +44,11 @@ class Distiller:
 
     def begin(self, averages: Mapping[str, Tensor], device: torch.device) -> None:
         """Let the target have the averaged weights, which follow the training in place."""
-        self.teacher.to(device)
+        for model in (self.teacher, self.target):
+            model.to(device)  # before the averages: to a processor with a number, as gloo's are, it copies
         parameters = dict(self.target.named_parameters())
         for name, average in averages.items():
             parameters[name].data = average
-        self.target.to(device)
 
 
 def copy_with_own(backbone: Backbone, own: Mapping[str, nn.Parameter]) -> Backbone:
