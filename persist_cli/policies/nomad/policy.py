@@ -78,7 +78,8 @@ class NomadPolicy(Policy):
         ahead, turns = gait(situation.info.vocabulary)
         masked = self.settings.masked or situation.goal.rgb is None
         condition = self._condition(situation, masked)
-        if not masked and float(self.network.distance(condition)) <= self.settings.stop:
+        stop = self.settings.stop
+        if stop and not masked and float(self.network.distance(condition)) <= stop:
             return [()] * count
         sampled = self.network.sample(condition, count, self.steps, generator).tolist()
         return [follow_waypoints([(x, y) for x, y in way], ahead, turns, horizon) for way in sampled]
