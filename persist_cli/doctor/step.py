@@ -20,7 +20,7 @@ from torch import nn
 
 from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.api.cameras import Cameras
-from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.clips import ClipLatents
 from persist_cli.api.scene_model import SceneForm, SceneModel, SceneSamples
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.doctor.tracing import LiveBytes, device_kernels, fake_tensors

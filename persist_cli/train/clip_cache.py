@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 
 from persist_cli import __version__
 from persist_cli.api.backbone import Backbone, Clip, Clips
-from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.clips import ClipLatents
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Observations

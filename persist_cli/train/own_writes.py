@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from persist_cli.api.backbone import Clip, Clips
-from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.clips import ClipLatents
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Origin
 from persist_cli.data.writing_noise import WritingNoise

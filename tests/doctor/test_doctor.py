@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from persist_backbones.cogvideox.inputs import _fitted_positions
-from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.clips import ClipLatents
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
 from persist_cli.doctor.machine import GIB, Machine

@@ -12,7 +12,7 @@ import torch
 from accelerate import Accelerator
 
 from persist_cli.api.checkpoint import find_checkpoint
-from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.clips import ClipLatents
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.clips import ClipDataset, ClipPlan

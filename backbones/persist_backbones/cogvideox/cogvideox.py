@@ -64,7 +64,7 @@ from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_backbones.noise_levels import add_level, draw_levels
 from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.checkpoint import lora_base
-from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.clips import ClipLatents
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.errors import CheckpointError, PersistError

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from persist_cli.api.backbone import Clips
-from persist_cli.api.clip_latents import ClipLatents
+from persist_cli.api.clips import ClipLatents
 from persist_cli.api.stages import Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
