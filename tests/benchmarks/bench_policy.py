@@ -1,0 +1,109 @@
+"""What the ways of a trained policy follow from: its goal, or what it sees alone.
+
+    python tests/benchmarks/bench_policy.py --policy runs/policy --data runs/houses-test
+
+Prints a table, asserts nothing; ``--out`` keeps it as ``policy.json``. Moments of the data have a goal that the walk
+came to later. The policy is asked with that goal, with the goal of another moment, and without one. For the walk's last
+waypoint, ahead and to the side, the table has its correlation over all moments with the mean over sampled ways; for the
+distance, that with the predicted one. A policy that takes no notice of its goal has the same in all rows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
+
+from persist_cli.api.policy_network import PolicySample, PolicySamples
+from persist_cli.data.policy_samples import PolicySampleDataset
+from persist_cli.data.reference import sample_data
+from persist_cli.io.files import write_json
+from persist_cli.policies.nomad.network import NomadNetwork
+from persist_cli.policies.trained import find_policy, packaged_policy
+from persist_cli.viewing.console import print_table, say
+
+BATCH = 50
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, print the table and write what ``--out`` asks for."""
+    options = parse(arguments)
+    trained = packaged_policy() if options.policy is None else find_policy(options.policy)
+    network = trained.load()
+    assert isinstance(network, NomadNetwork), f"{trained.folder}: of policy {trained.policy!r}, not 'nomad'"
+    samples = moments(network, options.data or [sample_data()], options.moments, options.seed)
+    others = torch.randperm(len(samples.goal), generator=torch.Generator().manual_seed(options.seed))
+    hidden = torch.ones(len(others), dtype=torch.bool)
+    with torch.no_grad():
+        rows = {
+            "its goal": correlations(network, samples, samples.goal, ~hidden, options.ways),
+            "another goal": correlations(network, samples, samples.goal[others], ~hidden, options.ways),
+            "no goal": correlations(network, samples, samples.goal, hidden, options.ways),
+        }
+    say(f"{trained.name}: {len(others)} moments of {', '.join(map(str, options.data or ['sample']))}")
+    print_table(
+        "correlation with what the walk did", ["asked with", "ahead", "to the side", "distance"],
+        [[name, *(f"{value:.2f}" for value in row.values())] for name, row in rows.items()],
+    )  # fmt: skip
+    if options.out:
+        options.out.mkdir(parents=True, exist_ok=True)
+        write_json(options.out / "policy.json", {"policy": trained.fingerprint, "moments": len(others), "rows": rows})
+
+
+def moments(network: NomadNetwork, data: Sequence[Path], count: int, seed: int) -> PolicySamples:
+    """Return moments whose waypoints lead to the goal and do not stand still."""
+    dataset = PolicySampleDataset(data, network.sample_form, seed)
+    kept: list[PolicySample] = []
+    number = 0
+    while len(kept) < count:
+        sample, number = dataset[number], number + 1
+        if sample.leads_to_goal and float(sample.waypoints.norm(dim=-1).max()) >= network.settings.still:
+            kept.append(sample)
+    return PolicySamples.stack(kept)
+
+
+def correlations(
+    network: NomadNetwork, samples: PolicySamples, goal: Tensor, hidden: Tensor, ways: int
+) -> dict[str, float]:
+    """Return the correlations of the last waypoint and of the distance with the true ones."""
+    last, distance = [], []
+    for first in range(0, len(goal), BATCH):
+        part = slice(first, first + BATCH)
+        conditions = network.condition(samples.seen[part], goal[part], hidden[part])
+        distance.append(network.distance(conditions)[:, 0])
+        for number, condition in enumerate(conditions, start=first):
+            generator = torch.Generator().manual_seed(number)
+            sampled = network.sample(condition, ways, network.settings.noise_levels, generator)
+            last.append(sampled[:, -1].mean(0))
+    predicted, true = torch.stack(last).numpy(), samples.waypoints[:, -1].numpy()
+    pairs = {
+        "ahead": (predicted[:, 0], true[:, 0]),
+        "to the side": (predicted[:, 1], true[:, 1]),
+        "distance": (torch.cat(distance).numpy(), samples.distance.numpy()),
+    }
+    return {name: float(np.corrcoef(*pair)[0, 1]) for name, pair in pairs.items()}
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policy", type=Path, help="run or folder of a trained policy; else that of the package")
+    parser.add_argument(
+        "--data", type=Path, action="append", help="data set of held-out houses, repeat; else the sample"
+    )
+    parser.add_argument("--moments", type=int, default=200)
+    parser.add_argument("--ways", type=int, default=8, help="sampled for each moment")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="folder for policy.json")
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    main()
