@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -77,15 +77,37 @@ def driven_chromium(*flags: str) -> Iterator[Browser]:
         flags: more than those that keep it from asking other machines.
 
     Raises:
-        PersistError: when there is no Playwright or no Chromium.
+        PersistError: when there is no Playwright or no Chromium, or the browser cannot do what it is told.
     """
     try:
-        from playwright.sync_api import sync_playwright
+        from playwright.sync_api import Error, sync_playwright
     except ImportError as error:
         raise PersistError("a browser is driven by Playwright; pip install 'persist-cli[dev]'") from error
     if CHROMIUM is None:
         raise PersistError("no chromium, chromium-browser or google-chrome on PATH; install one of them")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*OFFLINE, *flags])
-        yield browser
-        browser.close()
+        try:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*OFFLINE, *flags])
+            yield browser
+            browser.close()
+        except Error as error:
+            raise PersistError(f"the browser says: {str(error).partition(chr(10))[0]}") from error
+
+
+def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the arguments before ``--`` and those after it."""
+    own = list(arguments)
+    place = own.index("--") if "--" in own else len(own)
+    return own[:place], own[place + 1 :]
+
+
+def window_size(text: str) -> tuple[int, int]:
+    """Return width and height of a text such as ``1360x800``.
+
+    Raises:
+        PersistError: when it is something else, or empty.
+    """
+    width, cross, height = text.partition("x")
+    if not (width.isdecimal() and cross and height.isdecimal() and int(width) and int(height)):
+        raise PersistError(f"cannot read the size {text!r}; write width x height in pixels, as in 1360x800")
+    return int(width), int(height)

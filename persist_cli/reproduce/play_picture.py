@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from persist_cli.errors import PersistError
 from persist_cli.io.files import written_aside
-from persist_cli.reproduce.pages import driven_chromium, served_page
+from persist_cli.reproduce.pages import driven_chromium, served_page, split_arguments, window_size
 from persist_cli.viewing.console import say
 
 if TYPE_CHECKING:
@@ -47,13 +47,6 @@ def take_picture(address: str, out: Path, walk: str, size: tuple[int, int]) -> N
             page.screenshot(path=aside, type="png")
 
 
-def split_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the arguments before ``--`` and those after it."""
-    own = list(arguments)
-    place = own.index("--") if "--" in own else len(own)
-    return own[:place], own[place + 1 :]
-
-
 def presses(walk: str) -> list[tuple[str, int]]:
     """Return the keys of a text such as ``"a*4 w"``, and the frames that each is held for.
 
@@ -64,18 +57,6 @@ def presses(walk: str) -> list[tuple[str, int]]:
     if not all(count.isdecimal() or not star for _, star, count in parts):
         raise PersistError(f"cannot read the walk {walk!r}; write keys and frames, as in 'a*4 w'")
     return [(key, int(count or 1)) for key, _, count in parts]
-
-
-def window_size(text: str) -> tuple[int, int]:
-    """Return width and height of a text such as ``1360x800``.
-
-    Raises:
-        PersistError: when it is something else.
-    """
-    width, cross, height = text.partition("x")
-    if not (width.isdecimal() and cross and height.isdecimal()):
-        raise PersistError(f"cannot read the size {text!r}; write width x height in pixels, as in 1360x800")
-    return int(width), int(height)
 
 
 def hold(page: Page, key: str, frames: int) -> None:

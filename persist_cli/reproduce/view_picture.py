@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from persist_cli.errors import PersistError
 from persist_cli.io.files import written_aside
-from persist_cli.reproduce.pages import driven_chromium, served_page
-from persist_cli.reproduce.play_picture import split_arguments, window_size
+from persist_cli.reproduce.pages import driven_chromium, served_page, split_arguments, window_size
 from persist_cli.viewing.console import say
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from torch import Tensor
 from persist_cli.api.cameras import Cameras, check_poses
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Origin
-from persist_cli.data.reference import parse_reference
+from persist_cli.data.reference import Reference, parse_reference
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.editing.views import path_cameras
 from persist_cli.errors import DataError, PersistError
@@ -101,7 +101,7 @@ def open_subject(text: str, truth: str | None = None, start: str | None = None) 
     else:
         subject = _of_trajectory(text)
     if truth is not None:
-        subject = _with_truth(subject, truth)
+        subject = _with_truth(subject, parse_reference(truth), f"--truth {truth}")
     if start is not None:
         file = parse_reference(start).single()
         _check_scene(subject, file, f"--start {start}")
@@ -134,7 +134,7 @@ def _stored_frames(memory: Memory) -> list[Walk]:
 
 
 def _of_trajectory(text: str) -> Subject:
-    file, walk, notices = _read_walk(text, "walk")
+    file, walk, notices = _read_walk(parse_reference(text), "walk")
     return Subject(
         text, file.info.scene, file.info.world_up, (walk,), _layers_of(file, walk), start=file, notices=notices
     )
@@ -181,14 +181,14 @@ def _of_rollout(folder: Path) -> Subject:
         subject = replace(subject, layers=layers, memory=memory, file=memory_file)
     if not plan.get("follow"):
         return subject
-    last = min(first + len(poses), file.length)
-    return _with_truth(subject, f"{plan['start'].partition(':')[0]}:{first}-{last}")
+    followed = replace(reference, frames=slice(first, min(first + len(poses), file.length)))
+    return _with_truth(subject, followed, plan["start"])
 
 
-def _with_truth(subject: Subject, text: str) -> Subject:
-    """Return a subject with true frames, and what they saw, beside it."""
-    file, walk, notices = _read_walk(text, "truth")
-    _check_scene(subject, file, f"--truth {text}")
+def _with_truth(subject: Subject, reference: Reference, named: str) -> Subject:
+    """Return a subject with true frames, and what they saw, beside it; ``named`` says where they were named."""
+    file, walk, notices = _read_walk(reference, "truth")
+    _check_scene(subject, file, named)
     walk = replace(walk, is_truth=True)
     layers = _layers_of(file, walk)
     truth = layers.get(SCENE, layers[POINTS])
@@ -208,10 +208,9 @@ def _check_scene(subject: Subject, file: TrajectoryFile, option: str) -> None:
         )
 
 
-def _read_walk(text: str, name: str) -> tuple[TrajectoryFile, Walk, tuple[str, ...]]:
-    reference = parse_reference(text)
+def _read_walk(reference: Reference, name: str) -> tuple[TrajectoryFile, Walk, tuple[str, ...]]:
     file = reference.single()
-    numbers, notices = _chosen(file.frame_numbers(reference.frames or slice(None)), text)
+    numbers, notices = _chosen(file.frame_numbers(reference.frames or slice(None)), reference.text)
     part = file.read(numbers).observations
     return file, _small(Walk(name, part.cameras, tuple(numbers), part.rgb, part.depth)), notices
 

@@ -116,11 +116,17 @@ def serve_page(plan: ViewPlan, subject: Subject, address: Address, as_json: bool
         except KeyboardInterrupt:
             with page.lock:  # what is being done is finished first
                 pass
-    if session is not None and session.unsaved:
-        count = len(session.edits)
-        say(f"{count} edits are not saved in {session.out}" if count else f"{session.out} has edits that were undone")
+    if session is not None:
+        say_unsaved(session)
     if imaginer is not None and imaginer.busy:
         leave()
+
+
+def say_unsaved(session: EditSession) -> None:
+    """Say what is edited and not saved, if anything is."""
+    count = len(session.edits)
+    if session.unsaved:
+        say(f"{count} edits are not saved in {session.out}" if count else f"{session.out} has edits that were undone")
 
 
 def check_address(address: Address) -> None:

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from persist_cli.errors import PersistError
-from persist_cli.reproduce.pages import CHROMIUM, served_page
-from persist_cli.reproduce.play_picture import main, presses, split_arguments, take_picture
+from persist_cli.reproduce.pages import CHROMIUM, served_page, split_arguments
+from persist_cli.reproduce.play_picture import main, presses, take_picture
 from tests.support.scripted_walks import ScriptedWalks, serving
 
 
@@ -23,6 +23,16 @@ def test_a_picture_of_the_page_is_taken_after_a_walk(tmp_path: Path) -> None:
     assert [message["held"] for message in walks.messages("keys", 4)] == [["left"], [], ["forward"], []]
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+def test_a_key_that_there_is_not_and_a_page_that_is_gone_are_told_in_one_line(tmp_path: Path) -> None:
+    walks = ScriptedWalks({"none": [np.full((16, 16, 3), 250, np.uint8)]})
+    with serving(walks) as address, pytest.raises(PersistError, match=r"^the browser says: .*Unknown key.*$"):
+        take_picture(address, tmp_path / "play.png", "foo*3", (800, 600))
+    with pytest.raises(PersistError, match=r"^the browser says: .*ERR_CONNECTION_REFUSED"):
+        take_picture(address, tmp_path / "play.png", "a", (800, 600))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_walk_is_keys_and_frames() -> None:
     assert presses("a*4 w d*12") == [("a", 4), ("w", 1), ("d", 12)]
 
@@ -34,7 +44,10 @@ def test_what_follows_two_dashes_is_for_persist_play() -> None:
     assert split_arguments(["play.png"]) == (["play.png"], [])
 
 
-@pytest.mark.parametrize(("option", "message"), [("--walk=a*b", "as in 'a*4 w'"), ("--size=big", "as in 1360x800")])
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [("--walk=a*b", "as in 'a*4 w'"), ("--size=big", "as in 1360x800"), ("--size=0x9", "1360x800")],
+)
 def test_a_mistake_is_one_line(option: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="1"):
         main(["play.png", option])

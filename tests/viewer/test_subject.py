@@ -1,6 +1,7 @@
 """What ``persist view`` names: trajectories, memory files and folders of rollouts."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -38,6 +39,15 @@ def test_a_rollout_that_followed_a_trajectory_stands_beside_the_truth(walks, rol
     assert truth.numbers == (2, 3, 4, 5, 6)
     assert torch.allclose(imagined.cameras.world_from_camera, truth.cameras.world_from_camera, atol=1e-6)
     assert list(subject.layers) == [MAP, TRUTH]
+
+
+def test_the_truth_of_a_rollout_is_found_in_a_folder_with_a_colon_in_its_name(walks, rollout, tmp_path):
+    data, folder = tmp_path / "walks: all", tmp_path / "rollout"
+    data.symlink_to(walks)
+    shutil.copytree(rollout, folder)
+    values = (folder / "rollout.json").read_text()
+    (folder / "rollout.json").write_text(values.replace(str(walks), str(data)))
+    assert open_subject(str(folder)).walks[1].numbers == (2, 3, 4, 5, 6)
 
 
 def test_of_a_long_walk_evenly_chosen_frames_are_shown_and_that_is_said(walks, monkeypatch):

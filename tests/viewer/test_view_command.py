@@ -5,8 +5,15 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 
 import pytest
+
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.viewer.edit_session import EditSession
+from persist_cli.viewer.view import say_unsaved
+from tests.support.processes import start_persist, wait_until
+from tests.support.view_tabs import PATIENCE, Tab, open_socket
 
 
 def test_a_trajectory_is_exported_as_one_page(persist, walks, tmp_path):
@@ -33,6 +40,35 @@ def test_ctrl_c_ends_it_without_an_error(walks):
     assert "Traceback" not in complaints
 
 
+def test_ctrl_c_while_the_model_is_loaded_ends_it_without_an_error(walks, voxel, tmp_path):
+    printed = tmp_path / "printed"
+    options = ("--checkpoint", voxel, "--port", 0, "--json")
+    process = start_persist("view", f"{walks}#0:0-2", *options, output=printed)
+    wait_until(lambda: printed.is_file() and '"address"' in printed.read_text(), process)
+    with open_socket(json.loads(printed.read_text())["address"]) as page:
+        page.recv(timeout=PATIENCE)
+        Tab(page).look()
+        time.sleep(0.5)  # it begins to load when a tab is known
+        process.send(signal.SIGINT)
+        assert process.wait() == 0
+    assert "Traceback" not in printed.read_text()
+
+
+def test_edits_that_are_not_saved_are_named_at_the_end(room, tmp_path, capsys):
+    session = EditSession(load_memory(room), {}, tmp_path / "edited.safetensors")
+    say_unsaved(session)
+    session.select_thing("box#1")
+    session.remove()
+    say_unsaved(session)
+    session.save()
+    say_unsaved(session)
+    session.undo()
+    say_unsaved(session)
+    printed = capsys.readouterr().out.replace("\n", "")
+    assert printed.count("1 edits are not saved in") == 1
+    assert printed.endswith("edited.safetensors has edits that were undone")
+
+
 def test_a_port_that_is_taken_is_told_in_one_line(persist, walks):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -42,6 +78,11 @@ def test_a_port_that_is_taken_is_told_in_one_line(persist, walks):
     assert result.code == 1
     assert f"cannot serve at 127.0.0.1:{port}: Address already in use" in result.err
     assert result.err.count("\n") == 1
+
+
+@pytest.fixture
+def places(walks, voxel, voxel_map, room):
+    return {"walks": walks, "map": voxel_map, "voxel": voxel, "room": room}
 
 
 @pytest.mark.parametrize(
@@ -54,11 +95,22 @@ def test_a_port_that_is_taken_is_told_in_one_line(persist, walks):
         (["{map}", "--export", "page.txt"], "name a page to write, as in view.html"),
         (["{map}", "--host", "no.such.host.invalid"], "give an address of this machine"),
         (["{walks}#0", "--truth", "{walks}#9"], "has 2 trajectories (0-1), there is no number 9"),
+        (["{map}", "--start", "{walks}#9"], "has 2 trajectories (0-1), there is no number 9"),
+        (["{room}", "--start", "{walks}#1"], "--start {walks}#1: is of scene"),
+        (["{map}", "--checkpoint", "reference"], "has no true frame to begin at; add --start DATA#trajectory"),
+        (["{walks}#0", "--checkpoint", "gone"], "gone"),
+        (
+            ["{walks}#0", "--checkpoint", "{voxel}", "--adapter", "scene"],
+            "no memory adapter 'scene' in it; it has voxel",
+        ),
     ],
 )
-def test_what_cannot_be_shown_ends_in_one_line_and_writes_nothing(persist, walks, voxel_map, tmp_path, options, words):
-    result = persist("view", *(option.format(walks=walks, map=voxel_map) for option in options), "--no-open")
+def test_what_cannot_be_shown_ends_in_one_line_and_writes_nothing(
+    persist, places, tmp_path, monkeypatch, options, words
+):
+    monkeypatch.chdir(tmp_path)
+    result = persist("view", *(option.format(**places) for option in options), "--no-open", "--port", 0)
     assert result.code == 1
-    assert words in result.err
+    assert words.format(**places) in result.err
     assert result.err.count("\n") == 1
     assert not list(tmp_path.iterdir())
