@@ -47,7 +47,7 @@ LANGUAGES = {"bash", "console", "python", "toml", "yaml", "json", "text", "bibte
 SHORTER = {
     "finetune": (
         "training.steps=1", "training.batch=1", "training.accumulation=1", "training.workers=0", "training.warmup=1",
-        "training.cooldown=0",
+        "training.cooldown=0", "data.clip_frames=[]",  # the small model's codec folds time, and it has one length
     ),
     "rollout": ("--steps", "1"),
     "plan": ("--candidates", "5", "--rounds", "1"),

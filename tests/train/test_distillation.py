@@ -14,7 +14,7 @@ from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.errors import RecipeError
-from persist_cli.recipe import make_recipe
+from persist_cli.recipe import make_recipe, parse_yaml_mapping
 from persist_cli.train.run_folder import source_scenes
 from persist_cli.train.trainer import Trainer
 from tests.support.micro_model import micro, shaken
@@ -133,6 +133,10 @@ def test_an_adapter_that_is_not_distilled_on_a_base_that_is_gets_a_warning(persi
 def test_another_checkpoint_may_teach(persist, walks, voxel, stage1, tmp_path):
     changes = ["memory=null", "adapter={}", f"adapter_from={voxel}", f"distill.teacher={voxel}", *DISTILL]
     assert persist(*stage("stage2-voxel", walks, tmp_path / "run", f"base={stage1}", *changes)).code == 0
+    assert persist("export", tmp_path / "run", "--out", tmp_path / "model").code == 0
+    assert find_checkpoint(tmp_path / "model").sampling.sampler == "consistency"
+    recipe = parse_yaml_mapping((tmp_path / "model/recipes/adapters/voxel.yaml").read_text(), "exported")
+    assert (recipe["adapter_from"], recipe["distill"]["teacher"]) == ("voxel", "voxel")  # no paths of this machine
     missing = [f"base={stage1}", f"distill.teacher={tmp_path / 'none'}", *DISTILL]
     failed = persist(*stage("stage1", walks, tmp_path / "other", *missing))
     assert (failed.code, len(failed.err.strip().splitlines())) == (1, 1)
