@@ -115,14 +115,16 @@ def test_the_model_without_an_adapter_cannot_read_a_memory(walks, voxel, own_map
 
 
 def test_a_rollout_goes_through_a_map_that_was_edited_by_hand(persist, walks, voxel, own_map, tmp_path):
-    memory = load_memory(own_map)
-    session = EditSession(memory, {}, tmp_path / "edited.safetensors")
+    session = EditSession(load_memory(own_map), {}, tmp_path / "edited.safetensors")
     session.select_box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
-    session.paint((200, 30, 30))
+    session.remove()
     edited, _ = session.save()
-    options = ("--start", f"{walks}#0:2", "--actions", "left", "--steps", 1, "--memory", edited)
-    result = persist("rollout", voxel, *options, "--out", tmp_path / "rollout")
-    assert result.code == 0, result.err
+    options = ("--start", f"{walks}#0:2", "--actions", "left", "--steps", 1)
+    for name, memory in (("edited", edited), ("unedited", own_map)):
+        result = persist("rollout", voxel, *options, "--memory", memory, "--out", tmp_path / name)
+        assert result.code == 0, result.err
+    cells = [load_memory(tmp_path / name / "memory.safetensors").figures().observed for name in ("edited", "unedited")]
+    assert cells[0] < cells[1]
 
 
 def test_a_model_that_cannot_read_the_memory_is_told(walks, voxel, room):

@@ -18,10 +18,11 @@ from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
 from persist_cli.reproduce.view_picture import SOFTWARE_3D
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.export import export_page
+from persist_cli.viewer.imagine import Imaginer, ImagineSettings
 from persist_cli.viewer.page import Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look, Stage
-from persist_cli.viewer.subject import MAP, TRUTH, open_subject
+from persist_cli.viewer.subject import MAP, POINTS, TRUTH, open_subject
 from persist_cli.viewing.own_address import address_of
 from tests.support.browser import watched
 
@@ -108,6 +109,21 @@ def test_an_edit_that_cannot_be_done_is_told_on_the_page(browser, room, tmp_path
         tab.get_by_role("button", name="Remove").click()
         tab.get_by_text("nothing is selected").wait_for()
         assert page.session.edits == []
+
+
+def test_a_camera_that_is_placed_shows_what_the_model_imagines(browser, walks, voxel):
+    subject = open_subject(f"{walks}#0:0-4")
+    with page_server("127.0.0.1", 0) as server:
+        imaginer = Imaginer(ImagineSettings(voxel), subject.start, None)
+        page = Page(server, subject, Look(layers={POINTS}), None, imaginer)
+        server.on_client_connect(page.imagine_panel.load_ahead)
+        with opened(browser, address_of("127.0.0.1", server.get_port())) as tab:
+            tab.get_by_role("tab", name="Imagine").click()
+            tab.get_by_role("button", name="Camera at this frame").click()
+            tab.get_by_text("8 frames on from frame 0 of").wait_for()
+            tab.get_by_text("imagined", exact=True).wait_for()
+            tab.get_by_role("button", name="Take the camera away").click()
+            until(lambda: page.imagine_panel._camera is None)
 
 
 def test_an_exported_page_is_one_file_that_draws_without_a_server(browser, rollout, tmp_path):
