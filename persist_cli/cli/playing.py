@@ -94,9 +94,8 @@ def play(
     from persist_cli.play.settings import PlaySettings
     from persist_cli.play.start import SAMPLE_FRAMES, SAMPLE_START, StartOptions
 
-    picture = PictureOptions(depth, depth_model, fov, None)
     given = (SAMPLE_FRAMES,) if start is None and not memory else tuple(memory or ())
-    begin = StartOptions(start or SAMPLE_START, picture, step, turn, body)
+    begin = StartOptions(start or SAMPLE_START, PictureOptions(depth, depth_model, fov, None), step, turn, body)
     options = PlayOptions(
         checkpoint or REFERENCE, begin, split_names(memories), given,
         PlaySettings(steps or 1, guidance, seed, ahead, clip_frames), InferenceOptions.of(dtype, save_memory),
