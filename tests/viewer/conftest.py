@@ -50,6 +50,14 @@ def voxel_map(walks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def own_map(walks: Path, voxel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a map of the first walk that the voxel model reads."""
+    file = tmp_path_factory.mktemp("own") / "map.safetensors"
+    run_persist("memorize", f"{walks}#0", "--checkpoint", str(voxel), "--out", str(file))
+    return file
+
+
+@pytest.fixture(scope="session")
 def rollout(walks: Path, voxel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a rollout that followed the first walk."""
     folder = tmp_path_factory.mktemp("rollouts") / "follow"

@@ -11,14 +11,6 @@ from persist_cli.errors import PersistError
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.imagine import MOST_CLIPS, STEP, TURN, Imaginer, ImagineSettings, nearest_frame, way_to
-from tests.support.micro_runs import run_persist
-
-
-@pytest.fixture(scope="module")
-def own_map(walks, voxel, tmp_path_factory):
-    file = tmp_path_factory.mktemp("own") / "map.safetensors"
-    run_persist("memorize", f"{walks}#0", "--checkpoint", str(voxel), "--out", str(file))
-    return file
 
 
 def moved(pose, metres):

@@ -155,6 +155,24 @@ def test_a_camera_that_moves_on_is_imagined_where_it_is_last(server, walks, voxe
     until(lambda: "on from frame 4" in panel.text.text and "ms" in panel.text.text)
 
 
+def test_an_edit_renews_what_is_imagined(server, walks, voxel, own_map):
+    server.scene.reset()
+    server.gui.reset()
+    subject = open_subject(str(own_map), start=f"{walks}#0")
+    session = EditSession(subject.memory, {}, own_map.with_name("edited.safetensors"))
+    imaginer = Imaginer(ImagineSettings(voxel), subject.start, own_map)
+    page = Page(server, subject, Look(layers={MAP}), session, imaginer)
+    panel = page.imagine_panel
+    panel.place(page.present_camera())
+    until(lambda: "ms" in panel.text.text and not panel._works)
+    before = server.scene.get_handle_by_name("/placed/camera").image
+    session.select_box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
+    session.remove()
+    page.edit_panel._done()
+    until(lambda: "ms" in panel.text.text and not panel._works)
+    assert not np.array_equal(server.scene.get_handle_by_name("/placed/camera").image, before)
+
+
 def test_a_model_that_cannot_be_loaded_is_told_in_the_tab(server, walks, tmp_path):
     panel = imagining_page(server, f"{walks}#0:0-6", ImagineSettings(tmp_path / "gone")).imagine_panel
     panel.load_ahead()
