@@ -57,7 +57,6 @@ class Play:
         self._clips = 0  # that were shown under these
         self._done: frozenset[str] = frozenset()  # interactions that are still held and were done
         self._recording: Recording | None = None
-        self._records = False
         self._goal: Goal | None = None
         self._guide: Guide | None = None
         self.settings = settings
@@ -182,7 +181,7 @@ class Play:
             return None
         self._drop()
         self._surveyor.undo()
-        if self._recording is not None and self._records:
+        if self._recording is not None:
             self._recording.undo()
         return self._show(None, True, begun)
 
@@ -275,17 +274,22 @@ class Play:
 
     @property
     def recording(self) -> bool:
-        """Whether frames are recorded; ``LONGEST`` of them at most."""
-        return self._recording is not None and self._records and not self._recording.full
+        """Whether there is a recording, which is not saved yet."""
+        return self._recording is not None
 
-    def record(self, on: bool) -> None:
-        """Begin a recording with the present frame, or end it; what was recorded stays until the next begins."""
-        self._records = on
-        if on:
-            self._recording = Recording(self.memories, self._frames)
+    @property
+    def recording_is_full(self) -> bool:
+        """Whether no more frames are recorded, since there are ``LONGEST`` already; it is still to be saved."""
+        return self._recording is not None and self._recording.full
+
+    def record(self) -> None:
+        """Begin a recording with the present frame."""
+        self._recording = Recording(self.memories, self._frames)
 
     def save_recording(self, folder: Path) -> SavedRecording:
-        """Write the last recording as a video and a data set of a trajectory for each memory.
+        """Write the recording as a video and a data set of a trajectory for each memory; nothing else may go on.
+
+        It stays until ``end_recording``, so that it can be saved elsewhere.
 
         Raises:
             PersistError: when nothing was recorded, or the folder cannot be written.
@@ -293,6 +297,10 @@ class Play:
         if self._recording is None:
             raise PersistError("nothing was recorded; begin a recording first")
         return self._recording.save(folder, self.info, {"checkpoint": self.model, "start": self._start.name})
+
+    def end_recording(self) -> None:
+        """Record no more, and forget what was recorded."""
+        self._recording = None
 
     @property
     def _frames(self) -> tuple[Observations, ...]:
@@ -353,7 +361,7 @@ class Play:
         return self._show(None, True, begun)
 
     def _record(self, action: str | None) -> None:
-        if self._recording is not None and self._records:
+        if self._recording is not None:
             self._recording.add(action, self._frames)
 
     def _show(self, action: str | None, free: bool, begun: float) -> Shown:

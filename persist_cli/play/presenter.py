@@ -14,10 +14,11 @@ from persist_cli.errors import PersistError
 from persist_cli.play import messages
 from persist_cli.play.messages import FrameHeader, ImagePart, MapHeader, Pose, ToPage, pack
 from persist_cli.play.play import Play
+from persist_cli.play.recording import LONGEST
 from persist_cli.play.recordings import Shelf
 from persist_cli.play.settings import Picture, Shown
 from persist_cli.play.wishes import Wishes
-from persist_cli.play.worker import Worker
+from persist_cli.play.worker import Workers
 
 Send = Callable[[ToPage | bytes], Awaitable[None]]
 Frame = tuple[Shown, list[bytes]]  # and its images as PNG
@@ -30,6 +31,8 @@ BUSY_SECONDS: Final = 0.2  # after which it is asked again whether nobody walks,
 PNG_EFFORT: Final = 1  # 0.2 ms and 5.5 kB for 64x64 pixels; WebP is a quarter smaller and takes twice as long, or more
 
 PLANNER_ENDED: Final = "the planner has ended: nothing near looks more like the goal, as far as the model knows"
+
+RECORDING_FULL: Final = f"the recording is full, with {LONGEST:,} frames; it is saved now, and you can begin another"
 
 KEYS: Final = {
     "forward": ["KeyW", "ArrowUp"],
@@ -60,17 +63,19 @@ class Presenter:
     Args:
         play: the walk; all that takes time is done with it in the worker.
         wishes: what the page wants.
-        worker: imagines and encodes.
+        workers: imagine, encode and save.
         send: sends a message to the page.
         shelf: where recordings of this page lie.
     """
 
-    def __init__(self, play: Play, wishes: Wishes, worker: Worker, send: Send, shelf: Shelf) -> None:
-        self.play, self.wishes, self.worker, self.send, self.shelf = play, wishes, worker, send, shelf
+    def __init__(self, play: Play, wishes: Wishes, workers: Workers, send: Send, shelf: Shelf) -> None:
+        self.play, self.wishes, self.send, self.shelf = play, wishes, send, shelf
+        self.worker, self.saver = workers.model, workers.saver
         self.may_think: Callable[[], bool] = lambda: not wishes.restless  # the worker is for those who walk first
         self._map_is_old, self._map_due = True, 0.0
         self._thinks = True  # whether something may be left to imagine ahead
         self._told: messages.State | None = None
+        self._was_full = False
 
     async def run(self) -> None:
         """Welcome the page, and serve it until this is cancelled."""
@@ -125,13 +130,14 @@ class Presenter:
         if frame is not None:
             self.wishes.restless = True
             await self._show(frame)
+            await self._save_full()
         await self._tell_changes()
 
     async def _obey(self, command: messages.Command) -> None:
         """Do a command, and say what has changed."""
         try:
             if isinstance(command, messages.Record) and not command.on:
-                await self.send(await self.worker.run(lambda: self.shelf.save(self.play)))
+                await self._save()
             else:
                 frame = await self.worker.run(lambda: encoded(self._do(command)))
                 if isinstance(command, messages.Undo) and frame is None:
@@ -139,8 +145,23 @@ class Presenter:
                 await self._show(frame)
         except PersistError as error:
             await self.send(messages.Error(text=str(error)))
+        await self._save_full()
         self.wishes.restless = self._thinks = True
         await self._tell_changes(anyway=True)
+
+    async def _save(self) -> None:
+        """Save the recording; this page waits, and the others go on."""
+        await self.send(await self.saver.run(lambda: self.shelf.save(self.play)))
+
+    async def _save_full(self) -> None:
+        """Save a recording that has become full, once; where that fails it stays until the page ends it."""
+        if self.play.recording_is_full and not self._was_full:
+            await self.send(messages.Notice(text=RECORDING_FULL))
+            try:
+                await self._save()
+            except PersistError as error:
+                await self.send(messages.Error(text=str(error)))
+        self._was_full = self.play.recording_is_full
 
     def _do(self, command: messages.Command) -> Shown | None:
         """Do a command, and return the frame that it leads to, if any."""
@@ -157,7 +178,7 @@ class Presenter:
             case messages.Jump():
                 return play.jump(command.x, command.y)
             case messages.Record():
-                play.record(command.on)
+                play.record()
             case messages.Goal():
                 play.take_goal()
             case messages.Plan():

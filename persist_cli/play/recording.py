@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import torch
+from jaxtyping import UInt8
+from torch import Tensor
 
 from persist_cli.api.actions import FREE, Action, ActionVocabulary
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
@@ -17,7 +19,7 @@ from persist_cli.io.files import check_folder
 from persist_cli.navigation.ground_mapper import body_of, tells_body
 from persist_cli.viewing.video import beside, enlarge, labelled, write_video
 
-LONGEST: Final = 5000  # frames of a recording; some 150 MB at 64×64 for each memory
+LONGEST: Final = 5000  # frames of a recording, ten minutes at eight a second; some 150 MB at 64×64 for each memory
 RATE: Final = 8  # frames a second of the video
 VIDEO: Final = "walk.mp4"
 DATA: Final = "data"
@@ -38,7 +40,6 @@ class SavedRecording:
     data: Path
 
 
-@dataclass
 class Recording:
     """The frames of a walk, from one on.
 
@@ -47,26 +48,33 @@ class Recording:
         first: the frame of each at the beginning.
     """
 
-    names: Sequence[str]
-    first: tuple[Observations, ...]
-    _steps: list[tuple[str | None, tuple[Observations, ...]]] = field(default_factory=list, init=False)
+    def __init__(self, names: Sequence[str], first: Sequence[Observations]) -> None:
+        self.names = names
+        self._frames = [_kept(first)]
+        self._actions: list[str] = []
 
     def __len__(self) -> int:
-        return 1 + len(self._steps)
+        return len(self._frames)
 
     @property
     def full(self) -> bool:
-        """Whether no more frames are taken."""
+        """Whether no more frames are taken, nor any taken away."""
         return len(self) >= LONGEST
 
-    def add(self, action: str | None, frames: tuple[Observations, ...]) -> None:
+    def add(self, action: str | None, frames: Sequence[Observations]) -> None:
         """Append the frames of all memories after an action, ``None`` for a jump; nothing once it is full."""
         if not self.full:
-            self._steps.append((action, frames))
+            self._actions.append(action or FREE)
+            self._frames.append(_kept(frames))
 
     def undo(self) -> None:
-        """Take the last frame away again, if it is not the first."""
-        del self._steps[-1:]
+        """Take the last frame away again, if it is not the first; nothing once it is full.
+
+        The walker may have gone on since a recording became full: what is undone then is no part of it.
+        """
+        if self._actions and not self.full:
+            self._actions.pop()
+            self._frames.pop()
 
     def save(self, folder: Path, info: TrajectoryInfo, source: Mapping[str, Any]) -> SavedRecording:
         """Write the video and the data set.
@@ -83,25 +91,37 @@ class Recording:
         if len(self) < 2:
             raise PersistError("nothing was walked while recording, so there is nothing to save; walk a step first")
         check_folder(folder)
-        actions = [action or FREE for action, _ in self._steps]
-        info = replace(info, vocabulary=_with_free(info.vocabulary, actions))
+        info = replace(info, vocabulary=_with_free(info.vocabulary, self._actions))
         info = replace(info, source={"format": "play", **_told_body(info), **source})
-        videos = []
         for number, name in enumerate(self.names):
-            frames = [self.first[number], *(seen[number] for _, seen in self._steps)]
             told = replace(info, source=info.source | {"memory": name})
-            write_trajectory(folder / DATA / f"{name}{SUFFIX}", told, _frames(frames, [*actions, None]))
-            videos.append(torch.cat([frame.rgb for frame in frames]))
-        if len(videos) > 1:
-            videos = [beside([labelled(enlarge(one), name) for one, name in zip(videos, self.names, strict=True)])]
-        write_video(folder / VIDEO, videos[0], RATE)
+            write_trajectory(folder / DATA / f"{name}{SUFFIX}", told, self._walk(number))
+        write_video(folder / VIDEO, map(self._picture, self._frames), RATE)
         return SavedRecording(len(self), folder / VIDEO, folder / DATA)
 
+    def _walk(self, memory: int) -> Iterator[Frame]:
+        """Give the frames of one memory with their actions and times."""
+        for number, (frames, action) in enumerate(zip(self._frames, [*self._actions, None], strict=True)):
+            yield replace(frames[memory], action=action, timestamp=number / RATE)
 
-def _frames(frames: Sequence[Observations], actions: Sequence[str | None]) -> Iterator[Frame]:
-    for number, (seen, action) in enumerate(zip(frames, actions, strict=True)):
-        pose = seen.cameras.world_from_camera[0].cpu().double().numpy()
-        yield Frame(seen.rgb[0].cpu().numpy(), seen.depth[0].cpu().numpy(), pose, action, number / RATE)
+    def _picture(self, frames: Sequence[Frame]) -> UInt8[Tensor, "height width 3"]:
+        """Return what the video shows of the frames of all memories."""
+        views = [torch.from_numpy(frame.rgb)[None] for frame in frames]
+        if len(views) > 1:
+            views = [beside([labelled(enlarge(one), name) for one, name in zip(views, self.names, strict=True)])]
+        return views[0][0]
+
+
+def _kept(frames: Sequence[Observations]) -> tuple[Frame, ...]:
+    """Return frames on the processor, without the clips that they are parts of."""
+    return tuple(
+        Frame(
+            seen.rgb[0].cpu().numpy().copy(),
+            seen.depth[0].cpu().numpy().copy(),
+            seen.cameras.world_from_camera[0].cpu().double().numpy().copy(),
+        )
+        for seen in frames
+    )
 
 
 def _with_free(vocabulary: ActionVocabulary, actions: Sequence[str]) -> ActionVocabulary:

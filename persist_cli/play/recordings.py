@@ -37,7 +37,9 @@ class Recordings:
 
     def __init__(self, folder: Path | None = None) -> None:
         self.stays = folder is not None
-        self._temporary = None if folder else tempfile.TemporaryDirectory(prefix="persist-play-")
+        self._temporary = (
+            None if folder else tempfile.TemporaryDirectory(prefix="persist-play-", ignore_cleanup_errors=True)
+        )  # in which a recording may still be written when it goes
         self.folder = folder or Path(self._temporary.name if self._temporary else "")
         self._downloads: dict[str, Download] = {}
 
@@ -75,12 +77,12 @@ class Shelf:
         self._folders: list[Path] = []
 
     def save(self, play: Play) -> Recorded:
-        """End a recording and save it: a video, and a data set of its trajectory.
+        """Save a recording and end it: a video, and a data set of its trajectory.
 
         Raises:
-            PersistError: when nothing is recorded, or it cannot be written; then nothing is left of it in the folder.
+            PersistError: when nothing is recorded, or it cannot be written; then nothing is left of it in the folder,
+                and it goes on.
         """
-        play.record(False)
         folder = self._recordings.folder / f"{time.strftime('walk-%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
         try:
             saved = play.save_recording(folder)
@@ -89,7 +91,10 @@ class Shelf:
             shutil.rmtree(folder, ignore_errors=True)
             if isinstance(error, PersistError):
                 raise
-            raise PersistError(f"{folder}: {error.strerror}; make room there, and stop recording once more") from error
+            raise PersistError(
+                f"{folder}: {error.strerror}; make room there, and end the recording once more"
+            ) from error
+        play.end_recording()
         self._folders.append(folder)
         video = self._publish(Download(saved.video, "walk.mp4", "video/mp4"))
         trajectory = self._publish(Download(archive, "walk.zip", "application/zip"))

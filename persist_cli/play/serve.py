@@ -65,7 +65,7 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
             server = Server(app, sessions, lambda: announce(bound, options, serving))
             signals.end(server)
             server.serve_on(bound)
-            done = sessions.worker.close(LAST_CALL_SECONDS if serving.recordings is None else SAVING_SECONDS)
+            done = sessions.workers.close(LAST_CALL_SECONDS if serving.recordings is None else SAVING_SECONDS)
         except KeyboardInterrupt:  # before there was a server
             return
         finally:

@@ -19,7 +19,7 @@ from persist_cli.play.play import Play
 from persist_cli.play.presenter import Presenter
 from persist_cli.play.recordings import Recordings
 from persist_cli.play.wishes import Allowance, Pace, Wishes
-from persist_cli.play.worker import Worker
+from persist_cli.play.worker import Workers
 
 GOING_AWAY: Final = 1001
 NOT_ALLOWED: Final = 1008
@@ -58,14 +58,14 @@ class Sessions:
     """All sessions of a server.
 
     Args:
-        open_play: makes the walk of a new session; called in the worker.
+        open_play: makes the walk of a new session; called where the model works.
         limits: what sessions may take.
         recordings: where they save.
     """
 
     def __init__(self, open_play: Callable[[], Play], limits: Limits, recordings: Recordings) -> None:
         self.open_play, self.limits, self.recordings = open_play, limits, recordings
-        self.worker = Worker()
+        self.workers = Workers()
         self.open: set[Session] = set()
         self._closing = False
 
@@ -103,10 +103,10 @@ class Sessions:
 
 
 class Session:
-    """One page's walk. The event loop reads what the page sends and sends what it shall see; the worker imagines."""
+    """One page's walk. The event loop hears the page and sends what it shall see; workers imagine and save."""
 
     def __init__(self, socket: WebSocket, sessions: Sessions) -> None:
-        self.socket, self.sessions, self.worker = socket, sessions, sessions.worker
+        self.socket, self.sessions, self.workers = socket, sessions, sessions.workers
         self.wishes = Wishes(Pace(sessions.limits.frames_per_second))
         self.shelf = sessions.recordings.shelf()
         self._play: Play | None = None
@@ -134,12 +134,12 @@ class Session:
             for part in parts:
                 part.cancel()
             await asyncio.gather(*parts, return_exceptions=True)
-            self.worker.give(partial(self.shelf.clear, self._play))  # after what is under way
+            self.workers.give_last(partial(self.shelf.clear, self._play))  # after what is under way
             self.over.set_result(None)
 
     async def _walk(self) -> None:
-        self._play = await self.worker.run(self.sessions.open_play)
-        presenter = Presenter(self._play, self.wishes, self.worker, self._send, self.shelf)
+        self._play = await self.workers.model.run(self.sessions.open_play)
+        presenter = Presenter(self._play, self.wishes, self.workers, self._send, self.shelf)
         presenter.may_think = lambda: not self.sessions.somebody_walks
         await presenter.run()
 

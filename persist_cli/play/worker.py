@@ -1,4 +1,4 @@
-"""The one thread in which the models of all sessions run."""
+"""The thread in which the models of all sessions run, and the one in which their recordings are saved."""
 
 from __future__ import annotations
 
@@ -52,3 +52,18 @@ class Worker:
             except BaseException as error:  # it belongs to the one who waits, and the thread goes on for others
                 future.set_exception(error)
             del job, future, call  # what they hold is freed before the next call comes
+
+
+class Workers:
+    """What works for all sessions: ``model`` imagines and encodes, ``saver`` saves recordings meanwhile."""
+
+    def __init__(self) -> None:
+        self.model, self.saver = Worker(), Worker()
+
+    def give_last(self, call: Callable[[], object]) -> None:
+        """Let the saver do a call after all that both were given up to now."""
+        self.model.give(lambda: self.saver.give(call))
+
+    def close(self, seconds: float) -> bool:
+        """Take no more calls, and return whether those they were given are done within some seconds for each."""
+        return self.model.close(seconds) and self.saver.close(seconds)

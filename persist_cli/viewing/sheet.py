@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,7 @@ def write_sheet(
         sheet.save(aside, format="PNG")
 
 
+@cache
 def label_font(size: int = 12) -> ImageFont.FreeTypeFont:
     """Return the font of labels in pictures, with Greek letters and signs, which Pillow's own font lacks."""
     import matplotlib

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -58,17 +58,26 @@ def enlarge(video: UInt8[Tensor, "frame height width 3"]) -> UInt8[Tensor, "fram
     return video.repeat_interleave(factor, dim=1).repeat_interleave(factor, dim=2)
 
 
-def write_video(path: Path, video: UInt8[Tensor, "frame height width 3"], frames_per_second: int = 8) -> None:
-    """Write the frames, enlarged to be seen, as an MP4 (H.264), whole or not at all."""
+def write_video(path: Path, video: Iterable[UInt8[Tensor, "height width 3"]], frames_per_second: int = 8) -> None:
+    """Write the frames, enlarged to be seen, as an MP4 (H.264), whole or not at all.
+
+    Args:
+        path: of the file.
+        video: a tensor of frames, or one frame after the other; no more than one is enlarged at a time.
+        frames_per_second: of the video.
+    """
     import av
 
-    frames = enlarge(video)
-    height, width = (side - side % 2 for side in frames.shape[1:3])  # H.264 wants even sides
     with written_aside(path) as aside, av.open(str(aside), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=Fraction(frames_per_second), options={"crf": "18"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for image in frames[:, :height, :width].numpy():
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
+        stream.pix_fmt = "yuv420p"
+        for number, picture in enumerate(video):
+            image = enlarge(picture[None])[0]
+            height, width = (side - side % 2 for side in image.shape[:2])  # H.264 wants even sides
+            if number == 0:
+                stream.width, stream.height = width, height
+            even = np.ascontiguousarray(image[:height, :width].numpy())
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(even, format="rgb24")))
         container.mux(stream.encode())
 
 

@@ -11,7 +11,7 @@ def test_a_long_walk_keeps_a_bounded_past(walks, monkeypatch):
     monkeypatch.setattr(surveyor, "MOST_PLACES", 50)
     monkeypatch.setattr(recording, "LONGEST", 40)
     play = play_on(remembering_model(), walks)
-    play.record(True)
+    play.record()
     for _ in range(12):
         walked(play, LEFT, 12)
         walked(play, FORWARD, 8)
@@ -22,6 +22,6 @@ def test_a_long_walk_keeps_a_bounded_past(walks, monkeypatch):
     assert len(walkers._history._parts) == 2
     assert all(len(shown) <= walkers.longest for shown in walkers._shown)
     assert len(play._surveyor._way) == 50
-    assert not play.recording
+    assert play.recording_is_full
     assert len(play._recording) == 40
     assert not walkers.lead.reads[1:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import threading
 import urllib.request
 import zipfile
 
@@ -11,7 +12,9 @@ from PIL import Image
 
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
+from persist_cli.play import recording
 from persist_cli.play.guide import Guide
+from persist_cli.play.recording import Recording
 from tests.play.test_collisions import play_in_room
 from tests.support.micro_plays import micro_walks
 from tests.support.pixel_cost import PixelCost
@@ -101,6 +104,38 @@ def test_a_recording_is_fetched_as_a_video_and_a_data_set_while_its_session_last
     assert not page.until("state")[0]["recording"]
 
 
+def test_a_recording_that_is_full_is_saved_by_itself(page, monkeypatch):
+    monkeypatch.setattr(recording, "LONGEST", 3)
+    page.say("record", on=True)
+    page.say("keys", held=["left"])
+    assert page.until("notice")[0]["text"].startswith("the recording is full")
+    assert page.until("recorded")[0]["frames"] == 3
+    assert not page.until("state")[0]["recording"]
+    assert page.frames(1)[0]["action"] == "left"  # the walk goes on
+
+
+def test_a_page_walks_while_another_one_saves(server, page, monkeypatch):
+    begun, may_go_on, save = threading.Event(), threading.Event(), Recording.save
+
+    def slowly(*arguments):
+        begun.set()
+        assert may_go_on.wait(60)
+        return save(*arguments)
+
+    monkeypatch.setattr(Recording, "save", slowly)
+    page.say("record", on=True)
+    step(page)
+    page.say("record", on=False)
+    assert begun.wait(60)
+    try:
+        with server.page() as other:
+            other.until("frame")
+            assert step(other)["action"] == "left"
+    finally:
+        may_go_on.set()
+    assert page.until("recorded")[0]["frames"] == 2
+
+
 def test_what_was_not_recorded_cannot_be_saved(page):
     page.say("record", on=False)
     assert page.until("error")[0]["text"].startswith("nothing was recorded")
@@ -109,6 +144,7 @@ def test_what_was_not_recorded_cannot_be_saved(page):
     assert page.until("state")[0]["recording"]
     page.say("record", on=False)
     assert page.until("error")[0]["text"].startswith("nothing was walked while recording")
+    assert page.until("state")[0]["recording"]  # it goes on
 
 
 def test_what_is_imagined_ahead_is_what_the_key_then_shows(server, page):

@@ -9,6 +9,7 @@ import torch
 
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
+from persist_cli.play import recording
 from persist_cli.play.open_play import PlayOptions, open_play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import StartOptions
@@ -21,15 +22,13 @@ def recorded(voxel, walks, tmp_path_factory):
     """A walk of five frames with a jump home in it, its last frame, and its files."""
     options = PlayOptions(voxel, StartOptions(f"{walks}#0:2"), ("voxel", "stage1"), settings=PlaySettings())
     play = open_play(options)
-    play.record(True)
+    play.record()
     for held in ("left", "left", "forward"):
         play.advance({held})
     play.home()
     play.advance({"right"})
     play.undo()
     last = play.advance({"left"})
-    play.record(False)
-    play.advance({"left"})
     return last, play.save_recording(tmp_path_factory.mktemp("recorded"))
 
 
@@ -55,7 +54,7 @@ def test_a_recording_is_followed_by_rollout(persist, voxel, recorded, tmp_path):
 
 def test_a_recording_is_measured_by_eval(persist, voxel, held_out, tmp_path):
     play = open_play(PlayOptions(voxel, StartOptions(f"{held_out}#0:0")))
-    play.record(True)
+    play.record()
     for name in (*OUT, *BACK):
         play.advance({name})
     saved = play.save_recording(tmp_path / "walk")
@@ -65,11 +64,32 @@ def test_a_recording_is_measured_by_eval(persist, voxel, held_out, tmp_path):
     assert "psnr" in (tmp_path / "eval" / "metrics.json").read_text()
 
 
+def test_a_full_recording_keeps_its_frames_whatever_is_undone_and_walked_then(voxel, walks, tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "LONGEST", 3)
+    play = open_play(PlayOptions(voxel, StartOptions(f"{walks}#0:2")))
+    play.record()
+    seen = [play.advance({"left"}) for _ in range(3)]
+    play.undo()
+    play.undo()
+    play.advance({"right"})
+    assert play.recording_is_full
+    walk = Store(play.save_recording(tmp_path).data)[0].read()
+    assert walk.actions == ("left", "left", None)
+    assert torch.equal(walk.observations.rgb[-1], seen[1].images["voxel"])
+
+
+def test_a_recording_does_not_keep_the_clips_of_its_frames(voxel, walks):
+    play = open_play(PlayOptions(voxel, StartOptions(f"{walks}#0:2")))
+    play.record()
+    play.advance({"left"})
+    assert all(frame.rgb.base is None and frame.depth.base is None for [frame] in play._recording._frames)
+
+
 def test_nothing_is_saved_of_a_walk_without_a_step(voxel, walks, tmp_path):
     play = open_play(PlayOptions(voxel, StartOptions(f"{walks}#0:2")))
     with pytest.raises(PersistError, match="nothing was recorded"):
         play.save_recording(tmp_path)
-    play.record(True)
+    play.record()
     with pytest.raises(PersistError, match="walk a step first"):
         play.save_recording(tmp_path)
     assert not any(tmp_path.iterdir())

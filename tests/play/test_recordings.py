@@ -8,6 +8,7 @@ import pytest
 
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
+from persist_cli.play import recording
 from persist_cli.play.recordings import ADDRESS, Recordings
 from tests.support.micro_plays import micro_walks
 
@@ -21,7 +22,7 @@ def walk(walks):
 def play(walk):
     """A walk of two steps that is being recorded."""
     play = walk()
-    play.record(True)
+    play.record()
     for _ in range(2):
         play.advance({"left"})
     return play
@@ -48,6 +49,24 @@ def test_a_walk_that_ends_while_it_is_recorded_is_saved_in_the_folder(play, tmp_
     assert len(Store(folder / "data")[0].read()) == 3
 
 
+def test_a_full_recording_is_saved_when_its_walk_ends(play, tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "LONGEST", 3)
+    assert play.recording_is_full
+    Recordings(tmp_path).shelf().clear(play)
+    [folder] = tmp_path.iterdir()
+    assert len(Store(folder / "data")[0].read()) == 3
+
+
+def test_a_recording_that_is_saved_has_ended_and_is_not_saved_again(play, tmp_path):
+    shelf = Recordings(tmp_path).shelf()
+    shelf.save(play)
+    assert not play.recording
+    with pytest.raises(PersistError, match="nothing was recorded"):
+        shelf.save(play)
+    shelf.clear(play)
+    assert len([*tmp_path.iterdir()]) == 1
+
+
 def test_of_a_recording_that_cannot_be_saved_nothing_is_left(play, tmp_path, monkeypatch):
     def no_room(*_):
         raise OSError(28, "No space left on device")
@@ -58,4 +77,5 @@ def test_of_a_recording_that_cannot_be_saved_nothing_is_left(play, tmp_path, mon
         shelf.save(play)
     assert not [*tmp_path.iterdir()]
     monkeypatch.undo()
+    assert play.recording
     assert shelf.save(play).frames == 3

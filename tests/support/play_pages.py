@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -85,7 +86,9 @@ class Served:
         deadline = time.monotonic() + PATIENCE
         while self.sessions.open and time.monotonic() < deadline:
             time.sleep(0.01)
-        self.sessions.worker.give(lambda: None).result(PATIENCE)
+        done = Future[None]()
+        self.sessions.workers.give_last(lambda: done.set_result(None))
+        done.result(PATIENCE)
 
     @contextmanager
     def page(self, **headers: str) -> Iterator[Page]:
@@ -109,5 +112,5 @@ def serving(walk: Callable[[], Play], limits: Limits | None = None) -> Iterator[
         server.should_exit = True
         thread.join(PATIENCE)
         recordings.close()
-        assert sessions.worker.close(PATIENCE)
+        assert sessions.workers.close(PATIENCE)
         assert not thread.is_alive()

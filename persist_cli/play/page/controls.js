@@ -51,6 +51,7 @@ class Controls {
   command(name) {
     if (byId(name).disabled) return;
     this.tookGoal ||= name === "goal"; // its picture is shown when the server has it
+    if (name === "record") byId(name).disabled = true; // until the server has begun, or saved
     this.send(name, name === "record" ? { on: !this.state.recording } : {});
   }
 
@@ -62,8 +63,9 @@ class Controls {
 
   show(state) {
     this.state = state;
-    byId("record")?.setAttribute("aria-pressed", String(state.recording));
-    if (byId("record")) byId("record").firstChild.textContent = state.recording ? "End recording" : "Record";
+    byId("record").disabled = false;
+    byId("record").setAttribute("aria-pressed", String(state.recording));
+    byId("record").firstChild.textContent = state.recording ? "End recording" : "Record";
     if (byId("plan")) byId("plan").disabled = !state.goal || state.planning;
     if (byId("stop")) byId("stop").disabled = !state.planning;
     byId("goal-box").hidden = !state.goal;
