@@ -53,6 +53,7 @@ class Play:
         self._ahead: Ahead | None = None
         self._thoughts: dict[tuple[str, ...], Ahead] = {}  # clips from the present state, by their actions
         self._last: tuple[str, ...] = ()  # actions that were held last
+        self._turn = 0  # number of the one of these whose turn is next
         self._blocked = 0  # of these, one after the other
         self._clips = 0  # that were shown under these
         self._done: frozenset[str] = frozenset()  # interactions that are still held and were done
@@ -117,17 +118,18 @@ class Play:
         """
         if seed is not None:
             self.set(dataclasses.replace(self.settings, seed=seed))
-        begun, self._done = time.monotonic(), frozenset()
+        begun = time.monotonic()
         self._drop()
         self._walkers.begin(self._start.observations, self.info)
         self._walkers.set_clip_frames(self._lengths[-1])
         if int(self._start.observations.origins[0]) == Origin.IMAGINED:  # a drawing, which the model sees as a frame
             self._walkers.stand_at(self._walkers.look_from(self._walkers.pose))
+            self._walkers.begin_here()
         self._surveyor.begin()
         self._record(None)
         return self._show(None, True, begun)
 
-    def advance(self, held: Collection[str]) -> Shown | None:
+    def advance(self, held: Collection[str], pressed: Collection[str] = ()) -> Shown | None:
         """Return the next frame under the held actions, or ``None`` when there is nothing new to show.
 
         Several actions are combined as ``held_actions`` says. An interaction is done once for each time that it is
@@ -136,24 +138,29 @@ class Play:
 
         Args:
             held: names of the vocabulary's actions.
+            pressed: those that were pressed since the last call. One that is held counts as newly held; one that was
+                let go again acts now, before what is held.
 
         Raises:
             DataError: for an unknown action; nothing changes then.
         """
         begun = time.monotonic()
-        actions = self._next_actions(frozenset(held))
+        actions = self._next_actions(frozenset(held), frozenset(pressed))
         if not actions:
             return self._guided(begun)
         self.stop()
         if actions != self._last:
-            self._last, self._blocked, self._clips = actions, 0, 0
+            self._last = actions
+            self._let_go()
+            self._turn = next((number for number, name in enumerate(actions) if name in pressed), 0)
         if self._blocked >= len(actions):
             return None
-        ahead = self._ahead
-        if ahead is None or ahead.actions != actions or not ahead.left:
-            ahead = self._ahead = self._thoughts.pop(actions, None) or self._imagine(actions, self._clips)
+        if self._ahead is None or not self._ahead.left:
+            actions = actions[self._turn :] + actions[: self._turn]
+            self._ahead = self._thoughts.pop(actions, None) or self._imagine(actions, self._clips)
             self._clips += 1
-        return self._take(ahead, begun)
+        self._turn = (self._turn + 1) % len(actions)
+        return self._take(self._ahead, begun)
 
     def think(self, seconds: float) -> bool:
         """Imagine what the likely next actions lead to, while nobody waits, and return whether more is left to imagine.
@@ -182,13 +189,16 @@ class Play:
         self._drop()
         self._surveyor.undo()
         if self._recording is not None:
-            self._recording.undo()
+            if len(self._recording) > 1:
+                self._recording.undo()
+            else:  # what is undone was shown before the recording
+                self._recording = Recording(self.memories, self._frames)
         return self._show(None, True, begun)
 
     def _guided(self, begun: float) -> Shown | None:
         """Return the planner's next frame; ``None`` when it does not walk, or is where it wants to be."""
         if self._guide is None:
-            self._ahead, self._blocked, self._clips = None, 0, 0
+            self._let_go()
             return None
         if self._ahead is None or not self._ahead.left or self._blocked:
             self._walkers.remember()
@@ -200,14 +210,14 @@ class Play:
             self._ahead, self._blocked = self._walkers.imagine(actions, repeat=False), 0
         return self._take(self._ahead, begun)
 
-    def _next_actions(self, held: frozenset[str]) -> tuple[str, ...]:
-        """Return the actions to take in turn: an interaction that is newly held, else what moves."""
-        moving = held_actions(held, self.info.vocabulary)
-        done = self._done & held
-        fresh = sorted(name for name in held - done if self.info.vocabulary[name].interaction)
+    def _next_actions(self, held: frozenset[str], pressed: frozenset[str]) -> tuple[str, ...]:
+        """Return the actions to take in turn: an interaction that is newly pressed, else what moves."""
+        moving = held_actions(pressed - held or held, self.info.vocabulary)
+        done = self._done & held - pressed
+        fresh = sorted(name for name in (held | pressed) - done if self.info.vocabulary[name].interaction)
         self._done = done | frozenset(fresh[:1])
         if fresh:
-            self._ahead, self._last = None, ()
+            self._last = ()
         return tuple(fresh[:1]) or moving
 
     @property
@@ -236,6 +246,7 @@ class Play:
         if self._goal is None:
             raise PersistError("there is no goal picture yet; take one, walk away, and let it be looked for")
         self._drop()
+        self._last = ()  # so that a key after the planner is newly held
         self._guide = Guide(self._goal, make_cost(COST, {}), self.settings.seed)
 
     def stop(self) -> None:
@@ -308,9 +319,13 @@ class Play:
 
     def _drop(self) -> None:
         """Drop all that is imagined and not shown, and let the planner stop."""
-        self._ahead, self._blocked, self._clips = None, 0, 0
+        self._let_go()
         self.stop()
         self._thoughts.clear()
+
+    def _let_go(self) -> None:
+        """Drop the rest of the clip, and begin anew with the held actions."""
+        self._ahead, self._turn, self._blocked, self._clips = None, 0, 0, 0
 
     def _next_thought(self) -> tuple[str, ...] | None:
         """Return the likeliest next actions of which nothing is imagined yet: those before, else a single move."""

@@ -117,20 +117,22 @@ class Presenter:
 
     async def _advance(self) -> None:
         """Show the next frame under the held actions or of the planner, if there is one."""
-        self.wishes.restless = False  # unless the page says something meanwhile
-        held, planned = self.wishes.keys.take(), self.play.planning
+        (held, pressed), planned = self.wishes.keys.take(), self.play.planning
+        self.wishes.restless = bool(pressed - held)  # a tap acts alone; else unless the page says something meanwhile
         try:
-            frame = await self.worker.run(lambda: encoded(self.play.advance(held)))
+            frame = await self.worker.run(lambda: encoded(self.play.advance(held, pressed)))
         except PersistError as error:
             self.play.stop()  # or the planner would fail again and again
             await self.send(messages.Error(text=str(error)))
             frame = None
-        if planned and not held and not self.play.planning:
+        if planned and not held | pressed and not self.play.planning:
             await self.send(messages.Notice(text=PLANNER_ENDED))
         if frame is not None:
             self.wishes.restless = True
             await self._show(frame)
             await self._save_full()
+        else:
+            self._map_is_old = True  # what was shown last is remembered only now
         await self._tell_changes()
 
     async def _obey(self, command: messages.Command) -> None:

@@ -50,13 +50,11 @@ class Ahead:
     """A clip that was imagined, of which some frames may not be shown yet.
 
     Args:
-        actions: that were asked for, in turn.
         names: of the actions of the clip, the blocked ones too.
         free: whether the way of each was free.
         seen: for each world model the frames of the free ones.
     """
 
-    actions: tuple[str, ...]
     names: Sequence[str]
     free: Sequence[bool]
     seen: Sequence[Observations]
@@ -118,6 +116,11 @@ class Walkers:
         self._history = History(Checkpoint.of(self.agents))
         self.version += 1
 
+    def begin_here(self) -> None:
+        """Remember what was shown, and let no undo go back behind the present frame."""
+        self.remember()
+        self._history = History(Checkpoint.of(self.agents))
+
     def set_clip_frames(self, frames: int) -> None:
         """Let the next clips have so many frames, the present one included.
 
@@ -148,7 +151,7 @@ class Walkers:
         seen = [agent.now[:0] for agent in self.agents]
         if walk.poses:
             seen = self._predict(walk.cameras, interactions_of(walk.moves, self.info.vocabulary))
-        return Ahead(tuple(actions), walk.names, walk.free, seen)
+        return Ahead(walk.names, walk.free, seen)
 
     def look_from(self, pose: Pose) -> list[Observations]:
         """Return for each world model a single frame from a pose that no action leads to; nothing is shown yet.

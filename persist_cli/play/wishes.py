@@ -23,17 +23,20 @@ class HeldActions:
 
     def __init__(self) -> None:
         self.held: frozenset[str] = frozenset()
-        self._tapped: frozenset[str] = frozenset()
+        self._pressed: list[str] = []  # since they last acted
 
     def hold(self, actions: Collection[str]) -> None:
         """Hold these actions and no others."""
-        self.held = frozenset(actions)
-        self._tapped = self.held or self._tapped
+        held = frozenset(actions)
+        self._pressed += sorted(held - self.held - {*self._pressed})
+        self.held = held
 
-    def take(self) -> frozenset[str]:
-        """Return the actions of the next frame."""
-        actions, self._tapped = self.held or self._tapped, frozenset()
-        return actions
+    def take(self) -> tuple[frozenset[str], frozenset[str]]:
+        """Return the held actions of the next frame, and those newly pressed; of these at most one was let go again."""
+        gone = [name for name in self._pressed if name not in self.held]
+        pressed = frozenset(self._pressed) - frozenset(gone[1:])
+        self._pressed = gone[1:]
+        return self.held, pressed
 
 
 class Pace:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,16 +12,25 @@ from persist_cli.errors import PersistError
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.rollout.world_model import Agent
+from tests.support.micro_model import FRAMEWISE, micro
 from tests.support.room_worlds import BODY, RoomWorld, room_info, room_views
 from tests.support.rooms import look
 
 FORWARD, LEFT = frozenset({"forward"}), frozenset({"left"})
 
 
-def play_in_room(pose: np.ndarray) -> Play:
+class ShortClips(RoomWorld):
+    """The room in clips of any number of frames."""
+
+    def __init__(self, agents: list[Agent]) -> None:
+        super().__init__(agents)
+        self.backbone = micro(**FRAMEWISE)
+
+
+def play_in_room(pose: np.ndarray, kind: type[RoomWorld] = RoomWorld, **settings: Any) -> Play:
     """A walk in the ray-traced room."""
     start = Trajectory("room", room_views(pose), (None,), room_info())
-    return Play({"none": RoomWorld([Agent(None, body=BODY)])}, start, PlaySettings())
+    return Play({"none": kind([Agent(None, body=BODY)])}, start, PlaySettings(**settings))
 
 
 def test_a_wall_is_shown_as_blocked_once_until_another_key_is_held():
@@ -29,6 +40,15 @@ def test_a_wall_is_shown_as_blocked_once_until_another_key_is_held():
     assert shown[-1] is None
     assert play.advance(LEFT).free
     assert play.advance(FORWARD).pose == play.shown.pose
+
+
+@pytest.mark.parametrize("frames", [None, 2, 4])
+def test_a_step_and_a_turn_take_turns_at_a_wall_too_however_long_the_clips_are(frames):
+    play = play_in_room(look((1.7, 1.25, -1.6), 0.0, 0.0), ShortClips, clip_frames=frames)  # before the wall
+    shown = [play.advance(FORWARD | LEFT) for _ in range(8)]
+    assert [one.action for one in shown] == ["forward", "left"] * 4
+    assert not shown[0].free
+    assert all(one.free for one in shown[1::2])
 
 
 def test_a_wall_that_only_the_shown_frames_show_stops_the_walker():

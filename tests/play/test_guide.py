@@ -60,6 +60,17 @@ def test_a_walk_to_the_goal_is_shown_step_by_step(monkeypatch):
     assert play.advance(frozenset()) is None
 
 
+def test_a_key_after_a_blocked_step_of_the_planner_is_newly_held(monkeypatch):
+    monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    monkeypatch.setattr(Guide, "decide", lambda *_: ("forward",))
+    play = play_in_room(look((1.7, 1.25, -1.6), 0.0, 0.0))  # before the wall
+    play.take_goal()
+    assert play.advance(FORWARD) is not None
+    play.plan()
+    assert not play.advance(frozenset()).free
+    assert play.advance(FORWARD) is not None
+
+
 def test_a_plan_without_a_goal_is_refused():
     play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
     with pytest.raises(PersistError, match="there is no goal picture yet"):

@@ -35,6 +35,7 @@ def test_a_walk_begins_where_the_last_path_of_a_memory_ends(voxel, walks, rememb
     one, two = play.shown.pose, there.shown.pose
     assert (one.x, one.y, one.degrees) == pytest.approx((two.x, two.y, two.degrees))
     assert play.shown.images["voxel"].shape == (SIZE, SIZE, 3)
+    assert play.undo() is None  # to the drawing of points from which the first frame was imagined
     assert play.advance({"left"}).action == "left"
     assert play._walkers.lead.memory.figures().observed == load_memory(remembered).figures().observed
 

@@ -74,6 +74,16 @@ def test_clips_under_newly_held_keys_begin_short_and_grow(walks):
     assert {world.clip_frames for world in worlds} == {9}
 
 
+def test_a_tap_acts_alone_before_what_is_held(backbone, walks):
+    play = play_on(backbone, walks)
+    walked(play, FORWARD, 2)
+    assert play.advance(FORWARD, LEFT).action == "left"
+    assert play.advance(FORWARD | LEFT, LEFT).action == "left"
+    assert play.advance(FORWARD | LEFT).action == "forward"
+    assert play.advance(FORWARD, {"backward"}).action == "backward"
+    assert [one.action for one in walked(play, FORWARD, 2)] == ["forward"] * 2
+
+
 def test_frames_of_keys_that_are_let_go_are_dropped_and_not_remembered(backbone, walks):
     play, world = play_on(backbone, walks), rollout_world(backbone, walks)
     walked(play, FORWARD, 3)

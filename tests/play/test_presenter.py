@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import threading
 import urllib.request
@@ -14,7 +15,12 @@ from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
 from persist_cli.play import recording
 from persist_cli.play.guide import Guide
+from persist_cli.play.messages import Keys
+from persist_cli.play.presenter import Presenter
 from persist_cli.play.recording import Recording
+from persist_cli.play.recordings import Recordings
+from persist_cli.play.wishes import Pace, Wishes
+from persist_cli.play.worker import Workers
 from tests.play.test_collisions import play_in_room
 from tests.support.micro_plays import micro_walks
 from tests.support.pixel_cost import PixelCost
@@ -54,6 +60,35 @@ def test_the_map_follows_where_the_walker_is(page):
     assert bottom < frame["pose"]["y"] < top
     assert page.until("map")[1] != [image]
     assert max(Image.open(io.BytesIO(image)).size) <= 320
+
+
+def test_the_map_is_drawn_again_with_the_last_frames_of_a_walk(walks):
+    async def walk():
+        async def send(message): ...
+
+        wishes = Wishes(Pace(10))
+        presenter = Presenter(micro_walks(walks)(), wishes, workers, send, Recordings().shelf())
+        wishes.hear(Keys(held=["left"]))
+        await presenter._advance()
+        await presenter._show_map()  # in the middle of a clip, of which nothing is remembered yet
+        wishes.hear(Keys(held=[]))
+        await presenter._advance()
+        return presenter._map_is_old
+
+    workers = Workers()
+    assert asyncio.run(walk())
+    assert workers.close(60)
+
+
+def test_a_tap_while_another_key_is_held_acts(page):
+    page.say("keys", held=["forward"])
+    page.frames(2)
+    page.say("keys", held=["forward", "left"])
+    page.say("keys", held=["forward"])
+    actions = [frame["action"] for frame in page.frames(4)]
+    page.say("keys", held=[])
+    assert actions.count("left") == 1
+    assert actions[-1] == "forward"
 
 
 def test_an_undone_step_is_gone_and_the_first_frame_cannot_be_undone(page):

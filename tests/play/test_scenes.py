@@ -39,6 +39,17 @@ def test_a_thing_is_picked_up_once_and_the_way_is_free_then():
     assert play.advance(FORWARD).free
 
 
+def test_a_key_that_is_pressed_again_acts_again_and_one_held_through_a_reset_does_not():
+    play = play_in_scene()
+    assert play.advance(PICK_UP).free
+    play.undo()
+    assert play.advance(PICK_UP) is None
+    assert play.advance(PICK_UP, PICK_UP).free
+    play.reset()
+    assert play.advance(PICK_UP) is None
+    assert box_is_there(play)
+
+
 def test_a_thing_that_is_picked_up_is_back_after_undo():
     play = play_in_scene()
     play.advance(FORWARD)

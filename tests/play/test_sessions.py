@@ -23,12 +23,12 @@ from tests.support.play_pages import serving
 class FragilePlay(Play):
     """Fails in the middle of a step backward, and refuses one to the right."""
 
-    def advance(self, held):
+    def advance(self, held, pressed=()):
         if "backward" in held:
             raise ZeroDivisionError("secret")
         if "right" in held:
             raise PersistError("no way to the right")
-        return super().advance(held)
+        return super().advance(held, pressed)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from persist_cli.data.store import Store
 from persist_cli.play import history
 from tests.play.test_play import FORWARD, LEFT, play_on, walked
 from tests.support.micro_worlds import remembering_model
@@ -53,3 +54,14 @@ def test_undo_reaches_back_over_copies_of_the_memory_and_is_bounded(backbone, wa
     assert 4 <= len(undone) < 20
     for one, truth in zip(undone, shown[-2::-1], strict=False):
         assert torch.equal(one.images["voxel"], truth.images["voxel"])
+
+
+def test_what_is_undone_before_the_first_recorded_frame_is_not_recorded(backbone, walks, tmp_path):
+    play = play_on(backbone, walks)
+    walked(play, FORWARD, 1)
+    play.record()
+    first = play.undo()
+    walked(play, LEFT, 2)
+    walk = Store(play.save_recording(tmp_path).data)["voxel"].read()
+    assert walk.actions == ("left", "left", None)
+    assert torch.equal(walk.observations.rgb[0], first.images["voxel"])

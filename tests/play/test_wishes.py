@@ -27,17 +27,28 @@ def test_the_newest_held_actions_count():
     keys = HeldActions()
     keys.hold(["forward"])
     keys.hold(["forward", "left"])
-    assert keys.take() == keys.take() == {"forward", "left"}
+    assert keys.take() == ({"forward", "left"}, {"forward", "left"})
+    assert keys.take() == ({"forward", "left"}, set())
     keys.hold([])
-    assert keys.take() == set()
+    assert keys.take() == (set(), set())
 
 
-def test_what_was_let_go_before_it_acted_acts_once():
+def test_what_was_let_go_before_it_acted_acts_once_and_one_at_a_time():
     keys = HeldActions()
-    keys.hold(["forward"])
+    for held in (["forward"], ["forward", "toggle"], ["forward", "left"], ["forward"]):
+        keys.hold(held)
+    assert keys.take() == ({"forward"}, {"forward", "toggle"})
+    assert keys.take() == ({"forward"}, {"left"})
+    assert keys.take() == ({"forward"}, set())
+
+
+def test_what_is_let_go_and_held_again_counts_as_newly_pressed():
+    keys = HeldActions()
+    keys.hold(["toggle"])
+    keys.take()
     keys.hold([])
-    assert keys.take() == {"forward"}
-    assert keys.take() == set()
+    keys.hold(["toggle"])
+    assert keys.take() == ({"toggle"}, {"toggle"})
 
 
 def test_two_frames_may_be_on_the_way(clock):
