@@ -16,7 +16,7 @@ The page sends JSON text of at most ``MOST_BYTES``, an object with a ``type``::
 
 The server sends JSON text: ``welcome`` first, ``state`` after each change that is no frame, ``notice``, ``error``,
 ``recorded``. Pictures come as binary messages: four bytes with the length of a JSON header (big-endian), the header,
-and the images, one after another in the header's order, as PNG (see ``pack`` and ``unpack``). ``frame`` has one image
+and the images, one after another in the header's order, as PNG (see ``pack``). ``frame`` has one image
 for each memory, ``map`` one.
 
 The server has at most ``MOST_UNDRAWN`` frames on the way that were not acknowledged. It imagines none meanwhile, so a
@@ -25,12 +25,12 @@ slow page drops nothing and sees the newest keys' frame next. The first frame, a
 
 A closed WebSocket has one of these codes: 1000 or 1001 at the end, 1008 for what the page must not do (too many
 messages), 1009 for a message that is too long, 1011 for a fault of this session, 1013 where all sessions are taken.
-An ``error`` with the reason comes before, where something can still be sent.
+An ``error`` with the reason comes before, where something can still be sent. 1011 without one means that the page was
+not there for long.
 """
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Sequence
 from typing import Annotated, Any, Final, Literal
@@ -208,8 +208,6 @@ class Welcome(ToPage):
         image: width and height of each image in pixels.
         settings: as they are at the start.
         limits: least and most of the settings that are numbers.
-        can: which of ``undo``, ``jump``, ``map``, ``record``, ``goal`` and ``plan`` there are here.
-        frames_per_second: most that the server sends.
     """
 
     type: Literal["welcome"] = "welcome"
@@ -224,8 +222,6 @@ class Welcome(ToPage):
         "guidance": (0, MOST_GUIDANCE),
         "seed": (0, MOST_SEED),
     }
-    can: list[str]
-    frames_per_second: float
 
 
 class State(ToPage):
@@ -301,7 +297,6 @@ class FrameHeader(ToPage):
         free: whether its way was free; a blocked action shows the frame before it once more.
         pose: where the agent stands.
         milliseconds: that the server took for this frame.
-        frames_per_second: of the last second in which frames were sent.
         images: one for each memory.
     """
 
@@ -311,7 +306,6 @@ class FrameHeader(ToPage):
     free: bool
     pose: Pose
     milliseconds: float
-    frames_per_second: float
     images: list[ImagePart]
 
 
@@ -328,14 +322,3 @@ def pack(header: FrameHeader | MapHeader, images: Sequence[bytes]) -> bytes:
     assert [part.bytes for part in header.images] == [len(image) for image in images]
     head = header.to_json().encode()
     return b"".join((LENGTH.pack(len(head)), head, *images))
-
-
-def unpack(message: bytes) -> tuple[dict[str, Any], list[bytes]]:
-    """Return the header and the images of a binary message, as the page reads them."""
-    (length,) = LENGTH.unpack_from(message)
-    header = json.loads(message[LENGTH.size : LENGTH.size + length])
-    images, place = [], LENGTH.size + length
-    for part in header["images"]:
-        images.append(message[place : place + part["bytes"]])
-        place += part["bytes"]
-    return header, images

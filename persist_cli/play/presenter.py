@@ -30,7 +30,7 @@ THINK_SECONDS: Final = 0.01  # after which no other clip is begun ahead, so that
 BUSY_SECONDS: Final = 0.2  # after which it is asked again whether nobody walks, so that there is time to think
 PNG_EFFORT: Final = 1  # 0.2 ms and 5.5 kB for 64x64 pixels; WebP is a quarter smaller and takes twice as long, or more
 
-PLANNER_ENDED: Final = "the planner has ended: nothing near looks more like the goal, as far as the model knows"
+PLANNER_ENDED: Final = "the planner has ended: nothing near looks more like the goal, or it has looked for long enough"
 
 RECORDING_FULL: Final = f"the recording is full, with {LONGEST:,} frames; it is saved now, and you can begin another"
 
@@ -196,7 +196,7 @@ class Presenter:
         (shown, images), pace = frame, self.wishes.pace
         header = FrameHeader(
             number=pace.send(), action=shown.action, free=shown.free, pose=Pose(**vars(shown.pose)),
-            milliseconds=shown.milliseconds, frames_per_second=pace.rate,
+            milliseconds=shown.milliseconds,
             images=[ImagePart(memory=name, bytes=len(image)) for name, image in zip(shown.images, images, strict=True)],
         )  # fmt: skip
         self._map_is_old = self._thinks = True
@@ -230,8 +230,7 @@ class Presenter:
         ]
         return messages.Welcome(
             model=self.play.model, memories=list(self.play.memories), actions=actions, image=(width, height),
-            settings=self._settings(), can=["undo", "jump", "map", "record", "goal", "plan"],
-            frames_per_second=self.wishes.pace.most,
+            settings=self._settings(),
         )  # fmt: skip
 
     def _settings(self) -> messages.Settings:

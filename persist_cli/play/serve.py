@@ -62,7 +62,7 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
         try:
             sessions = Sessions(first_ready(open_walks(options)), serving.limits, recordings)
             app = make_app(walking_page(), sessions, names_of(serving.host), serving.host in EVERYWHERE)
-            server = Server(app, sessions, lambda: announce(bound, options, serving))
+            server = Server(app, sessions, lambda: announce(bound, serving))
             signals.end(server)
             server.serve_on(bound)
             done = sessions.workers.close(LAST_CALL_SECONDS if serving.recordings is None else SAVING_SECONDS)
@@ -108,7 +108,7 @@ class StopSignals:
         self._server.should_exit = True
 
 
-def announce(bound: socket.socket, options: PlayOptions, serving: ServeOptions) -> None:
+def announce(bound: socket.socket, serving: ServeOptions) -> None:
     """Print the address of the page, and open a browser there if that is wanted and there is one."""
     address = address_of(serving.host, bound.getsockname()[1])
     if serving.json:

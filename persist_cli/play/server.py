@@ -25,7 +25,9 @@ from persist_cli.play.sessions import Sessions
 from persist_cli.play.walking_page import WalkingPage
 from persist_cli.viewing.own_address import leads_here, same_host
 
-MORE_CONNECTIONS: Final = 32  # than sessions: for the page, recordings, and those who are refused
+MORE_CONNECTIONS: Final = (
+    32  # than sessions: of these, requests beyond get 503; WebSockets count, and ``Sessions`` refuses them
+)
 PING_SECONDS: Final = 20.0  # after which a page that says nothing is asked whether it is there, and is given up
 GRACE_SECONDS: Final = 1.0  # for answers that are under way when the server ends
 

@@ -27,7 +27,7 @@ FAULT: Final = 1011
 TRY_LATER: Final = 1013
 
 MESSAGES: Final = (200.0, 100.0)  # of a page: at once, and a second
-MOST_WRONG: Final = 20  # messages of a session that cannot be read
+WRONG: Final = (20.0, 0.1)  # of these, that cannot be read
 SEND_SECONDS: Final = 30.0  # in which a page takes a message, or is given up
 RELOAD_SECONDS: Final = 1.0  # in which a session may end for one that wants to begin
 CLOSE_SECONDS: Final = 1.0  # in which it takes the last one
@@ -85,7 +85,7 @@ class Sessions:
     @property
     def somebody_walks(self) -> bool:
         """Whether some page waits for its next frame."""
-        return any(session.wishes.restless for session in self.open)
+        return any(session.wishes.restless and session.wishes.pace.is_open for session in self.open)
 
     async def _has_room(self) -> bool:
         """Return whether another session may begin; a tab that is loaded again waits for its old one to end."""
@@ -110,7 +110,7 @@ class Session:
         self.wishes = Wishes(Pace(sessions.limits.frames_per_second))
         self.shelf = sessions.recordings.shelf()
         self._play: Play | None = None
-        self._allowance, self._wrong = Allowance(*MESSAGES), 0
+        self._allowance, self._wrong = Allowance(*MESSAGES), Allowance(*WRONG)
         loop = asyncio.get_running_loop()
         self._stopped: asyncio.Future[None] = loop.create_future()
         self.over: asyncio.Future[None] = loop.create_future()
@@ -151,16 +151,20 @@ class Session:
             try:
                 self._hear(message)
             except PersistError as error:
-                self._wrong += 1
-                if self._wrong > MOST_WRONG:
-                    raise SessionEndError(f"{self._wrong} messages could not be read", NOT_ALLOWED) from error
                 await self._send(messages.Error(text=str(error)))
 
     def _hear(self, message: Mapping[str, Any]) -> None:
-        text = message.get("text")
-        if text is None:
-            raise PersistError("cannot read binary messages; the page sends JSON text")
-        self.wishes.hear(read_message(text))
+        """Take up a message; too many that cannot be read end the session."""
+        try:
+            text = message.get("text")
+            if text is None:
+                raise PersistError("cannot read binary messages; the page sends JSON text")
+            said = read_message(text)
+        except PersistError as error:
+            if not self._wrong.spend():
+                raise SessionEndError("too many messages could not be read; reload the page", NOT_ALLOWED) from error
+            raise
+        self.wishes.hear(said)
 
     async def _send(self, message: ToPage | bytes) -> None:
         try:

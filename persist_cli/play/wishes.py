@@ -14,7 +14,6 @@ from persist_cli.play.messages import MOST_UNDRAWN, Ack, ChangeSettings, Command
 
 Clock = Callable[[], float]
 
-MEASURED: Final = 1.0  # seconds over which frames are counted
 MOST_COMMANDS: Final = 16  # that wait
 
 
@@ -51,7 +50,6 @@ class Pace:
         self.most, self.clock = most, clock
         self.sent = self.drawn = 0  # numbers of frames, which begin at 1
         self._due = 0.0
-        self._times: deque[float] = deque()
 
     @property
     def is_open(self) -> bool:
@@ -68,20 +66,11 @@ class Pace:
         now, between = self.clock(), 1 / self.most
         self.sent += 1
         self._due = max(self._due, now - between / 2) + between  # half a frame of delay is made up for, no more
-        self._times.append(now)
         return self.sent
 
     def draw(self, number: int) -> None:
         """Note that the page has drawn the frame with a number, and so those before; other numbers change nothing."""
         self.drawn = max(self.drawn, min(number, self.sent))
-
-    @property
-    def rate(self) -> float:
-        """Frames a second, of those that were sent within the last second."""
-        earliest = self.clock() - MEASURED
-        while self._times and self._times[0] <= earliest:
-            self._times.popleft()
-        return len(self._times) / MEASURED
 
 
 class Allowance:

@@ -2,7 +2,8 @@ import pytest
 
 from persist_cli.errors import PersistError
 from persist_cli.play import messages
-from persist_cli.play.messages import FrameHeader, ImagePart, Pose, pack, read_message, unpack
+from persist_cli.play.messages import FrameHeader, ImagePart, Pose, pack, read_message
+from tests.support.play_pages import unpack
 
 
 def test_a_message_of_the_page_is_read():
@@ -46,7 +47,7 @@ def test_a_message_that_is_too_long_is_not_even_parsed():
 
 def test_a_frame_is_unpacked_as_it_was_packed():
     header = FrameHeader(
-        number=7, action="forward", free=True, pose=Pose(x=1, y=2, degrees=90), milliseconds=12.5, frames_per_second=8,
+        number=7, action="forward", free=True, pose=Pose(x=1, y=2, degrees=90), milliseconds=12.5,
         images=[ImagePart(memory="voxel", bytes=3), ImagePart(memory="none", bytes=2)],
     )  # fmt: skip
     head, images = unpack(pack(header, [b"abc", b"de"]))

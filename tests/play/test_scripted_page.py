@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 
 DESK = {"width": 1280, "height": 800}
+TWO_PICTURES = "new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)))"  # of the screen
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def test_a_held_key_walks_until_it_is_released_and_is_told_once(browser: Browser
         page.keyboard.up("w")
         page.wait_for_selector("#state:text('Ready')")
         assert held(walks, 2) == [["forward"], []]
-        assert [message["number"] for message in walks.messages("ack", frame_number(page))][:4] == [0, 1, 2, 3]
+        assert [message["number"] for message in walks.messages("ack", frame_number(page))][:4] == [1, 2, 3, 4]
 
 
 def test_two_keys_are_told_together_and_arrows_are_the_same_actions(browser: Browser, walks: ScriptedWalks) -> None:
@@ -96,6 +97,43 @@ def test_keys_are_released_when_the_window_loses_the_focus(browser: Browser, wal
         page.evaluate("dispatchEvent(new Event('blur'))")
         page.wait_for_selector("#state:text('Ready')")
         assert held(walks, 2) == [["forward"], []]
+
+
+def test_no_key_sticks_that_is_let_go_while_meta_is_down(browser: Browser, walks: ScriptedWalks) -> None:
+    walks.answering = False
+    with opened(browser, walks) as page:
+        page.keyboard.down("w")
+        page.keyboard.down("Meta")
+        page.keyboard.up("Meta")  # a Mac tells no keyup of W
+        assert held(walks, 2) == [["forward"], []]
+
+
+def test_keys_walk_and_stop_the_planner_after_a_click_on_the_map_or_a_box(
+    browser: Browser, walks: ScriptedWalks
+) -> None:
+    walks.answering = False
+    with opened(browser, walks) as page:
+        page.wait_for_selector("#agent", state="attached")
+        for place, key in (("#map", "ArrowUp"), ("#ahead", "ArrowLeft")):
+            page.click(place)
+            page.keyboard.press(key)
+        assert held(walks, 4) == [["forward"], [], ["left"], []]
+        walks.tell_state(goal=True, planning=True)
+        page.wait_for_selector("#stop:enabled")
+        page.locator("#map").focus()
+        page.keyboard.press("Escape")
+        walks.messages("stop", 1)
+
+
+def test_buttons_name_the_keys_of_another_keyboard(browser: Browser, walks: ScriptedWalks) -> None:
+    with serving(walks) as address:
+        page = browser.new_page()
+        page.add_init_script("navigator.keyboard.getLayoutMap = async () => new Map([['KeyW', 'z'], ['KeyA', 'q']])")
+        page.goto(address)
+        page.wait_for_selector("#stage[data-number]")
+        keys = [page.locator(f"[data-action={name}] kbd").inner_text() for name in ("forward", "left", "right")]
+        assert keys == ["Z", "Q", "D"]
+        page.close()
 
 
 def test_typing_in_a_field_does_not_walk(browser: Browser, walks: ScriptedWalks) -> None:
@@ -167,7 +205,9 @@ def test_commands_are_buttons_and_keys(browser: Browser, walks: ScriptedWalks) -
         walks.tell_state(goal=True, recording=True)
         page.wait_for_selector("#goal-picture", state="visible")
         page.click("#plan")
+        page.wait_for_selector("#record:enabled")
         page.keyboard.press("r")
+        page.keyboard.press("r")  # is not told before the server has answered
         page.click("#goal")
         walks.messages("goal", 2)
         said = [message for message in walks.said if message["type"] not in ("ack", "keys")]
@@ -217,6 +257,26 @@ def test_a_lost_connection_comes_back_by_itself(browser: Browser, walks: Scripte
         assert len(walks.sockets) == 2
 
 
+def test_a_key_that_was_pressed_before_the_welcome_is_not_held_after_it(browser: Browser, walks: ScriptedWalks) -> None:
+    with opened(browser, walks) as page:
+        walks.welcoming.clear()
+        walks.sockets[-1].close(1001)
+        page.wait_for_selector("#state:text('Connection lost')")
+        page.keyboard.down("w")
+        walks.welcoming.set()
+        page.wait_for_selector("#state:text('Ready')")
+        page.wait_for_selector("[data-action=forward][aria-pressed=false]")
+        assert held(walks)[-1:] in ([], [[]])
+
+
+def test_a_page_that_did_not_answer_for_long_comes_back_by_itself(browser: Browser, walks: ScriptedWalks) -> None:
+    with opened(browser, walks) as page:
+        walks.sockets[-1].close(1011)  # as after a laptop's sleep: the server has said nothing of a fault
+        page.wait_for_selector("#state:text('Connection lost')")
+        page.wait_for_selector("#state:text('Ready')")
+        assert len(walks.sockets) == 2
+
+
 def test_a_session_that_failed_is_begun_again_by_hand(browser: Browser, walks: ScriptedWalks) -> None:
     with opened(browser, walks) as page:
         walks.tell(Error(text="the model failed", ended=True))
@@ -231,7 +291,7 @@ def test_a_session_that_failed_is_begun_again_by_hand(browser: Browser, walks: S
 def test_the_page_fits_its_window(browser: Browser, walks: ScriptedWalks, width: int, scheme: str) -> None:
     with opened(browser, walks, color_scheme=scheme) as page:
         page.set_viewport_size({"width": width, "height": 800})
-        page.wait_for_timeout(50)  # the views take their new size
+        page.evaluate(TWO_PICTURES)  # the views take their new size
         assert page.evaluate("document.documentElement.scrollWidth") == width
         panes = [box for box in (pane.bounding_box() for pane in page.locator("#panes canvas").all()) if box]
         assert all(box["x"] >= 0 and box["x"] + box["width"] <= width and box["width"] >= 96 for box in panes)

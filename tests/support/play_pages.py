@@ -13,7 +13,7 @@ from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
 
-from persist_cli.play.messages import unpack
+from persist_cli.play.messages import LENGTH
 from persist_cli.play.play import Play
 from persist_cli.play.recordings import Recordings
 from persist_cli.play.server import Server, make_app
@@ -22,6 +22,17 @@ from persist_cli.play.walking_page import walking_page
 from persist_cli.viewing.own_address import bind
 
 PATIENCE = 60.0  # seconds in which a busy machine answers
+
+
+def unpack(message: bytes) -> tuple[dict[str, Any], list[bytes]]:
+    """Return the header and the images of a binary message, as the page reads them."""
+    (length,) = LENGTH.unpack_from(message)
+    header = json.loads(message[LENGTH.size : LENGTH.size + length])
+    images, place = [], LENGTH.size + length
+    for part in header["images"]:
+        images.append(message[place : place + part["bytes"]])
+        place += part["bytes"]
+    return header, images
 
 
 @dataclass

@@ -61,13 +61,14 @@ class ScriptedWalks:
         self.settings = Settings(steps=4, guidance=1.5, seed=0, ahead=True)
         self.welcome = Welcome(
             model="scripted", memories=list(pictures), actions=ACTIONS, image=(width, height), settings=self.settings,
-            can=["undo", "jump", "map", "record", "goal", "plan"], frames_per_second=15,
         )  # fmt: skip
         self.said: list[dict[str, Any]] = []  # by the page
         self.heard = threading.Condition()
         self.sockets: list[ServerConnection] = []
         self.free = True
         self.answering = True  # whether held keys give frames
+        self.welcoming = threading.Event()  # while it is cleared, no new page is welcomed
+        self.welcoming.set()
         self.ground = png(np.full((30, 60, 3), 200, np.uint8))
 
     def page(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -81,12 +82,13 @@ class ScriptedWalks:
     def walk(self, socket: ServerConnection) -> None:
         """Serve one page until it closes."""
         self.sockets.append(socket)
+        assert self.welcoming.wait(20)
         socket.send(self.welcome.to_json())
-        self.frame(socket, 0, None)
+        self.frame(socket, 1, None)
         socket.send(
             pack(MapHeader(extent=EXTENT, images=[ImagePart(memory="", bytes=len(self.ground))]), [self.ground])
         )
-        sent = drawn = 0
+        sent, drawn = 1, 0
         held: list[str] = []
         try:
             for text in socket:
@@ -103,14 +105,12 @@ class ScriptedWalks:
             return
 
     def frame(self, socket: ServerConnection, number: int, action: str | None) -> None:
-        """Send the pictures of one number."""
-        images = [row[number % len(row)] for row in self.pictures.values()]
+        """Send the pictures of one number, the first of which is 1, as the real server counts."""
+        images = [row[(number - 1) % len(row)] for row in self.pictures.values()]
         parts = [ImagePart(memory=name, bytes=len(image)) for name, image in zip(self.pictures, images, strict=True)]
-        pose = Pose(x=0.1 * number % 3, y=0.5, degrees=30)
+        pose = Pose(x=0.1 * (number - 1) % 3, y=0.5, degrees=30)
         free = self.free or action is None
-        header = FrameHeader(
-            number=number, action=action, free=free, pose=pose, milliseconds=40, frames_per_second=12, images=parts
-        )
+        header = FrameHeader(number=number, action=action, free=free, pose=pose, milliseconds=40, images=parts)
         socket.send(pack(header, images))
 
     def tell(self, message: ToPage) -> None:

@@ -3,7 +3,8 @@
 const PROTOCOL = 1;
 const FIRST_WAIT = 400, LONGEST_WAIT = 5000; // milliseconds between two attempts
 const TAKEN = 1013; // all sessions are taken
-const ENDED = new Set([1008, 1009, 1011]); // this session has failed; another one is begun by hand
+const REFUSED = new Set([1008, 1009]); // the page did what it must not do
+const FAULT = 1011; // of this session, if the server has said so; else it only had no answer for long, as from a laptop asleep
 
 class Connection {
   // `on` has a function for each type of message, and `open`, `lost(wait, taken)` and `ended`.
@@ -23,12 +24,14 @@ class Connection {
     };
     socket.onclose = ({ code }) => this.socket === socket && this.turn.then(() => this.closed(code));
     this.socket = socket;
+    this.failed = false;
   }
 
   async read(data) {
     if (typeof data === "string") {
       const message = JSON.parse(data);
       if (message.type === "welcome") this.wait = FIRST_WAIT;
+      if (message.ended) this.failed = true;
       this.on[message.type]?.(message);
     } else {
       const { header, images } = await unpack(data);
@@ -37,7 +40,7 @@ class Connection {
   }
 
   closed(code) {
-    if (ENDED.has(code)) return this.on.ended();
+    if (REFUSED.has(code) || (code === FAULT && this.failed)) return this.on.ended();
     this.on.lost(this.wait, code === TAKEN);
     this.later = setTimeout(() => this.open(), this.wait);
     this.wait = Math.min(2 * this.wait, LONGEST_WAIT);

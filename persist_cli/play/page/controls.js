@@ -9,7 +9,6 @@ const COMMANDS = [ // name, words, key, what it does
   ["stop", "Stop", "Escape", "the planner stops"],
   ["reset", "Reset", "", "begin again; what was imagined is forgotten"],
 ];
-const ALWAYS = ["home", "reset"];
 const NOTICE = 6000; // milliseconds
 const MOST_LINES = 3;
 
@@ -31,11 +30,10 @@ class Controls {
     input.onkeydown = event => void (["Enter", "Escape"].includes(event.key) && input.blur()); // false would stop the key
   }
 
-  begin({ can, limits, actions, settings }) {
+  begin({ limits, actions, settings }) {
     const taken = new Set(actions.flatMap(({ keys }) => keys));
-    const known = COMMANDS.filter(([name]) => ALWAYS.includes(name) || can.includes(name) || (name === "stop" && can.includes("plan")));
-    this.keys = Object.fromEntries(known.filter(([, , key]) => key && !taken.has(key)).map(([name, , key]) => [key, name]));
-    byId("commands").replaceChildren(...known.map(command => this.button(...command)));
+    this.keys = Object.fromEntries(COMMANDS.filter(([, , key]) => key && !taken.has(key)).map(([name, , key]) => [key, name]));
+    byId("commands").replaceChildren(...COMMANDS.map(command => this.button(...command)));
     for (const [name, [least, most]] of Object.entries(limits)) Object.assign(byId(name), { min: least, max: most });
     this.show({ settings, recording: false, goal: false, planning: false });
   }
@@ -66,8 +64,8 @@ class Controls {
     byId("record").disabled = false;
     byId("record").setAttribute("aria-pressed", String(state.recording));
     byId("record").firstChild.textContent = state.recording ? "End recording" : "Record";
-    if (byId("plan")) byId("plan").disabled = !state.goal || state.planning;
-    if (byId("stop")) byId("stop").disabled = !state.planning;
+    byId("plan").disabled = !state.goal || state.planning;
+    byId("stop").disabled = !state.planning;
     byId("goal-box").hidden = !state.goal;
     this.fill();
   }

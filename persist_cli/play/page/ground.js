@@ -8,6 +8,7 @@ class Ground {
     this.canvas = byId("map");
     this.jump = jump;
     this.canvas.onclick = event => {
+      this.canvas.blur(); // the arrow keys walk again
       const box = this.canvas.getBoundingClientRect();
       this.choose((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
     };
@@ -15,11 +16,8 @@ class Ground {
     this.canvas.onblur = () => (byId("cross").hidden = true);
   }
 
-  begin(can) {
+  begin() {
     this.extent = this.cross = null;
-    this.canJump = can.includes("jump");
-    byId("around").hidden = !can.includes("map");
-    byId("map-hint").hidden = !this.canJump;
     byId("agent").hidden = byId("cross").hidden = true;
   }
 
@@ -41,14 +39,14 @@ class Ground {
 
   // Jump to a place in shares of the map's width and height, from its top left.
   choose(across, down) {
-    if (!this.extent || !this.canJump) return;
+    if (!this.extent) return;
     const [x0, y0, x1, y1] = this.extent;
     this.cross = [across, down];
     this.jump(x0 + across * (x1 - x0), y1 - down * (y1 - y0));
   }
 
   pressed(event) {
-    if (!this.canJump || !this.extent) return;
+    if (!this.extent) return;
     this.cross ??= [0.5, 0.5];
     if (event.code === "Enter") this.choose(...this.cross);
     else if (ASIDE[event.code]) this.cross = this.cross.map((at, axis) => Math.min(1, Math.max(0, at + STRIDE * ASIDE[event.code][axis])));

@@ -3,13 +3,16 @@
 const MOVES = ["forward", "left", "backward", "right"]; // they stand as a cross
 const ARROWS = { forward: "↑", left: "←", backward: "↓", right: "→" };
 
+const layout = (await navigator.keyboard?.getLayoutMap().catch(() => null)) ?? new Map(); // letter by KeyboardEvent.code
+
 class Held {
   constructor(changed) {
     this.sources = new Map(); // action by what holds it
     this.changed = changed;
     this.keys = {}; // action by KeyboardEvent.code
     addEventListener("keydown", event => this.pressed(event));
-    addEventListener("keyup", event => this.release(event.code));
+    // On a Mac no keyup comes of the keys that are let go while Meta is down.
+    addEventListener("keyup", event => (event.key === "Meta" ? this.releaseAll() : this.release(event.code)));
     addEventListener("blur", () => this.releaseAll());
     document.addEventListener("visibilitychange", () => document.hidden && this.releaseAll());
   }
@@ -19,7 +22,7 @@ class Held {
   }
 
   begin(actions, place) {
-    this.sources.clear();
+    this.releaseAll(); // what was pressed before, this session may have heard already
     this.keys = Object.fromEntries(actions.flatMap(({ name, keys }) => keys.map(key => [key, name])));
     const buttons = Object.fromEntries(actions.map(action => [action.name, this.button(action)]));
     const cross = make("div", { className: "cross" }), others = make("div", { className: "others" });
@@ -88,12 +91,14 @@ class Held {
 
 // Whether a key belongs to the field or the map that has the focus: letters mean nothing to a slider.
 function inField({ target, code }) {
-  if (target.matches?.("#map, input[type=range], input[type=checkbox]")) return !/^Key/.test(code);
+  if (target.matches?.("input[type=checkbox]")) return code === "Space";
+  if (target.matches?.("#map, input[type=range]")) return !/^(Key.|Escape)$/.test(code);
   return Boolean(target.matches?.("input, textarea, select"));
 }
 
+// What stands on the key at a place, "Z" at KeyW on a French keyboard; where the browser does not tell, as on an American one.
 function keyName(code) {
-  return code.replace(/^(Key|Digit)/, "");
+  return layout.get(code)?.toUpperCase() ?? code.replace(/^(Key|Digit)/, "");
 }
 
 function make(tag, properties = {}) {

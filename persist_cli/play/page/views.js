@@ -48,7 +48,7 @@ class Views {
     for (let columns = this.canvases.length; columns; columns--) { // side by side, unless rows are clearly larger
       const rows = Math.ceil(this.canvases.length / columns);
       const fits = Math.min((across - 7 * (columns - 1)) / columns / width, (most / rows - CAPTION) / height);
-      if (fits > (scale ? 1.3 : 0) * scale) scale = fits;
+      if (fits > 1.3 * scale) scale = fits;
     }
     const dots = scale * devicePixelRatio, whole = Math.floor(dots);
     if (whole > 0.85 * dots) scale = whole / devicePixelRatio;

@@ -26,7 +26,7 @@ const connection = new Connection({
     views.begin(message.memories, message.image);
     held.begin(message.actions, byId("moves"));
     controls.begin(message);
-    ground.begin(message.can);
+    ground.begin();
     figures.forget();
     byId("recording-list").replaceChildren(); // they went with the session before
     byId("recordings").hidden = true;
@@ -97,7 +97,8 @@ function tell(trouble) {
   else if (controls.state.planning) [kind, words] = ["busy", "Walking to the goal"];
   else if (walking) [kind, words] = ["busy", "Walking"];
   const state = byId("state");
-  if (state.textContent !== words) state.textContent = words; // screen readers say what changes
+  if (state.textContent !== words) state.textContent = words;
+  if (kind !== "busy" && byId("news").textContent !== words) byId("news").textContent = words; // screen readers say this
   state.dataset.kind = kind;
   byId("stage").classList.toggle("lost", ever && !connected);
   controls.able(connected);
