@@ -126,7 +126,7 @@ def cache_lpips(cache: Path) -> None:
 GIVEN: dict[str, Callable[[Path], object]] = {
     "captures/kitchen": lambda path: write_sequence(path, 48, (48, 64)),  # twice around, so that clips return
     "DATA": write_walks,
-    "runs/walks/walk-1/data": lambda path: shutil.copytree(sample_data(), path),  # what was recorded
+    "runs/walks/walk-20260501-101500-3f2a/data": lambda path: shutil.copytree(sample_data(), path),  # what was recorded
     "DIR": lambda path: write_text_encoder(write_twin("5b-i2v", path)),
     "weights fetch lpips-alex\npersist": lambda path: cache_lpips(path.parent / "cache"),
 }

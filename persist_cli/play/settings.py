@@ -23,8 +23,7 @@ GROWTH: Final = (2, 3, 5)  # frames of the first clips under newly held keys, th
 class PlaySettings:
     """How frames are imagined while somebody walks.
 
-    Fewer steps answer a key sooner. With the reference model a step without guidance takes about a seventh of a second
-    for a clip of eight frames on one processor core, and guidance doubles that.
+    Fewer steps answer a key sooner; guidance doubles the time of each.
 
     Args:
         steps: denoising steps of a clip, at least 1.

@@ -6,6 +6,11 @@ depends on what else the machine does: of the frames that show a newly held acti
 
     python tests/benchmarks/bench_play.py --frames 5000
     python tests/benchmarks/bench_play.py --frames 500 --cells 1000000
+
+With ``--save`` nothing is walked: the memory is written to a file, as ``persist play --memory FILE`` and
+``bench_play_page.py`` take it.
+
+    python tests/benchmarks/bench_play.py --cells 1000000 --save large.safetensors
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import random
 import resource
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -136,13 +142,17 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--part", type=int, default=0, help="frames of a row of the table; a fifth of all")
     parser.add_argument("--cells", type=int, default=0)
+    parser.add_argument("--save", type=Path, help="file for the first memory, which is written instead of a walk")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     arguments.memory = arguments.memory or [SAMPLE_FRAMES] * (arguments.start == SAMPLE_START)
-    costs = costs_of_walk(
-        opened(arguments), arguments.frames, arguments.part or -(-arguments.frames // 5), arguments.seed
-    )
+    play = opened(arguments)
+    if arguments.save:
+        play._walkers.lead.memory.save(arguments.save)
+        say(f"wrote {arguments.save}")
+        return
+    costs = costs_of_walk(play, arguments.frames, arguments.part or -(-arguments.frames // 5), arguments.seed)
     if arguments.json:
         print_json([dataclasses.asdict(cost) for cost in costs])
         return

@@ -55,6 +55,7 @@ class Answers:
     Args:
         after: frames that had been walked before.
         presses: number of presses.
+        answered: those whose picture came; the others have no latency.
         latency: median milliseconds from a key to its picture.
         latency_95: its 95th percentile.
         rate: median frames a second while a key is held.
@@ -65,6 +66,7 @@ class Answers:
 
     after: int
     presses: int
+    answered: int
     latency: float
     latency_95: float
     rate: float
@@ -87,7 +89,8 @@ def measure(page: Page, server: psutil.Process, presses: int, hold: int) -> Answ
     latencies, walked = page.evaluate("latencies"), frame_number(page) - after
     seconds = processor_seconds(server) - began
     return Answers(
-        after, len(latencies), *np.percentile(latencies, (50, 95)).round(1), *np.percentile(rates, (50, 5)).round(2),
+        after, presses, len(latencies), *np.percentile(latencies, (50, 95)).round(1),
+        *np.percentile(rates, (50, 5)).round(2),
         round(1000 * seconds / walked, 1), round(server.memory_info().rss / 2**20),
     )  # fmt: skip
 
@@ -158,7 +161,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     line = shlex.join(["play", *passed])
     with served_page(line) as served:
         answers = measured(served, options.presses, options.hold, options.after)
-    columns = ["after frames", "presses", "ms to picture", "95%", "frames/s", "5%", "processor ms/frame", "MB"]
+    columns = [
+        *("after frames", "presses", "answered", "ms to picture", "95%", "frames/s", "5%"),
+        *("processor ms/frame", "MB"),
+    ]
     print_table(
         f"keys in `persist {line}`", columns, [[str(value) for value in asdict(row).values()] for row in answers]
     )
