@@ -1,7 +1,8 @@
 """The last frames of a walk, so that they can be undone together with what was remembered of them.
 
 Memories cannot forget single frames. They are copied now and then instead. To undo a frame, the last copy is taken up
-again and the frames since, but for that one, are written anew, in the same parts.
+again and the frames since, but for that one, are written anew, in the same parts. What a scene imagined depends on
+dropped clips too, so a scene is copied wherever it has changed.
 """
 
 from __future__ import annotations
@@ -12,10 +13,30 @@ from typing import Final
 
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
+from persist_cli.api.scene import Scene
 from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent
 
 UNDO: Final = 32  # frames from one copy of the memories to the next; so many at least can be undone
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """A copy of an agent's scene, and of what the agent knows of the ground if it has a body."""
+
+    scene: Scene
+    surroundings: Surroundings | None
+
+    @staticmethod
+    def of(agent: Agent) -> SceneState | None:
+        """Return the state of an agent, ``None`` without a scene."""
+        if agent.scene is None:
+            return None
+        return SceneState(agent.scene.copy(), agent.surroundings and agent.surroundings.copy())
+
+    def restore(self, agent: Agent) -> None:
+        """Bring an agent into this state, which stays as it is."""
+        agent.memory, agent.surroundings = self.scene.copy(), self.surroundings and self.surroundings.copy()
 
 
 @dataclass(frozen=True)
@@ -27,12 +48,14 @@ class Step:
         frames: of each world model.
         clips: number of each agent's clips up to it.
         begins: whether it is the first of a clip; all frames before it were remembered then.
+        scenes: of each agent, before the frame; ``None`` where no scene changed since the frame before.
     """
 
     action: str | None
     frames: tuple[Observations, ...]
     clips: tuple[int, ...]
     begins: bool
+    scenes: tuple[SceneState | None, ...]
 
 
 @dataclass(frozen=True)

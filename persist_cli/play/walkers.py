@@ -16,9 +16,10 @@ from torch import Tensor
 
 from persist_cli.api.backbone import Backbone, Clips, Interactions, Sampling
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.cells import CellGrid
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.clips import interactions_of
-from persist_cli.play.history import Checkpoint, History, Step
+from persist_cli.play.history import Checkpoint, History, SceneState, Step
 from persist_cli.rollout.surroundings import plan_walks
 from persist_cli.rollout.world_model import Agent, WorldModel
 
@@ -80,6 +81,7 @@ class Walkers:
         self._start = [world.agents[0].memory for world in worlds.values()]
         self._shown: list[list[Observations]] = [[] for _ in worlds]  # of each world, not remembered yet
         self._history: History
+        self._cells: list[CellGrid | None]  # of the agents' scenes when the last step was kept
         self.version = 0  # grows with every change of the memories and of what is known of the ground
 
     @property
@@ -114,6 +116,7 @@ class Walkers:
             world.reset([start], [info])
         self._shown = [[] for _ in self.worlds]
         self._history = History(Checkpoint.of(self.agents))
+        self._cells = self._present_cells()
         self.version += 1
 
     def begin_here(self) -> None:
@@ -191,7 +194,7 @@ class Walkers:
             begins: whether it is the first of a clip.
         """
         clips = tuple(agent.clips + begins for agent in self.agents)
-        step = Step(action, tuple(frames), clips, begins)
+        step = Step(action, tuple(frames), clips, begins, self._changed_scenes())
         self._take(step)
         self._history.add(step)
 
@@ -207,15 +210,26 @@ class Walkers:
         for step in steps:
             if step.begins:
                 self._write()
-            if step.action is not None and self.info.vocabulary[step.action].interaction:
-                self._interact(step.action, self.agents)
+            for agent, state in zip(self.agents, step.scenes, strict=True):
+                if state is not None:
+                    state.restore(agent)
             self._take(step)
+        self._cells = self._present_cells()
         return True
 
     def remember(self) -> None:
         """Write what was shown into the memories."""
         self._write()
         self._history.remembered(self.agents)
+
+    def _present_cells(self) -> list[CellGrid | None]:
+        return [None if agent.scene is None else agent.scene.cells for agent in self.agents]
+
+    def _changed_scenes(self) -> tuple[SceneState | None, ...]:
+        """Return the states of the agents whose scenes changed since the last call or undo."""
+        before, self._cells = self._cells, self._present_cells()
+        pairs = zip(self.agents, before, self._cells, strict=True)
+        return tuple(None if cells is old else SceneState.of(agent) for agent, old, cells in pairs)
 
     def _take(self, step: Step) -> None:
         """Let the agents stand at the frames of a step."""

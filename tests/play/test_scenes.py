@@ -8,10 +8,10 @@ from persist_cli.api.observations import Trajectory
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from tests.support.cell_rooms import BOX_CELLS, camera_at, cell_room
-from tests.support.drawn_scenes import empty_scene
+from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.scene_worlds import scene_world
 
-FORWARD, PICK_UP = frozenset({"forward"}), frozenset({"pick_up"})
+FORWARD, LEFT, PICK_UP = frozenset({"forward"}), frozenset({"left"}), frozenset({"pick_up"})
 
 
 def play_in_scene() -> Play:
@@ -21,6 +21,20 @@ def play_in_scene() -> Play:
     world = scene_world(scene, camera_at(cell_room(), (4, 4, 5), (9, 4, 5), size=64))
     agent = world.agents[0]
     return Play({"scene": world}, Trajectory("room", agent.now, (None,), agent.info), PlaySettings())
+
+
+def play_through_walls() -> Play:
+    """A walk from the same place without a body, in a scene that imagines what is outside of the room."""
+    play = play_in_scene()
+    world = play._walkers.worlds["scene"]
+    world.agents[0].body = None
+    world.agents[0].memory = empty_scene(DrawnWalls())
+    world.agents[0].memory.add(cell_room())
+    return Play({"scene": world}, play._start, PlaySettings(ahead=False))
+
+
+def cells_of(play: Play) -> dict[str, torch.Tensor]:
+    return play._walkers.lead.memory.tensors()
 
 
 def box_is_there(play: Play) -> bool:
@@ -59,6 +73,17 @@ def test_a_thing_that_is_picked_up_is_back_after_undo():
     back = play.undo()
     assert box_is_there(play)
     assert torch.equal(back.images["scene"], before.images["scene"])
+
+
+def test_undo_keeps_what_a_scene_imagined_for_the_steps_before():
+    play, known = play_through_walls(), []
+    for held in (LEFT, FORWARD, PICK_UP, *(FORWARD, LEFT) * 8):
+        if play.advance(held):
+            known.append((play.shown.pose, cells_of(play)))
+    assert len(known[2][1]["cells"]) < len(known[3][1]["cells"]) < len(known[-1][1]["cells"])
+    for pose, cells in known[-2::-1]:
+        assert play.undo().pose == pose
+        assert all(torch.equal(cells_of(play)[name], cells[name]) for name in cells)
 
 
 def test_thinking_ahead_does_no_interaction():

@@ -7,8 +7,10 @@ import torch
 
 from persist_cli.data.store import Store
 from persist_cli.play import history
+from tests.play.test_collisions import play_in_room
 from tests.play.test_play import FORWARD, LEFT, play_on, walked
 from tests.support.micro_worlds import remembering_model
+from tests.support.rooms import look
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +67,28 @@ def test_what_is_undone_before_the_first_recorded_frame_is_not_recorded(backbone
     walk = Store(play.save_recording(tmp_path).data)["voxel"].read()
     assert walk.actions == ("left", "left", None)
     assert torch.equal(walk.observations.rgb[0], first.images["voxel"])
+
+
+def test_an_undone_jump_leads_back_to_where_it_began(backbone, walks):
+    play, other = play_on(backbone, walks), play_on(backbone, walks)
+    before = walked(play, FORWARD, 2)[-1]
+    walked(other, FORWARD, 2)
+    play.home()
+    walked(play, LEFT, 1)
+    play.undo()
+    back = play.undo()
+    assert back.pose == before.pose
+    assert torch.equal(back.images["voxel"], before.images["voxel"])
+    assert same(memory_of(play), memory_of(other))
+
+
+def test_an_undone_turn_shows_no_ground():
+    play = play_in_room(look((1.7, 1.25, 0.0), 0.0, 0.0))
+    known = [play._walkers.lead.surroundings.map().states]
+    for held in (LEFT, LEFT, FORWARD, LEFT):
+        play.advance(held)
+        known.append(play._walkers.lead.surroundings.map().states)
+    assert int((known[0] > 0).sum()) < int((known[-1] > 0).sum())
+    for ground in known[-2::-1]:
+        assert play.undo().free
+        assert torch.equal(play._walkers.lead.surroundings.map().states, ground)
