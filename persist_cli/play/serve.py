@@ -24,7 +24,7 @@ from persist_cli.viewing.console import print_json, say, warn
 from persist_cli.viewing.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, names_of, open_browser
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
-SAVING_SECONDS: Final = 20.0  # the same, where a recording that is under way is saved
+SAVING_SECONDS: Final = 120.0  # the same, where a recording is saved; a full one takes a minute or more
 
 
 @dataclass(frozen=True)
