@@ -28,7 +28,7 @@ from persist_cli.play.walkers import Ahead, Pose, Walkers
 from persist_cli.plugins import make_cost
 from persist_cli.rollout.world_model import WorldModel
 
-THOUGHT: Final = 1  # number of the clip as long as which those are that are imagined ahead: short, and not one frame
+THOUGHT: Final = 1  # what is imagined ahead is as long as this clip under newly held keys, counted from 0
 COST: Final = "lpips"  # says how unlike the goal picture a view looks
 
 
@@ -60,6 +60,7 @@ class Play:
         self._recording: Recording | None = None
         self._goal: Goal | None = None
         self._guide: Guide | None = None
+        self._rest: tuple[str, ...] = ()  # of the way that the planner decided on, after the clip
         self.settings = settings
         self.set(settings)
         self._walkers.begin(start.observations, start.info)
@@ -166,7 +167,8 @@ class Play:
         """Imagine what the likely next actions lead to, while nobody waits, and return whether more is left to imagine.
 
         Each clip is imagined alone, so that a key waits for one at most: on a processor a batch of clips takes no less
-        time. What was imagined is dropped as soon as anything else is shown.
+        time. What was imagined is dropped as soon as anything else is shown. It may be longer than the first clip under
+        newly held keys, and a model that denoises all frames of a clip together then shows somewhat other pictures.
 
         Args:
             seconds: after which no further clip is begun; one that is begun is finished.
@@ -203,11 +205,13 @@ class Play:
         if self._ahead is None or not self._ahead.left or self._blocked:
             self._walkers.remember()
             self._walkers.set_clip_frames(self._lengths[-1])
-            actions = self._guide.decide(next(iter(self._walkers.worlds.values())))
+            rest = () if self._blocked else self._rest  # a way may be longer than a clip
+            actions = rest or self._guide.decide(next(iter(self._walkers.worlds.values())))
             if not actions:
                 self.stop()
                 return self._guided(begun)
             self._ahead, self._blocked = self._walkers.imagine(actions, repeat=False), 0
+            self._rest = actions[len(self._ahead.names) :]
         return self._take(self._ahead, begun)
 
     def _next_actions(self, held: frozenset[str], pressed: frozenset[str]) -> tuple[str, ...]:
@@ -246,7 +250,7 @@ class Play:
         if self._goal is None:
             raise PersistError("there is no goal picture yet; take one, walk away, and let it be looked for")
         self._drop()
-        self._last = ()  # so that a key after the planner is newly held
+        self._last, self._rest = (), ()  # so that a key after the planner is newly held
         self._guide = Guide(self._goal, make_cost(COST, {}), self.settings.seed)
 
     def stop(self) -> None:

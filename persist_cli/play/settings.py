@@ -29,7 +29,8 @@ class PlaySettings:
         steps: denoising steps of a clip, at least 1.
         guidance: weight of guidance over memory, at least 0; 1 means none.
         seed: of the sampling noise.
-        ahead: whether the likely next actions are imagined while no key is held.
+        ahead: whether the likely next actions are imagined while no key is held. Where ``growing`` makes clips shorter,
+            pictures differ somewhat by whether there was time for that.
         clip_frames: frames of a clip, the present one included; ``None`` for as many as in training. Short clips answer
             a key sooner and take more time a frame.
         growing: whether the first clips under newly held keys are shorter, as ``GROWTH`` says, where the model can make

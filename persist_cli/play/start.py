@@ -41,8 +41,8 @@ class StartOptions:
     def plan(self) -> RolloutPlan:
         """The same options as a rollout's."""
         return RolloutPlan(
-            self.start, (), False, 0, None, None, True, 0, SamplingOverrides(), InferenceOptions(),
-            self.step, self.turn, body=self.body,
+            start=self.start, actions=(), follow=False, frames=0, memory=None, adapter=None, write=True, seed=0,
+            sampling=SamplingOverrides(), placement=InferenceOptions(), step=self.step, turn=self.turn, body=self.body,
         )  # fmt: skip
 
 

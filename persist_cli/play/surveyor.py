@@ -1,8 +1,7 @@
-"""Draws the map of a walk, anew as often as a small share of the time allows."""
+"""Draws the map of a walk."""
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from typing import Final
 
@@ -20,8 +19,6 @@ from persist_cli.play.settings import GroundPose
 from persist_cli.play.walkers import Walkers
 
 MOST_PLACES: Final = 5000  # of the way that is drawn; older ones are forgotten
-SHARE: Final = 0.05  # of the time that may go into drawing what is remembered
-SOON: Final = 0.02  # seconds of drawing that are never too many
 
 
 class Surveyor:
@@ -35,7 +32,7 @@ class Surveyor:
         self._walkers = walkers
         self._way: deque[tuple[float, float, bool]] = deque(maxlen=MOST_PLACES)  # and whether it was jumped to
         self._backdrop: Backdrop | None = None
-        self._version, self._drawn, self._seconds = -1, 0.0, 0.0
+        self._version = -1  # of what is remembered, as the backdrop shows it
         self.home = self.pose
 
     @property
@@ -59,18 +56,14 @@ class Surveyor:
             self._way.pop()
 
     def draw(self, size: int, goal: Goal | None) -> GroundPicture:
-        """Return the map; what is remembered may be drawn as it was some seconds ago, where drawing takes long.
+        """Return the map; with millions of remembered points it takes seconds.
 
         Args:
             size: pixels of its longer side.
             goal: is marked where it has a place.
         """
-        now, walkers = time.monotonic(), self._walkers
-        resting = self._seconds < SOON or now - self._drawn >= self._seconds / SHARE
-        if walkers.version != self._version and resting:
-            self._backdrop = self._survey()
-            self._version, self._drawn = walkers.version, time.monotonic()
-            self._seconds = self._drawn - now
+        if self._walkers.version != self._version:
+            self._backdrop, self._version = self._survey(), self._walkers.version
         return draw_ground(self._backdrop, Marks(self.pose, self.home, self._parts(), self._place(goal)), size)
 
     def _place(self, goal: Goal | None) -> tuple[float, float] | None:

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import pytest
 
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
 from persist_cli.play.guide import Guide
 from persist_cli.play.play import Play
-from persist_cli.play.settings import GroundPose
+from persist_cli.play.settings import GroundPose, Shown
+from persist_cli.policies.shortest_path import wrapped
 from tests.play.test_collisions import FORWARD, LEFT, play_in_room
 from tests.support.pixel_cost import PixelCost
 from tests.support.room_worlds import room_views, room_world
 from tests.support.rooms import UP, look
 
 
-def guided(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the planner walk until it stays."""
+def guided(play: Play, monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
+    """Let the planner walk until it stays, and return what is shown."""
     monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
     play.plan()
+    shown = []
     while play.planning:
-        play.advance(frozenset())
+        shown.append(play.advance(frozenset()))
+    assert shown.pop() is None
+    return shown
+
+
+def metres(one: GroundPose, two: GroundPose) -> float:
+    return math.dist((one.x, one.y), (two.x, two.y))
 
 
 def test_the_planner_goes_to_where_the_picture_was_taken():
@@ -33,7 +44,7 @@ def test_the_planner_goes_to_where_the_picture_was_taken():
         GroundPose.of(pose, UP)
         for pose in (picture.cameras.world_from_camera[0], world.agents[0].now.cameras.world_from_camera[0])
     )
-    assert ((goal.x - here.x) ** 2 + (goal.y - here.y) ** 2) ** 0.5 < 0.9  # from 1.8 m
+    assert metres(goal, here) < 0.9  # from 1.8 m
     assert abs(goal.degrees - here.degrees) < 30
 
 
@@ -50,13 +61,18 @@ def test_a_held_key_stops_the_planner(monkeypatch):
     assert play.advance(frozenset()) is None
 
 
-def test_a_walk_to_the_goal_is_shown_step_by_step(monkeypatch):
-    play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
+def test_a_walk_to_the_goal_is_shown_step_by_step_and_ends_nearer_to_it(monkeypatch):
+    play = play_in_room(look((1.6, 1.25, -0.6), 60.0, 0.0))
     play.take_goal()
-    play.advance(LEFT)
-    before = play.shown.number
-    guided(play, monkeypatch)
-    assert play.shown.number > before
+    goal = play.shown.pose
+    for name, times in {"right": 4, "backward": 7}.items():
+        shown = [play.advance({name}) for _ in range(times)][-1:]
+    shown += guided(play, monkeypatch)
+    for one, two in itertools.pairwise(shown):
+        assert two.number == one.number + 1
+        assert metres(one.pose, two.pose) < 0.26
+        assert abs(wrapped(two.pose.degrees - one.pose.degrees)) < 16
+    assert metres(goal, shown[-1].pose) < metres(goal, shown[0].pose) / 2
     assert play.advance(frozenset()) is None
 
 
@@ -69,6 +85,14 @@ def test_a_key_after_a_blocked_step_of_the_planner_is_newly_held(monkeypatch):
     play.plan()
     assert not play.advance(frozenset()).free
     assert play.advance(FORWARD) is not None
+
+
+def test_a_way_that_is_longer_than_a_clip_is_walked_to_its_end(monkeypatch):
+    ways = [("left",) * 10, ()]
+    monkeypatch.setattr(Guide, "decide", lambda *_: ways.pop(0))
+    play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
+    play.take_goal()
+    assert [one.action for one in guided(play, monkeypatch)] == ["left"] * 10
 
 
 def test_a_plan_without_a_goal_is_refused():

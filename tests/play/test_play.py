@@ -11,7 +11,6 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
-from persist_cli.play import surveyor
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.plugins import make_encoder, make_memory
@@ -148,19 +147,26 @@ def test_settings_that_cannot_be_used_leave_the_old_ones(backbone, walks):
     assert play.settings.steps == 2
 
 
-def test_a_clip_that_was_thought_of_is_what_the_key_shows(backbone, walks):
+def test_a_clip_that_was_thought_of_is_shown_without_imagining_it_again(backbone, walks, monkeypatch):
+    clips, generate = [], backbone.generate
+    monkeypatch.setattr(backbone, "generate", lambda *given: clips.append(given) or generate(*given))
     play, other = play_on(backbone, walks), play_on(backbone, walks)
     assert not play.think(600)
-    shown, truth = walked(play, LEFT, 3), walked(other, LEFT, 3)
+    assert len(clips) == 8  # two moves and two turns, for each memory
+    shown = walked(play, LEFT, 3)
+    assert len(clips) == 8
+    truth = walked(other, LEFT, 3)
     assert all(torch.equal(one.images["voxel"], two.images["voxel"]) for one, two in zip(shown, truth, strict=True))
-    play.advance(frozenset())
+
+
+def test_thinking_ends_with_its_time_and_where_nobody_wants_it(backbone, walks):
+    play = play_on(backbone, walks)
     assert play.think(0)  # something is left to imagine, and no time
     play.set(PlaySettings(steps=2, ahead=False))
     assert not play.think(0)
 
 
-def test_the_map_grows_with_the_walk(backbone, walks, monkeypatch):
-    monkeypatch.setattr(surveyor, "SOON", 600)  # drawn anew each time
+def test_the_map_grows_with_the_walk(backbone, walks):
     play = play_on(backbone, walks)
     before = play.map(128)
     walked(play, LEFT, 9)

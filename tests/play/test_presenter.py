@@ -16,6 +16,7 @@ from persist_cli.errors import PersistError
 from persist_cli.play import recording
 from persist_cli.play.guide import Guide
 from persist_cli.play.messages import Keys
+from persist_cli.play.play import Play
 from persist_cli.play.presenter import Presenter
 from persist_cli.play.recording import Recording
 from persist_cli.play.recordings import Recordings
@@ -182,20 +183,31 @@ def test_what_was_not_recorded_cannot_be_saved(page):
     assert page.until("state")[0]["recording"]  # it goes on
 
 
-def test_what_is_imagined_ahead_is_what_the_key_then_shows(server, page):
-    def images(ahead):
+class ThinkingPlay(Play):
+    """Says when nothing is left to imagine ahead."""
+
+    thought = threading.Event()
+
+    def think(self, seconds):
+        more = super().think(seconds)
+        if self.settings.ahead and not more:
+            self.thought.set()
+        return more
+
+
+def test_what_is_imagined_ahead_while_nobody_walks_is_what_the_key_then_shows(walks):
+    def images(page, ahead):
         page.say("reset")
         page.say("settings", ahead=ahead)
-        page.until("state")
-        if ahead:
-            page.until("map")
+        assert not ahead or ThinkingPlay.thought.wait(60)
         page.say("keys", held=["right"])
         page.say("keys", held=[])
         while (message := page.until("frame"))[0]["action"] is None:
             pass
         return message[1]
 
-    assert images(True) == images(False)
+    with serving(micro_walks(walks, ThinkingPlay)) as served, served.page() as page:
+        assert images(page, False) == images(page, True)
 
 
 def test_the_planner_walks_to_the_goal_until_nothing_near_looks_more_like_it(monkeypatch):
