@@ -7,8 +7,9 @@ most like the picture by the shortest way, and there compares short ways until n
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -26,8 +27,12 @@ from persist_cli.play.settings import GroundPose
 from persist_cli.policies.shortest_path import Target, Walker, middles, wrapped
 from persist_cli.rollout.world_model import WorldModel
 
+Result = TypeVar("Result")
+InParts: TypeAlias = Generator[None, None, Result]  # gives way to others after each part of the work
+
 VIEWS: Final = 24  # of places all over the known ground that are imagined
 CLOSER: Final = 12  # of places around the best of these
+AT_ONCE: Final = 6  # views that are imagined in one part of a decision
 REACH: Final = 8.0  # metres of the shortest way to a place
 NEAR: Final = 0.2  # metres at which a place is reached
 AROUND: Final = (0.4, 20.0)  # metres and degrees by which the places around the best one differ from it
@@ -61,11 +66,15 @@ class Guide:
         check_goal(self.goal, self._cost)
         self._generator = torch.Generator().manual_seed(seed)
         self._decisions = 0
+        self._decision: InParts[tuple[str, ...]] | None = None  # that is being made
         self._target: GroundPose | None = None
         self._searched = False
 
-    def decide(self, world: WorldModel) -> tuple[str, ...]:
+    def decide(self, world: WorldModel) -> tuple[str, ...] | None:
         """Return the next actions; none where staying looks most like the picture, or when it gives up.
+
+        A decision is made in parts of about a second, so that others get their turn: ``None`` until it is made. It is
+        asked again then, with the same world model, unchanged.
 
         Args:
             world: its first agent stands where it decides; the agent is not changed.
@@ -73,20 +82,31 @@ class Guide:
         Raises:
             PersistError: when the agent has no step ahead or no turn.
         """
-        self._decisions += 1
-        if self._decisions > DECISIONS:
-            return ()
-        with torch.no_grad():
-            return self._on_the_way(world) or self._approach(world)
+        if self._decision is None:
+            self._decisions += 1
+            if self._decisions > DECISIONS:
+                return ()
+            self._decision = self._decide(world)
+        try:
+            with torch.no_grad():
+                next(self._decision)
+        except StopIteration as made:
+            self._decision = None
+            return tuple(made.value)
+        return None
 
-    def _on_the_way(self, world: WorldModel) -> tuple[str, ...]:
+    def _decide(self, world: WorldModel) -> InParts[tuple[str, ...]]:
+        return (yield from self._on_the_way(world)) or self._approach(world)
+
+    def _on_the_way(self, world: WorldModel) -> InParts[tuple[str, ...]]:
         """Return actions towards the place whose view looks most like the goal; none there, or where none is known."""
         agent = world.agents[0]
         if agent.surroundings is None:
             return ()
         walker = Walker(Situation(agent.now, agent.info, self.goal, agent.surroundings.map()))
         if not self._searched:
-            self._searched, self._target = True, self._search(world, walker)
+            self._target = yield from self._search(world, walker)
+            self._searched = True
         target = self._target
         if target is None:
             return ()
@@ -99,7 +119,7 @@ class Guide:
         turns = agent.info.vocabulary
         return tuple(min(walker.options(), key=lambda way: abs(wrapped(sum(turns[name].turn for name in way) - left))))
 
-    def _search(self, world: WorldModel, walker: Walker) -> GroundPose | None:
+    def _search(self, world: WorldModel, walker: Walker) -> InParts[GroundPose | None]:
         """Return the place whose imagined view looks most like the goal, ``None`` where no ground can be reached."""
         metres = distances_to(walker.ground, walker.place[None], walker.radius).metres
         places = middles(walker.ground, metres <= REACH)
@@ -108,15 +128,26 @@ class Guide:
         numbers = torch.randint(len(places), (VIEWS,), generator=self._generator)
         headings = torch.rand(VIEWS, generator=self._generator, dtype=torch.float64) * 360 - 180
         drawn = torch.cat([places[numbers], headings[:, None]], dim=1)
-        best = self._best(world, walker.ground, drawn)
+        best = yield from self._best(world, walker.ground, drawn)
         metres_around, degrees_around = AROUND
         spread = torch.tensor([metres_around, metres_around, degrees_around], dtype=torch.float64)
         center = torch.tensor([best.pose.x, best.pose.y, best.pose.degrees], dtype=torch.float64)
         closer = center + spread * torch.randn(CLOSER, 3, generator=self._generator, dtype=torch.float64)
-        return min(best, self._best(world, walker.ground, closer), key=lambda place: place.cost).pose
+        closest = yield from self._best(world, walker.ground, closer)
+        return min(best, closest, key=lambda place: place.cost).pose
 
-    def _best(self, world: WorldModel, ground: GroundMap, drawn: Float[Tensor, "view 3"]) -> Place:
+    def _best(self, world: WorldModel, ground: GroundMap, drawn: Float[Tensor, "view 3"]) -> InParts[Place]:
         """Return of some places and headings (metres, metres, degrees) the one whose view looks most like the goal."""
+        costs = []
+        for part in drawn.split(AT_ONCE):
+            costs.append(self._costs(world, ground, part))
+            yield
+        measured = torch.cat(costs)
+        number = int(measured.argmin())
+        return Place(GroundPose(*drawn[number].tolist()), float(measured[number]))
+
+    def _costs(self, world: WorldModel, ground: GroundMap, drawn: Float[Tensor, "view 3"]) -> Float[Tensor, " view"]:
+        """Return how unlike the goal the views at some places and headings look."""
         now, info = world.agents[0].now.cameras, world.agents[0].info
         start = now.world_from_camera[0]
         poses = [turned(pose_at(start, x, y, info), degrees, info) for x, y, degrees in drawn.tolist()]
@@ -127,9 +158,7 @@ class Guide:
         rgb, depth = views.denoise_frame(clips, [length] * len(ways))
         free = torch.ones(len(ways), 1, dtype=torch.bool)
         futures = Futures(rgb[:, None], depth[:, None], torch.stack(poses)[:, None], free)
-        costs = self._cost.measure(futures, self.goal, ground)[:, 0]
-        number = int(costs.argmin())
-        return Place(GroundPose(*drawn[number].tolist()), float(costs[number]))
+        return self._cost.measure(futures, self.goal, ground)[:, 0]
 
     def _approach(self, world: WorldModel) -> tuple[str, ...]:
         """Return the actions to the best view on short ways; none where staying looks as good."""

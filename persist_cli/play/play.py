@@ -198,7 +198,7 @@ class Play:
         return self._show(None, True, begun)
 
     def _guided(self, begun: float) -> Shown | None:
-        """Return the planner's next frame; ``None`` when it does not walk, or is where it wants to be."""
+        """Return the planner's next frame; ``None`` while it decides, when it has ended, and when it does not walk."""
         if self._guide is None:
             self._let_go()
             return None
@@ -207,6 +207,8 @@ class Play:
             self._walkers.set_clip_frames(self._lengths[-1])
             rest = () if self._blocked else self._rest  # a way may be longer than a clip
             actions = rest or self._guide.decide(next(iter(self._walkers.worlds.values())))
+            if actions is None:
+                return None
             if not actions:
                 self.stop()
                 return self._guided(begun)
@@ -242,7 +244,8 @@ class Play:
     def plan(self) -> None:
         """Let the planner walk to the goal picture; ``advance`` without held actions shows its steps.
 
-        Each decision takes a second or more, in which nothing else is done. A held action stops the planner.
+        A decision takes several calls of ``advance``, of up to some seconds each, which give ``None``. It walks as long
+        as ``planning`` is true. A held action stops it.
 
         Raises:
             PersistError: when there is no goal, or the weights are missing that compare pictures.

@@ -131,6 +131,8 @@ class Presenter:
             self.wishes.restless = True
             await self._show(frame)
             await self._save_full()
+        elif self.play.planning:
+            self.wishes.restless = True  # the planner decides in parts, between which others take their turns
         else:
             self._map_is_old = True  # what was shown last is remembered only now
         await self._tell_changes()
