@@ -19,7 +19,7 @@ from persist_cli.api.cost import Cost, Futures
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.navigation.routes import distances_to
-from persist_cli.planning.approach import best_approach
+from persist_cli.planning.approach import best_approach, glances, straight_ways
 from persist_cli.planning.futures import WorldFutures
 from persist_cli.planning.judge import Judge, check_goal
 from persist_cli.play.ground import pose_at, turned
@@ -32,7 +32,8 @@ InParts: TypeAlias = Generator[None, None, Result]  # gives way to others after 
 
 VIEWS: Final = 24  # of places all over the known ground that are imagined
 CLOSER: Final = 12  # of places around the best of these
-AT_ONCE: Final = 6  # views that are imagined in one part of a decision
+VIEWS_AT_ONCE: Final = 6  # that are imagined in one part of a decision
+WAYS_AT_ONCE: Final = 3  # that are compared in one part
 REACH: Final = 8.0  # metres of the shortest way to a place
 NEAR: Final = 0.2  # metres at which a place is reached
 AROUND: Final = (0.4, 20.0)  # metres and degrees by which the places around the best one differ from it
@@ -73,8 +74,8 @@ class Guide:
     def decide(self, world: WorldModel) -> tuple[str, ...] | None:
         """Return the next actions; none where staying looks most like the picture, or when it gives up.
 
-        A decision is made in parts of about a second, so that others get their turn: ``None`` until it is made. It is
-        asked again then, with the same world model, unchanged.
+        A decision is made in parts, so that others get their turn: ``None`` until it is made. It is asked again then,
+        with the same world model, unchanged. A part takes half a second on two cores with the reference model.
 
         Args:
             world: its first agent stands where it decides; the agent is not changed.
@@ -96,7 +97,7 @@ class Guide:
         return None
 
     def _decide(self, world: WorldModel) -> InParts[tuple[str, ...]]:
-        return (yield from self._on_the_way(world)) or self._approach(world)
+        return (yield from self._on_the_way(world)) or (yield from self._approach(world))
 
     def _on_the_way(self, world: WorldModel) -> InParts[tuple[str, ...]]:
         """Return actions towards the place whose view looks most like the goal; none there, or where none is known."""
@@ -139,7 +140,7 @@ class Guide:
     def _best(self, world: WorldModel, ground: GroundMap, drawn: Float[Tensor, "view 3"]) -> InParts[Place]:
         """Return of some places and headings (metres, metres, degrees) the one whose view looks most like the goal."""
         costs = []
-        for part in drawn.split(AT_ONCE):
+        for part in drawn.split(VIEWS_AT_ONCE):
             costs.append(self._costs(world, ground, part))
             yield
         measured = torch.cat(costs)
@@ -160,10 +161,15 @@ class Guide:
         futures = Futures(rgb[:, None], depth[:, None], torch.stack(poses)[:, None], free)
         return self._cost.measure(futures, self.goal, ground)[:, 0]
 
-    def _approach(self, world: WorldModel) -> tuple[str, ...]:
+    def _approach(self, world: WorldModel) -> InParts[tuple[str, ...]]:
         """Return the actions to the best view on short ways; none where staying looks as good."""
         agent = world.agents[0]
         known = agent.surroundings
         ground = GroundMap.empty(agent.info.world_up) if known is None else known.map()
         judge = Judge(WorldFutures(world, ground, agent.body), self._cost, self.goal, ground, "best")
-        return best_approach(judge, agent.info.vocabulary, STEPS)
+        vocabulary = agent.info.vocabulary
+        ways = [*glances(vocabulary), *straight_ways(vocabulary, STEPS)]
+        for first in range(0, len(ways), WAYS_AT_ONCE):
+            judge.judge(ways[first : first + WAYS_AT_ONCE], 1)  # which remembers them
+            yield
+        return best_approach(judge, vocabulary, STEPS)
