@@ -74,7 +74,7 @@ class Scene(Memory):
     @property
     @abstractmethod
     def cells(self) -> CellGrid:
-        """All cells, in the smallest box that holds the known ones; shall not be written to."""
+        """All cells, in the smallest box that holds the known ones; new after each change, never written to."""
 
     @abstractmethod
     def add(self, cells: CellGrid) -> None:
