@@ -150,7 +150,7 @@ class Play:
         if not actions:
             return self._guided(begun)
         self.stop()
-        if actions != self._last:
+        if actions != self._last or set(pressed) & set(held):
             self._last = actions
             self._let_go()
             self._turn = next((number for number, name in enumerate(actions) if name in pressed), 0)

@@ -33,11 +33,12 @@ def play_in_room(pose: np.ndarray, kind: type[RoomWorld] = RoomWorld, **settings
     return Play({"none": kind([Agent(None, body=BODY)])}, start, PlaySettings(**settings))
 
 
-def test_a_wall_is_shown_as_blocked_once_until_another_key_is_held():
+def test_a_wall_is_shown_as_blocked_once_until_a_key_is_pressed_anew():
     play = play_in_room(look((1.7, 1.25, 0.0), 0.0, 0.0))  # along -z, 2 m from the wall
     shown = [play.advance(FORWARD) for _ in range(12)]
     assert [one.free for one in shown if one is not None] == [True] * 7 + [False]
     assert shown[-1] is None
+    assert play.advance(FORWARD, pressed=FORWARD).free is False  # let go and pressed again between two frames
     assert play.advance(LEFT).free
     assert play.advance(FORWARD).pose == play.shown.pose
 
