@@ -33,6 +33,11 @@ def glances(vocabulary: ActionVocabulary) -> list[tuple[str, ...]]:
     return list(zip(names, reversed(names), strict=True)) if len(names) > 1 else [()]
 
 
+def approach_ways(vocabulary: ActionVocabulary, horizon: int) -> list[tuple[str, ...]]:
+    """Return all ways that ``best_approach`` compares: those that stay, then those that go; errors as of these."""
+    return [*glances(vocabulary), *straight_ways(vocabulary, horizon)]
+
+
 def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> tuple[str, ...]:
     """Return the actions to the best view on straight ways; none where the view is as good without a step.
 
@@ -43,7 +48,6 @@ def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> t
         vocabulary: of the agent.
         horizon: actions of each way.
     """
-    here, ways = glances(vocabulary), straight_ways(vocabulary, horizon)
-    judged = judge.judge([*here, *ways], 1)
-    stay, best = (min(part, key=lambda one: one.cost) for part in (judged[: len(here)], judged[len(here) :]))
+    judged, here = judge.judge(approach_ways(vocabulary, horizon), 1), len(glances(vocabulary))
+    stay, best = (min(part, key=lambda one: one.cost) for part in (judged[:here], judged[here:]))
     return best.chosen if best.cost < stay.cost else ()
