@@ -25,9 +25,8 @@ from persist_cli.play.sessions import Sessions
 from persist_cli.play.walking_page import WalkingPage
 from persist_cli.viewing.own_address import leads_here, same_host
 
-MORE_CONNECTIONS: Final = (
-    32  # than sessions: of these, requests beyond get 503; WebSockets count, and ``Sessions`` refuses them
-)
+# Connections beside those of sessions. Requests beyond get 503; WebSockets count, and ``Sessions`` refuses them.
+MORE_CONNECTIONS: Final = 32
 PING_SECONDS: Final = 20.0  # after which a page that says nothing is asked whether it is there, and is given up
 GRACE_SECONDS: Final = 1.0  # for answers that are under way when the server ends
 
@@ -81,13 +80,15 @@ async def refuse(scope: Scope, receive: Receive, send: Send, why: str) -> None:
         await PlainTextResponse(why, 403)(scope, receive, send)
 
 
-def make_app(page: WalkingPage, sessions: Sessions, names: Collection[str] = (), anywhere: bool = False) -> ASGIApp:
+def make_app(
+    page: WalkingPage, sessions: Sessions, names: Collection[str] = ("localhost",), anywhere: bool = False
+) -> ASGIApp:
     """Return the app: ``/``, ``/walk`` and ``/recordings/NAME``.
 
     Args:
         page: shown at ``/``.
         sessions: serve the WebSocket.
-        names: names of this server beside ``localhost``.
+        names: names of this server.
         anywhere: whether the server listens on all addresses.
     """
 
@@ -109,7 +110,7 @@ def make_app(page: WalkingPage, sessions: Sessions, names: Collection[str] = (),
         WebSocketRoute("/walk", walk),
     ]
     app = Starlette(routes=routes, exception_handlers={Exception: answer_fault})
-    return OwnAddress(app, {"localhost", *names}, anywhere)
+    return OwnAddress(app, names, anywhere)
 
 
 async def answer_fault(request: Request, error: Exception) -> Response:
