@@ -37,10 +37,11 @@ class Recordings:
 
     def __init__(self, folder: Path | None = None) -> None:
         self.stays = folder is not None
-        self._temporary = (
-            None if folder else tempfile.TemporaryDirectory(prefix="persist-play-", ignore_cleanup_errors=True)
-        )  # in which a recording may still be written when it goes
-        self.folder = folder or Path(self._temporary.name if self._temporary else "")
+        self._temporary: tempfile.TemporaryDirectory[str] | None = None
+        if folder is None:  # a recording may still be written into it when it goes
+            self._temporary = tempfile.TemporaryDirectory(prefix="persist-play-", ignore_cleanup_errors=True)
+            folder = Path(self._temporary.name)
+        self.folder = folder
         self._downloads: dict[str, Download] = {}
 
     def find(self, name: str) -> Download | None:

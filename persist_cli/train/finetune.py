@@ -142,9 +142,8 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     path = run / "recipe.yaml"
     values = parse_yaml_mapping(path.read_text(encoding="utf-8"), str(path))
     before = to_plain(make_recipe(values, str(path)))  # settings that the run's version did not have get their defaults
-    changeable = changeable_on_resume() | (
-        known_hashes(run).keys() & distilled(recipe).keys()
-    )  # found by their weights
+    found_by_weights = known_hashes(run).keys() & distilled(recipe).keys()
+    changeable = changeable_on_resume() | found_by_weights
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]
     pointer = base_pointer(read_card(steps[-1] / "model")) if network_of(recipe) is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
