@@ -3,7 +3,8 @@
 ``python -m persist_cli.reproduce.ablations [OUT] --samples 1000,5000`` trains every recipe whose name begins with
 ``houses-64-paper`` on one frozen base to 1,000 samples, measures each against the base on validation houses, then
 trains all of them on to 5,000 samples, and so forth. So it draws a curve of gain against samples for each. It stops
-and goes on like ``make table1``: what is done is not done again, and a longer list of samples continues.
+and goes on like ``make table1``: what is done is not done again, and a longer list of samples continues. ``OUT`` keeps
+to one base, data, clips and seed: with others it refuses.
 
 ``OUT/ablations.json`` has all figures, ``ablations.md`` the table and ``gain.png`` the curves; they are written anew
 after each figure.
@@ -27,6 +28,7 @@ from persist_cli.io.files import write_json, written_aside
 from persist_cli.io.hub import cached_weight
 from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_names
 from persist_cli.reproduce.commands import COLLECT, run_line
+from persist_cli.reproduce.plan_file import base_json, keep_plan, places
 from persist_cli.viewing.console import say
 from persist_cli.viewing.curve import Curve, draw_curves
 
@@ -274,12 +276,27 @@ def _gain_text(mean: float | None, low: float | None, high: float | None) -> str
     return f"{mean:+.3f}" if low is None or high is None else f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]"
 
 
+def identity(plan: Plan, houses: int) -> dict[str, Any]:
+    """JSON values of all that changes a figure; recipes and numbers of samples may be added later."""
+    return {
+        "base": base_json(plan.base),
+        "data": places(plan.data),
+        "houses": houses if plan.data == default_data(plan.out) else None,
+        "held_out": places(plan.held_out),
+        "clips": plan.clips,
+        "seed": plan.seed,
+        "sampling": SAMPLING,
+    }
+
+
 def run_ablations(plan: Plan, houses: int = HOUSES) -> None:
     """Train and measure what is not measured yet, all recipes to one number of samples before any goes on.
 
     Raises:
-        PersistError: when a checkpoint of an earlier number of samples is gone.
+        PersistError: when the folder holds figures of another plan, or a checkpoint of an earlier number of samples is
+            gone.
     """
+    keep_plan(plan.out, identity(plan, houses))
     for line in preparations(plan, houses):
         run_line(line)
     recipes = {name: make_recipe(read_recipe(name), name) for name in plan.recipes}

@@ -3,7 +3,8 @@
 ``python -m persist_cli.reproduce.choose OUT --base runs/stage1 --data runs/houses --validation runs/validation`` trains
 each memory a short time with each of a few settings and measures them on houses that are neither of the training nor of
 the test split. It then measures the best of them with other steps, samplers and guidance. So no memory is compared by
-choices that were made for another. It stops and goes on like ``make table1``: what is done is not done again.
+choices that were made for another. It stops and goes on like ``make table1``: what is done is not done again, and
+with another base, other data, steps or clips it refuses.
 
 ``OUT/choices.json`` has what was chosen and every trial, ``choices.md`` the same as a table, and ``OUT/recipes`` has a
 recipe for each memory with what was chosen. They are written anew after each figure.
@@ -27,6 +28,7 @@ from persist_cli.evaluate.report.result_file import read_results
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.recipe import EXTENDS, apply_overrides, make_recipe, read_recipe
 from persist_cli.reproduce.commands import COLLECT, run_line
+from persist_cli.reproduce.plan_file import base_json, keep_plan, places
 from persist_cli.viewing.console import say
 
 CHOICES: Final = "choices.json"
@@ -315,8 +317,24 @@ def chosen_costs(out: Path) -> dict[str, float]:
     return {memory: float("inf") if choice["cost"] is None else choice["cost"] for memory, choice in choices.items()}
 
 
+def identity(plan: Plan) -> dict[str, Any]:
+    """JSON values of all that changes a figure; memories may be added later."""
+    return {
+        "base": base_json(plan.base),
+        "data": places(plan.data),
+        "validation": places(plan.validation),
+        "steps": plan.steps,
+        "clips": plan.clips,
+    }
+
+
 def run_choose(plan: Plan) -> None:
-    """Make the choices of every memory, one after the other."""
+    """Make the choices of every memory, one after the other.
+
+    Raises:
+        PersistError: when the folder holds figures of another plan.
+    """
+    keep_plan(plan.out, identity(plan))
     for line in preparations(plan):
         run_line(line)
     choices: dict[str, Any] = {}

@@ -10,11 +10,13 @@ from pathlib import Path
 import pytest
 import typer.main
 
+from persist_cli.checkpoints.save import write_card
 from persist_cli.cli.app import app
 from persist_cli.errors import PersistError
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.reproduce import ablations
 from persist_cli.reproduce.ablations import (
+    HOUSES,
     PREFIX,
     Plan,
     ablation_names,
@@ -23,6 +25,7 @@ from persist_cli.reproduce.ablations import (
     default_data,
     default_held_out,
     eval_command,
+    identity,
     numbers,
     preparations,
     result_folder,
@@ -31,6 +34,7 @@ from persist_cli.reproduce.ablations import (
     train_command,
     write_results,
 )
+from persist_cli.reproduce.plan_file import keep_plan
 from tests.support.example_results import example_results
 
 OUT = Path("my runs/ablations")
@@ -123,13 +127,47 @@ def test_the_table_and_the_curves_say_what_was_measured_and_what_was_left_out(tm
     assert (tmp_path / "gain.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_is_measured_is_not_done_again_and_missing_weights_leave_one_ablation_out(tmp_path, monkeypatch):
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+    """A plan of which one recipe is measured already, and the commands that ran."""
     lines: list[str] = []
     monkeypatch.setattr(ablations, "run_line", lines.append)
     monkeypatch.setattr(ablations, "cached_weight", lambda name: None if name.startswith("clip") else tmp_path)
-    plan = dataclasses.replace(PLAN, out=tmp_path, recipes=(PREFIX, f"{PREFIX}-clip"), samples=(1000,))
+    folders, recipes = (tmp_path / "houses",), (PREFIX, f"{PREFIX}-clip")
+    write_card(tmp_path / "base", {"backbone": "cogvideox", "settings": {}, "fingerprint": "f" * 64}, None)
+    changes = {"out": tmp_path, "base": str(tmp_path / "base"), "recipes": recipes, "samples": (1000,)}
+    plan = dataclasses.replace(PLAN, **changes, data=folders, held_out=folders)
+    keep_plan(tmp_path, identity(plan, HOUSES))
     measured(plan, PREFIX, 1000)
-    run_ablations(dataclasses.replace(plan, data=(tmp_path,), held_out=(tmp_path,)))
+    return plan, lines
+
+
+def test_what_is_measured_is_not_done_again_and_missing_weights_leave_one_ablation_out(begun):
+    plan, lines = begun
+    run_ablations(plan)
     assert [line.split()[0] for line in lines] == ["weights"]
-    assert "left out" not in (tmp_path / "ablations.md").read_text()
-    assert "not trained" in (tmp_path / "ablations.md").read_text()
+    assert "left out" not in (plan.out / "ablations.md").read_text()
+    assert "not trained" in (plan.out / "ablations.md").read_text()
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"clips": 8}, {"held_out": (OUT,)}, {"data": (OUT,)}])
+def test_figures_of_one_plan_are_not_told_of_another(begun, change):
+    plan, lines = begun
+    with pytest.raises(PersistError, match=rf"holds trials of another plan \({next(iter(change))}.*choose another"):
+        run_ablations(dataclasses.replace(plan, **change))
+    assert not lines
+
+
+def test_samples_and_recipes_may_be_added(begun):
+    plan, lines = begun
+    measured(plan, PREFIX, 5000)
+    run_ablations(dataclasses.replace(plan, samples=(1000, 5000), recipes=(*plan.recipes, f"{PREFIX}-clip")))
+    assert [line.split()[0] for line in lines] == ["weights"]
+    assert "5,000" in (plan.out / "ablations.md").read_text()
+
+
+def test_figures_without_a_plan_are_not_taken_for_those_of_this_one(begun):
+    plan, _ = begun
+    (plan.out / "plan.json").unlink()
+    with pytest.raises(PersistError, match=r"holds figures but no plan.json"):
+        run_ablations(plan)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
 
 from persist_cli.api.backbone import Sampling
+from persist_cli.checkpoints.save import write_card
 from persist_cli.cli.app import app
 from persist_cli.errors import PersistError
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
@@ -39,7 +42,7 @@ HOUSES = (Path("runs/houses"),)
 
 def plan(out: Path, *memories: str) -> Plan:
     """The plan of some memories with validation houses of its own."""
-    return Plan(out, "reference", HOUSES, default_validation(out), memories or tuple(TRIALS))
+    return Plan(out, str(out / "base"), HOUSES, default_validation(out), memories or tuple(TRIALS))
 
 
 @pytest.mark.parametrize("memory", TRIALS)
@@ -81,6 +84,7 @@ def test_the_lowest_cost_is_chosen_and_of_equal_ones_the_first() -> None:
 def measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[str]]:
     """A folder in which evaluations find the lower LPIPS the more a clip is guided, and the commands that ran."""
     lines: list[str] = []
+    write_card(tmp_path / "base", {"backbone": "cogvideox", "settings": {}, "fingerprint": "f" * 64}, None)
 
     def run(line: str) -> None:
         lines.append(line)
@@ -132,6 +136,32 @@ def test_what_was_measured_is_not_measured_again(measured: tuple[Path, list[str]
     run_choose(plan(out, "none"))
     assert [line for line in lines[before:] if line.startswith(("finetune", "eval"))] == []
     assert result_folder(plan(out), "none", "canvas", FIRST).is_dir()
+
+
+CHANGES = [{"steps": 7}, {"clips": 8}, {"validation": HOUSES}, {"data": (Path("other"),)}]
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_figures_of_one_plan_are_not_told_of_another(measured: tuple[Path, list[str]], change: dict[str, Any]) -> None:
+    out, _ = measured
+    run_choose(plan(out, "none"))
+    with pytest.raises(PersistError, match=rf"holds trials of another plan \({next(iter(change))}"):
+        run_choose(replace(plan(out, "none"), **change))
+
+
+def test_figures_of_one_base_are_not_told_of_another(measured: tuple[Path, list[str]]) -> None:
+    out, _ = measured
+    run_choose(plan(out, "none"))
+    write_card(out / "base", {"backbone": "cogvideox", "settings": {}, "fingerprint": "e" * 64}, None)
+    with pytest.raises(PersistError, match=r"base fingerprint: ffff.*, now eeee"):
+        run_choose(plan(out, "none"))
+
+
+def test_memories_may_be_added(measured: tuple[Path, list[str]]) -> None:
+    out, _ = measured
+    run_choose(plan(out, "none"))
+    run_choose(plan(out, "none", "snapshots"))
+    assert list(chosen_sampling(out)) == ["none", "snapshots"]
 
 
 def test_before_anything_is_chosen_an_error_says_what_chooses(tmp_path: Path) -> None:
