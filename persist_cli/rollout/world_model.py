@@ -65,7 +65,7 @@ class Agent:
         seed: seed of the sampling noise.
         write: whether observed and imagined frames are written into the memory.
         disturb: changes frames before they are written, as an evaluation with noisy poses does.
-        shared: whether other agents read this memory too, so that it is copied before it is written.
+        shared: whether other agents read this memory too, so that it is copied before it is written or imagines.
         body: what of it can be blocked; ``None`` for a camera that goes through walls.
     """
 
@@ -124,11 +124,24 @@ class Agent:
         assert self.scene is not None
         trial = self.walk()
         plan_walks([trial], [actions], most)
-        self.scene.foresee(
-            [self.now.cameras.at(torch.stack([self.now.cameras.world_from_camera[0].double(), *trial.poses]))]
-        )
+        self.foresee(self.now.cameras.at(torch.stack([self.now.cameras.world_from_camera[0].double(), *trial.poses])))
         if self.surroundings is not None:
             self.surroundings.know(self.scene)
+
+    def foresee(self, path: Cameras) -> None:
+        """Let the memory make ready to be read along a path; one that others share is not changed by what it imagines.
+
+        As long as a shared scene has nothing to imagine there, it stays shared.
+        """
+        scene = self.scene
+        if scene is None or not self.shared or not scene.imagines:
+            if self.memory is not None:
+                self.memory.foresee([path])
+            return
+        before, own = scene.cells, scene.copy()
+        own.foresee([path])
+        if own.cells is not before:
+            self.memory, self.shared = own, False
 
     def interact(self, action: str) -> Walk:
         """Let an interaction change the scene, and return a walk that begins with it."""
@@ -289,7 +302,7 @@ class WorldModel:
         """Return a world model with ``count`` agents in the state of the first agent, with the same sampling noise.
 
         Each imagines what the first agent would. They share its present frame and a copy of its memory, which each
-        copies again when it first writes; this world model is not changed.
+        copies again when it first writes or imagines; this world model is not changed.
 
         Raises:
             PersistError: when ``count`` is less than 1.
@@ -387,12 +400,13 @@ class WorldModel:
     def read_memories(self, agents: Sequence[Agent], paths: Sequence[Cameras]) -> list[MemoryTokens | None]:
         """Return the tokens of each agent's path, ``None`` without memory; a memory of several agents is read once."""
         tokens: list[MemoryTokens | None] = [None] * len(agents)
+        for agent, path in zip(agents, paths, strict=True):
+            agent.foresee(path)
         for memory in {id(agent.memory): agent.memory for agent in agents}.values():
             if memory is None:
                 continue
             readers = [number for number, agent in enumerate(agents) if agent.memory is memory]
             wanted = [paths[number] for number in readers]
-            memory.foresee(wanted)
             batch = memory.read_batch(wanted, self.backbone.token_budget)
             for number, sample in zip(readers, batch, strict=True):
                 tokens[number] = sample

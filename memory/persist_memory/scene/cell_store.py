@@ -49,6 +49,7 @@ class CellStore:
         self.columns = {
             name: torch.zeros(*shape, *rest, dtype=dtype, device=device) for name, (dtype, rest) in COLUMNS.items()
         }
+        self._shared = False  # whether a copy has the same columns
 
     @property
     def box(self) -> CellGrid:
@@ -79,13 +80,14 @@ class CellStore:
         return CellGrid(classes, colors, origins, (first, second, level), self.form, self.axes)
 
     def copy(self) -> CellStore:
-        """Return a store of the same cells in tensors of its own."""
+        """Return a store of the same cells; the two share their tensors until one of them is written."""
+        self._shared = True
         copy = CellStore.__new__(CellStore)
-        copy.__dict__ |= self.__dict__ | {"columns": {name: part.clone() for name, part in self.columns.items()}}
+        copy.__dict__ |= self.__dict__ | {"columns": dict(self.columns)}
         return copy
 
     def reach(self, low: Sequence[int], high: Sequence[int]) -> None:
-        """Let the box hold the cells from ``low`` to below ``high``.
+        """Let the box hold the cells from ``low`` to below ``high``, in tensors that no copy shares.
 
         Raises:
             DataError: when it would then have more than ``MOST_CELLS`` cells; the box stays as it was.
@@ -94,6 +96,7 @@ class CellStore:
         ends = [a + b for a, b in zip(self.corner, self.shape, strict=True)]
         holds = [c <= a and b <= e for c, a, b, e in zip(self.corner, low, high, ends, strict=True)]
         if not empty and all(holds):
+            self._own()
             return
         room = (ROOM, ROOM, 0)
         first = [a - r for a, r in zip(low, room, strict=True)]
@@ -110,7 +113,7 @@ class CellStore:
             )
         before = [0] * 3 if empty else [c - a for c, a in zip(self.corner, first, strict=True)]
         after = [b - a - s for b, a, s in zip(sides, before, self.shape, strict=True)]
-        self.columns = {name: _padded(part, before, after) for name, part in self.columns.items()}
+        self.columns, self._shared = {name: _padded(part, before, after) for name, part in self.columns.items()}, False
         self.corner = (first[0], first[1], first[2])
 
     def places(self, numbers: Int64[Tensor, "cell 3"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -184,6 +187,7 @@ class CellStore:
 
     def name(self, cells: CellGrid, chosen: Bool[Tensor, "first second level"]) -> None:
         """Give chosen cells of a grid, which lie in the box, their classes there; votes, colours and origins stay."""
+        self._own()
         chosen = chosen.to(self.device)
         self.columns["classes"][self._part(cells)][chosen] = cells.classes.to(self.device)[chosen]
 
@@ -226,6 +230,11 @@ class CellStore:
         at = self.places(numbers)
         for name, part in self.columns.items():
             part[at] = tensors[name]
+
+    def _own(self) -> None:
+        """Let no copy have the tensors of this store."""
+        if self._shared:
+            self.columns, self._shared = {name: part.clone() for name, part in self.columns.items()}, False
 
     def _part(self, cells: CellGrid) -> tuple[slice, slice, slice]:
         """Return the slices of the box in which a grid lies."""
