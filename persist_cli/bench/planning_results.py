@@ -14,8 +14,9 @@ from persist_cli.bench.navigation_metrics import SUCCESS_METRES
 from persist_cli.bench.plan_bench import PlanningBench
 from persist_cli.bench.rows import NO_MEMORY, POLICY_WALK, RETRIEVAL, SIMULATOR, PlanningRow
 from persist_cli.bench.stop_rules import AT_PLACE
-from persist_cli.evaluate.provenance import checkpoint_json, command, environment, weight_hashes, weight_sources
+from persist_cli.evaluate.provenance import checkpoint_json, environment, weight_hashes, weight_sources
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, Draws, Figure, difference, mean_figure
+from persist_cli.io.command_line import running_command
 from persist_cli.metrics.src import chosen_encoder
 
 FORMAT: Final = "persist-planning"
@@ -115,7 +116,7 @@ def results_json(bench: PlanningBench, processes: int) -> dict[str, Any]:
         "tables": tables,
         "checkpoint": None if bench.checkpoint is None else checkpoint_json(bench.checkpoint),
         "environment": environment(processes),
-        "command": command(),
+        "command": running_command(),
     }  # fmt: skip
 
 

@@ -17,12 +17,15 @@ from typer.core import TyperGroup
 from persist_cli import __version__
 from persist_cli.errors import INTERRUPTED, TERMINATED, PersistError
 from persist_cli.io.checksums import verifying
+from persist_cli.io.command_line import command_line
 from persist_cli.plugins import plugin_errors
 
 DISK_ERRORS: Final = {  # of a disk that is full, closed or read-only, which is no fault of a command
     errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EISDIR, errno.ENAMETOOLONG, errno.ENOSPC, errno.ENOTDIR, errno.EPERM,
     errno.EROFS,
 }  # fmt: skip
+
+WORDS: Final = "persist_cli.words"  # key of a context for the words of the command line
 
 SPINS: Final = "3000"  # rounds of busy waiting, some microseconds; tests/benchmarks/bench_spinning.py measures it
 
@@ -204,10 +207,17 @@ def show_version(show: bool) -> None:
 class Commands(TyperGroup):
     """Commands that end in one line: Ctrl-C with exit code 130, SIGTERM with 143, full disks or bad plugins with 1."""
 
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Read the words of the command line, and keep them for results that say how they were made."""
+        words = tuple(args)  # reading takes them out of the list
+        context = super().make_context(info_name, args, parent, **extra)
+        context.meta[WORDS] = words
+        return context
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command of the context."""
         try:
-            with _terminated_like_interrupted(), plugin_errors():
+            with _terminated_like_interrupted(), plugin_errors(), command_line(ctx.meta.get(WORDS, ())):
                 return super().invoke(ctx)
         except OSError as error:
             if error.errno not in DISK_ERRORS:

@@ -17,13 +17,14 @@ from persist_cli.evaluate.example_clips import make_pictures
 from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.measure import measure_rows
 from persist_cli.evaluate.plan import EvalPlan, Evaluation, contamination_warnings, prepare
-from persist_cli.evaluate.provenance import checkpoint_json, command, environment, metric_json, scenes_json
+from persist_cli.evaluate.provenance import checkpoint_json, environment, metric_json, scenes_json
 from persist_cli.evaluate.report.page import PAGE, write_report
 from persist_cli.evaluate.report.result_file import check_results
 from persist_cli.evaluate.report.scrutiny import scrutiny_json
 from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
+from persist_cli.io.command_line import running_command
 from persist_cli.io.files import check_folder, write_json, write_text
 from persist_cli.viewing.console import print_json, say
 
@@ -104,7 +105,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
         "warnings": contamination_warnings(run.checkpoints, run.cases),
         "training_scenes_allowed": run.plan.allow_training_scenes,
         "environment": environment(processes),
-        "command": command(),
+        "command": running_command(),
         "checkpoints": [
             checkpoint_json(checkpoint) | scenes_json(checkpoint, run.cases) for checkpoint in run.checkpoints
         ],

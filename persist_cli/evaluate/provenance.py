@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import platform
-import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -37,11 +36,6 @@ def environment(processes: int) -> dict[str, Any]:
         "packages": {name: version(name) for name in PACKAGES},
         "processes": processes,
     }
-
-
-def command() -> list[str]:
-    """The command line that this process was started with."""
-    return ["persist", *sys.argv[1:]]
 
 
 def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -7,7 +7,10 @@ import subprocess
 import sys
 
 import pytest
+import typer
 
+from persist_cli.cli.options import Commands
+from persist_cli.io.command_line import running_command
 from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO_SETTINGS, stage
 
@@ -42,6 +45,21 @@ def test_every_command_explains_itself(persist, command):
     ended = persist(command, "--help")
     assert ended.code == 0
     assert "Usage" in ended.out
+
+
+def test_a_command_knows_the_words_it_was_given_and_not_those_of_the_process(monkeypatch):
+    told: list[list[str]] = []
+
+    def walk(place: str, often: int = 1) -> None:
+        told.append(running_command())
+
+    commands = typer.Typer(cls=Commands)
+    commands.callback()(lambda: None)
+    commands.command()(walk)
+    monkeypatch.setattr("sys.argv", ["demo", "runs/demo"])
+    commands(["walk", "the kitchen", "--often", "2"], standalone_mode=False)
+    assert told == [["persist", "walk", "the kitchen", "--often", "2"]]
+    assert running_command() == []
 
 
 def test_the_version_is_that_of_the_package(persist):

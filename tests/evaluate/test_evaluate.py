@@ -28,11 +28,9 @@ def tables(folder):
 
 
 def run(*arguments):
-    """Run a command in this process, as if it had been typed."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["persist", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
+    """Run a command in this process, as another program may."""
+    with pytest.raises(SystemExit) as ended:
+        main([*map(str, arguments)])
     assert not ended.value.code
 
 
@@ -69,7 +67,8 @@ def test_emptying_the_memory_changes_the_figures(uninterrupted):
 
 def test_the_results_hold_all_that_is_needed_to_measure_again(uninterrupted, voxel):
     values = results(uninterrupted)
-    assert values["command"][:2] == ["persist", "eval"]
+    assert values["command"][:4] == ["persist", "eval", str(voxel), "--data"]
+    assert values["command"][-2:] == ["--report", str(uninterrupted / "report")]
     assert values["sampling"] == {
         "chosen": "named on the command line", "steps": 2, "sampler": "ddim", "memory_guidance": 1.0,
         "context_noise": 0.0, "seeds": [0, 1], "batch": 1,

@@ -14,8 +14,9 @@ from persist_cli.bench.scenes.scene_report import PAGE, write_scene_report
 from persist_cli.bench.scenes.scene_tables import print_results, tables_text
 from persist_cli.bench.scenes.speed_part import run_speed, speed_json
 from persist_cli.bench.scenes.walk_part import run_walks, walk_json
-from persist_cli.evaluate.provenance import command, environment
+from persist_cli.evaluate.provenance import environment
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
+from persist_cli.io.command_line import running_command
 from persist_cli.io.files import check_folder, write_json, write_text
 from persist_cli.viewing.console import print_json, say
 
@@ -87,7 +88,7 @@ def results_json(bench: SceneBench) -> dict[str, Any]:
         "palette": bench.palette,
         "statistics": {"resamples": RESAMPLES, "least_houses": LEAST_UNITS, "drawn": "houses"},
         "environment": environment(1),
-        "command": command(),
+        "command": running_command(),
     }
     rendering = bench.plan.rendering
     if "completion" in bench.plan.parts:
