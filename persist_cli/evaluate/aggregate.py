@@ -225,7 +225,11 @@ class Table:
         return figures
 
     def frame_figure(self, column: Column, results: RowResults) -> Figure:
-        """The figure of a metric that has one for each frame."""
+        """The figure of a metric that has one for each frame.
+
+        Clips count by the sum of their frames' weights where frames count by weights, so that a mean of ratios is the
+        ratio of the sums over all clips as it is over the frames of one.
+        """
         values, weights = (tensor.numpy() for tensor in self.frame_values(column.metric, results))
         draws = self.draws(results)
         if column.frames == "windows":
@@ -234,7 +238,9 @@ class Table:
             return curve_figure(*window_values(values, weights, windows), curve.figure, draws)
         cases = [self.run.cases[clip] for clip in self.clips]
         chosen = chosen_frames(cases, column.frames, self.run.clip_frames).numpy()
-        return mean_figure(weighted_mean(np.where(chosen, values, np.nan), weights, 3), draws)
+        by_clip, totals = window_values(np.where(chosen, values, np.nan), weights, [np.arange(values.shape[-1])])
+        weighted = results.suite.is_weighted(column.metric)
+        return mean_figure(by_clip[..., 0], draws, totals[..., 0] if weighted else None)
 
     def windows(self, results: RowResults) -> dict[str, list[float | None]]:
         """Means of each window of frames along the clips, for the metrics that show how a rollout goes on."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -105,6 +105,7 @@ class Figure:
         per_clip: mean of each clip over seeds; ``None`` where only a set of clips has a figure.
         by_model: mean of each training seed.
         resampled: mean of every bootstrap sample, for paired differences.
+        clip_weights: how much each clip counts; ``None`` where all count the same.
     """
 
     mean: float
@@ -116,6 +117,7 @@ class Figure:
     per_clip: Array | None
     by_model: Array
     resampled: Array
+    clip_weights: Array | None = None
 
     @property
     def units(self) -> int:
@@ -124,7 +126,8 @@ class Figure:
 
     def to_json(self) -> dict[str, Any]:
         """The figure as JSON values, with ``None`` for numbers that are not defined."""
-        return {
+        weights = {} if self.clip_weights is None else {"clip_weights": self.clip_weights.tolist()}
+        return weights | {
             "mean": number(self.mean), "std": number(self.std), "low": number(self.low), "high": number(self.high),
             "count": self.count, "units": self.units,
             "by_training_seed": [number(value) for value in self.by_model],
@@ -147,17 +150,20 @@ def draw_one_fewer(units: int, count: int, name: str) -> Counts:
     return drawn
 
 
-def mean_figure(values: Array, draws: Draws) -> Figure:
+def mean_figure(values: Array, draws: Draws, weights: Array | None = None) -> Figure:
     """The figure of a metric that every clip has; without an interval where too few scenes have it.
 
     Args:
         values: ``[model, seed, clip]``, NaN where a clip has no figure.
         draws: draws of the row's clips and models.
+        weights: how much each value counts, of the same shape; ``None`` when all count the same.
     """
-    by_seed = mean(values, axis=2)
+    by_seed = mean(values, axis=2) if weights is None else weighted_mean(values, weights, axis=2)
     per_clip = mean(mean(values, axis=1), axis=0)
-    drawn = resampled_means(values[..., None], draws)[:, 0]
-    return make_figure(by_seed, drawn, np.where(np.isfinite(per_clip), draws.clusters, -1), per_clip)
+    clip_weights = None if weights is None else weights.mean(axis=(0, 1))
+    drawn = resampled_means(values[..., None], draws, None if weights is None else weights[..., None])[:, 0]
+    figure = make_figure(by_seed, drawn, np.where(np.isfinite(per_clip), draws.clusters, -1), per_clip)
+    return replace(figure, clip_weights=clip_weights)
 
 
 def curve_figure(values: Array, weights: Array, of_curve: Callable[[Array], Array], draws: Draws) -> Figure:

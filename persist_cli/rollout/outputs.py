@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,7 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
         figures = figures | {
             "against_ground_truth": against,
             "new_poses": {"metres": NEAR_METRES, "degrees": NEAR_DEGREES, "counted": counted},
-            "mean_against_ground_truth": means(against, counted),
+            "mean_against_ground_truth": means(against, counted, frame_weights(against, start, truth)),
         }
     scale = write_pictures(rollout, out)
     figures = figures | {"depth_colors": scale and scale.to_json()}
@@ -153,13 +153,37 @@ def new_frames(rollout: Rollout) -> list[bool]:
     return [not bool(frames.any()) for frames in near]
 
 
-def means(figures: Mapping[str, Sequence[float]], counted: Sequence[bool]) -> dict[str, float]:
-    """Return the mean of each figure over the frames that count and have it; a figure of no such frame is left out."""
-    known = {
-        name: torch.tensor([value for value, new in zip(values, counted, strict=True) if new], dtype=torch.float64)
-        for name, values in figures.items()
-    }
-    return {name: float(values.nanmean()) for name, values in known.items() if bool(values.isfinite().any())}
+def means(
+    figures: Mapping[str, Sequence[float]], counted: Sequence[bool], weights: Mapping[str, Tensor]
+) -> dict[str, float]:
+    """Return the mean of each figure over the frames that count and have it; a figure of no such frame is left out.
+
+    Args:
+        figures: figures of each imagined frame, by metric, NaN where there is none.
+        counted: whether a frame's pose is new.
+        weights: how much each frame counts, by metric, see ``frame_weights``.
+    """
+    averages = {}
+    for name, numbers in figures.items():
+        values = torch.tensor(numbers, dtype=torch.float64)
+        known = torch.where(torch.tensor(counted) & values.isfinite(), weights[name], 0.0)
+        if bool(known.sum() > 0):
+            averages[name] = float((values.nan_to_num() * known).sum() / known.sum())
+    return averages
+
+
+def frame_weights(names: Iterable[str], start: Observations, truth: Observations) -> dict[str, Float[Tensor, " frame"]]:
+    """Return how much each imagined frame counts in the mean of each metric, by the true frames alone.
+
+    Args:
+        names: names of metrics of single frames.
+        start: the observed first frame.
+        truth: the true frames after it.
+    """
+    known = Observations.concatenate([start, truth])
+    prediction = Prediction(known.rgb, known.depth, known, torch.full((len(known),), -1))
+    metrics = {name: metric for name in names if isinstance(metric := METRICS[name], FrameMetric)}
+    return {name: metric.frame_weights(prediction)[1:] for name, metric in metrics.items()}
 
 
 def counted_words(figures: Mapping[str, Any]) -> str:

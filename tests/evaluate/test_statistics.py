@@ -109,6 +109,18 @@ def test_houses_that_both_rows_have_are_counted_for_a_paired_interval():
     assert difference(apart(one), apart(two))["low"] is None
 
 
+def test_weighted_clips_of_ratios_give_the_ratio_of_the_sums_in_the_mean_and_in_every_resample():
+    energies = np.array([1.0, 400.0, 300.0, 500.0, 200.0, 600.0])  # the first clip is before a plain wall
+    values = np.array([98.6, 1.4, 1.2, 1.3, 1.5, 1.1])[None, None]
+    draws = Draws.of(range(6))
+    figure = mean_figure(values, draws, energies[None, None])
+    assert figure.mean == pytest.approx((values * energies).sum() / energies.sum())
+    sums = draws.clips * energies
+    assert figure.resampled == pytest.approx((sums * values[0, 0]).sum(1) / sums.sum(1))
+    assert figure.high < 2 < mean_figure(values, draws).mean
+    assert figure.to_json()["clip_weights"] == energies.tolist()
+
+
 def test_clips_without_a_figure_are_left_out():
     values = clips()
     values[..., :10] = np.nan

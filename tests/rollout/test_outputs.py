@@ -8,6 +8,7 @@ import shutil
 
 import av
 import pytest
+import torch
 
 from persist_cli.rollout.outputs import means, summary
 
@@ -41,9 +42,17 @@ def test_means_against_the_truth_are_printed_and_stored_beside_the_lists(roll, h
 
 
 def test_the_terminal_shows_lpips_where_it_was_measured_and_no_figure_that_is_not_defined_spoils_a_mean():
-    measured = means({"psnr": [20.0, 22.0], "lpips-alex": [0.25, 0.75], "absrel": [0.5, math.nan]}, [True, True])
+    figures = {"psnr": [20.0, 22.0], "lpips-alex": [0.25, 0.75], "absrel": [0.5, math.nan]}
+    measured = means(figures, [True, True], dict.fromkeys(figures, torch.ones(2)))
     assert measured["absrel"] == 0.5
     assert summary({"mean_against_ground_truth": measured}) == "PSNR 21, LPIPS-Alex 0.5"
+
+
+def test_the_mean_sharpness_of_a_rollout_is_the_ratio_of_the_sums_over_the_frames_that_count():
+    weights = {"sharpness": torch.tensor([30.0, 10.0, 1000.0])}
+    measured = means({"sharpness": [0.5, 2.0, 9.0]}, [True, True, False], weights)
+    assert measured == {"sharpness": pytest.approx(35 / 40)}
+    assert means({"sharpness": [math.nan, 2.0, 9.0]}, [True, False, False], weights) == {}
 
 
 def test_frames_near_a_remembered_one_are_in_the_lists_but_not_in_the_means(roll, persist, walks, tmp_path):

@@ -35,6 +35,7 @@ def differing_notes(a: EvalResults, b: EvalResults) -> list[str]:
         *_unequal_items("", _versions(a), _versions(b)),
         *_unequal("checkpoints", ", ".join(prints_a) or "none", ", ".join(prints_b) or "none"),
         *_unequal_items("checkpoint ", prints_a, prints_b, common=True),
+        *_clip_weights(a, b),
         *_one_sided("column", a.columns, b.columns),
         *_one_sided("row", rows_a, rows_b),
         *_unequal_items("row ", rows_a, rows_b, common=True),
@@ -92,6 +93,26 @@ def _tables(a: EvalResults, b: EvalResults) -> Iterator[str]:
     for one, two in zip(a.tables, b.tables, strict=False):
         if one.clips != two.clips:
             yield f"clips of a table: {len(one.clips)} in {one.name} and {len(two.clips)} in {two.name}, not the same"
+
+
+def _clip_weights(a: EvalResults, b: EvalResults) -> list[str]:
+    """A line for each column whose clips are weighted in one run alone: an earlier version counted all the same."""
+    one, two = (_weighted_columns(results) for results in (a, b))
+    return [
+        f"clips of {a.columns[name].title} are weighted in {'A' if one[name] else 'B'} only, so it has no difference: "
+        f"evaluate {'B' if one[name] else 'A'} again in its folder"
+        for name in one
+        if name in two and one[name] != two[name]
+    ]
+
+
+def _weighted_columns(results: EvalResults) -> dict[str, bool]:
+    """Whether the clips of each column that has figures of single clips are weighted."""
+    weighted: dict[str, bool] = {}
+    for name, cell in (item for table in results.tables for row in table.rows.values() for item in row.columns.items()):
+        if cell.per_clip is not None:
+            weighted[name] = weighted.get(name, False) or cell.clip_weights is not None
+    return weighted
 
 
 def _fingerprints(results: EvalResults) -> dict[str, str]:

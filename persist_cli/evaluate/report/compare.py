@@ -182,11 +182,14 @@ def compare_cells(a: Cell | None, b: Cell | None, clusters: Counts) -> ComparedC
     first, second = (cell.mean if cell else None for cell in (a, b))
     if a is None or b is None or first is None or second is None:
         return ComparedCell(first, second, None)
+    if (a.clip_weights is None) != (b.clip_weights is None):  # one run is of a version that counted all clips the same
+        return ComparedCell(first, second, None)
     in_a, in_b = (np.array(cell.per_clip or [], dtype=np.float64) for cell in (a, b))
     gaps = in_b - in_a if len(in_a) == len(in_b) else np.array([])
     if not np.isfinite(gaps).any():
         return ComparedCell(first, second, second - first)
-    gap = mean_figure(gaps[None, None], Draws.of(clusters))
+    weights = None if a.clip_weights is None else np.array(a.clip_weights)[None, None]  # those of the truth: b's too
+    gap = mean_figure(gaps[None, None], Draws.of(clusters), weights)
     return ComparedCell(first, second, gap.mean, number(gap.low), number(gap.high), gap.units)
 
 

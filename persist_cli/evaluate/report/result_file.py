@@ -126,8 +126,9 @@ class Difference(ResultModel):
 class Cell(ResultModel):
     """A figure with its spread, or in ``na`` the reason why there is none.
 
-    ``units`` counts the scenes, or clips, that its interval was drawn from. Intervals of fewer than ``LEAST_UNITS``
-    clips, which earlier versions wrote, are left out on reading.
+    ``units`` counts the scenes, or clips, that its interval was drawn from, and ``clip_weights`` says how much each
+    clip counts where this differs. Intervals of fewer than ``LEAST_UNITS`` clips, which earlier versions wrote, are
+    left out on reading.
     """
 
     na: str | None = None
@@ -139,6 +140,7 @@ class Cell(ResultModel):
     units: int | None = None
     by_training_seed: list[FiniteOrNone] = []
     per_clip: list[FiniteOrNone] | None = None
+    clip_weights: list[float] | None = None
     difference: Difference | None = None
     differences: dict[str, Difference | None] = {}
 
@@ -313,9 +315,10 @@ def check_results(value: Mapping[str, Any], where: str) -> EvalResults:
             raise DataError(f"{where}: results are damaged: table {table.name!r} names clips that are not there")
         for name, row in table.rows.items():
             for column, cell in row.columns.items():
-                if cell.per_clip is not None and len(cell.per_clip) != len(table.clips):
-                    raise DataError(
-                        f"{where}: results are damaged: {table.name}, {name}, {column} has {len(cell.per_clip)} "
-                        f"figures for {len(table.clips)} clips"
-                    )
+                for what, values in (("figures", cell.per_clip), ("weights", cell.clip_weights)):
+                    if values is not None and len(values) != len(table.clips):
+                        raise DataError(
+                            f"{where}: results are damaged: {table.name}, {name}, {column} has {len(values)} {what} "
+                            f"for {len(table.clips)} clips"
+                        )
     return results

@@ -98,6 +98,30 @@ def test_the_interval_covers_the_true_difference_and_excludes_zero_only_when_it_
     assert -1.91 < cell.low < cell.high < 2.11
 
 
+def weigh(results, *weights):
+    """Let the clips of the voxel row's PSNR count by weights."""
+    results["tables"][0]["rows"]["voxel"]["columns"]["psnr"]["clip_weights"] = [*weights]
+
+
+def test_weighted_clips_are_weighted_in_the_difference_too(tmp_path):
+    def better_in_one_clip(results):
+        weigh(results, 5, 1, 1, 1, 1, 1)
+        results["tables"][0]["rows"]["voxel"]["columns"]["psnr"]["per_clip"][0] += 1
+
+    a = write_results(tmp_path, "a.json", lambda results: weigh(results, 5, 1, 1, 1, 1, 1))
+    comparison = compare_runs(a, write_results(tmp_path, "b.json", better_in_one_clip))
+    assert comparison.tables[0].rows["voxel"]["psnr"].difference == pytest.approx(0.5)
+    assert comparison.notes == []
+
+
+def test_clips_that_an_earlier_version_did_not_weigh_have_no_difference_and_a_note(tmp_path):
+    a = write_results(tmp_path, "a.json", lambda results: weigh(results, 5, 1, 1, 1, 1, 1))
+    comparison = compare_runs(a, write_results(tmp_path, "b.json"))
+    assert comparison.tables[0].rows["voxel"]["psnr"].difference is None
+    note = "clips of PSNR are weighted in A only, so it has no difference: evaluate B again in its folder"
+    assert comparison.notes == [note]
+
+
 DIFFERENCES = {
     "protocol: revisit and return": lambda results: results["measured"]["protocol"].update(name="return"),
     "frames a clip: 9 and 112": lambda results: results["measured"]["protocol"].update(frames=112),
