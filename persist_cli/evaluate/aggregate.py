@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.columns import Column, chosen_frames, make_columns, without_known_poses
 from persist_cli.evaluate.journal import TRUTH
-from persist_cli.evaluate.metric_suite import CELLS, FEATURES, FIGURES, READS, WEIGHTS, MetricSuite
+from persist_cli.evaluate.metric_suite import CELLS, FEATURES, FIGURES, READS, WEIGHTS, MetricSuite, make_setup
 from persist_cli.evaluate.plan import Evaluation
+from persist_cli.evaluate.provenance import scenes_of
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.rows.training_seeds import training_of
 from persist_cli.evaluate.statistics import (
@@ -155,16 +157,23 @@ class Table:
     @cached_property
     def clusters(self) -> Counts:
         """For each clip the number of what is drawn with it: of its scene, or of the clip where clips are drawn."""
-        cases = [self.run.cases[clip] for clip in self.clips]
-        names = [(case.data, case.scene) for case in cases]
-        if self.run.plan.resample == "clips":
-            return np.arange(len(cases))
+        return np.arange(len(self.cases)) if self.run.plan.resample == "clips" else self.scene_numbers
+
+    @cached_property
+    def cases(self) -> list[Case]:
+        """The clips."""
+        return [self.run.cases[clip] for clip in self.clips]
+
+    @cached_property
+    def scene_numbers(self) -> Counts:
+        """For each clip the number of the first one that shows the same scene, in whichever data set."""
+        names = [case.scene for case in self.cases]
         return np.array([names.index(name) for name in names])
 
     @property
     def scenes(self) -> int:
         """Number of different scenes that the clips show."""
-        return len({(self.run.cases[clip].data, self.run.cases[clip].scene) for clip in self.clips})
+        return len(scenes_of(self.cases))
 
     def draws(self, results: RowResults, count: int = RESAMPLES) -> Draws:
         """The bootstrap samples of a row."""
@@ -199,8 +208,9 @@ class Table:
             results: row of the cell.
             figures: figures by row and column; the first row is the one of ``difference``.
         """
-        if column.metric in results.suite.obstacles:
-            return {"na": results.suite.obstacles[column.metric]}
+        obstacles = self.obstacles(results)
+        if column.metric in obstacles:
+            return {"na": obstacles[column.metric]}
         figure = figures[results.row.group][column.name]
         if not np.isfinite(figure.mean):
             return {"na": "not defined for any of these clips"}
@@ -212,10 +222,17 @@ class Table:
         first = differences.get(next(iter(figures)))
         return figure.to_json() | {"difference": first, "differences": differences}
 
+    def obstacles(self, results: RowResults) -> dict[str, str]:
+        """Reasons why metrics cannot be measured of a row, or of the clips of this table alone, by name."""
+        setup = make_setup(self.cases, results.suite.setup.generated_depth, self.run.clip_frames)
+        return MetricSuite(self.run.metrics, setup).obstacles | results.suite.obstacles
+
     def figures(self, results: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""
-        suite, figures = results.suite, {}
+        suite, figures, obstacles = results.suite, {}, self.obstacles(results)
         for column in self.columns:
+            if column.metric in obstacles:
+                continue
             if column.metric in suite.frame_metrics:
                 figures[column.name] = self.frame_figure(column, results)
             elif column.metric in suite.set_metrics:
@@ -236,8 +253,7 @@ class Table:
             curve = CURVE_COLUMNS[column.metric]
             windows = curve.windows(self.run.cases[0].frames)
             return curve_figure(*window_values(values, weights, windows), curve.figure, draws)
-        cases = [self.run.cases[clip] for clip in self.clips]
-        chosen = chosen_frames(cases, column.frames, self.run.clip_frames).numpy()
+        chosen = chosen_frames(self.cases, column.frames, self.run.clip_frames).numpy()
         by_clip, totals = window_values(np.where(chosen, values, np.nan), weights, [np.arange(values.shape[-1])])
         weighted = results.suite.is_weighted(column.metric)
         return mean_figure(by_clip[..., 0], draws, totals[..., 0] if weighted else None)
@@ -284,6 +300,8 @@ class Table:
         clusters = torch.from_numpy(draws.clusters)
         places, scenes = torch.unique(clusters[:, None].expand_as(taken)[taken], return_inverse=True)
         firsts = [draws.clusters.tolist().index(place) for place in places.tolist()]
+        shown = torch.from_numpy(self.scene_numbers[firsts])
+        apart = shown[:, None] != shown  # clips of one scene are no pairs where clips are drawn, either
         frame_set_metric = results.suite.frame_set_metrics[metric]
         sums = {
             (model, seed): frame_set_metric.scene_sums(generated[model, seed][taken], truth[taken], scenes)
@@ -293,7 +311,7 @@ class Table:
 
         def distance(counts: Counts, model: int, seed: int) -> float:
             weights = torch.from_numpy(counts[firsts]).double()
-            total, pairs = (weights @ matrix @ weights for matrix in sums[model, seed])
+            total, pairs = (weights @ (matrix * apart) @ weights for matrix in sums[model, seed])
             return float(total / pairs) if pairs > 0 else float("nan")
 
         known = np.where(taken.any(1).numpy(), draws.clusters, -1)

@@ -50,7 +50,7 @@ def make_setup(cases: Sequence[Case], generated_depth: bool = True, clip_frames:
         depth=any(share is not None for case in cases for share in case.seen_before),
         generated_depth=generated_depth,
         returns=any(True for case in cases for _ in far_returns(case, clip_frames)),
-        unseen_scenes=len({(case.data, case.scene) for case in cases if any(unseen_frames(case))}),
+        unseen_scenes=len({case.scene for case in cases if any(unseen_frames(case))}),
         clip_frames=clip_frames,
     )
 

@@ -202,7 +202,8 @@ def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | Non
     """The figure of a distance between sets of videos.
 
     A resampled set holds some videos twice, which may shift such a distance; its interval is therefore that of the
-    resampled distances moved so that their mean is the distance itself.
+    resampled distances moved so that their mean is the distance itself. A set of fewer than two clips, as a sample of
+    few scenes may be, has no distance.
 
     Args:
         distance: distance of the clips, each counted so often, from the true ones, of a model at a sampling seed.
@@ -210,12 +211,17 @@ def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | Non
         seeds: number of sampling seeds; bootstrap samples take turns over them.
         known: clusters with -1 where a clip does not take part; ``None`` when all do.
     """
+
+    def known_distance(counts: Counts, model: int, seed: int) -> float:
+        return distance(counts, model, seed) if counts.sum() > 1 else float("nan")
+
     once = np.ones(draws.clips.shape[1], np.int64)
-    by_seed = np.array([[distance(once, model, seed) for seed in range(seeds)] for model in range(draws.trained)])
+    by_seed = np.array([[known_distance(once, model, seed) for seed in range(seeds)] for model in range(draws.trained)])
     drawn = np.array(
         [
             np.average(
-                [distance(clips, model, turn % seeds) for model in models.nonzero()[0]], weights=models[models > 0]
+                [known_distance(clips, model, turn % seeds) for model in models.nonzero()[0]],
+                weights=models[models > 0],
             )
             for turn, (clips, models) in enumerate(zip(draws.clips, draws.models, strict=True))
         ]

@@ -46,6 +46,12 @@ def test_shuffling_needs_another_scene(cases):
     )
 
 
+def test_a_house_in_two_data_sets_is_one_house_whose_memory_is_not_shuffled_into_itself(cases):
+    again = [replace(cases[0], data="elsewhere"), *cases]
+    assert Shuffled(again).partners[again[0]].scene == cases[1].scene
+    assert one_scene(again[:2]) == f"needs clips of two scenes, all are of {cases[0].scene!r}"
+
+
 def test_the_oracle_holds_the_frames_of_the_clip_and_the_emptied_memory_none(cases):
     clip = read_case(cases[0])
     assert torch.equal(Oracle().context(clip).rgb[-9:], clip.observations.rgb)

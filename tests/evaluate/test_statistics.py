@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from persist_cli.evaluate.aggregate import seen_bins
 from persist_cli.evaluate.statistics import (
@@ -15,6 +16,7 @@ from persist_cli.evaluate.statistics import (
     mean_figure,
     set_figure,
 )
+from persist_cli.metrics.fvd import frechet_distance
 
 
 def clips(offset: float = 0.0, count: int = 50, seeds: int = 3) -> np.ndarray:
@@ -138,6 +140,19 @@ def test_the_interval_of_a_distance_between_sets_lies_around_it():
     assert figure.low < figure.mean < figure.high
     assert figure.resampled.mean() == pytest.approx(figure.mean)
     assert figure.per_clip is None
+
+
+def test_a_sample_of_one_clip_has_no_frechet_distance_and_ends_nothing():
+    features = torch.from_numpy(np.random.default_rng(0).normal(0, 1, (2, 5, 3)))
+    draws = Draws.of([0, 0, 0, 0, 1], count=200)  # of two scenes one is drawn: four clips, or a single one
+
+    def distance(counts, model, seed):
+        return frechet_distance(*features[:, np.repeat(np.arange(5), counts)])
+
+    figure = set_figure(distance, draws, 1)
+    assert figure.mean == pytest.approx(frechet_distance(*features))
+    assert np.isnan(figure.resampled).tolist() == (draws.clips.sum(1) == 1).tolist()
+    assert figure.to_json()["low"] is None
 
 
 def test_the_least_value_of_a_mean_curve_has_an_interval():

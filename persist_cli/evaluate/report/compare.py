@@ -201,7 +201,7 @@ def _drawn_unit(one: EvalResults, two: EvalResults) -> str:
 def _compared_tables(one: EvalResults, two: EvalResults, columns: dict[str, ColumnRecord]) -> Iterator[ComparedTable]:
     for table_a, table_b in zip(one.tables, two.tables, strict=True):
         clips = [one.measured.clips[number] for number in table_a.clips]
-        names = [(clip.data, clip.scene) for clip in clips]
+        names = [clip.scene for clip in clips]
         scenes = np.array([names.index(name) for name in names])
         clusters = scenes if _drawn_unit(one, two) == "scenes" else np.arange(len(clips))
         rows = {

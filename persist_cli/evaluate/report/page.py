@@ -91,7 +91,7 @@ def _page(results: EvalResults, pictures: Pictures, folder: Path) -> str:
         new_poses_line=new_poses_line(results),
         unknown_scenes=unknown_scenes_lines(results), known_scenes=known_scenes,
         too_few_lines=too_few_lines, left_out_line=left_out_line, seed_legend=seed_legend(results),
-        drawn_units=drawn_units(results), scenes=len({(clip.data, clip.scene) for clip in results.measured.clips}),
+        drawn_units=drawn_units(results), scenes=len({clip.scene for clip in results.measured.clips}),
         answers=scrutiny(results), windows=windows_tables(results),
         sheets=write_sheets(pictures, folder), dark_colors=DARK_COLORS,
         facts=environment_facts(results.environment),

@@ -59,7 +59,7 @@ def scrutiny_json(results: EvalResults) -> list[dict[str, Any]]:
 
 def _data(results: EvalResults) -> Answer:
     clips, seeds = results.measured.clips, results.sampling.seeds
-    scenes = len({(clip.data, clip.scene) for clip in clips})
+    scenes = len({clip.scene for clip in clips})
     splits = Counter(split for data in results.measured.data for split in data.splits.values())
     named = ", ".join(f"{counted(number, 'trajectories')} of the split {split}" for split, number in splits.items())
     lines = [
@@ -101,7 +101,7 @@ def _intervals(results: EvalResults) -> Answer:
     lines = [
         f"95 % intervals from {count}bootstrap samples that draw {drawn}{trainings}; none below {LEAST_UNITS} {unit}"
     ]
-    scenes = len({(clip.data, clip.scene) for clip in results.measured.clips})
+    scenes = len({clip.scene for clip in results.measured.clips})
     if unit == "clips" and scenes < len(results.measured.clips):
         lines.append(f"these clips are of {counted(scenes, 'scenes')}, so intervals over clips are too narrow")
     return Answer("What do the intervals cover?", tuple(lines), len(lines) > 1 or scenes < LEAST_UNITS)

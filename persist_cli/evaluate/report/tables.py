@@ -253,7 +253,7 @@ def _view_table(results: EvalResults, table: TableRecord, notes: list[str]) -> T
 def table_scenes(results: EvalResults, table: TableRecord) -> int:
     """Number of different scenes that a table's clips show."""
     clips = [results.measured.clips[number] for number in table.clips]
-    return table.scenes or len({(clip.data, clip.scene) for clip in clips})
+    return table.scenes or len({clip.scene for clip in clips})
 
 
 def _column_views(key: str, column: ColumnRecord, rows: Sequence[RowRecord], notes: list[str]) -> list[CellView]:

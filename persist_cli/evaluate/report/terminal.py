@@ -82,7 +82,7 @@ def headline(results: EvalResults, table: TerminalTable) -> str:
     """One line with the protocol, the clips, the sampling, and what stands in a cell."""
     measured, sampling = results.measured, results.sampling
     height, width = measured.image_size
-    scenes = counted(len({(clip.data, clip.scene) for clip in measured.clips}), "scenes")
+    scenes = counted(len({clip.scene for clip in measured.clips}), "scenes")
     clips = f"{counted(len(measured.clips), 'clips')} of {measured.protocol.frames} frames in {scenes}"
     seeds = f"{len(sampling.seeds)} seed{'s' * (len(sampling.seeds) != 1)}"
     steps = f", {sampling_line(results)}" if sampling_line(results) else ""

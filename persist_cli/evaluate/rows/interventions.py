@@ -226,14 +226,14 @@ class DriftingPoses(NoisyPoses):
 
 def one_scene(cases: Sequence[Case]) -> str | None:
     """The reason why memories cannot be shuffled among these cases, ``None`` when they are of two scenes or more."""
-    scenes = {(case.data, case.scene) for case in cases}
+    scenes = {case.scene for case in cases}
     return f"needs clips of two scenes, all are of {cases[0].scene!r}" if len(scenes) < 2 else None
 
 
 def next_in_another_scene(cases: Sequence[Case], number: int) -> Case:
-    """The case after this number, cyclically, that is in another scene; there must be one."""
-    scene = (cases[number].data, cases[number].scene)
-    return next(case for case in (*cases[number + 1 :], *cases[:number]) if (case.data, case.scene) != scene)
+    """The case after this number, cyclically, that is in another scene, of whichever data set; there must be one."""
+    scene = cases[number].scene
+    return next(case for case in (*cases[number + 1 :], *cases[:number]) if case.scene != scene)
 
 
 def move_cameras(cameras: Cameras, motion: Tensor) -> Cameras:
