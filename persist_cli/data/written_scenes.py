@@ -104,8 +104,10 @@ class SceneWriter:
         return scene.cells
 
     def _key(self, file: TrajectoryFile, frames: Sequence[int]) -> str:
-        """A hash of all that a scene depends on, but the pixels; those depend on the poses."""
-        depends = [FORMAT, self._version, asdict(self.form), file.name, file.info.scene, str(file.info.source), *frames]
+        """A hash of all that a scene depends on, but the pixels; those depend on poses, size and intrinsics."""
+        info = file.info
+        depends = [FORMAT, self._version, asdict(self.form), file.name, info.scene, str(info.source), *frames]
+        depends += [info.height, info.width, info.intrinsics.tolist()]
         if str(file.path) not in self._fingerprints:
             self._fingerprints[str(file.path)] = zlib.crc32(file.poses().numpy().tobytes())
         poses = self._fingerprints[str(file.path)]

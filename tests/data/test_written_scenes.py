@@ -1,0 +1,38 @@
+"""Scenes that were written once are taken from a cache, and only where they would be written the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.data.written_scenes import SceneWriter
+from tests.support.cell_houses import FORM, write_cell_houses
+
+
+class Kept(dict[str, dict[str, torch.Tensor]]):
+    """A cache in memory."""
+
+    put = dict.__setitem__
+
+
+def house(folder: Path, size: int) -> TrajectoryFile:
+    return next(iter(Store(write_cell_houses(folder, [5], size=size))))
+
+
+@pytest.mark.parametrize("first", [32, 64])
+def test_a_kept_scene_is_not_taken_for_that_of_frames_of_another_size(tmp_path: Path, first: int) -> None:
+    kept, files = Kept(), {size: house(tmp_path / str(size) / "data", size) for size in (32, 64)}
+    for size in (first, 96 - first):
+        known = SceneWriter(FORM, kept).scene(files[size], [3]).known
+        assert torch.equal(known.classes, SceneWriter(FORM).scene(files[size], [3]).known.classes)
+    assert len(kept) == 2
+
+
+def test_a_kept_scene_is_taken_again(tmp_path: Path) -> None:
+    kept, file = Kept(), house(tmp_path / "data", 32)
+    known = [SceneWriter(FORM, kept).scene(file, [3]).known for _ in range(2)]
+    assert torch.equal(known[0].classes, known[1].classes)
+    assert len(kept) == 1
