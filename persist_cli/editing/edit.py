@@ -66,8 +66,13 @@ def run_edit(plan: EditPlan, out: Path, save_edits: Path | None, as_json: bool) 
             ``-views.png``.
         save_edits: JSON file that gets the edits, if any.
         as_json: whether JSON is printed instead of text.
+
+    Raises:
+        DataError: when an edit cannot be done, or a file that is written would take the place of another one of this
+            command; then nothing is written.
     """
     _check_plan(plan, out)
+    _check_files(plan, out, save_edits)
     with busy("loading the memory"):
         memory, paths = load_memory(plan.memory), load_paths(plan.memory)
     edits = make_edits(plan.written, boxes_by_name(memory), plan.overwrite)
@@ -92,6 +97,27 @@ def _check_plan(plan: EditPlan, out: Path) -> None:
         raise DataError(f"{out}: name a memory file to write, as in edited.safetensors")
     if plan.imagination is not None and plan.camera is None:
         raise DataError("--checkpoint imagines a view that begins at a true frame; add --camera DATA#trajectory:frame")
+
+
+def files_beside(out: Path) -> dict[str, Path]:
+    """Return the files that stand beside an edited memory, by what they are."""
+    return {
+        "map": out.with_suffix(".png"),
+        "report": out.with_suffix(".json"),
+        "views": out.with_name(f"{out.stem}-views.png"),
+    }
+
+
+def _check_files(plan: EditPlan, out: Path, save_edits: Path | None) -> None:
+    """Raise ``DataError`` when a file that is written would take the place of what is read or written too."""
+    others = {Path(edit.values[0]): "--edits" for edit in plan.written if edit.option == "edits"}
+    others |= {plan.memory: "the memory"} | ({} if save_edits is None else {save_edits: "--save-edits"})
+    for what, file in files_beside(out).items():
+        for other, role in others.items():
+            if file.resolve() == other.resolve():
+                raise DataError(f"{file}: it is {role}, and the {what} of --out {out} would replace it; rename one")
+    if save_edits is not None and save_edits.resolve() in (out.resolve(), plan.memory.resolve()):
+        raise DataError(f"{save_edits}: it is the memory, and --save-edits would replace it; name another JSON file")
 
 
 def boxes_by_name(memory: Memory) -> Mapping[str, Any] | None:
@@ -169,8 +195,8 @@ def write_outputs(
 ) -> dict[str, str]:
     """Write the edited memory with its maps, views and report, and return the files by what they are."""
     before, after = memories
-    files = {"file": out, "map": out.with_suffix(".png"), "report": out.with_suffix(".json")}
-    views = out.with_name(f"{out.stem}-views.png")
+    files = {"file": out} | files_beside(out)
+    views = files.pop("views")
     for path in (*files.values(), views):
         remove_leftovers(path.parent, path.name)
     with busy("writing the memory and its pictures"):

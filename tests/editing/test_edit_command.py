@@ -86,6 +86,27 @@ def test_an_edit_that_cannot_be_done_is_one_line_and_writes_nothing(persist, roo
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("option", ["--edits", "--save-edits"])
+def test_the_report_of_an_edit_replaces_no_file_of_edits(persist, room, tmp_path, option):
+    mine = tmp_path / "mine.json"
+    if option == "--edits":
+        mine.write_text('[{"edit": "remove", "low": [0.4, 0, 0.4], "high": [0.8, 1, 1.1]}]')
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    given = ["--remove", "box#1", option, mine]
+    result = persist("edit", room, *given, "--out", tmp_path / "mine.safetensors")
+    assert (result.code, len(result.err.strip().splitlines())) == (1, 1)
+    assert f"mine.json: it is {option}, and the report of --out" in result.err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_the_edits_are_not_saved_in_the_place_of_the_memory(persist, room, tmp_path):
+    mine = tmp_path / "mine.safetensors"
+    mine.write_bytes(room.read_bytes())
+    result = persist("edit", mine, "--remove", "box#1", "--out", tmp_path / "a.safetensors", "--save-edits", mine)
+    assert (result.code, "--save-edits would replace it" in result.err) == (1, True)
+    assert mine.read_bytes() == room.read_bytes()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
