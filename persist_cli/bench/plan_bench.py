@@ -374,7 +374,7 @@ def run_rows(bench: PlanningBench, processes: Processes) -> None:
 def run_episode(bench: PlanningBench, row: PlanningRow, parts: RowParts, episode: Episode) -> dict[str, Any]:
     """Run the loops of one episode of one row, and return what happened as JSON values."""
     plan, scene = bench.plan, TrueScene(bench.simulator, episode)
-    record: dict[str, Any] = {"row": row.name, "episode": episode.name, "open": None, "closed": None}
+    record: dict[str, Any] = {"row": row.name, "walk": row.walk, "episode": episode.name, "open": None, "closed": None}
     if "open" in plan.loops and episode.bin <= plan.loop.open_longest:
         record["open"] = run_open_loop(scene, Navigator(row, parts, plan.planning, scene, episode.bin))
     if "closed" in plan.loops:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
-from persist_cli.bench.rows import PlanningRow
+from persist_cli.bench.rows import NO_MEMORY, PlanningRow
+from persist_cli.errors import DataError
 from persist_cli.evaluate.journal import check_same
 from persist_cli.io.files import read_json, remove_leftovers, write_json
 
@@ -61,8 +62,21 @@ class PlanningJournal:
         write_json(self.parts / STOP, values)
 
     def has(self, row: PlanningRow, episode: Episode) -> bool:
-        """Whether an episode of a row was run."""
-        return self._file(row, episode).is_file()
+        """Whether an episode of a row was run.
+
+        Raises:
+            DataError: when it was run by an agent that was given more or less of the scene than the row says now.
+        """
+        file = self._file(row, episode)
+        if not file.is_file():
+            return False
+        walk = read_json(file).get("walk", row.walk if row.memory is None else row.memory != NO_MEMORY)  # as once was
+        if walk != row.walk:
+            raise DataError(
+                f"{file.parent}: was run when {row.name!r} was {'given the walk' if walk else 'not given the walk'}; "
+                "delete this folder to run the row again"
+            )
+        return True
 
     def write(self, row: PlanningRow, episode: Episode, record: dict[str, Any]) -> None:
         """Keep what happened in an episode of a row, whole or not at all."""

@@ -12,7 +12,7 @@ from persist_cli.bench.episodes import Episode
 from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.navigation_metrics import SUCCESS_METRES
 from persist_cli.bench.plan_bench import PlanningBench
-from persist_cli.bench.rows import NO_MEMORY, POLICY_WALK, RETRIEVAL, SIMULATOR, PlanningRow
+from persist_cli.bench.rows import FORGETFUL, NO_MEMORY, POLICY_WALK, RETRIEVAL, SIMULATOR, WALK, PlanningRow
 from persist_cli.bench.stop_rules import AT_PLACE
 from persist_cli.evaluate.provenance import checkpoint_json, environment, weight_hashes, weight_sources
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, Draws, Figure, difference, mean_figure
@@ -157,6 +157,8 @@ def define(row: PlanningRow, bench: PlanningBench) -> str:
     if not row.imagines:
         return f"policy {row.policy!r} without imagination; {told}"
     model = "the simulator itself as the model" if row.memory == SIMULATOR else f"memory {row.memory!r}"
+    if row.walk and row.memory in FORGETFUL:
+        model += ", which remembers nothing of the walk"
     how = f"ranks {row.candidates} proposals of {row.policy!r}"
     if row.planner == "cem":
         how = f"cross-entropy method, {row.candidates} candidates a round, at most {bench.plan.planning.rounds} rounds"
@@ -207,9 +209,10 @@ def row_json(
 
 
 def compared_with(row: PlanningRow, rows: Sequence[PlanningRow]) -> list[str]:
-    """Return the names of the rows that a row is compared with: its planner without memory, and the policy alone."""
+    """Return the names of the rows that a row is compared with: its planner without memory, and those without one."""
     names = [other.name for other in rows]
     alone = next((name for name in ("policy", "random") if name in names), None)
     head = row.name.partition(",")[0]
-    wanted = [f"{head}, {NO_MEMORY}", alone, POLICY_WALK, "shortest-path", RETRIEVAL] if row.imagines else [alone]
+    without = [f"{head.removesuffix(WALK)}{walk}, {NO_MEMORY}" for walk in (WALK, "")]
+    wanted = [*without, alone, POLICY_WALK, "shortest-path", RETRIEVAL] if row.imagines else [alone]
     return [name for name in wanted if name is not None and name in names and name != row.name]

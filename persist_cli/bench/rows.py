@@ -7,12 +7,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
+from persist_cli.api.checkpoint import PLAIN
 from persist_cli.api.policy import GoalKind
 from persist_cli.errors import PersistError, hint
 
 SIMULATOR: Final = "simulator"  # in place of a memory: the simulator itself is the model
 
 NO_MEMORY: Final = "none"
+
+FORGETFUL: Final = (NO_MEMORY, PLAIN)  # models that remember nothing, whose agents are not given the walk
 
 POLICY: Final = "policy"  # the row of the policy that ``--policy`` names, without imagination
 
@@ -24,7 +27,11 @@ CEM_POLICY: Final = "cem-policy"  # ``cem`` whose first round the policy begins
 
 POLICIES: Final = (POLICY, POLICY_WALK)
 
-RANK = re.compile(r"rank-(?P<count>[1-9]\d*)")
+WALK: Final = "-walk"  # ends the names of rows that are given the walk for the ground that it shows
+
+IMAGINING: Final = re.compile(r"(?P<planner>rank-(?P<count>[1-9]\d*)|cem|cem-policy)(?P<walk>-walk)?")
+"""Names of rows that imagine. With ``-walk`` the agent knows the ground of the walk, and the model remembers nothing of
+it: the difference to a row with a memory is what the model's memory is worth."""
 
 Planning = Literal["policy", "rank", "cem"]
 
@@ -39,7 +46,7 @@ class PlanningRow:
         policy: name or folder of the policy that proposes; ``None`` for ``cem``.
         memory: of the world model, or ``simulator`` for the simulator in its place; ``None`` without a model.
         goal: what it is told of the goal.
-        walk: whether it is given the walk.
+        walk: whether it is given the walk: its frames go into the memory, and its ground into what the agent knows.
         candidates: that a round imagines; 0 without a model.
         retrieves: whether the place that it is told is that of the given frame most like the goal image, by the cost.
     """
@@ -94,7 +101,8 @@ class RowChoice:
     """What the rows are made of.
 
     Args:
-        names: of ``ALONE``, of ``POLICIES``, ``rank-N``, ``cem`` or ``cem-policy``.
+        names: of ``ALONE``, of ``POLICIES``, ``rank-N``, ``cem`` or ``cem-policy``; with ``-walk`` behind one of the
+            last three the model without memory is given the walk's ground.
         memories: of the world model, and ``simulator``; each makes a row of every ``rank-N`` and of ``cem``.
         policy: name or folder of the policy of ``policy`` and ``rank-N``; ``None`` where none is named, which ranks
             ``random``.
@@ -116,11 +124,11 @@ class RowChoice:
         """
         names, memories = list(dict.fromkeys(self.names)), list(dict.fromkeys(self.memories))
         for name in names:
-            if name not in (*ALONE, *POLICIES, "cem", CEM_POLICY) and not RANK.fullmatch(name):
+            if name not in (*ALONE, *POLICIES) and not IMAGINING.fullmatch(name):
                 raise PersistError(f"unknown row {name!r}; {hint(name, [*ALONE, *POLICIES, *PLANNED, CEM_POLICY])}")
             if self.goal == "place" and (name == RETRIEVAL or ALONE.get(name, ("", "", False))[1] == "image"):
                 raise PersistError(f"row {name!r} is shown the goal image, and the cost reads a place; leave it out")
-        alone = next((name for name in names if name in (*POLICIES, CEM_POLICY)), None)
+        alone = next((name for name in names if name in POLICIES or name.startswith(CEM_POLICY)), None)
         if alone is not None and self.policy is None:
             raise PersistError(f"the row {alone!r} needs a policy; give --policy a name or the folder of a trained one")
         rows = [row for name in names for row in self._rows_of(name, memories)]
@@ -134,12 +142,21 @@ class RowChoice:
         elif name in ALONE:
             alone, goal, walk = ALONE[name]
             yield PlanningRow(name, "policy", alone, None, goal or self.goal, walk, retrieves=name == RETRIEVAL)
-        else:
-            ranked = RANK.fullmatch(name)
-            count = int(ranked["count"]) if ranked else self.cem_candidates
-            policy = (self.policy or "random") if ranked else self.policy if name == CEM_POLICY else None
-            for memory in memories:
-                yield PlanningRow(
-                    f"{name}, {memory}", "rank" if ranked else "cem", policy, memory, self.goal, memory != NO_MEMORY,
-                    count,
-                )  # fmt: skip
+        elif named := IMAGINING.fullmatch(name):
+            yield from self._imagining(named, memories)
+
+    def _imagining(self, named: re.Match[str], memories: Sequence[str]) -> Iterator[PlanningRow]:
+        """Yield the rows of a name that imagines: one for each memory, or for each model that remembers nothing."""
+        count = int(named["count"] or self.cem_candidates)
+        led = self.policy if named["planner"] == CEM_POLICY else None
+        policy = (self.policy or "random") if named["count"] else led
+        given = [memory for memory in memories if not named["walk"] or memory in FORGETFUL]
+        if not given:
+            raise PersistError(
+                f"row {named[0]!r} is of a model that remembers nothing, as other memories are given the walk anyway; "
+                f"add {NO_MEMORY} to --memories"
+            )
+        planner: Planning = "rank" if named["count"] else "cem"
+        for memory in given:
+            walk = named["walk"] is not None or memory not in FORGETFUL
+            yield PlanningRow(f"{named[0]}, {memory}", planner, policy, memory, self.goal, walk, count)

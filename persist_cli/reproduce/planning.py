@@ -71,7 +71,7 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
             f"bench episodes --scenes {figures.scenes} --bins {figures.bins} --each {figures.each} "
             f"--out {home}/episodes.json"
         )
-    for rows in (f"{ALONE},rank-16", f"{ALONE},rank-8,rank-16"):
+    for rows in (f"{ALONE},rank-16,rank-16-walk", f"{ALONE},rank-8,rank-16,rank-16-walk"):
         yield f"{plan} {LOOP} --rows {rows} --memories {MEMORIES} {_to(home, 'lpips')}"
     if figures.trained:
         ranked = f"--policy {shlex.quote(figures.trained)} --rows policy,rank-8,rank-16 --memories {MEMORIES}"

@@ -121,6 +121,16 @@ def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     assert "holds another benchmark (planning horizon: 8, now 5)" in refused.err
 
 
+def test_figures_of_an_agent_that_was_given_more_are_refused(bench: Bench, tmp_path: Path) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--patience", 1, "--rows", "straight")
+    assert bench(*options).code == 0
+    file = next((tmp_path / "bench/parts/straight").iterdir())
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"walk": True}))
+    refused = bench(*options)
+    assert refused.code == 1
+    assert "was run when 'straight' was given the walk; delete this folder" in refused.err
+
+
 @pytest.fixture
 def random_lpips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Random weights of LPIPS, and no others."""

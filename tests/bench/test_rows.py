@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from persist_cli.bench.planning_results import compared_with
 from persist_cli.bench.rows import RowChoice, default_rows
 from persist_cli.errors import PersistError
 
@@ -17,11 +18,30 @@ def test_rows_that_imagine_come_with_each_memory_and_others_once() -> None:
     assert names == ["random", "rank-8, none", "rank-8, voxel", "cem, none", "cem, voxel"]
 
 
-def test_a_memory_and_the_simulator_are_given_the_walk() -> None:
-    rows = choice("rank-16", memories=("none", "voxel", "simulator")).rows()
-    assert [row.walk for row in rows] == [False, True, True]
-    assert [row.uses_world_model for row in rows] == [True, True, False]
+def test_a_memory_and_the_simulator_are_given_the_walk_and_models_that_forget_are_not() -> None:
+    rows = choice("rank-16", memories=("none", "stage1", "voxel", "simulator")).rows()
+    assert [row.walk for row in rows] == [False, False, True, True]
+    assert [row.uses_world_model for row in rows] == [True, True, True, False]
     assert {row.candidates for row in rows} == {16}
+
+
+def test_a_model_that_forgets_can_be_given_the_ground_of_the_walk() -> None:
+    rows = choice("rank-16-walk", "cem-walk", memories=("simulator", "voxel", "none", "stage1")).rows()
+    assert [row.name for row in rows] == [
+        "rank-16-walk, none", "rank-16-walk, stage1", "cem-walk, none", "cem-walk, stage1",
+    ]  # fmt: skip
+    assert all(row.walk for row in rows)
+    (led,) = choice("cem-policy-walk", memories=("none",), policy="straight").rows()
+    assert (led.planner, led.policy, led.walk) == ("cem", "straight", True)
+    with pytest.raises(PersistError, match=r"row 'rank-16-walk' is of a model that remembers nothing, .* add none"):
+        choice("rank-16-walk", memories=("voxel",)).rows()
+
+
+def test_a_memory_is_compared_with_the_models_that_forget_with_and_without_the_walk() -> None:
+    rows = choice("policy", "rank-16", "rank-16-walk", policy="straight").rows()
+    compared = {row.name: compared_with(row, rows) for row in rows}
+    assert compared["rank-16, voxel"] == ["rank-16-walk, none", "rank-16, none", "policy"]
+    assert compared["rank-16-walk, none"] == ["rank-16, none", "policy"]
 
 
 def test_the_classical_planner_is_told_the_place_whatever_the_others_see() -> None:
@@ -67,6 +87,7 @@ def test_default_rows_can_be_made_whatever_the_cost_reads() -> None:
         (("randm",), None, "unknown row 'randm'; did you mean 'random'?"),
         (("rank-0",), None, "unknown row 'rank-0'"),
         (("policy",), None, "needs a policy; give --policy"),
+        (("cem-policy-walk",), None, "needs a policy; give --policy"),
         (("shortest-path-retrieval",), "place", "is shown the goal image, and the cost reads a place"),
         (("shortest-path-image",), "place", "is shown the goal image, and the cost reads a place"),
         ((), None, "no row is left"),
