@@ -16,6 +16,7 @@ from persist_cli.evaluate.columns import column_json, make_columns
 from persist_cli.evaluate.example_clips import make_pictures
 from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.measure import measure_rows
+from persist_cli.evaluate.metric_suite import CELLS
 from persist_cli.evaluate.plan import EvalPlan, Evaluation, contamination_warnings, prepare
 from persist_cli.evaluate.provenance import checkpoint_json, environment, metric_json, scenes_json
 from persist_cli.evaluate.report.page import PAGE, write_report
@@ -24,6 +25,7 @@ from persist_cli.evaluate.report.scrutiny import scrutiny_json
 from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
+from persist_cli.evaluate.windows import SHOWN, window_bounds
 from persist_cli.io.command_line import running_command
 from persist_cli.io.files import check_folder, write_json, write_text
 from persist_cli.viewing.console import print_json, say
@@ -112,7 +114,20 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
         "columns": column_json(make_columns(run.metrics, run.protocol)),
         "tables": [Table(run, name, clips).to_json(rows) for name, clips in clips_by_domain(run).items()],
         "first_row": run.rows[0].group,
+        "windows": windows_json(run),
     }
+
+
+def windows_json(run: Evaluation) -> dict[str, list[tuple[int, int]]]:
+    """First and last frame of each window along the rollouts, by what has windows; none without rollouts.
+
+    Cells are counted after every predicted clip.
+    """
+    if not run.protocol.writes:
+        return {}
+    frames = run.cases[0].frames
+    bounds = {metric: window_bounds(frames) for metric in SHOWN if metric in run.metrics}
+    return bounds | {CELLS: window_bounds(frames, run.clip_frames)}
 
 
 def splits_of(cases: Sequence[Case], folder: str) -> dict[str, str]:

@@ -47,13 +47,23 @@ class CurveColumn:
     figure: Callable[[Array], Array]
 
 
+def window_bounds(frames: int, length: int = WINDOW) -> list[tuple[int, int]]:
+    """First and last predicted frame of each window of a clip; the last window may be shorter.
+
+    Args:
+        frames: length of the clip, the given frame included.
+        length: frames of a window.
+    """
+    return [(first, min(first + length, frames) - 1) for first in range(1, frames, length)]
+
+
 def windows_of(frames: int) -> list[Counts]:
-    """Numbers of the predicted frames of each window of a clip; the last may be shorter.
+    """Numbers of the predicted frames of each window of a clip.
 
     Args:
         frames: length of the clip, the given frame included.
     """
-    return [np.arange(first, min(first + WINDOW, frames), dtype=np.int64) for first in range(1, frames, WINDOW)]
+    return [np.arange(first, last + 1, dtype=np.int64) for first, last in window_bounds(frames)]
 
 
 def tenths_of(frames: int) -> list[Counts]:

@@ -210,6 +210,8 @@ def test_data_without_depth_is_measured_by_metrics_and_controls_that_need_none(p
     assert rows["geometric warp"]["columns"]["psnr"] == {"na": rows["geometric warp"]["na"]}
     assert rows["voxel"]["columns"]["absrel"] == {"na": "the data has no depth"}
     assert rows["ground truth"]["columns"]["psnr-return"]["mean"] == 100.0
+    bounds, windows = results(tmp_path / "o")["windows"], rows["voxel"]["windows"]
+    assert {name: len(bounds[name]) for name in windows} == {name: len(values) for name, values in windows.items()}
 
 
 @pytest.fixture

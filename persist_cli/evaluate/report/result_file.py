@@ -269,7 +269,11 @@ class StatisticsRecord(ResultModel):
 
 
 class EvalResults(ResultModel):
-    """All results of one ``persist eval``."""
+    """All results of one ``persist eval``.
+
+    ``windows`` has the first and the last frame of each of the rows' windows, by metric; results of earlier versions do
+    not say them.
+    """
 
     measured: Measured
     sampling: SamplingRecord
@@ -281,6 +285,7 @@ class EvalResults(ResultModel):
     columns: dict[str, ColumnRecord]
     tables: list[TableRecord]
     first_row: str | None = None
+    windows: dict[str, list[tuple[int, int]]] = {}
 
 
 def read_results(path: Path) -> EvalResults:

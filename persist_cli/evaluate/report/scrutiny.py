@@ -189,9 +189,14 @@ def windows_tables(results: EvalResults) -> Sequence[tuple[str, list[str], list[
             digits = 0 if record is None else 2
             name = record.title if record else CELLS.get(metric, metric)
             title = f"{where}{name} along the rollout"
-            length = results.measured.protocol.frames - 1
-            step = -(-length // count)
-            heads = ["row", *(f"{first + 1}–{min(first + step, length)}" for first in range(0, length, step))]
+            heads = ["row", *_window_heads(results.windows.get(metric, []), count)]
             texts = [[name, *(number_text(value, digits) for value in values)] for name, values in rows.items()]
             tables.append((title, heads, texts))
     return tables
+
+
+def _window_heads(bounds: Sequence[tuple[int, int]], count: int) -> list[str]:
+    """The frames of each window, or its number where the results do not say them."""
+    if len(bounds) != count:
+        return [f"window {number}" for number in range(1, count + 1)]
+    return [f"{first}–{last}" if last > first else str(first) for first, last in bounds]

@@ -7,6 +7,7 @@ from persist_cli.evaluate.report.pictures import Pictures
 from persist_cli.evaluate.report.result_file import check_results
 from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
 from persist_cli.evaluate.report.text import table_text
+from persist_cli.evaluate.windows import window_bounds
 from tests.support.example_results import example_results
 
 
@@ -93,12 +94,21 @@ def test_weights_name_their_source_and_rows_what_truth_they_are_given():
 
 
 def test_markdown_and_page_have_the_answers_and_the_windows_along_the_rollout(tmp_path):
-    results = example_results(frames=17)
-    voxel(results)["windows"] = {"psnr": [21.0, 18.5], "cells": [812.0, 1440.0]}
+    results = example_results(frames=21)
+    voxel(results)["windows"] = {"psnr": [21.0, 18.5, 17.0], "cells": [812.0, 1440.0]}
+    results["windows"] = {"psnr": window_bounds(21), "cells": window_bounds(21, 16)}
     write_report(results, Pictures(), tmp_path)
     for text in (table_text(results), (tmp_path / "report.html").read_text()):
         assert "Before you believe it" in text
         assert "PSNR along the rollout" in text
     tables = windows_tables(check_results(results, "example"))
-    assert tables[0] == ("PSNR along the rollout", ["row", "1–8", "9–16"], [["voxel", "21.00", "18.50"]])
-    assert tables[1][2] == [["voxel", "812", "1440"]]
+    heads = ["row", "1–8", "9–16", "17–20"]
+    assert tables[0] == ("PSNR along the rollout", heads, [["voxel", "21.00", "18.50", "17.00"]])
+    assert tables[1][1:] == (["row", "1–16", "17–20"], [["voxel", "812", "1440"]])
+
+
+def test_windows_of_results_that_do_not_say_their_frames_are_numbered():
+    results = example_results(frames=21)
+    voxel(results)["windows"] = {"psnr": [21.0, 18.5, 17.0]}
+    (table,) = windows_tables(check_results(results, "example"))
+    assert table[1] == ["row", "window 1", "window 2", "window 3"]
