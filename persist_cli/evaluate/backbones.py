@@ -47,7 +47,7 @@ class BaseProperties:
 
     Args:
         frames_per_clip: frames that each of them predicts at once, the given frame included.
-        depthless: fingerprints of the bases whose models give no depth.
+        depthless: fingerprints of the bases whose models take no depth and give none.
     """
 
     frames_per_clip: int

@@ -165,9 +165,10 @@ def prepare(
     rows = [*models, *controls.rows]
     if processes.main:
         warn_of_clips(cases, checkpoints, search)
-    depths = [not (row.uses_model and row.base.fingerprint in bases.depthless) for row in rows]
+    for row in [*rows, *(row for row, _ in controls.missing)]:
+        row.has_depth = not (row.uses_model and row.base.fingerprint in bases.depthless)
     clip_frames = bases.frames_per_clip - 1
-    suites = [MetricSuite(metrics, make_setup(cases, gives_depth, clip_frames)) for gives_depth in depths]
+    suites = [MetricSuite(metrics, make_setup(cases, row.has_depth, clip_frames)) for row in rows]
     return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
 
 

@@ -80,6 +80,10 @@ def test_only_rows_of_a_model_without_depth_lack_depth_metrics(persist, held_out
     assert all(row["psnr"]["mean"] > 0 for row in rows.values())
     assert all(row["absrel"]["mean"] > 0 for name, row in rows.items() if "/b/" not in name)
     assert (tmp_path / "r/report.html").is_file()
+    given = {name: row["truth"] for name, row in read_json(tmp_path / "o/metrics.json")["tables"][0]["rows"].items()}
+    assert {name: "without its depth" in text for name, text in given.items() if name.startswith("voxel")} == {
+        name: "/b/" in name for name in given if name.startswith("voxel")
+    }
 
 
 def test_an_evaluation_does_not_go_on_with_trajectories_that_changed(persist, held_out, tmp_path):

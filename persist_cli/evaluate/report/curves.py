@@ -138,7 +138,7 @@ def _share_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]]) ->
     series = []
     for style, curve in curves:
         bins = _fill_gaps(curve.by_seen_before)
-        names = [f"{share.low:.0%} to {share.high:.0%} seen before, n = {share.count}" for share in bins]
+        names = [f"{share.low:.0%} to {share.high:.0%} seen by frames in memory, n = {share.count}" for share in bins]
         series.append(Series(style, [share.middle for share in bins], [share.mean for share in bins], names))
     if not _known(series):
         return None
@@ -146,7 +146,7 @@ def _share_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]]) ->
     for _, curve in curves:
         for share in curve.by_seen_before:
             bins_by_low.setdefault(share.low, share)
-    across = "share of the view seen before the clip"
+    across = "share of the view seen by frames in memory"
     ticks = [(edge / 5, f"{edge / 5:.0%}") for edge in range(6)]
     counts = [(share.middle, f"{share.count}") for share in bins_by_low.values()]
     return _lay_out(f"{name}-seen-before", title, across, series, (0.0, 1.0), ticks, counts)

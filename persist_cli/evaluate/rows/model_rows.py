@@ -89,7 +89,7 @@ class ModelRow(Row):
     @property
     def truth(self) -> str:
         """What of the truth model and memory are given."""
-        given = "the first frame with its depth, and the true cameras"
+        given = f"the first frame {'with' if self.has_depth else 'without'} its depth, and the true cameras"
         factory, intervention = self.row_memory.factory, self.row_memory.intervention
         if factory is None or self.adapter == NO_MEMORY:
             return given

@@ -34,6 +34,7 @@ class Row(ABC):
     random: ClassVar[bool] = False
     uses_model: ClassVar[bool] = False
     adapter: str | None = None
+    has_depth: bool = True  # whether the base's model, where it makes the videos, takes depth and gives it
 
     def __init__(self, name: str, base: Checkpoint, group: str | None = None) -> None:
         self.name, self.base, self.group = name, base, group or name
