@@ -42,7 +42,7 @@ class ImaginedSettings(TaskSettings):
         checkpoint: a run, an export or ``reference``, the model that comes with the package.
         adapter: name of a memory adapter, by default the checkpoint's own; ``stage1`` for none.
         memory: a file of ``persist memorize``, or frames of a data set to make one of; ``None`` for an empty memory.
-        write: whether what is imagined is written into the memory, for the rest of the episode.
+        write: whether what is imagined is written into the memory, for the episode; given frames always are.
         collide: whether the agent is stopped by what it saw, remembers or imagined, or walks through walls; ``None``
             stops it where the data tell how high its camera is, as a simulator's do.
         sampling: steps, sampler and guidance in place of the checkpoint's own.
@@ -107,8 +107,9 @@ class ImaginedScenes(Scenes):
         start, goal = self._draw(draws)
         frame = self.starts[start]
         first = self.first
-        agent = Agent(first.memory, int(draws.integers(SEEDS)), first.write, shared=True, body=first.body)
-        self._world([agent]).reset([frame], [self.info])
+        agent = Agent(first.memory, int(draws.integers(SEEDS)), shared=True, body=first.body)
+        self._world([agent]).reset([frame], [self.info])  # what it sees there is true, so it is remembered
+        agent.write = first.write
         self._agents[number], self._goals[number] = agent, goal
         (view,) = self._views(number, frame, [True])
         return Attempt(view, self.goals.goal(goal), self.info.world_up, self.task)
@@ -204,10 +205,13 @@ def open_house(settings: ImaginedSettings, starts: PosedFrames) -> tuple[WorldMo
 
 
 def memorize_frames(world: WorldModel, frames: PosedFrames) -> None:
-    """Write given frames into the memory of the world's agent."""
+    """Write given frames into the memory of the world's agent, also where it writes nothing that it imagines."""
+    memory = world.agents[0].memory
+    if memory is None:
+        return
     for source in frames.sources:
         for piece in source.pieces():
-            world.agents[0].memorize(piece, world.backbone.device)
+            memory.memorize(piece.to(world.backbone.device))
 
 
 class ImaginedHouse(HouseEnv):

@@ -70,6 +70,21 @@ def test_each_episode_begins_with_the_memory_as_it_was_given(settings):
     assert all(np.array_equal(one["rgb"], two["rgb"]) for one, two in zip(first, again, strict=True))
 
 
+def test_without_writing_the_given_frames_are_remembered_and_nothing_that_is_imagined(settings):
+    writes, reads = make(settings), make(settings, write=False)
+    given = writes.unwrapped.scenes.first.memory.figures()
+    assert given.cells > 0
+    assert reads.unwrapped.scenes.first.memory.figures() == given
+    for env in (writes, reads):
+        env.reset(seed=3)
+    first, second = (env.unwrapped.scenes._agents[0].memory for env in (writes, reads))
+    start = second.figures()
+    assert start == first.figures()
+    for action in (0, 1, 1):
+        reads.step(action)
+    assert second.figures() == start
+
+
 def test_an_agent_that_walks_straight_on_stops_at_the_wall_and_pays_for_it(packaged):
     env, ghost = (gymnasium.make(**packaged, collide=collide).unwrapped for collide in (True, False))
     for one in (env, ghost):
