@@ -28,7 +28,7 @@ planning: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.planning runs/planning
 
 learning: $(STAMP)
-	$(VENV)/bin/python -m persist_cli.reproduce.learning runs/learning --policy runs/policy
+	$(VENV)/bin/python -m persist_cli.reproduce.learning runs/learning
 
 # two processes of one thread each take about half the time of one, and each file stays in one process
 test: $(STAMP) lint

@@ -1,6 +1,6 @@
 """``make learning``: policies that learn inside the model, in many held-out houses, compared in the true houses.
 
-``python -m persist_cli.reproduce.learning OUT --policy runs/policy`` draws episodes in held-out houses, collects a
+``python -m persist_cli.reproduce.learning OUT`` draws episodes in held-out houses, collects a
 short exploring walk in each as its given views, and lets the policy learn there by ``persist learn``: inside the model
 with each memory, and in the true house with as many actions and training steps. It stops and goes on like
 ``make table1``.
@@ -38,7 +38,7 @@ class Plan:
     Args:
         out: folder of everything.
         model: checkpoint of the world model.
-        policy: run or folder of the trained policy.
+        policy: run or folder of the trained policy; ``None`` for the packaged one.
         memories: adapters of the model, and ``simulator`` for practice in the true house.
         houses: number of held-out houses.
         first: seed of the first of them.
@@ -49,7 +49,7 @@ class Plan:
 
     out: Path
     model: str
-    policy: str
+    policy: str | None
     memories: Sequence[str]
     houses: int
     first: int
@@ -85,8 +85,9 @@ def learn(plan: Plan, scene: str, memory: str) -> None:
         return
     views = next(file.name for file in Store(plan.out / "views") if file.info.scene == scene)
     inside = "--inside simulator" if memory == SIMULATOR else f"--adapter {memory}"
+    named = f"--policy {plan.policy} " if plan.policy else ""
     run_line(
-        f"learn {plan.model} --views {plan.out / 'views'}#{views} --policy {plan.policy} {inside} "
+        f"learn {plan.model} --views {plan.out / 'views'}#{views} {named}{inside} "
         f"--episodes {plan.out / 'episodes.json'} --rounds {plan.rounds} --out {out} {plan.options}".strip()
     )
 
@@ -165,7 +166,7 @@ def parse(arguments: Sequence[str]) -> Plan:
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.learning", description=__doc__)
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/learning"))
     parser.add_argument("--model", default="reference", help="checkpoint of the world model")
-    parser.add_argument("--policy", required=True, help="run or folder of the trained policy")
+    parser.add_argument("--policy", help="run or folder of the trained policy; else the packaged one")
     parser.add_argument("--memories", default="voxel,none,simulator", help="adapters, and simulator")
     parser.add_argument("--houses", type=int, default=24)
     parser.add_argument("--first", type=int, default=0, help="seed of the first house of the test split")

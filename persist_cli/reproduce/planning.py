@@ -7,7 +7,7 @@ continues where it was stopped and repeats nothing that is done, so this may be 
   which the ways of planning were chosen (scenes 0:16).
 - The main table ranks ways over known ground by the paper's cost. Rows of the simulator in place of the model show what
   the model costs, and rows without imagination what imagining is worth. Its first half comes first, with a report.
-- The proposals of a trained policy are ranked likewise, where one is given.
+- The proposals of a trained policy are ranked likewise.
 - The same is ranked without what an agent keeps of its last plan, and without its approach: what do these two give?
 - The cross-entropy method, another cost of images, and the way that is left follow. They take most of the time.
 """
@@ -45,7 +45,7 @@ class PlanningFigures:
         out: folder of everything.
         checkpoint: the world model; ``reference`` is that of the package.
         policy: proposes what is ranked.
-        trained: folder of a trained policy whose proposals are ranked, too; ``None`` for none.
+        trained: a trained policy whose proposals are ranked, too; ``nomad`` is that of the package.
         scenes: held-out houses.
         each: most episodes of each bin, in sight and hidden.
         bins: actions of the shortest ways.
@@ -54,7 +54,7 @@ class PlanningFigures:
     out: Path
     checkpoint: str = "reference"
     policy: str = "routes"
-    trained: str | None = None
+    trained: str = "nomad"
     scenes: str = "40:96"
     each: int = 32
     bins: str = "8,16"
@@ -73,9 +73,8 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
         )
     for rows in (f"{ALONE},rank-16,rank-16-walk", f"{ALONE},rank-8,rank-16,rank-16-walk"):
         yield f"{plan} {LOOP} --rows {rows} --memories {MEMORIES} {_to(home, 'lpips')}"
-    if figures.trained:
-        ranked = f"--policy {shlex.quote(figures.trained)} --rows policy,rank-8,rank-16 --memories {MEMORIES}"
-        yield f"{bench} --loops closed {ranked} {_to(home, 'trained')}"
+    ranked = f"--policy {shlex.quote(figures.trained)} --rows policy,rank-8,rank-16 --memories {MEMORIES}"
+    yield f"{bench} --loops closed {ranked} {_to(home, 'trained')}"
     for choice in ("no-keep", "no-approach"):
         yield f"{plan} {LOOP} --{choice} --loops closed --rows rank-16 --memories simulator,voxel {_to(home, choice)}"
     if not (figures.out / "collisions.json").is_file():
@@ -96,7 +95,7 @@ def main() -> None:
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/planning"), help="folder of everything")
     parser.add_argument("--checkpoint", default="reference", help="the world model; else that of the package")
     parser.add_argument("--policy", default="routes", help="proposes what is ranked")
-    parser.add_argument("--trained", help="folder of a trained policy, whose proposals are ranked too")
+    parser.add_argument("--trained", default="nomad", help="a trained policy, whose proposals are ranked too")
     parser.add_argument("--scenes", default="40:96", help="held-out houses")
     parser.add_argument("--each", type=int, default=32, help="most episodes of each bin, in sight and hidden")
     parser.add_argument("--bins", default="8,16", help="actions of the shortest ways")

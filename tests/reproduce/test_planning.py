@@ -16,7 +16,7 @@ OUT = Path("my runs/planning")
 
 
 def test_every_command_and_option_exists() -> None:
-    for line in commands(PlanningFigures(OUT, trained="runs/policy")):
+    for line in commands(PlanningFigures(OUT)):
         command, words = typer.main.get_command(app), shlex.split(line)
         while hasattr(command, "commands"):
             command = command.commands[words.pop(0)]
