@@ -20,7 +20,7 @@ from persist_cli.io.files import file_sha256, read_json, read_tensors, remove_le
 
 FOLDER = "parts"
 
-PLAN, CASES, DATA = "plan.json", "cases.json", "data.json"
+PLAN, CASES, DATA, ROWS = "plan.json", "cases.json", "data.json", "rows.json"
 
 TRUTH = -1  # stands for the true videos where a row's number is expected
 
@@ -114,6 +114,17 @@ class Journal:
                         f"{path}: not what it was when the evaluation in {self.folder.parent} began; choose another "
                         "--out or delete that one"
                     )
+
+    @property
+    def names_rows(self) -> bool:
+        """Whether it is kept which row has which number; earlier versions did not keep it."""
+        return (self.folder / ROWS).is_file()
+
+    def check_rows(self, names: Sequence[str]) -> None:
+        """Keep the names of the rows by number; raise ``PersistError`` when the numbers stand for other rows."""
+        if self.names_rows:
+            check_same(read_json(self.folder / ROWS), list(names), f"{self.folder.parent}: holds other rows")
+        write_json(self.folder / ROWS, list(names))
 
     def has(self, part: Unit | ExampleClip) -> bool:
         """Whether a batch was measured, or a clip was predicted to be shown."""

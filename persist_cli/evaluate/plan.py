@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,8 +23,15 @@ from persist_cli.evaluate.new_poses import NEW_POSES, NewPoses
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, Protocol
 from persist_cli.evaluate.provenance import checkpoint_json, metric_json, scenes_of, trained_on, training_scenes
 from persist_cli.evaluate.report.remarks import contamination
-from persist_cli.evaluate.rows.build_rows import RowConfig, build_control_rows, build_model_rows, default_memories
+from persist_cli.evaluate.rows.build_rows import (
+    RowConfig,
+    build_control_rows,
+    build_model_rows,
+    default_memories,
+    owners_of_rows,
+)
 from persist_cli.evaluate.rows.row import Row
+from persist_cli.evaluate.rows.training_seeds import is_reordered
 from persist_cli.evaluate.statistics import RESAMPLE_UNITS
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
@@ -151,6 +159,7 @@ def prepare(
     if processes.main:
         values = identity(plan, sampling, checkpoints, metrics)
         journal.check(values)
+        check_row_numbers(journal, checkpoints, plan.memories or ())
         if journal.cases() is None:
             cases = find_cases(protocol, search, plan)
             build_control_rows(models, checkpoints, config, protocol, cases)  # controls may not suit the clips
@@ -164,6 +173,7 @@ def prepare(
     controls = build_control_rows(models, checkpoints, config, protocol, cases)
     rows = [*models, *controls.rows]
     if processes.main:
+        journal.check_rows([row.name for row in rows])
         warn_of_clips(cases, checkpoints, search)
     for row in [*rows, *(row for row, _ in controls.missing)]:
         row.has_depth = not (row.uses_model and row.base.fingerprint in bases.depthless)
@@ -193,8 +203,23 @@ def find_cases(protocol: Protocol, search: ClipSearch, plan: EvalPlan) -> list[C
     return protocol.find(search)
 
 
+def check_row_numbers(journal: Journal, checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> None:
+    """Raise ``PersistError`` where an evaluation of an earlier version may have numbered its rows in another order.
+
+    Its journal does not name them, and ``--training-seeds`` put rows of one group together.
+    """
+    if journal.begun and not journal.names_rows and any(map(is_reordered, owners_of_rows(checkpoints, memories))):
+        raise PersistError(
+            f"{journal.folder.parent}: begun by an earlier version, which does not say in what order its rows are; "
+            "choose another --out or delete it"
+        )
+
+
 def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], search: ClipSearch) -> None:
-    """Say when there are fewer clips than asked for, and whether a checkpoint was trained on their scenes."""
+    """Say how many clips are of each data set, whether there are too few, and which scenes were trained on."""
+    if len(search.folders) > 1:
+        counts = Counter(case.data for case in cases)
+        warn(f"clips of each data set: {', '.join(f'{counts[str(folder)]} of {folder}' for folder in search.folders)}")
     if len(cases) < search.limit:
         warn(f"{len(cases)} clip{'s' * (len(cases) != 1)} found, {search.limit} asked for")
     for line in contamination_warnings(checkpoints, cases):

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+import yaml
 
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.errors import CheckpointError
@@ -16,6 +17,7 @@ from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.rows.build_rows import named_owners
 from persist_cli.evaluate.rows.training_seeds import check_any_grouped, group_by_training, training_of
 from persist_cli.io.files import read_json
+from persist_cli.recipe import parse_yaml_mapping
 from tests.support.example_results import example_results
 
 RECIPE = "stage: '2'\nbase: runs/stage1-{seed}\ndata: {{path: [houses]}}\ntraining: {{seed: {seed}, steps: {steps}}}\n"
@@ -35,6 +37,8 @@ def test_checkpoints_whose_recipes_differ_in_seed_and_base_alone_are_one_group(t
     assert training_of(b, "voxel").seeds == (1,)
     names = [(name, group) for name, group, _ in named_owners("voxel", [a, b, other], True)]
     assert names == [("voxel (0)", "voxel (0)"), ("voxel (1)", "voxel (0)"), ("voxel (long)", "voxel (long)")]
+    mixed = [a, other, b]
+    assert [owner for *_, owner in named_owners("voxel", mixed, True)] == mixed  # row numbers stay, grouped or not
     assert [group for _, group, _ in named_owners("voxel", [a, b, c], True)] == ["voxel"] * 3
     assert len({group for _, group, _ in named_owners("voxel", [a, b, c], False)}) == 3
 
@@ -77,14 +81,34 @@ def test_tables_show_the_spread_over_training_seeds_and_say_where_they_are_too_f
     assert "2 training seeds (voxel): a difference" in table_text(results_of(0, 1))
 
 
+def trained_again(voxel, folder, **changes):
+    """A copy of a run whose recipe has other values, as if it had been trained so."""
+    shutil.copytree(voxel, folder)
+    (recipe,) = folder.glob("step-*/model/recipe.yaml")
+    (recipe.parent / "SHA256SUMS").unlink(missing_ok=True)
+    values = parse_yaml_mapping(recipe.read_text(), "recipe")
+    recipe.write_text(yaml.safe_dump(values | {"training": values["training"] | changes}))
+    shutil.copytree(voxel.parent / "stage1", folder.parent / "stage1", dirs_exist_ok=True)
+    return folder
+
+
+def test_rows_keep_their_figures_when_they_are_grouped_afterwards(persist, voxel, held_out, tmp_path):
+    trainings = {"a": {"seed": 0}, "b": {"seed": 0, "keep_checkpoints": 7}, "c": {"seed": 1}}
+    runs = [trained_again(voxel, tmp_path / name, **changes) for name, changes in trainings.items()]
+    options = ["--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1, "--controls", "copy"]
+    command = ["eval", *runs, "--data", held_out, *options, "--out", tmp_path / "o"]
+    assert persist(*command).code == 0
+    journal = tmp_path / "o/parts"
+    assert read_json(journal / "rows.json") == [*(f"voxel ({run})" for run in "abc"), "copy of the first frame"]
+    assert persist(*command, "--training-seeds").code == 0
+    (journal / "rows.json").unlink()  # as in an evaluation of an earlier version, which put a and c together
+    ended = persist(*command)
+    assert (ended.code, ended.err.count("error: ")) == (1, 1)
+    assert "begun by an earlier version, which does not say in what order its rows are" in ended.err
+
+
 def test_eval_makes_one_row_of_three_trainings(persist, voxel, held_out, tmp_path):
-    for seed in range(3):
-        shutil.copytree(voxel, tmp_path / f"voxel-{seed}")
-        (recipe,) = (tmp_path / f"voxel-{seed}").glob("step-*/model/recipe.yaml")
-        (recipe.parent / "SHA256SUMS").unlink(missing_ok=True)
-        recipe.write_text(recipe.read_text().replace("seed: 0", f"seed: {seed}"))
-    shutil.copytree(voxel.parent / "stage1", tmp_path / "stage1", dirs_exist_ok=True)
-    runs = [tmp_path / f"voxel-{seed}" for seed in range(3)]
+    runs = [trained_again(voxel, tmp_path / f"voxel-{seed}", seed=seed) for seed in range(3)]
     options = ["--memories", "voxel", "--metrics", "psnr", "--seeds", 1, "--steps", 1, "--controls", "emptied"]
     command = ["eval", *runs, "--data", held_out, *options, "--training-seeds"]
     ended = persist(*command, "--out", tmp_path / "o")

@@ -147,6 +147,8 @@ def named_owners(
 ) -> Iterator[tuple[str, str, Checkpoint]]:
     """Name of the row and of its group, and checkpoint, for each checkpoint that has a memory or a control's base.
 
+    They come in the order of the checkpoints, grouped or not, so that the journal's numbers of rows mean the same rows.
+
     Args:
         memory: name of the memory, or title of the control.
         owners: the checkpoints.
@@ -155,10 +157,19 @@ def named_owners(
     adapter = memory if all(memory in owner.adapters for owner in owners) else None
     groups = group_by_training(owners, adapter) if training_seeds else [[owner] for owner in owners]
     names = {id(owner): label for owner, label in zip(owners, labels(owners), strict=True)}
-    for group in groups:
-        title = memory if len(groups) == 1 else f"{memory} ({names[id(group[0])]})"
-        for owner in group:
-            yield memory if len(owners) == 1 else f"{memory} ({names[id(owner)]})", title, owner
+    firsts = {id(owner): group[0] for group in groups for owner in group}
+    for owner in owners:
+        title = memory if len(groups) == 1 else f"{memory} ({names[id(firsts[id(owner)])]})"
+        yield memory if len(owners) == 1 else f"{memory} ({names[id(owner)]})", title, owner
+
+
+def owners_of_rows(
+    checkpoints: Sequence[Checkpoint], memories: Sequence[str]
+) -> list[tuple[Sequence[Checkpoint], str | None]]:
+    """The checkpoints of each memory's rows, with the adapter, and last the bases of controls."""
+    adapters = [(memory, None if memory == PLAIN else memory) for memory in memories]
+    owners = [(checkpoints_with(memory, checkpoints), adapter) for memory, adapter in adapters]
+    return [*owners, (unique_bases(checkpoints), None)]
 
 
 def build_control_rows(

@@ -67,6 +67,16 @@ def group_by_training(checkpoints: Sequence[Checkpoint], adapter: str | None) ->
     return list(groups.values())
 
 
+def is_reordered(owners: tuple[Sequence[Checkpoint], str | None]) -> bool:
+    """Whether groups one after the other are another order than that of some checkpoints of an adapter."""
+    checkpoints, adapter = owners
+    try:
+        groups = group_by_training(checkpoints, adapter)
+    except CheckpointError:  # they were never grouped
+        return False
+    return [checkpoint for group in groups for checkpoint in group] != list(checkpoints)
+
+
 def check_any_grouped(groups: Sequence[list[Checkpoint]], adapter: str | None) -> None:
     """Raise ``CheckpointError`` when no group has two checkpoints, naming what the first two differ in."""
     if any(len(group) > 1 for group in groups):
