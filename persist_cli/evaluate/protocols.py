@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -21,6 +21,8 @@ from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.coverage import GRID, held_frames, recalled_share, seen_share
 from persist_cli.evaluate.new_poses import NEW_POSES, RETURN_DEGREES, RETURN_METRES, NewPoses, returning_frames
 from persist_cli.viewing.console import watched
+
+T = TypeVar("T")
 
 FrameSelection = Literal["all", "last", "return", "new"]  # frames of a clip that a column is the mean over
 
@@ -69,6 +71,17 @@ class ClipSearch:
     def trajectories(self) -> list[TrajectoryFile]:
         """Every trajectory of the data sets, in order."""
         return [file for folder in self.folders for file in Store(folder)]
+
+    def in_turns(self, found: Sequence[Sequence[T]]) -> list[T]:
+        """All that was found, taking turns over the data sets and, in each, over its trajectories.
+
+        So the first ones are of as many data sets, and of as many houses, as can be.
+
+        Args:
+            found: what was found in each of ``trajectories()``, the first to be taken first.
+        """
+        parts = iter(found)
+        return take_turns([take_turns([next(parts) for _ in Store(folder)]) for folder in self.folders])
 
 
 class Protocol(ABC):
@@ -151,14 +164,11 @@ class Revisit(Protocol):
     selections = ("all", "last", "new")
 
     def find(self, search: ClipSearch) -> list[Case]:
-        """Find the clips with the most to recall, taking turns over trajectories, disjoint within each."""
+        """Find the clips with the most to recall, taking turns as ``in_turns`` does, disjoint in each trajectory."""
         frames = search.frames or search.predicted_at_once + 1
         files = watched(search.trajectories(), "what returns", "trajectories")
         ranked = [self.rank_starts(file, frames, search.new_poses) for file in files]
-        turns = range(max(map(len, ranked), default=0))
-        chosen = [
-            (starts[turn], number) for turn in turns for number, starts in enumerate(ranked) if turn < len(starts)
-        ]
+        chosen = search.in_turns([[(start, number) for start in starts] for number, starts in enumerate(ranked)])
         if not chosen:
             raise DataError(
                 f"{search.where}: no clip of {frames} frames returns to a place seen before, by poses that are new; "
@@ -242,14 +252,15 @@ class Later(Revisit):
         return int(file.info.source.get(HELD_OUT_FROM, 0))
 
     def find(self, search: ClipSearch) -> list[Case]:
-        """Find the clips of every capture in the order of its frames."""
+        """Find the clips of each capture in the order of its frames, taking turns as ``in_turns`` does."""
         frames = search.frames or search.predicted_at_once + 1
-        chosen = []
+        found = []
         for number, file in enumerate(search.trajectories()):
             first = file.info.source.get(HELD_OUT_FROM)
             if first is None:
                 raise DataError(f"{file.path}: holds no frame out; import the capture with --hold-out 0.3")
-            chosen += [(start, number) for start in range(first, len(file) - frames + 1, max(1, frames // 2))]
+            found.append([(start, number) for start in range(first, len(file) - frames + 1, max(1, frames // 2))])
+        chosen = search.in_turns(found)
         if not chosen:
             raise DataError(f"{search.where}: no capture has {frames} frames held out; give --frames or hold out more")
         return self.make_cases(chosen[: search.limit], frames, search)
@@ -271,14 +282,15 @@ class ThereAndBack(Protocol):
     guards = ("copy", "truth")  # a frozen video has the best SRC, the truth not quite
 
     def find(self, search: ClipSearch) -> list[Case]:
-        """Find one clip in each trajectory that comes back, all of one length."""
+        """Find one clip in each trajectory that comes back, all of one length, taking turns over the data sets."""
         found: dict[Path, tuple[Tensor, int, int]] = {}
-        for file in watched(search.trajectories(), "what comes back", "trajectories"):
+        files = search.in_turns([[file] for file in search.trajectories()])
+        for file in watched(files, "what comes back", "trajectories"):
             poses = file.poses()
             found[file.path] = (poses, *turning_point(poses))
         frames = search.frames or self.usual_frames(list(found.values()), search)
         cases: list[Case] = []
-        for file in watched(search.trajectories(), "seen before", "trajectories"):
+        for file in watched(files, "seen before", "trajectories"):
             poses, twice, length = found[file.path]
             if len(cases) == search.limit or len(poses) < max(frames, LEAST_RETURN_FRAMES):
                 continue
@@ -327,14 +339,15 @@ class Long(Protocol):
     selections = ("all", "last")
 
     def find(self, search: ClipSearch) -> list[Case]:
-        """Find disjoint clips from the beginning of each trajectory on."""
+        """Find disjoint clips from the beginning of each trajectory on, taking turns as ``in_turns`` does."""
         frames = search.frames or LEAST_LONG_FRAMES + 1
         if frames <= LEAST_LONG_FRAMES:
             raise DataError(
                 f"the protocol 'long' predicts at least {LEAST_LONG_FRAMES} frames; --frames {frames} are too few"
             )
         files = search.trajectories()
-        places = [(file, start) for file in files for start in range(0, len(file) - frames + 1, frames)]
+        starts = [range(0, len(file) - frames + 1, frames) for file in files]
+        places = search.in_turns([[(file, start) for start in own] for file, own in zip(files, starts, strict=True)])
         if not places:
             longest = max(len(file) for file in files)
             raise DataError(
@@ -350,6 +363,12 @@ class Long(Protocol):
 PROTOCOLS: dict[str, Protocol] = {
     protocol.name: protocol for protocol in (Revisit(), ThereAndBack(), Long(), Unseen(), Later())
 }
+
+
+def take_turns(queues: Sequence[Sequence[T]]) -> list[T]:
+    """The first of each queue, then the second of each, and so on; a queue that has ended is passed over."""
+    turns = range(max(map(len, queues), default=0))
+    return [queue[turn] for turn in turns for queue in queues if turn < len(queue)]
 
 
 def turning_point(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, int]:

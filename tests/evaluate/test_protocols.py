@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -133,6 +134,29 @@ def test_a_long_clip_needs_112_frames_to_predict(walks, tmp_path):
     (case,) = PROTOCOLS["long"].find(search(tmp_path))
     assert (case.frames, case.context) == (113, 0)
     assert case.seen_before[100] > 0.9  # after a full turn
+
+
+def test_the_first_long_clips_are_of_different_trajectories(tmp_path):
+    turning = np.stack([look((0.0, 1.3, 0.0), 6.0 * number, 0.0) for number in range(226)])
+    for name in "ab":
+        Room(8, 8).write(tmp_path / f"{name}.parquet", turning)
+    cases = PROTOCOLS["long"].find(replace(search(tmp_path), limit=3))
+    assert [(case.trajectory, case.start) for case in cases] == [("a", 0), ("b", 0), ("a", 113)]
+
+
+@pytest.mark.parametrize("protocol", ["revisit", "return"])
+def test_a_limit_of_clips_takes_turns_over_the_data_sets(held_out, tmp_path, protocol):
+    again = shutil.copytree(held_out, tmp_path / "again")
+    few = replace(search(held_out), folders=[held_out, again], limit=3)
+    cases = PROTOCOLS[protocol].find(few)
+    assert [case.data for case in cases] == [str(held_out), str(again), str(held_out)]
+    assert len({case.trajectory for case in cases if case.data == str(held_out)}) == 2
+
+
+def test_turns_go_over_data_sets_then_trajectories_and_pass_over_those_that_have_no_more(held_out, tmp_path):
+    again = shutil.copytree(held_out, tmp_path / "again")
+    few = replace(search(held_out), folders=[held_out, again])
+    assert few.in_turns(["ab", "cde", "x", ""]) == [*"axcbde"]
 
 
 def test_unseen_refuses_scenes_that_were_trained_on(walks, held_out, tmp_path):
