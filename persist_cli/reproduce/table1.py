@@ -33,7 +33,7 @@ SEEDS = 3  # trainings of none, voxel and the best other, each on a third of the
 SEED_SCHEDULE = "training.steps=500 training.cooldown=200"
 
 SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # of the packaged model; chosen in a trial on eight clips
-COMMON = "--steps 4 --sampler unipc --guidance 1"  # where nothing was chosen
+COMMON = "--steps 4 --sampler unipc --guidance 1"  # where nothing was chosen, or for another recipe than those compared
 INVENTING = "--steps 20 --sampler ddim --guidance 1"  # few steps blur what is invented, which raises PSNR and SRC
 METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
 WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of every metric that can be fetched
@@ -153,7 +153,11 @@ def memory_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
 
 
 def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
-    """The command lines of all tables of the runs in ``out``; each memory is sampled as was chosen for it."""
+    """The command lines of all tables of the runs in ``out``.
+
+    Each memory is sampled as was chosen for it. In the tables of equal information and of forms all rows are sampled
+    alike: what was chosen was chosen for the winner's recipe, which would have the advantage.
+    """
     home, runs = shlex.quote(str(out)), tables(out, tuple(CHOSEN), chosen)
     revisit = revisit_options(out)
     equal = [f"{home}/equal-{memory}" for memory in EQUAL]
@@ -163,8 +167,8 @@ def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
     seeds = [f"{home}/seeds/{memory}-{seed}" for memory in seeded for seed in range(SEEDS)]
     return [
         *runs,
-        table(out, "equal", equal, f"{named(EQUAL, chosen)} {revisit} --controls codec --metrics {METRICS}"),
-        table(out, "forms", forms, f"{named(('voxel',), chosen)} {revisit} --controls codec --metrics {METRICS}"),
+        table(out, "equal", equal, f"{alike(EQUAL)} {revisit} --controls codec --metrics {METRICS}"),
+        table(out, "forms", forms, f"{alike(('voxel',))} {revisit} --controls codec --metrics {METRICS}"),
         table(
             out, "without-depth", without_depth,
             f"{named(WITHOUT_DEPTH, chosen)} {revisit} --controls codec --metrics psnr,ssim,lpips-alex",
@@ -229,7 +233,12 @@ def named(memories: Sequence[str], chosen: Chosen) -> str:
         for memory in memories
         if (sampling := chosen.sampling.get(memory)) is not None
     ]
-    return " ".join([f"--memories {','.join(memories)}", COMMON, *own])
+    return " ".join([alike(memories), *own])
+
+
+def alike(memories: Sequence[str]) -> str:
+    """The options of some memories that are sampled alike, by no choice of any of them."""
+    return f"--memories {','.join(memories)} {COMMON}"
 
 
 def table(out: Path, name: str, checkpoints: Sequence[str], options: str) -> str:

@@ -24,6 +24,7 @@ from persist_cli.recipe import make_recipe, read_recipe, recipe_names
 from persist_cli.reproduce.choose import TRIALS, recipe_file
 from persist_cli.reproduce.table1 import (
     CHOSEN,
+    COMMON,
     Chosen,
     base_commands,
     choice_plan,
@@ -130,9 +131,18 @@ def test_models_are_trained_chosen_and_measured_on_houses_of_three_splits() -> N
 
 
 def test_each_memory_is_sampled_as_was_chosen_for_it() -> None:
-    lines = [line for line in evaluate_commands(OUT, CHOICES) if "--protocol revisit" in line]
+    revisits = [line for line in evaluate_commands(OUT, CHOICES) if "--protocol revisit" in line]
+    lines = [line for line in revisits if "eval-equal" not in line and "eval-forms" not in line]
+    assert len(lines) == len(revisits) - 2
     assert all("--sampling-of voxel:steps=10,sampler=ddim,guidance=2 " in line for line in lines)
     assert not [line for line in lines if "--sampling-of none" in line]
+
+
+@pytest.mark.parametrize("name", ["equal", "forms"])
+def test_what_differs_in_one_thing_alone_is_sampled_alike(name: str) -> None:
+    (line,) = [line for line in evaluate_commands(OUT, CHOICES) if f"eval-{name}" in line]
+    assert "--sampling-of" not in line
+    assert f" {COMMON} " in line
 
 
 def test_none_voxel_and_the_best_other_memory_are_trained_with_three_seeds() -> None:
