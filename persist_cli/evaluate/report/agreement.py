@@ -63,7 +63,23 @@ def _data(one: Measured, two: Measured) -> Iterator[str]:
 def _clips(one: Measured, two: Measured) -> Iterator[str]:
     yield from _unequal("number of clips", len(one.clips), len(two.clips))
     for number, (first, second) in enumerate(zip(one.clips, two.clips, strict=False)):
-        yield from _unequal(f"clip {number}", _clip_name(first), _clip_name(second))
+        names = _clip_name(first), _clip_name(second)
+        yield from _unequal(f"clip {number}", *names) or _frames(number, first, second)
+
+
+def _frames(number: int, one: ClipRecord, two: ClipRecord) -> list[str]:
+    """The first frame of a clip that counts, or returns to an earlier one, in one run alone; one line at most.
+
+    Which do depends on how many frames are predicted at once, where the model's own frames go into the memory.
+    """
+    for frame, counts in enumerate(zip(one.counted, two.counted, strict=False)):
+        if counts[0] != counts[1]:
+            return [f"clip {number}: frame {frame} counts in {'A' if counts[0] else 'B'} only"]
+    for frame, visits in enumerate(zip(one.first_visits, two.first_visits, strict=False)):
+        if visits[0] != visits[1]:
+            earlier = ["no earlier frame" if visit < 0 else f"frame {visit}" for visit in visits]
+            return [f"clip {number}: frame {frame} returns to {earlier[0]} in A and {earlier[1]} in B"]
+    return []
 
 
 def _clip_name(clip: ClipRecord) -> str:

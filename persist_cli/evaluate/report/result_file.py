@@ -67,7 +67,11 @@ class DataSet(ResultModel):
 
 
 class ClipRecord(ResultModel):
-    """One clip; ``data`` is the number of its data set, ``seen_before`` holds a share for each frame."""
+    """One clip; ``data`` is the number of its data set, ``seen_before`` holds a share for each frame.
+
+    ``counted`` says which frames count and ``first_visits`` which earlier frame each returns to, -1 for none. Both
+    depend on how many frames the model predicts at once; results of earlier versions lack them.
+    """
 
     data: int
     trajectory: str
@@ -75,6 +79,8 @@ class ClipRecord(ResultModel):
     start: int
     frames: int
     seen_before: list[FiniteOrNone] = []
+    counted: list[bool] = []
+    first_visits: list[int] = []
     path_metres: FiniteOrNone = None
     farthest_metres: FiniteOrNone = None
     turned_degrees: FiniteOrNone = None

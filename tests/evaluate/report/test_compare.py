@@ -49,6 +49,24 @@ def test_the_difference_is_paired_clip_by_clip(tmp_path):
     assert cell.pairs == 6
 
 
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"counted": [True, False, True]}, "clip 0: frame 2 counts in B only; .*3 more clips"),
+        ({"first_visits": [-1, -1, 0]}, "clip 0: frame 2 returns to no earlier frame in A and frame 0 in B"),
+    ],
+)
+def test_runs_of_which_other_frames_count_or_return_are_not_compared(tmp_path, changes, reason):
+    def frames(**values):
+        known = {"counted": [True, False, False], "first_visits": [-1, -1, -1]} | values
+        return lambda results: [clip.update(known) for clip in results["measured"]["clips"]]
+
+    a, b = write_results(tmp_path, "a.json", frames()), write_results(tmp_path, "b.json", frames(**changes))
+    with pytest.raises(DataError, match=reason):
+        compare_runs(a, b)
+    assert compare_runs(a, write_results(tmp_path, "c.json")).notes == []  # an earlier version, which does not say it
+
+
 def test_a_clip_without_a_figure_in_one_run_is_no_pair(tmp_path):
     def change(results):
         add_one_decibel(results)
