@@ -61,6 +61,16 @@ def test_cells_before_a_surface_are_free_and_those_of_the_surface_solid():
 
 
 def test_a_grazing_look_over_the_floor_frees_none_of_its_cells():
+def test_a_pixel_that_looks_far_away_does_not_change_what_the_others_free():
+    frame = observe([look((0.0, 1.3, 0.0), 0.0, 0.0)])
+    depth = frame.depth.clone()
+    depth[0, 32, 32] = 100.0
+    near, far = scene(frame).cells, scene(replace(frame, depth=depth)).cells
+    freed = near.known & ~near.solid
+    still = far.box(near.corner, near.shape).known & freed
+    assert int(still.sum()) > 0.97 * int(freed.sum()) > 150
+
+
     grid = scene(observe([look((2.2, 1.3, 0.0), 90.0, -2.0)], 64, 64)).cells
     floor = -grid.corner[2]
     assert int((grid.solid[:, :, floor]).sum()) > 10

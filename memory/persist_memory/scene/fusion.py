@@ -150,7 +150,7 @@ def _passed(
     ends = view.points[view.depth > 0]
     if not len(ends):
         return home
-    ends = ends * (farthest / ends[:, 2].amax().clamp_min(farthest))
+    ends = ends * (farthest / ends[:, 2:].clamp_min(farthest))  # each ray alone: one far pixel shortens no other
     low, high = (_extreme(ends @ lattice_from_camera.T + origin, home[0], largest) for largest in (False, True))
     numbers, local = _cells_in_front(low, high, lattice_from_camera, origin, size)
     matrix = view.camera.intrinsics.double()
