@@ -86,6 +86,12 @@ def check_origins(tensors: Mapping[str, Tensor], where: str, known: type[IntEnum
         raise CheckpointError(f"{where}: unknown origin {min(unknown)} of an item; a newer persist may know it")
 
 
+def check_classes(classes: Tensor, count: int, where: str, what: str = "a cell") -> None:
+    """Raise ``CheckpointError`` when one of some cells is of a class that a palette of so many does not have."""
+    if len(classes) and int(classes.max()) >= count:
+        raise CheckpointError(f"{where}: {what} is of class {int(classes.max())}, but its palette has {count} classes")
+
+
 def check_mergeable(memory: Memory, other: Memory) -> None:
     """Raise ``CheckpointError`` naming the first difference that keeps two memories apart."""
     pairs = {

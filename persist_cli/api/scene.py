@@ -111,7 +111,9 @@ class Scene(Memory):
             body: the agent's body.
 
         Returns:
-            Whether the scene allows it: false where a step is blocked or nothing is in reach. Then nothing changes.
+            Whether the scene allows it: false where an interaction finds nothing in reach, or cannot be done, such as
+            a second ``pick_up``. Then nothing changes. Steps and turns may always be true: what blocks a step is
+            decided where the agent's map of the ground is, by ``Surroundings``, which knows the cells of a scene.
         """
 
     @abstractmethod

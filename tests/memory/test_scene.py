@@ -12,6 +12,7 @@ from persist_cli.api.observations import Origin
 from persist_cli.errors import CheckpointError, DataError, PersistError
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder, make_memory
+from persist_memory.scene import cell_store
 from persist_memory.scene.grid_scene import GridScene
 from tests.support.cell_rooms import FORM, TABLE_CELLS, camera_at, cell_room
 from tests.support.room_views import observe, room_walk
@@ -60,7 +61,6 @@ def test_cells_before_a_surface_are_free_and_those_of_the_surface_solid():
     assert int((grid.known & free).sum()) > 0.8 * int(free.sum())
 
 
-def test_a_grazing_look_over_the_floor_frees_none_of_its_cells():
 def test_a_pixel_that_looks_far_away_does_not_change_what_the_others_free():
     frame = observe([look((0.0, 1.3, 0.0), 0.0, 0.0)])
     depth = frame.depth.clone()
@@ -71,6 +71,7 @@ def test_a_pixel_that_looks_far_away_does_not_change_what_the_others_free():
     assert int(still.sum()) > 0.97 * int(freed.sum()) > 150
 
 
+def test_a_grazing_look_over_the_floor_frees_none_of_its_cells():
     grid = scene(observe([look((2.2, 1.3, 0.0), 90.0, -2.0)], 64, 64)).cells
     floor = -grid.corner[2]
     assert int((grid.solid[:, :, floor]).sum()) > 10
@@ -218,6 +219,26 @@ def test_a_scene_with_wrong_cells_is_refused_in_one_line_and_nothing_changes(nam
     with pytest.raises(CheckpointError, match=cause):
         memory.restore(tensors)
     assert same(memory, scene(room_walk(1)))
+
+
+def test_a_scene_at_the_largest_size_can_be_loaded_again(monkeypatch):
+    memory = named_scene()
+    memory.add(cell_room())
+    monkeypatch.setattr(cell_store, "MOST_CELLS", memory.cells.known.numel())
+    loaded = named_scene()
+    loaded.restore(memory.tensors())
+    assert same(loaded, memory)
+
+
+def test_a_scene_that_carries_a_thing_of_a_class_it_does_not_have_is_refused():
+    memory = named_scene()
+    carried = {
+        "carried.cells": torch.zeros(1, 3, dtype=torch.int32),
+        "carried.classes": torch.tensor([200], dtype=torch.uint8),
+        "carried.colors": torch.zeros(1, 3, dtype=torch.uint8),
+    }
+    with pytest.raises(CheckpointError, match="the carried thing is of class 200, but its palette has 10 classes"):
+        memory.restore(carried)
 
 
 def test_a_scene_without_a_part_of_its_view_or_with_cells_out_of_order_is_refused():

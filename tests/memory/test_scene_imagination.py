@@ -170,3 +170,26 @@ def test_solid_cells_that_the_model_calls_free_stay_solid():
     before = seen().cells
     assert torch.equal(scene.cells.box(before.corner, before.shape).solid[solid], solid[solid])
     assert WALL not in scene.cells.classes
+
+
+def test_a_solid_cell_of_no_class_gets_one_in_a_window_in_which_all_is_known():
+    scene = seen()
+    scene.complete()
+    given = scene.cells.copy()
+    place = tuple(((given.origins == CellOrigin.IMAGINED) & (given.classes == 0)).nonzero()[0])
+    given.classes[place], given.origins[place] = SOLID, CellOrigin.OBSERVED
+    scene.add(given)
+    assert scene.complete() == 0
+    assert int(scene.cells.classes[place]) == WALL
+
+
+def test_merging_observed_cells_keeps_an_imagined_class_as_writing_their_frames_does():
+    frames = room_walk(8)
+    written, seen_alone = seen(), empty_scene()
+    written.complete(seed=1)
+    merged = written.copy()
+    written.write(frames)
+    seen_alone.write(frames)
+    merged.merge(seen_alone)
+    assert torch.equal(merged.cells.classes, written.cells.classes)
+    assert int((written.cells.classes == WALL)[written.cells.origins == CellOrigin.OBSERVED].sum()) > 100

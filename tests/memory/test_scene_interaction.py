@@ -134,6 +134,16 @@ def test_a_model_can_say_what_becomes_of_things():
         do(furnished(evolution="model"), "pick_up")
 
 
+def test_a_model_is_not_asked_to_pick_up_with_full_hands_or_to_drop_with_empty_ones():
+    scene, grid = empty_scene(DrawnWalls(), evolution="model"), cell_room()
+    grid.classes[2, 4, 1] = BOX
+    scene.add(grid)
+    assert not do(scene, "drop")
+    assert do(scene, "pick_up")
+    assert not do(scene, "pick_up", ((6, 4, 5), (2, 4, 5)))
+    assert int(classes(scene)[2, 4, 1]) == BOX
+
+
 def test_a_model_that_blurs_colours_and_names_classes_changes_nothing_else():
     class Blurring(DrawnWalls):
         def sample(self, samples, steps):

@@ -13,7 +13,7 @@ from torch.nn import functional
 from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellGrid, CellOrigin
 from persist_cli.errors import CheckpointError, DataError
 from persist_memory.scene.fusion import Votes
-from persist_memory.validation import ORIGINS, Shape, check_tensors
+from persist_memory.validation import ORIGINS, Shape, check_classes, check_tensors
 
 MOST_CELLS = 10_000_000  # of the box: some 500 MB, and at 0.25 m a house of 200 m by 200 m with four floors
 
@@ -86,8 +86,13 @@ class CellStore:
         copy.__dict__ |= self.__dict__ | {"columns": dict(self.columns)}
         return copy
 
-    def reach(self, low: Sequence[int], high: Sequence[int]) -> None:
+    def reach(self, low: Sequence[int], high: Sequence[int], room: int = ROOM) -> None:
         """Let the box hold the cells from ``low`` to below ``high``, in tensors that no copy shares.
+
+        Args:
+            low: number of the lowest cell along each axis.
+            high: numbers after those of the highest.
+            room: cells that the box grows by beyond that along the ground, if it must grow.
 
         Raises:
             DataError: when it would then have more than ``MOST_CELLS`` cells; the box stays as it was.
@@ -98,9 +103,9 @@ class CellStore:
         if not empty and all(holds):
             self._own()
             return
-        room = (ROOM, ROOM, 0)
-        first = [a - r for a, r in zip(low, room, strict=True)]
-        last = [a + r for a, r in zip(high, room, strict=True)]
+        margin = (room, room, 0)
+        first = [a - r for a, r in zip(low, margin, strict=True)]
+        last = [a + r for a, r in zip(high, margin, strict=True)]
         if not empty:
             first = [min(a, b) for a, b in zip(first, self.corner, strict=True)]
             last = [max(a, b) for a, b in zip(last, ends, strict=True)]
@@ -139,11 +144,12 @@ class CellStore:
         self._decide(touched)
 
     def _decide(self, numbers: Int64[Tensor, "cell 3"]) -> None:
-        """Let the votes say what cells hold that are not edited; a solid cell keeps the class that it has."""
+        """Let the votes say what cells hold that have some and are not edited; a solid cell keeps its class."""
         columns = self.columns
         chosen = torch.zeros_like(columns[ORIGINS], dtype=torch.bool)
         chosen[self.places(numbers)] = True
-        at = (chosen & (columns[ORIGINS] != CellOrigin.EDITED)).nonzero(as_tuple=True)
+        voted = (columns["hits"] > 0) | (columns["passes"] > 0)
+        at = (chosen & voted & (columns[ORIGINS] != CellOrigin.EDITED)).nonzero(as_tuple=True)
         hits, passes, sums, was = (columns[name][at] for name in ("hits", "passes", "sums", "classes"))
         solid = (hits > 0) & (hits >= passes)
         named = (was != FREE) & (was != OUTSIDE) & (columns[ORIGINS][at] > 0)
@@ -202,11 +208,13 @@ class CellStore:
         self.reach(other.corner, [a + b for a, b in zip(other.corner, other.shape, strict=True)])
         part = self._part(theirs)
         mine = self.columns[ORIGINS][part]
-        both = (mine == CellOrigin.OBSERVED) & (theirs.origins == CellOrigin.OBSERVED)
-        higher = theirs.origins > mine
-        named = both & (self.columns["classes"][part] <= SOLID) & (theirs.classes > OUTSIDE)
+        observed = theirs.origins == CellOrigin.OBSERVED
+        both, higher = (mine == CellOrigin.OBSERVED) & observed, theirs.origins > mine
+        named = self.columns["classes"][part] > OUTSIDE
+        kept = higher & observed & (theirs.classes == SOLID) & named & (mine > 0)  # as when frames are written
+        learned = both & (self.columns["classes"][part] <= SOLID) & (theirs.classes > OUTSIDE)
         for name in CONTENT:
-            taken = higher | named if name == "classes" else higher
+            taken = (higher & ~kept) | learned if name == "classes" else higher
             self.columns[name][part][taken] = other.columns[name].to(self.device)[taken]
         for name in set(COLUMNS) - set(CONTENT):
             values, added = self.columns[name][part], other.columns[name].to(self.device)
@@ -224,9 +232,9 @@ class CellStore:
         return {"cells": numbers} | {name: part[at] for name, part in self.columns.items()}
 
     def fill(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write cells that ``tensors()`` gave into an empty store."""
+        """Write cells that ``tensors()`` gave into an empty store; with no room more, so that all that fitted fits."""
         numbers = tensors["cells"].long()
-        self.reach(numbers.amin(0).tolist(), (numbers.amax(0) + 1).tolist())
+        self.reach(numbers.amin(0).tolist(), (numbers.amax(0) + 1).tolist(), room=0)
         at = self.places(numbers)
         for name, part in self.columns.items():
             part[at] = tensors[name]
@@ -252,17 +260,14 @@ def check_cells(tensors: Mapping[str, Tensor], classes: int, where: str) -> None
     expected: dict[str, tuple[torch.dtype, Shape]] = {"cells": (torch.int32, (None, 3))}
     expected |= {name: (dtype, (None, *rest)) for name, (dtype, rest) in COLUMNS.items()}
     check_tensors(tensors, expected, where)
-    numbers, content = tensors["cells"].long(), tensors["classes"]
+    numbers = tensors["cells"].long()
     steps = numbers.diff(dim=0)
     first = (steps != 0).long().argmax(dim=1, keepdim=True)
     if not bool((steps.gather(1, first) > 0).all()):
         raise CheckpointError(f"{where}: its cells are not in order, or one is there twice")
     if len(numbers) and float((numbers.amax(0) - numbers.amin(0) + 1).double().prod()) > MOST_CELLS:
         raise CheckpointError(f"{where}: its cells lie too far apart, in a box of more than {MOST_CELLS:,} cells")
-    if len(content) and int(content.max()) >= classes:
-        raise CheckpointError(
-            f"{where}: a cell is of class {int(content.max())}, but its palette has {classes} classes"
-        )
+    check_classes(tensors["classes"], classes, where)
     unknown = set(tensors[ORIGINS].unique().tolist()) - set(CellOrigin)
     if unknown:
         raise CheckpointError(f"{where}: unknown origin {min(unknown)} of a cell; a newer persist may know it")

@@ -36,7 +36,6 @@ from persist_memory.scene.imagination import (
     View,
     evolved,
     imagine_hidden,
-    limited,
     read_view,
     sees_unknown,
     windows_over,
@@ -309,7 +308,7 @@ class GridScene(Scene):
             CheckpointError: when they are not tensors of a scene with these classes; then it stays as it was.
         """
         where = f"memory {self.name!r}"
-        view, load = read_view(tensors, where), read_load(tensors, where)
+        view, load = read_view(tensors, where), read_load(tensors, len(self._form.palette), where)
         cells = {name: tensor for name, tensor in tensors.items() if name not in VIEW and name not in LOAD}
         store = self._empty_store(next(iter(cells.values())).device if cells else None)
         if cells:
@@ -394,19 +393,21 @@ class GridScene(Scene):
     def _imagine(
         self, imagination: Imagination, corner: tuple[int, int, int], seed: int, region: Box | None = None
     ) -> int:
-        """Imagine the unknown cells of a window, those in a region alone, and return how many."""
+        """Imagine the unknown cells of a window, those in a region alone, and return how many.
+
+        Where none is unknown, but the class of a solid one is, the model still says which class it has.
+        """
         window = self._store.box.box(corner, imagination.model.form.shape)
-        chosen = ~window.known
-        if region is not None:
-            chosen &= region.contains(window.centers())
-        count = int(chosen.sum())
-        if count:
-            filled = limited(imagination.fill(window, seed), window, chosen)
+        unnamed = window.known & (window.classes == SOLID)
+        wanted = torch.ones_like(unnamed) if region is None else region.contains(window.centers())
+        chosen = ~window.known & wanted
+        if bool((chosen | (unnamed & wanted)).any()):
+            filled = imagination.fill(window, seed)
             self._store.reach(corner, [a + b for a, b in zip(corner, window.shape, strict=True)])
             self._store.replace(filled, chosen)
-            self._store.name(filled, window.known & (window.classes == SOLID) & (filled.classes != SOLID))
+            self._store.name(filled, unnamed & (filled.classes != SOLID))
             self._cells = None
-        return count
+        return int(chosen.sum())
 
     def _foresee(self, path: Cameras) -> None:
         """Imagine windows around the cameras of a path until none sees an unknown cell."""
@@ -420,13 +421,15 @@ class GridScene(Scene):
 
     def _act_by_model(self, action: Action, pose: Float[Tensor, "4 4"]) -> bool:
         """Let the scene model say what becomes of the cells in reach; false when it changes nothing."""
+        if (action.name == "pick_up" and self._load is not None) or (action.name == "drop" and self._load is None):
+            return False  # the hands are full, or empty: no matter what a model would say
         imagination = self._imagination()
         center = self._number_at(pose[:3, 3])
         before = self._store.box.box(imagination.around(center), imagination.model.form.shape)
         after = evolved(imagination, before, action.name, pose, self.settings.seed)
         if after is None:
             return False
-        if action.name == "pick_up" and self._load is None:
+        if action.name == "pick_up":
             gone = (before.solid & ~after.solid).nonzero()
             self._load = Load.taken(before, gone) if len(gone) else None
         elif action.name == "drop":

@@ -230,14 +230,6 @@ def windows_over(
     return places
 
 
-def limited(filled: CellGrid, before: CellGrid, chosen: Bool[Tensor, "first second level"]) -> CellGrid:
-    """Return a filled window in which only chosen cells are new; other unknown ones stay unknown."""
-    dropped = ~before.known & ~chosen
-    origins = torch.where(dropped, 0, filled.origins)
-    classes = torch.where(dropped, 0, filled.classes)
-    return replace(filled, origins=origins, classes=classes, colors=filled.colors * ~dropped[..., None])
-
-
 def sees_unknown(window: CellGrid, camera: Cameras, foresight: float, floor: int) -> bool:
     """Whether a ray of a camera meets an unknown cell before any surface."""
     views = camera.resized(max(1, camera.height // FORESEEN_STRIDE), max(1, camera.width // FORESEEN_STRIDE))
@@ -251,7 +243,10 @@ def sees_unknown(window: CellGrid, camera: Cameras, foresight: float, floor: int
 def imagine_hidden(
     imagination: Imagination, grid: CellGrid, hidden: Bool[Tensor, "first second level"], seed: int
 ) -> CellGrid:
-    """Return a grid with its hidden cells imagined, as far as the model's windows reach."""
+    """Return a grid with its hidden cells imagined, as far as the model's windows reach, and all others as they were.
+
+    Solid cells of no known class get none here, since an edit changes nothing but what it is asked to.
+    """
     places = hidden.nonzero() + torch.tensor(grid.corner)
     low, high = places.amin(0).tolist(), (places.amax(0) + 1).tolist()
     center = [(a + b) // 2 for a, b in zip(low, high, strict=True)]
@@ -262,7 +257,10 @@ def imagine_hidden(
         window = result.box(corner, imagination.model.form.shape)
         chosen = ~window.known & wanted.box(corner, window.shape).known
         if bool(chosen.any()):
-            result.put(limited(imagination.fill(window, seed), window, chosen | window.known))
+            filled = imagination.fill(window, seed)
+            for mine, drawn in zip(window.tensors(), filled.tensors(), strict=True):
+                mine[chosen] = drawn[chosen]
+            result.put(window)
     return result
 
 

@@ -16,7 +16,7 @@ from persist_cli.api.ground import Body
 from persist_cli.api.reach import AHEAD, CHANGED, REACH, place_and_heading
 from persist_cli.errors import CheckpointError
 from persist_memory.scene.surroundings import fill_from_surroundings
-from persist_memory.validation import Shape, part_of
+from persist_memory.validation import Shape, check_classes, part_of
 
 BEFORE = 0.3  # metres between the agent's body and the thing that it puts down
 
@@ -65,15 +65,17 @@ class Load:
         return dict(zip(LOAD, (self.cells.to(torch.int32), self.classes, self.colors), strict=True))
 
 
-def read_load(tensors: Mapping[str, Tensor], where: str) -> Load | None:
-    """Return the carried thing among the tensors of a memory, ``None`` without one.
+def read_load(tensors: Mapping[str, Tensor], classes: int, where: str) -> Load | None:
+    """Return the carried thing among the tensors of a memory of so many classes, ``None`` without one.
 
     Raises:
-        CheckpointError: when a part of it is missing or damaged.
+        CheckpointError: when a part of it is missing or damaged, or it is of another class.
     """
     parts = part_of(tensors, LOAD, where)
     if parts and (len({len(part) for part in parts}) > 1 or not len(parts[0])):
         raise CheckpointError(f"{where}: the carried thing has {[len(part) for part in parts]} cells, classes, colours")
+    if parts:
+        check_classes(parts[1], classes, where, "the carried thing")
     return Load(parts[0].long(), parts[1], parts[2]) if parts else None
 
 
