@@ -69,6 +69,8 @@ class Copy(_Edit):
     overwrite: bool = False
 
 
+FilledBy = Literal["model", "surroundings", "both"]
+
 Edit = Annotated[Remove | Paint | Insert | Move | Copy, Field(discriminator="edit")]
 
 
@@ -79,9 +81,10 @@ class EditOutcome:
     Args:
         changed: cells that hold another thing or have another colour now, the uncovered ones too.
         uncovered: cells that were never seen, behind or below what was taken away, and hold something or nothing now.
-        filled_by: what says what the uncovered cells hold: a model that imagines, or their surroundings.
+        filled_by: what says what the uncovered cells hold: a model that imagines, their surroundings, or for some cells
+            the one and for some the other; ``None`` where no cell was uncovered.
     """
 
     changed: int
     uncovered: int = 0
-    filled_by: Literal["model", "surroundings"] = "surroundings"
+    filled_by: FilledBy | None = None

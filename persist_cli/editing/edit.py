@@ -35,6 +35,12 @@ from persist_cli.viewing.map import draw_before_and_after
 
 AROUND = 2  # pixels at the border of what is edited that may change too
 
+FILLED = {  # by ``EditOutcome.filled_by``
+    "model": "a model says what they hold",
+    "surroundings": "their surroundings say what they hold",
+    "both": "a model or their surroundings say what they hold",
+}
+
 
 @dataclass(frozen=True)
 class EditPlan:
@@ -213,11 +219,10 @@ def write_outputs(
 
 def summary(report: Mapping[str, Any], files: Mapping[str, str]) -> str:
     """Return what became of the edits, for people."""
-    filled = "a model" if report["filled_by"] == "model" else "their surroundings"
     uncovered, count = report["uncovered"], len(report["edits"])
     lines = [f"{count} edit{'s' * (count > 1)} changed {report['changed']:,} cells of {report['scene']}"]
     if uncovered:
-        lines.append(f"{uncovered:,} of these were never seen before; {filled} say what they hold")
+        lines.append(f"{uncovered:,} of these were never seen before; {FILLED[report['filled_by']]}")
     lines += [
         f"{title} from {report['view']}: pixels that look at the edit change by {change['inside']:.3g} of 255 on "
         f"average, others by {change['outside']:.3g}"

@@ -10,9 +10,11 @@ from persist_cli.api.observations import Observations
 from persist_cli.api.scene_edits import Copy, Edit, Insert, Move, Paint, Remove
 from persist_cli.errors import DataError
 from persist_memory.scene.editing import apply_edits, changes, edit_grid
+from persist_memory.scene.grid_scene import GridScene
 from persist_memory.scene.surroundings import guess
 from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, TABLE, TABLE_CELLS, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
+from tests.support.room_views import room_walk
 
 EVERYWHERE = {"low": (-9.0, -9.0, -9.0), "high": (9.0, 9.0, 9.0)}
 
@@ -114,6 +116,69 @@ def test_a_scene_with_a_model_imagines_by_a_seed_what_a_removed_thing_hid():
         scenes.append(scene.cells.classes[4:6, 9:12, 1:4])
     assert torch.equal(scenes[0], scenes[1])
     assert not torch.equal(scenes[0], scenes[2])
+
+
+def observed_scene() -> GridScene:
+    """A scene that imagines, into which depth frames of a room were written: what is solid has no class yet."""
+    scene = empty_scene(DrawnWalls())
+    scene.write(room_walk(8))
+    return scene
+
+
+def test_an_edit_with_a_model_leaves_every_observed_cell_with_its_votes_and_its_class():
+    scene, before = observed_scene(), observed_scene()
+    box = find_things(scene.cells)[-1].box
+    scene.edit([Remove(low=box.low, high=box.high)], seed=1)
+    grid, was = scene.cells, before.cells
+    kept = (grid.box(was.corner, was.shape).origins == CellOrigin.OBSERVED) & was.known
+    assert int(kept.sum()) > 2000
+    assert torch.equal(grid.box(was.corner, was.shape).classes[kept], was.classes[kept])
+    votes = scene.tensors()
+    observed = votes["origins"] == CellOrigin.OBSERVED
+    assert bool((votes["hits"] + votes["passes"] > 0)[observed].all())
+
+
+def test_an_edited_scene_merged_with_its_own_copy_keeps_what_is_solid():
+    scene = observed_scene()
+    box = find_things(scene.cells)[-1].box
+    scene.edit([Remove(low=box.low, high=box.high)], seed=1)
+    solid = scene.cells.solid
+    scene.merge(scene.copy())
+    assert torch.equal(scene.cells.solid, solid)
+
+
+def test_a_box_around_two_things_frees_what_lies_between_them_as_imagined_and_not_for_good():
+    grid = cell_room()
+    between = (slice(6, 9), slice(5, 8), slice(1, 3))
+    grid.origins[between] = 0
+    gone, outcome = edit_grid(grid, [Remove(**EVERYWHERE)])
+    assert bool((gone.origins[between] == CellOrigin.IMAGINED).all())
+    assert outcome.uncovered == grid.origins[between].numel()
+
+
+def test_the_unseen_inside_of_a_removed_thing_goes_with_it_whatever_a_model_imagines_and_can_be_observed():
+    grid = cell_room()
+    grid.classes[3:8, 5:10, 1:4] = TABLE
+    grid.origins[4:7, 6:9, 2] = 0
+    gone, outcome = edit_grid(grid, [Remove(**box_of(grid, "table#1"))], lambda cells, hidden: cells)
+    assert bool((gone.classes[4:7, 6:9, 2] == FREE).all())
+    assert bool((gone.origins[4:7, 6:9, 2] == CellOrigin.IMAGINED).all())
+    assert outcome.uncovered == 9
+
+
+def test_the_outcome_says_who_filled_what_was_uncovered():
+    grid = cell_room()
+    table = Remove(**box_of(grid, "table#1"))
+    assert edit_grid(grid, [table], lambda cells, hidden: cells)[1].filled_by is None
+    grid.origins[4:6, 9:12, 1:4] = 0
+
+    def imagine_one(cells: CellGrid, hidden: torch.Tensor) -> CellGrid:
+        filled = cells.copy()
+        filled.origins[tuple(hidden.nonzero()[0])] = CellOrigin.IMAGINED
+        return filled
+
+    assert edit_grid(grid, [table], lambda cells, hidden: cells)[1].filled_by == "surroundings"
+    assert edit_grid(grid, [table], imagine_one)[1].filled_by == "both"
 
 
 def test_things_of_no_known_class_are_removed_and_walls_stay():

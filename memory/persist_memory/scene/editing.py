@@ -13,10 +13,10 @@ from torch import Tensor
 
 from persist_cli.api.cell_things import box_of, ceiling_level, find_things, floor_level, structure
 from persist_cli.api.cells import FREE, OUTSIDE, Box, CellGrid, CellOrigin
-from persist_cli.api.scene_edits import Copy, Edit, EditOutcome, Insert, Move, Paint, Remove
+from persist_cli.api.scene_edits import Copy, Edit, EditOutcome, FilledBy, Insert, Move, Paint, Remove
 from persist_cli.errors import DataError, hint
 from persist_memory.scene.support import free_below, standing_on
-from persist_memory.scene.surroundings import fill_from_surroundings, guess, repair_floor
+from persist_memory.scene.surroundings import fill_from_surroundings, first_known, guess, repair_floor
 
 BORDER: Final = 1e-6  # metres by which a box is grown, so that rounding leaves no cell of it out
 REACH: Final = 8  # cells from face to face behind a removed thing that it may have hidden
@@ -63,12 +63,20 @@ def edit_grid(
         DataError: when an edit cannot be done.
     """
     edited = apply_edits(grid, edits)
-    filled, uncovered = edited.grid, int(edited.hidden.sum())
-    if imagine is not None and uncovered:
-        filled = imagine(filled, edited.hidden)
-    filled = fill_from_surroundings(filled, edited.hidden & ~filled.known)
-    changed = int(changes(grid, filled).sum())
-    return filled, EditOutcome(changed, uncovered, "surroundings" if imagine is None else "model")
+    filled, hidden = edited.grid, edited.hidden
+    if imagine is not None and bool(hidden.any()):
+        filled = imagine(filled, hidden)
+    by_model = int((hidden & filled.known).sum())
+    filled = fill_from_surroundings(filled, hidden & ~filled.known)
+    uncovered = int((~grid.known & (filled.origins == CellOrigin.IMAGINED)).sum())
+    return filled, EditOutcome(int(changes(grid, filled).sum()), uncovered, _filled_by(uncovered, by_model))
+
+
+def _filled_by(uncovered: int, by_model: int) -> FilledBy | None:
+    """Return what says what some uncovered cells hold, of which a model filled so many."""
+    if not uncovered:
+        return None
+    return "surroundings" if not by_model else "model" if by_model == uncovered else "both"
 
 
 def apply_edits(grid: CellGrid, edits: Sequence[Edit]) -> EditedCells:
@@ -142,18 +150,38 @@ def _paint(grid: CellGrid, edit: Paint) -> None:
 
 
 def _remove(grid: CellGrid, targets: Cells) -> Cells:
-    """Free the targets, let the floor go on below them, and return the unknown cells that they hid."""
-    floor, around = floor_level(grid), _bounding(targets)
+    """Free the targets, let the floor go on below them, and return the unknown cells that they hid.
+
+    The inside of a thing that was seen from outside alone goes with it. It counts as imagined, not as edited: nobody
+    saw what is there.
+    """
+    floor, inside = floor_level(grid), _inside(grid, targets)
     columns = torch.zeros_like(targets[:, :, 0])
     if floor is not None:
         columns = targets[:, :, floor : floor + 2].any(dim=-1)
         targets = targets.clone()
-        targets[:, :, floor] = around[:, :, floor] = False
+        targets[:, :, floor] = inside[:, :, floor] = False
     _set(grid, targets.nonzero(), FREE, (0, 0, 0))
     repair_floor(grid, columns)
-    within = around & ~grid.known & (guess(grid).classes == FREE)  # the inside of what was seen from outside alone
-    _set(grid, within.nonzero(), FREE, (0, 0, 0))
-    return _uncovered(grid, targets | within)
+    inside &= guess(grid).classes == FREE
+    _set(grid, inside.nonzero(), FREE, (0, 0, 0), CellOrigin.IMAGINED)
+    return _uncovered(grid, targets | inside)
+
+
+def _inside(grid: CellGrid, targets: Cells) -> Cells:
+    """Return the unknown cells that have targets of one thing on both sides along an axis."""
+    inside = torch.zeros_like(targets)
+    for thing in find_things(grid):
+        places = thing.cells[targets[tuple(thing.cells.T)]]
+        if not len(places):
+            continue
+        low, high = places.amin(0), places.amax(0) + 1
+        own = torch.zeros((high - low).tolist(), dtype=torch.bool)
+        own[tuple((places - low).T)] = True
+        sides = [(first_known(own, axis, False), first_known(own, axis, True)) for axis in range(3)]
+        first, second, level = (slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+        inside[first, second, level] |= torch.stack([(a >= 0) & (b >= 0) for a, b in sides]).any(0)
+    return inside & ~grid.known
 
 
 def _uncovered(grid: CellGrid, freed: Cells) -> Cells:
@@ -281,19 +309,17 @@ def _check_room(grid: CellGrid, places: Places, overwrite: bool) -> None:
     )
 
 
-def _set(grid: CellGrid, places: Places, kind: int | Tensor, color: tuple[int, ...] | Tensor) -> None:
+def _set(
+    grid: CellGrid,
+    places: Places,
+    kind: int | Tensor,
+    color: tuple[int, ...] | Tensor,
+    origin: CellOrigin = CellOrigin.EDITED,
+) -> None:
     picks = tuple(places.T)
     grid.classes[picks] = torch.as_tensor(kind, dtype=torch.uint8)
     grid.colors[picks] = torch.as_tensor(color, dtype=torch.uint8)
-    grid.origins[picks] = CellOrigin.EDITED
-
-
-def _bounding(cells: Cells) -> Cells:
-    """Return the smallest block of cells around some."""
-    block, places = torch.zeros_like(cells), cells.nonzero()
-    first, second, level = (slice(int(ends.min()), int(ends.max()) + 1) for ends in places.T)
-    block[first, second, level] = True
-    return block
+    grid.origins[picks] = origin
 
 
 def _box_text(edit: Boxed) -> str:

@@ -79,9 +79,9 @@ def _flat_sources(grid: CellGrid, level: int) -> Bool[Tensor, "first second"]:
 
 def _continue_walls(grid: CellGrid, guessed: CellGrid) -> None:
     wall, unknown = walls(grid), ~grid.known
-    up = _first_known(grid.known, 2, forward=True)
+    up = first_known(grid.known, 2, forward=True)
     open_above = _at(grid.known & (grid.classes == FREE), up, 2)
-    sides = [(_first_known(grid.known, axis, False), _first_known(grid.known, axis, True)) for axis in (0, 1)]
+    sides = [(first_known(grid.known, axis, False), first_known(grid.known, axis, True)) for axis in (0, 1)]
     inside = torch.stack([(low >= 0) & (high >= 0) for low, high in sides]).any(0)
     for level in range(grid.shape[2]):
         continue_level(guessed, level, (unknown & ~inside & ~open_above)[:, :, level], wall[:, :, level])
@@ -92,7 +92,7 @@ def _continue_walls(grid: CellGrid, guessed: CellGrid) -> None:
     _take(grid, guessed, unknown & _at(wall | (grid.known & (grid.classes == OUTSIDE)), up, 2), up, 2)
 
 
-def _first_known(known: Cells, axis: int, forward: bool) -> Places:
+def first_known(known: Cells, axis: int, forward: bool) -> Places:
     """Return for each cell the place along an axis of the first known cell on one side of it, or of itself; or -1."""
     shape = [1, 1, 1]
     shape[axis] = length = known.shape[axis]
