@@ -69,7 +69,7 @@ Numbers = NDArray[np.float64]
 
 def run_completion(bench: SceneBench) -> None:
     """Complete every view in every row, but those that the journal has."""
-    rows = [row for row in bench.rows if any(not bench.journal.has(row.name, view.name) for view in bench.views)]
+    rows = [row for row in bench.rows if any(missing_seeds(bench, row, view) for view in bench.views)]
     for row in rows:
         row.prepare(bench.views)
     with progress() as bar:
@@ -77,15 +77,37 @@ def run_completion(bench: SceneBench) -> None:
         for row in rows:
             bar.update(task, note=row.name)
             for place, view in enumerate(bench.views):
-                if not bench.journal.has(row.name, view.name):
-                    bench.journal.write_samples(row.name, view.name, sample(row, view, place, bench.plan.seeds))
+                if seeds := missing_seeds(bench, row, view):
+                    keep_samples(bench, row, view, sample(row, view, place, seeds))
                 bar.advance(task)
 
 
-def sample(row: Completion, view: View, place: int, seeds: int) -> dict[str, Tensor]:
+def missing_seeds(bench: SceneBench, row: Completion, view: View) -> range:
+    """Return the seeds of a row that the journal lacks for a view; a row that is not random has a single one."""
+    kept = 0
+    if bench.journal.has(row.name, view.name):
+        kept = len(bench.journal.samples(row.name, view.name)["classes"])
+    return range(kept, bench.plan.seeds if row.random else 1)
+
+
+def keep_samples(bench: SceneBench, row: Completion, view: View, added: dict[str, Tensor]) -> None:
+    """Keep samples behind those that the journal has of a row and view."""
+    if bench.journal.has(row.name, view.name):
+        kept = bench.journal.samples(row.name, view.name)
+        added = {name: torch.cat([kept[name], tensor]) for name, tensor in added.items()}
+    bench.journal.write_samples(row.name, view.name, added)
+
+
+def kept_samples(bench: SceneBench, row: Completion, view: View) -> dict[str, Tensor]:
+    """Return what ``sample`` gave of a row and view, for as many seeds as are measured."""
+    samples = bench.journal.samples(row.name, view.name)
+    return {name: tensor[: bench.plan.seeds] for name, tensor in samples.items()}
+
+
+def sample(row: Completion, view: View, place: int, seeds: Sequence[int]) -> dict[str, Tensor]:
     """Return the classes of a view's region, one draw for each seed, with the seconds of each."""
     classes, known, seconds = [], [], []
-    for seed in range(seeds if row.random else 1):
+    for seed in seeds:
         begun = time.perf_counter()
         done = row.complete(view, place, seed)
         seconds.append(time.perf_counter() - begun)
@@ -126,7 +148,7 @@ def row_counts(bench: SceneBench, row: Completion) -> NDArray[np.int64]:
     """Return ``[seed, view, class + 1, 3]`` as of ``class_counts``; what a row leaves unknown counts as free."""
     counts = []
     for view in bench.views:
-        samples = bench.journal.samples(row.name, view.name)
+        samples = kept_samples(bench, row, view)
         said = torch.where(samples["known"], samples["classes"], 0)
         truth, mask = view.truth.classes, view.unseen
         counts.append([class_counts(classes, truth, mask, len(bench.palette)) for classes in said])
@@ -137,7 +159,7 @@ def row_figures(
     bench: SceneBench, row: Completion, counts: NDArray[np.int64], present: Sequence[int], draws: Draws
 ) -> dict[str, Figure]:
     """Return the figures of a row that have an interval."""
-    samples = {view.name: bench.journal.samples(row.name, view.name) for view in bench.views}
+    samples = {view.name: kept_samples(bench, row, view) for view in bench.views}
     doors, borders = connectedness(bench, samples)
     alike = [disagreement(samples[view.name]["classes"], view.unseen) for view in bench.views]
     different = [distinct(samples[view.name]["classes"], view.unseen) for view in bench.views]
@@ -199,7 +221,7 @@ def layout_figures(bench: SceneBench, row: Completion, layouts: Tensor | None) -
         return {}
     seeds: list[list[Tensor]] = []
     for view in bench.views:
-        for seed, classes in enumerate(bench.journal.samples(row.name, view.name)["classes"]):
+        for seed, classes in enumerate(kept_samples(bench, row, view)["classes"]):
             seeds += [[]] if len(seeds) <= seed else []
             seeds[seed].append(plan_features(classes, view.region, view.truth.form))
     pairs = np.array([precision_recall(torch.stack(plans), layouts) for plans in seeds])

@@ -47,6 +47,8 @@ TRIES: Final = 40  # of clips and edits for each edit that is wanted
 
 REACH: Final = (1.0, 3.5)  # metres from the camera within which a thing is put
 
+OTHER_NOISE: Final = 1_000_000  # what a seed grows by for other noise; no other edit has that seed
+
 SIZE: Final = (0.75, 0.75, 1.0)  # metres of a thing that is put in
 
 COLUMNS: Final = {
@@ -184,7 +186,7 @@ def judge_edit(bench: SceneBench, renderer: Renderer, trial: EditTrial, number: 
     drawn = [first_surfaces(grid, last).colors(grid)[0] for grid in (cells, edited)]
     before = rendered(bench, renderer, trial, trial.before.copy(), number)
     after = rendered(bench, renderer, trial, trial.after, number)
-    other = rendered(bench, renderer, trial, trial.before, number + bench.plan.edits)
+    other = rendered(bench, renderer, trial, trial.before, number + OTHER_NOISE)
     return {
         "scene": trial.view.scene,
         "kind": trial.kind,

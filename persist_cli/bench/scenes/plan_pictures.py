@@ -12,6 +12,7 @@ from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from persist_cli.api.cells import FREE, OUTSIDE, SOLID
+from persist_cli.bench.scenes.completion_part import kept_samples
 from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.views import View
 from persist_cli.viewing.data_uri import data_uri
@@ -55,7 +56,7 @@ def picture_view(bench: SceneBench, view: View) -> ViewPictures:
     colors = class_colors(bench.palette)
     plans = {"seen": plan(view, view.known.classes, view.known.known, colors)}
     for row in bench.rows:
-        samples = bench.journal.samples(row.name, view.name)
+        samples = kept_samples(bench, row, view)
         for seed in range(min(MOST_SEEDS, len(samples["classes"]))):
             name = f"{row.name}, seed {seed}" if row.random else row.name
             plans[name] = plan(view, samples["classes"][seed], samples["known"][seed], colors)

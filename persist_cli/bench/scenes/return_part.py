@@ -121,7 +121,7 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     scenes = {scene: place for place, scene in enumerate(dict.fromkeys(view.scene for view in views))}
     draws = Draws.of([scenes[view.scene] for view in views])
     true = true_pieces(bench)
-    detail = float(energy(true.flatten(0, 1), LAPLACIAN).mean())
+    detail = true_detail(true)
     length = RendererLoader(bench, plan).load(rows[0]).backbone.frames_per_clip - 1
     figures, videos = {}, {}
     for row in rows:
@@ -140,7 +140,7 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
         "columns": {name: column.definition for name, column in COLUMNS.items()},
         "views": [view.name for view in views],
         "steps": plan.steps,
-        "missing": [reason for name in (LpipsAlex.name, WEIGHTS) if (reason := missing_weights(name))],
+        "missing": obstacles(true),
         "rows": {row.name: figures[row.name] | {"fvd": distance(videos[row.name], true, count)} for row in rows},
     }
 
@@ -151,7 +151,7 @@ def walk_values(walk: dict[str, Tensor], length: int, detail: float) -> dict[str
     Args:
         walk: as ``there_and_back`` returns it.
         length: frames that are predicted at once; frames of one clip are not compared.
-        detail: mean energy of the Laplacian of true frames.
+        detail: mean energy of the Laplacian of true frames; NaN without any.
     """
     rgb, out = walk["rgb"], int(walk["out"])
     back = [frame for frame in range(out, len(rgb)) if frame - first_visit(frame, out) > length]
@@ -201,16 +201,28 @@ def pieces(rgb: UInt8[Tensor, "frame height width 3"]) -> list[UInt8[Tensor, "pi
     return [rgb[first : first + LEAST_FRAMES] for first in range(1, len(rgb) - LEAST_FRAMES + 1, LEAST_FRAMES)]
 
 
-def true_pieces(bench: SceneBench) -> UInt8[Tensor, "piece frame height width 3"]:
-    """Return pieces of the measured houses' own trajectories."""
+def true_pieces(bench: SceneBench) -> list[UInt8[Tensor, "frame height width 3"]]:
+    """Return pieces of the measured houses' own trajectories; none where all of these are too short."""
     wanted, scenes = {view.scene for view in bench.views}, []
     for file in parse_reference(bench.plan.data).trajectories():
         if file.info.scene in wanted and len(file) > LEAST_FRAMES:
             scenes += pieces(file.read().observations.rgb)
-    return torch.stack(scenes)
+    return scenes
 
 
-def distance(imagined: Sequence[Tensor], true: Tensor, count: int) -> dict[str, float | None]:
+def true_detail(true: Sequence[UInt8[Tensor, "frame height width 3"]]) -> float:
+    """Return the mean energy of the Laplacian of true frames; NaN without any."""
+    return float(energy(torch.cat([*true]), LAPLACIAN).mean()) if true else float("nan")
+
+
+def obstacles(true: Sequence[Tensor]) -> list[str]:
+    """Return the reasons why walks have no LPIPS, FVD or sharpness."""
+    short = f"no trajectory of the measured houses has more than {LEAST_FRAMES} frames, so no sharpness and no FVD"
+    weights = [reason for name in (LpipsAlex.name, WEIGHTS) if (reason := missing_weights(name))]
+    return weights + [short] * (not true)
+
+
+def distance(imagined: Sequence[Tensor], true: Sequence[Tensor], count: int) -> dict[str, float | None]:
     """Return FVD of ``count`` imagined and true pieces; ``None`` without the weights or with too few."""
     if missing_weights(WEIGHTS) or count < LEAST_VIDEOS:
         return {"mean": None, "low": None, "high": None}

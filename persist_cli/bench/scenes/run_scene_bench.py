@@ -9,7 +9,7 @@ from persist_cli.bench.scenes.completion_part import completion_json, run_comple
 from persist_cli.bench.scenes.edit_part import edits_json, run_edits
 from persist_cli.bench.scenes.plan_pictures import picture_views
 from persist_cli.bench.scenes.return_part import return_json, run_returns
-from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, identity, prepare
+from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, identity, part_identities, prepare
 from persist_cli.bench.scenes.scene_report import PAGE, write_scene_report
 from persist_cli.bench.scenes.scene_tables import print_results, tables_text
 from persist_cli.bench.scenes.speed_part import run_speed, speed_json
@@ -81,7 +81,8 @@ def results_json(bench: SceneBench) -> dict[str, Any]:
     results: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
-        "settings": identity(bench.plan, bench.views, bench.houses, bench.trained) | {"model": bench.plan.model},
+        "settings": identity(bench.plan, bench.views) | {"model": bench.plan.model, "seeds": bench.plan.seeds},
+        "parts": part_identities(bench.plan, bench.houses, bench.trained),
         "views": [view.name for view in bench.views],
         "scenes": [view.scene for view in bench.views],
         "training_houses": [house.scene for house in bench.houses],

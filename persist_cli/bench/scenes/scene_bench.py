@@ -165,7 +165,7 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     journal = SceneJournal(out)
     views = read_views(files, plan)
     houses = training_houses(plan, views)
-    journal.begin(identity(plan, views, houses, trained))
+    journal.begin(identity(plan, views), part_identities(plan, houses, trained))
     return SceneBench(plan, views, houses, journal, trained)
 
 
@@ -261,24 +261,35 @@ def training_houses(plan: SceneBenchPlan, views: Sequence[View]) -> list[House]:
     return read_houses(store, plan.houses, views[0].truth.form)
 
 
-def identity(
-    plan: SceneBenchPlan, views: Sequence[View], houses: Sequence[House], trained: TrainedSceneModel | None
-) -> dict[str, Any]:
-    """Return JSON values of all that changes a figure: a benchmark with equal values goes on.
-
-    Parts, the number of seeds and that of walks may change: what is there is kept.
-    """
+def identity(plan: SceneBenchPlan, views: Sequence[View]) -> dict[str, Any]:
+    """Return JSON values of all that changes the figures of every part."""
     values: Mapping[str, Any] = {
         "views": digest([f"{view.scene} {view.name}" for view in views]),
-        "training houses": digest([house.scene for house in houses]),
         "memory": asdict(plan.memory(views[0].truth.form)),
-        "model": None if trained is None else trained.fingerprint,
         "radius": plan.radius,
-        "seeds": plan.seeds,
-        "steps": plan.steps,
-        "rendering": None if plan.rendering is None else rendering_identity(plan.rendering),
     }
     return dict(json.loads(json.dumps(values, default=str)))
+
+
+def part_identities(
+    plan: SceneBenchPlan, houses: Sequence[House], trained: TrainedSceneModel | None
+) -> dict[str, dict[str, Any]]:
+    """Return by part, and by row of the completion, JSON values of all that changes its figures beside ``identity``.
+
+    The numbers of seeds, walks and edits may change: what is there is kept.
+    """
+    model = {"model": None if trained is None else trained.fingerprint}
+    parts: dict[str, dict[str, Any]] = {"walk": model | {"steps": plan.steps}, "speed": model}
+    if plan.rendering is not None:
+        rendering = rendering_identity(plan.rendering)
+        parts["return"] = model | rendering | {"steps": plan.rendering.steps}
+        parts["edits"] = rendering | {"seed": plan.seed}
+    found = {name: values for name, values in parts.items() if name in plan.parts}
+    if "completion" in plan.parts:
+        looked_up = {"training houses": digest([house.scene for house in houses])}
+        found |= {} if trained is None else {SceneCompletion.name: model}
+        found |= {row.name: looked_up for row in (Prior, NearestHouse) if houses}
+    return dict(json.loads(json.dumps(found, default=str)))
 
 
 def digest(names: Sequence[str]) -> str:
@@ -290,4 +301,4 @@ def rendering_identity(plan: RenderingPlan) -> dict[str, Any]:
     """Return JSON values of what draws the frames; memories may be added."""
     checkpoint = find_checkpoint(plan.checkpoint)
     sampling = asdict(checkpoint.sampling_with(plan.sampling)) | plan.placement.changes()
-    return {"checkpoint": checkpoint.fingerprint, "steps": plan.steps, "sampling": sampling}
+    return {"checkpoint": checkpoint.fingerprint, "sampling": sampling}

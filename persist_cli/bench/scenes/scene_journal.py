@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +21,8 @@ FOLDER: Final = "parts"
 class SceneJournal:
     """The files of a benchmark of scenes.
 
-    What its parts share is its identity. Rows and parts can be added to one that is finished.
+    It keeps what its parts share and what each part and row depends on beside that. So rows and parts can be added to a
+    benchmark that is finished, each with what it alone depends on.
 
     Args:
         out: folder of the benchmark.
@@ -28,16 +31,24 @@ class SceneJournal:
     def __init__(self, out: Path) -> None:
         self.out, self.parts = out, out / FOLDER
 
-    def begin(self, identity: dict[str, Any]) -> None:
+    def begin(self, shared: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]]) -> None:
         """Keep what is measured.
 
+        Args:
+            shared: JSON values that all parts depend on.
+            parts: what each part or row of this run depends on beside these.
+
         Raises:
-            PersistError: when the folder holds another benchmark than this one.
+            PersistError: when the folder holds another benchmark than this one, or another one's part of this name.
         """
+        kept: dict[str, Any] = {"shared": shared, "parts": {}}
         if (self.parts / IDENTITY).is_file():
-            check_same(read_json(self.parts / IDENTITY), identity, f"{self.out}: holds another benchmark")
+            kept = dict(read_json(self.parts / IDENTITY))
+            check_same(kept.get("shared"), shared, f"{self.out}: holds another benchmark")
+            for name in sorted(kept["parts"].keys() & parts.keys()):
+                check_same(kept["parts"][name], parts[name], f"{self.out}: holds {name!r} of another benchmark")
         remove_leftovers(self.parts)
-        write_json(self.parts / IDENTITY, identity)
+        write_json(self.parts / IDENTITY, kept | {"parts": kept["parts"] | parts})
 
     def has(self, part: str, name: str) -> bool:
         """Whether samples or a record were kept."""
@@ -60,5 +71,10 @@ class SceneJournal:
         return dict(read_json(self._file(part, name, "json")))
 
     def _file(self, part: str, name: str, suffix: str) -> Path:
-        folder, file = (re.sub(r"[^a-z0-9]+", "-", text.lower()) for text in (part, name))
-        return self.parts / folder / f"{file}.{suffix}"
+        return self.parts / file_name(part) / f"{file_name(name)}.{suffix}"
+
+
+def file_name(name: str) -> str:
+    """Return the name of a file or folder for any text, another one for each text."""
+    plain = re.sub(r"[^a-z0-9]+", "-", name.lower())
+    return plain if plain == name else f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

@@ -119,16 +119,24 @@ def tables_text(results: Mapping[str, Any]) -> str:
         "# Imagined scenes in held-out houses",
         "In brackets 95 % intervals by bootstrap over houses.",
         *(f"## {title}\n\n{markdown_table(heads, rows)}" for title, heads, rows in tables(results, short=False)),
+        *missing_lines(results),
         "## Definitions",
         "\n".join(f"- **{name}**: {text}." for name, text in definitions(results)),
     ]
     return "\n\n".join(lines) + "\n"
 
 
+def missing_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return for each figure that could not be measured a line that says why."""
+    return [f"Not measured: {reason}." for reason in results.get("return", {}).get("missing", ())]
+
+
 def print_results(results: Mapping[str, Any]) -> None:
     """Print the most important tables."""
     for title, heads, rows in tables(results, short=True):
         print_table(title, heads, rows)
+    for line in missing_lines(results):
+        say(line)
     if "completion" in results:
         part = results["completion"]
         say(f"mIoU over {', '.join(part['classes'])}; {part['cells']} cells, {part['unseen']}")

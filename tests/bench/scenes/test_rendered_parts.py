@@ -9,8 +9,20 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_cli.bench.scenes.return_part import first_visit, psnr, walk_values
+from persist_cli.bench.scenes.return_part import (
+    distance,
+    first_visit,
+    obstacles,
+    pieces,
+    psnr,
+    true_detail,
+    true_pieces,
+    walk_values,
+)
+from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, chosen_files, read_views
+from persist_cli.bench.scenes.scene_journal import SceneJournal
 from persist_cli.io.files import read_tensors
+from tests.support.cell_houses import write_cell_houses
 from tests.support.micro_runs import run_persist
 
 
@@ -28,7 +40,7 @@ def measured(
 
 
 def test_the_way_back_has_the_poses_of_the_way_out(measured: Path) -> None:
-    walk = read_tensors(next((measured / "parts" / "return-scene-true-grid").iterdir()))[0]
+    walk = read_tensors(next((measured / "parts").glob("return-scene-true-grid*/*")))[0]
     out, frames = int(walk["out"]), len(walk["poses"])
     assert frames == 2 * out - 1
     for frame in range(out, frames):
@@ -55,6 +67,21 @@ def test_frames_of_one_clip_are_not_compared_with_each_other() -> None:
     assert math.isfinite(walk_values(walk, 4, 1.0)["psnr"])
     same = torch.cat([rgb[:5], rgb[:4].flip(0)])
     assert walk_values(walk | {"rgb": same}, 4, 1.0)["psnr"] == 100.0
+
+
+def test_without_true_frames_there_is_no_sharpness_and_no_fvd() -> None:
+    rgb = torch.randint(0, 255, (33, 32, 32, 3), dtype=torch.uint8)
+    walk = {"rgb": rgb, "poses": torch.eye(4).expand(33, 4, 4), "out": torch.tensor(17), "seconds": torch.tensor(2.0)}
+    assert math.isnan(walk_values(walk, 4, true_detail([]))["sharpness"])
+    assert distance(pieces(rgb), [], 0)["mean"] is None
+    assert any("has more than 16 frames, so no sharpness and no FVD" in reason for reason in obstacles([]))
+
+
+def test_houses_seen_in_few_frames_have_no_true_pieces(tmp_path: Path) -> None:
+    data = write_cell_houses(tmp_path / "short", [5], frames=16)
+    plan = SceneBenchPlan(None, str(data), None, ("return",), radius=2)
+    bench = SceneBench(plan, read_views(chosen_files(plan), plan), [], SceneJournal(tmp_path / "out"))
+    assert true_pieces(bench) == []
 
 
 def test_psnr_is_that_of_the_mean_squared_error() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from persist_cli.api.actions import walking_actions
+from persist_cli.bench.scenes.scene_journal import file_name
 from persist_cli.bench.scenes.walk_part import Wanderer
 from tests.conftest import Persist
 from tests.support.cell_houses import write_cell_houses
@@ -73,7 +74,7 @@ def test_a_stopped_benchmark_goes_on_and_gives_the_same(
     persist: Persist, measured: Path, scene_model: Path, cell_houses: Path, training_cell_houses: Path
 ) -> None:
     before = json.loads((measured / "metrics.json").read_text())
-    kept = measured / "parts" / "model"
+    kept = next((measured / "parts").glob("model*"))
     times = {path.name: path.stat().st_mtime_ns for path in kept.iterdir()}
     first = min(times)
     (kept / first).unlink()
@@ -83,6 +84,25 @@ def test_a_stopped_benchmark_goes_on_and_gives_the_same(
     again = json.loads(result.out)["completion"]["rows"]["model"]["class_iou"]
     assert again == before["completion"]["rows"]["model"]["class_iou"]
     assert all((kept / name).stat().st_mtime_ns == time for name, time in times.items() if name != first)
+
+
+def test_parts_rows_and_seeds_are_added_to_a_finished_benchmark(
+    persist: Persist, measured: Path, scene_model: Path, cell_houses: Path, training_cell_houses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    small = ("--data", cell_houses, "--out", out, *SMALL)
+    for words in (small, (scene_model, *small, "--seeds", 1)):
+        run_persist("bench", "scene", *map(str, (*words, "--parts", "completion")))
+    kept = {path: path.stat().st_mtime_ns for path in (out / "parts").glob("empty*/*")}
+    more = ("--train", training_cell_houses, "--parts", "completion,walk")
+    assert persist("bench", "scene", scene_model, *small, *more).code == 0
+    assert kept == {path: path.stat().st_mtime_ns for path in kept}
+    added, whole = (json.loads((folder / "metrics.json").read_text()) for folder in (out, measured))
+    for row, part in whole["completion"]["rows"].items():
+        assert added["completion"]["rows"][row]["class_iou"] == part["class_iou"]
+    assert added["walk"]["windows"]["1-12"]["new"]["mean"] > 0
+    result = persist("bench", "scene", scene_model, *small, *more, "--steps", 13)
+    assert "holds 'walk' of another benchmark" in result.err
 
 
 def test_what_does_not_fit_is_refused_in_one_line(
@@ -103,6 +123,11 @@ def test_what_does_not_fit_is_refused_in_one_line(
         result = persist("bench", "scene", *given, "--out", tmp_path / "out", *options)
         assert (result.code, cause in result.err, len(result.err.strip().splitlines())) == (1, True, 1), result.err
     assert not (tmp_path / "out").exists()
+
+
+def test_every_name_has_a_file_of_its_own_in_the_journal() -> None:
+    names = ("return scene", "return-scene", "return scene, true grid", "return scene-true-grid", "Return scene")
+    assert len({file_name(name) for name in names}) == len(names)
 
 
 def test_an_agent_that_is_stopped_turns_before_it_goes_on() -> None:
