@@ -171,13 +171,27 @@ class Processes:
 def check_same(earlier: Any, now: Any, refusal: str) -> None:
     """Raise ``PersistError`` when a folder was begun with other values than those of now.
 
+    A checkpoint that was moved is the same one: where a fingerprint stands, the path beside it does not count.
+
     Args:
         earlier: JSON values that the folder holds.
         now: JSON values.
         refusal: the beginning of the error's line.
     """
+    earlier, now = _wherever_it_lies(earlier), _wherever_it_lies(now)
     if earlier != now:
         raise PersistError(f"{refusal} ({first_difference(earlier, now)}); choose another --out or delete it")
+
+
+def _wherever_it_lies(values: Any) -> Any:
+    """Return JSON values without the paths of what a fingerprint names."""
+    if isinstance(values, dict):
+        return {
+            key: _wherever_it_lies(value)
+            for key, value in values.items()
+            if not (key == "path" and "fingerprint" in values)
+        }
+    return [_wherever_it_lies(value) for value in values] if isinstance(values, list) else values
 
 
 def first_difference(earlier: Any, new: Any, where: str = "") -> str:

@@ -1,0 +1,27 @@
+"""What a folder of results was begun with, compared with what is asked now."""
+
+from __future__ import annotations
+
+import pytest
+
+from persist_cli.errors import PersistError
+from persist_cli.evaluate.journal import check_same
+
+
+def plan(path: str, fingerprint: str) -> dict[str, object]:
+    """Part of an evaluation's plan."""
+    return {"models": [{"path": path, "fingerprint": fingerprint}], "batch": 1}
+
+
+def test_a_checkpoint_that_was_moved_is_the_same_one():
+    check_same(plan("/home/ada/runs/voxel", "1f"), plan("/data/voxel", "1f"), "runs/eval: holds another evaluation")
+
+
+def test_another_checkpoint_in_the_same_place_is_refused():
+    with pytest.raises(PersistError, match=r"another evaluation .*fingerprint: 1f, now 2e"):
+        check_same(plan("/data/voxel", "1f"), plan("/data/voxel", "2e"), "runs/eval: holds another evaluation")
+
+
+def test_a_path_without_a_fingerprint_counts():
+    with pytest.raises(PersistError, match="path: a, now b"):
+        check_same({"path": "a"}, {"path": "b"}, "runs/eval: holds another evaluation")
