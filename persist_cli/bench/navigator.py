@@ -43,7 +43,7 @@ class PlanSettings:
         horizon: most actions that a decision looks ahead.
         over: which frame of a candidate is judged.
         rounds: most rounds of ``cem``.
-        frames: most imagined frames of a decision; ``None`` for no bound.
+        frames: most imagined frames of a decision; ``None`` for no bound. An approach compares all of its few ways.
         seconds: most seconds of a decision, likewise.
         body: whether imagined moves over ground known to be occupied do not move.
         keep: whether what is left of the last plan is judged again; ``cem`` begins near its distributions, too.
@@ -121,11 +121,13 @@ class Navigator:
         self.body = body if settings.body else None
         self.simulator = scene.simulator
         self.decisions = 0
+        self.writing = 0.0  # seconds of taking in what was seen
         self.least = math.inf  # cost of the best true view from which the agent approached the goal
         self.decide_once = self._decider(scene.simulator, horizon)
 
     def saw(self, frames: Observations, executed: int) -> None:
         """Take in the frames after ``executed`` actions: they are written to the memory and to the ground map."""
+        begun = time.monotonic()
         kept = self.parts.policy.frames if self.parts.policy is not None else 1
         self.seen = Observations.concatenate([self.seen, frames])[-kept:]
         self.ground.add(frames)
@@ -135,6 +137,8 @@ class Navigator:
             agent.memorize(frames, self.world.backbone.device)
         if self.planner is not None:
             self.planner.executed(executed)
+        self.ground.map()  # which is kept until something else is seen
+        self.writing += time.monotonic() - begun
 
     def collided(self, frame: Observations, action: str) -> None:
         """Take in that something was in the way of an action: its ground counts as occupied from now on.
@@ -151,10 +155,10 @@ class Navigator:
 
     def decide(self) -> Decision:
         """Return the next actions."""
+        begun = time.monotonic()
         generator = torch.Generator().manual_seed(self.seed * DECISIONS + self.decisions)
         situation = Situation(self.seen, self.info, self.goal, self.ground.map())
         self.decisions += 1
-        begun = time.monotonic()
         with torch.no_grad():
             actions, frames = self.decide_once(situation, generator)
         return Decision(actions, frames, time.monotonic() - begun)
@@ -172,7 +176,7 @@ class Navigator:
         """
         begun = time.monotonic()
         situation = Situation(self.seen, self.info, self.goal, self.ground.map())
-        judge = self._judge(self._model(self.simulator, situation), situation, "best")
+        judge = self._judge(self._model(self.simulator, situation), situation, "best", Budget())
         now = view_costs(judge.cost, self.seen[-1:], self.goal)[0]
         if now >= self.least:
             return Decision((), 0, time.monotonic() - begun)
@@ -195,7 +199,8 @@ class Navigator:
         planner = self.planner = make_planner(self.row, policy, self.settings, horizon)
 
         def imagine(situation: Situation, generator: torch.Generator) -> tuple[tuple[str, ...], int]:
-            judge = self._judge(self._model(simulator, situation), situation)
+            budget = Budget(self.settings.frames, self.settings.seconds)
+            judge = self._judge(self._model(simulator, situation), situation, self.settings.over, budget)
             plan = planner.plan(situation, judge, generator, _no_notice)
             return plan.actions, plan.frames
 
@@ -207,12 +212,11 @@ class Navigator:
             return SimulatorFutures(simulator)
         return WorldFutures(self.world, situation.ground, self.body)
 
-    def _judge(self, model: FutureModel, situation: Situation, over: Over | None = None) -> Judge:
-        cost, settings = self.parts.cost, self.settings
+    def _judge(self, model: FutureModel, situation: Situation, over: Over, budget: Budget) -> Judge:
+        cost = self.parts.cost
         if cost is None:
             raise ValueError(f"row {self.row.name!r} imagines and has no cost")
-        budget = Budget(settings.frames, settings.seconds)
-        return Judge(model, cost, self.goal, situation.ground, over or settings.over, budget)
+        return Judge(model, cost, self.goal, situation.ground, over, budget)
 
 
 def told_goal(goal: Goal, row: PlanningRow) -> Goal:

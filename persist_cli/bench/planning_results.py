@@ -51,9 +51,18 @@ COLUMNS: Final = {
     "collisions": Column("collisions", "lower", False, "actions that the scene refused, an episode", "closed"),
     "collisions_per_action": Column("collisions/action", "lower", True, "these by all actions", "closed"),
     "actions": Column("actions", None, False, "actions an episode, refused ones included", "closed"),
-    "decisions": Column("decisions", None, False, "plans an episode", "closed"),
-    "frames_per_decision": Column("frames/decision", None, False, "frames imagined for a plan", "closed"),
-    "seconds_per_decision": Column("s/decision", "lower", False, "seconds that a plan took", "closed"),
+    "decisions": Column(
+        "decisions", None, False,
+        "plans and approaches an episode; an approach that stops at once counts too, and imagines nothing", "closed",
+    ),
+    "frames_per_decision": Column("frames/decision", None, False, "frames imagined, by all of these", "closed"),
+    "seconds_per_decision": Column(
+        "s/decision", "lower", False, "seconds of proposing, imagining and judging, by all of these", "closed"
+    ),
+    "writing_per_decision": Column(
+        "s/writing", "lower", False,
+        "seconds of writing what was seen to the memory and to the map of the ground, by all of these", "closed",
+    ),
     "ate": Column("ATE", "lower", False, "root mean square of metres to the shortest way, pose by pose", "open"),
     "rpe": Column("RPE", "lower", False, "the same of translations from one pose to the next, metres", "open"),
     "sim": Column("SIM", "higher", False, "100 · cos(f(v), f(g)): v true view at the plan's end, g goal image", "open"),

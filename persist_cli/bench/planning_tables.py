@@ -19,6 +19,7 @@ SHORT: Final = (
     "missed_stop",
     "collisions",
     "seconds_per_decision",
+    "writing_per_decision",
     "ate",
     "rpe",
     "sim",

@@ -65,12 +65,12 @@ class Trace:
         self.decisions += 1
         self.frames, self.seconds = self.frames + decision.frames, self.seconds + decision.seconds
 
-    def to_json(self, ended: str, figures: dict[str, float]) -> dict[str, Any]:
-        """Return the trace with its figures as JSON values."""
+    def to_json(self, ended: str, figures: dict[str, float], writing: float) -> dict[str, Any]:
+        """Return the trace with its figures as JSON values; ``writing`` are the seconds of taking in what was seen."""
         decisions = max(self.decisions, 1)
         figures |= {
             "decisions": float(self.decisions), "frames_per_decision": self.frames / decisions,
-            "seconds_per_decision": self.seconds / decisions,
+            "seconds_per_decision": self.seconds / decisions, "writing_per_decision": writing / decisions,
         }  # fmt: skip
         return {
             "figures": figures, "ended": ended, "actions": format_actions(self.actions), "refused": self.refused,
@@ -159,7 +159,7 @@ def run_closed_loop(scene: TrueScene, navigator: Navigator, stop: StopRule, sett
     ended = ClosedLoop(scene, navigator, stop, settings, trace).run()
     metres = sum(math.dist(*pair) for pair in zip(trace.places, trace.places[1:], strict=False))
     walk = WalkRecord(trace.distances, metres, len(trace.refused), ended != OUT_OF_ACTIONS)
-    return trace.to_json(ended, closed_loop_figures(walk, scene.episode.metres))
+    return trace.to_json(ended, closed_loop_figures(walk, scene.episode.metres), navigator.writing)
 
 
 def run_open_loop(scene: TrueScene, navigator: Navigator) -> dict[str, Any]:

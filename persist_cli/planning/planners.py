@@ -223,6 +223,8 @@ class Cem:
 
     def executed(self, count: int) -> None:
         """Shift the distributions that the next plan begins with by the actions that were done."""
+        if self._last is not None and count >= len(self._last[1]):
+            self._last = None  # nothing is left of it
         if self._last is not None:
             probabilities, best = self._last
             uniform = torch.full_like(probabilities, 1 / probabilities.shape[1])

@@ -43,6 +43,20 @@ def test_an_agent_that_imagines_goes_to_the_best_view_before_it_stops(scene: Tru
     assert view_costs(COST, scene.look(), scene.goal)[0] < before
 
 
+def test_an_approach_compares_all_its_ways_whatever_a_decision_may_imagine(scene: TrueScene) -> None:
+    whole, bounded = (recognise_at_once(scene, RANKED, PlanSettings(frames=frames)) for frames in (None, 16))
+    assert bounded["actions"] == whole["actions"] != ""
+
+
+def test_what_an_agent_writes_down_after_its_actions_is_timed_apart(scene: TrueScene) -> None:
+    scene.back_to_start()
+    navigator = Navigator(ALONE, RowParts(make_policy("random", {})), PlanSettings(), scene, 8)
+    assert navigator.writing == 0
+    frames, _ = scene.follow(("left", "right"))
+    navigator.saw(frames[1:], 2)
+    assert navigator.writing > 0
+
+
 @pytest.mark.parametrize(("row", "approach"), [(RANKED, False), (ALONE, True)])
 def test_an_agent_that_does_not_approach_stops_at_once(scene: TrueScene, row: PlanningRow, approach: bool) -> None:
     record = recognise_at_once(scene, row, PlanSettings(approach=approach))

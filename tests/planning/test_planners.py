@@ -128,6 +128,17 @@ def test_a_shifted_plan_goes_on_where_the_last_one_was_left(judge, situation):
     assert next(iter(following.judged)) == kept[0]
 
 
+@pytest.mark.parametrize("count", [4, 1_000_000])
+def test_nothing_is_left_of_a_plan_that_was_done(judge, situation, count):
+    planner = Cem(CemSettings(horizon=4, candidates=6, rounds=1, shift=0.5))
+    planner.plan(situation, judge(), seeded())
+    planner.executed(count)
+    fresh = Cem(planner.settings).plan(situation, judge(), seeded(1))
+    assert [one.actions for one in planner.plan(situation, judge(), seeded(1)).candidates] == [
+        one.actions for one in fresh.candidates
+    ]
+
+
 def test_ranking_takes_the_proposal_of_least_cost(judge, situation):
     plan = Rank(make_policy("random", {}), RankSettings(4, 40)).plan(situation, judge(), seeded())
     assert len({candidate.actions for candidate in plan.candidates}) == len(plan.candidates) <= 40
