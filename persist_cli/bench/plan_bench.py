@@ -184,14 +184,14 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     if processes.main:
         values = identity(plan, cost, checkpoint)
         journal.check(values)
-        if not journal.begun:
-            episodes = plan.source.episodes()
+        episodes = journal.episodes() if journal.begun else plan.source.episodes()
+        if checkpoint is not None:
+            check_model(checkpoint, rows, episodes)
+        if not journal.begun or (checkpoint is not None and not journal.names_model()):
             check_scenes(episodes, trained_on(checkpoint, plan.policy), plan.allow_training_scenes)
-            journal.begin(values, episodes)
+        journal.begin(values, episodes)
     processes.wait()
     episodes = journal.episodes()
-    if checkpoint is not None:
-        check_model(checkpoint, rows, episodes)
     simulator = open_simulator(episodes)
     if processes.main:
         find_thresholds(plan, cost, rows, simulator, journal)
@@ -299,6 +299,9 @@ def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
     trained = None if plan.policy is None else trained_policy(plan.policy)
+    planning = asdict(plan.planning)
+    if plan.planning.frames is not None and plan.planning.approach:
+        planning["approach frames"] = "no bound"  # once they were those of a decision
     values = {
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
@@ -306,7 +309,7 @@ def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict
         if plan.policy is None
         else {"name": plan.policy, "fingerprint": trained and trained.fingerprint},
         "cem candidates": plan.cem_candidates,
-        "planning": asdict(plan.planning),
+        "planning": planning,
         "loop": asdict(plan.loop) | {"loops": list(plan.loops)},
         "stop cost": plan.stop_cost,
         "checkpoint": None if checkpoint is None else checkpoint_json(checkpoint),
@@ -374,7 +377,7 @@ def run_rows(bench: PlanningBench, processes: Processes) -> None:
 def run_episode(bench: PlanningBench, row: PlanningRow, parts: RowParts, episode: Episode) -> dict[str, Any]:
     """Run the loops of one episode of one row, and return what happened as JSON values."""
     plan, scene = bench.plan, TrueScene(bench.simulator, episode)
-    record: dict[str, Any] = {"row": row.name, "walk": row.walk, "episode": episode.name, "open": None, "closed": None}
+    record: dict[str, Any] = {"row": row.name, "episode": episode.name, "open": None, "closed": None}
     if "open" in plan.loops and episode.bin <= plan.loop.open_longest:
         record["open"] = run_open_loop(scene, Navigator(row, parts, plan.planning, scene, episode.bin))
     if "closed" in plan.loops:

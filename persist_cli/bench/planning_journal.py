@@ -20,11 +20,15 @@ STOP: Final = "stop.json"
 
 FOLDER: Final = "parts"
 
+VERSION: Final = 2  # of the records of episodes; those of the first have no version
+
+OF_MODEL: Final = ("checkpoint", "sampling")  # parts of the identity that only rows with a world model have
+
 
 class PlanningJournal:
     """The files of a benchmark that is under way or finished.
 
-    What the rows share is its identity. Rows can be added to one that is finished.
+    What the rows share is its identity. Rows can be added to one that is finished, also the first with a world model.
 
     Args:
         out: folder of the benchmark.
@@ -41,13 +45,24 @@ class PlanningJournal:
     def check(self, identity: dict[str, Any]) -> None:
         """Raise ``PersistError`` when the folder holds another benchmark than this one."""
         if self.begun:
-            check_same(read_json(self.parts / IDENTITY), identity, f"{self.out}: holds another benchmark")
+            earlier = read_json(self.parts / IDENTITY)
+            both = completed(earlier, identity), completed(identity, earlier)
+            check_same(*both, f"{self.out}: holds another benchmark")
         remove_leftovers(self.parts)
 
+    def names_model(self) -> bool:
+        """Whether the benchmark that was begun has a world model already."""
+        return read_json(self.parts / IDENTITY).get("checkpoint") is not None
+
     def begin(self, identity: dict[str, Any], episodes: EpisodeSet) -> None:
-        """Keep what is measured, on which episodes."""
-        episodes.write(self.out / EPISODES)
-        write_json(self.parts / IDENTITY, identity)
+        """Keep what is measured, on which episodes; the world model of a benchmark that had none is added."""
+        if not self.begun:
+            episodes.write(self.out / EPISODES)
+            write_json(self.parts / IDENTITY, identity)
+            return
+        earlier = read_json(self.parts / IDENTITY)
+        if completed(earlier, identity) != earlier:
+            write_json(self.parts / IDENTITY, completed(earlier, identity))
 
     def episodes(self) -> EpisodeSet:
         """The episodes of the benchmark that was begun."""
@@ -65,22 +80,18 @@ class PlanningJournal:
         """Whether an episode of a row was run.
 
         Raises:
-            DataError: when it was run by an agent that was given more or less of the scene than the row says now.
+            DataError: when it was run by an agent that knew more or less than the row's agent does now.
         """
         file = self._file(row, episode)
         if not file.is_file():
             return False
-        walk = read_json(file).get("walk", row.walk if row.memory is None else row.memory != NO_MEMORY)  # as once was
-        if walk != row.walk:
-            raise DataError(
-                f"{file.parent}: was run when {row.name!r} was {'given the walk' if walk else 'not given the walk'}; "
-                "delete this folder to run the row again"
-            )
+        if cause := outdated(row, read_json(file)):
+            raise DataError(f"{file.parent}: {cause}; delete this folder to run the row again")
         return True
 
     def write(self, row: PlanningRow, episode: Episode, record: dict[str, Any]) -> None:
         """Keep what happened in an episode of a row, whole or not at all."""
-        write_json(self._file(row, episode), record)
+        write_json(self._file(row, episode), {"version": VERSION, "walk": row.walk, **record})
 
     def read(self, row: PlanningRow, episode: Episode) -> dict[str, Any]:
         """What ``write`` kept."""
@@ -88,3 +99,18 @@ class PlanningJournal:
 
     def _file(self, row: PlanningRow, episode: Episode) -> Path:
         return self.parts / re.sub(r"[^a-z0-9]+", "-", row.name.lower()) / f"{episode.name}.json"
+
+
+def completed(identity: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Return an identity; where it has no world model, with that of another one."""
+    return identity | {name: other[name] for name in OF_MODEL if identity.get(name) is None and name in other}
+
+
+def outdated(row: PlanningRow, record: dict[str, Any]) -> str:
+    """Say how an episode was run otherwise than the row is run now; empty when it was not."""
+    walk = record.get("walk", row.walk if row.memory is None else row.memory != NO_MEMORY)  # as once was
+    if walk != row.walk:
+        return f"was run when {row.name!r} was {'' if walk else 'not '}given the walk"
+    if row.planner == "cem" and "version" not in record:
+        return "was run when cem still judged the end of a plan that was done"
+    return ""

@@ -29,9 +29,11 @@ Bench = Callable[..., CommandResult]
 
 PLACE = ("--cost", "distance", "--rows", "random,rank-12", "--memories", "simulator", "--loops", "closed")
 
+SIMULATED = ("--memories", "simulator", "--candidates", 2, "--rounds", 1)
+
 ALONE_STRAIGHT = PlanningRow("straight", "policy", "straight", None, "place", walk=False)
 
-TIMES = {"seconds_per_decision", "open_seconds"}
+TIMES = {"seconds_per_decision", "writing_per_decision", "open_seconds"}
 
 
 @pytest.fixture
@@ -119,6 +121,39 @@ def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     refused = bench(*options, "--rows", "random", "--horizon", 5)
     assert refused.code == 1
     assert "holds another benchmark (planning horizon: 8, now 5)" in refused.err
+
+
+def test_rows_with_a_model_can_be_added_to_a_benchmark_begun_without_one(bench: Bench, voxel: Path) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--memories", "none")
+    assert bench(*options, "--rows", "random").code == 0
+    added = bench(voxel, *options, "--steps", 1, "--rows", "random,rank-1", "--json")
+    assert added.code == 0, added.err
+    assert list(json.loads(added.out)["tables"][0]["rows"]) == ["random", "rank-1, none"]
+    assert bench(*options, "--rows", "random").code == 0  # rows without a model still go on
+    refused = bench(voxel, *options, "--steps", 2, "--rows", "random,rank-1")
+    assert "holds another benchmark (sampling steps: 1, now 2)" in refused.err
+
+
+def test_a_model_that_was_trained_on_the_scenes_of_a_begun_benchmark_is_refused(
+    bench: Bench, voxel: Path, episodes: EpisodeSet, tmp_path: Path
+) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--memories", "none")
+    assert bench(*options, "--rows", "random").code == 0
+    file = tmp_path / "bench/episodes.json"
+    file.write_text(file.read_text().replace(episodes.scenes[0], "room-0"))
+    refused = bench(voxel, *options, "--rows", "rank-1")
+    assert "scene 'room-0': the model was trained on it" in refused.err
+    assert bench(*options, "--rows", "random", "--json").code == 0  # and nothing of the model was kept
+
+
+def test_what_cem_did_before_it_forgot_plans_that_were_done_is_refused(bench: Bench, tmp_path: Path) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--rows", "cem", *SIMULATED)
+    assert bench(*options).code == 0
+    file = next((tmp_path / "bench/parts/cem-simulator").iterdir())
+    record = json.loads(file.read_text())
+    del record["version"]
+    file.write_text(json.dumps(record))
+    assert "was run when cem still judged the end of a plan that was done; delete this folder" in bench(*options).err
 
 
 def test_figures_of_an_agent_that_was_given_more_are_refused(bench: Bench, tmp_path: Path) -> None:
