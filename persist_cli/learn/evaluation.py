@@ -53,5 +53,5 @@ def evaluate_policy(
 def mean_figures(records: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Return the mean of each figure over the episodes that have it finite."""
     names = list(records[0]["figures"])
-    values = {name: torch.tensor([record["figures"][name] for record in records]).double() for name in names}
+    values = {name: torch.tensor([one["figures"][name] for one in records], dtype=torch.float64) for name in names}
     return {name: float(value[value.isfinite()].mean()) for name, value in values.items()}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -26,8 +27,8 @@ class PracticePlace(Protocol):
         """Begin walks at given frames; ``seeds`` are those of what is imagined."""
         ...
 
-    def act(self, ways: Sequence[Sequence[str]]) -> list[StepResult]:
-        """Do the actions of each walk, and return what is seen and which were free."""
+    def act(self, ways: Mapping[int, Sequence[str]]) -> dict[int, StepResult]:
+        """Do the actions of some walks, by their numbers, and return what is seen and which were free."""
         ...
 
     def ground(self, number: int) -> GroundMap:
@@ -55,9 +56,11 @@ class ImaginedPlace:
         self.world.reset(starts, [self.info] * len(starts))
 
     @torch.no_grad()
-    def act(self, ways: Sequence[Sequence[str]]) -> list[StepResult]:
-        """Imagine the actions of all walks in one batch."""
-        return self.world.step(ways)
+    def act(self, ways: Mapping[int, Sequence[str]]) -> dict[int, StepResult]:
+        """Imagine the actions of these walks in one batch."""
+        world = copy.copy(self.world)
+        world.agents = [self.world.agents[number] for number in ways]
+        return dict(zip(ways, world.step(list(ways.values())), strict=True))
 
     def ground(self, number: int) -> GroundMap:
         """Return the map of the memory's points and of what the walk imagined; without a body nothing is known."""
@@ -90,9 +93,9 @@ class TruePlace:
             self._mappers.append(GroundMapper(self.info.world_up, body_of(self.info)))
             self._mappers[-1].add(start)
 
-    def act(self, ways: Sequence[Sequence[str]]) -> list[StepResult]:
-        """Do the actions of each walk in turn."""
-        return [self._walk(number, way) for number, way in enumerate(ways)]
+    def act(self, ways: Mapping[int, Sequence[str]]) -> dict[int, StepResult]:
+        """Do the actions of each of these walks in turn."""
+        return {number: self._walk(number, way) for number, way in ways.items()}
 
     def ground(self, number: int) -> GroundMap:
         """Return the map of what the walk has seen."""

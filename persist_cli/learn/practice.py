@@ -85,10 +85,10 @@ def practise(
         numbers = range(first, min(first + settings.batch, settings.walks))
         walkers = [Walker(place.info, policies, views, settings, seed * SEEDS + number) for number in numbers]
         place.begin([walker.seen for walker in walkers], [walker.sampling_seed for walker in walkers])
-        while not all(walker.is_done for walker in walkers):
-            ways = [walker.decide(place.ground(number)) for number, walker in enumerate(walkers)]
-            for walker, way, result in zip(walkers, ways, place.act(ways), strict=True):
-                walker.saw(way, result.seen, result.free.tolist())
+        while going := [number for number, walker in enumerate(walkers) if not walker.is_done]:
+            ways = {number: walkers[number].decide(place.ground(number)) for number in going}
+            for number, result in place.act(ways).items():
+                walkers[number].saw(ways[number], result.seen, result.free.tolist())
         yield from (walker.walk() for walker in walkers)
 
 
@@ -128,7 +128,7 @@ class Walker:
         return self.taken >= self.settings.actions
 
     def decide(self, ground: GroundMap) -> tuple[str, ...]:
-        """Return its next actions, at least one; where the policy stops, it gets another goal and explores."""
+        """Return its next actions, at least one while it is not done; where the policy stops, another goal is drawn."""
         situation = Situation(self.seen[-self.policy.frames :], self.info, self.goal, ground)
         horizon = min(self.settings.execute, self.policy.longest or self.settings.execute)
         policy = self.explorer if self.random.random() < self.settings.explore else self.policy
@@ -136,13 +136,13 @@ class Walker:
         if not way:
             self._new_goal()
             way = self.explorer.propose(situation, horizon, 1, self.generator)[0]
-        return tuple(way[: max(1, min(horizon, self.settings.actions - self.taken))])
+        return tuple(way[: min(horizon, self.settings.actions - self.taken)])
 
     def saw(self, way: Sequence[str], seen: Observations, free: Sequence[bool]) -> None:
         """Take in the frame after each action; of a blocked one nothing is kept but the count."""
         moved = [number for number, is_free in enumerate(free) if is_free]
         self.taken, self.blocked = self.taken + len(way), self.blocked + len(way) - len(moved)
-        if moved and len(self.actions) < self.settings.actions:
+        if moved:
             self.seen = Observations.concatenate([self.seen, seen[moved]])
             self.actions += [way[number] for number in moved]
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 import yaml
 
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.ground import Body
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.store import Store
+from persist_cli.learn.evaluation import mean_figures
 from persist_cli.learn.learn import LearnPlan, open_place, prepare
 from persist_cli.learn.places import ImaginedPlace
 from persist_cli.learn.practice import PracticeSettings, PracticeWalk, practise
@@ -70,6 +72,27 @@ def test_a_walk_begins_at_a_given_view_and_each_frame_follows_from_its_action(pl
         assert len(walk.actions) + walk.blocked == SETTINGS.actions
 
 
+@dataclass(frozen=True)
+class OneOrThree:
+    """A policy of proposals of one action or of three, as the draws say."""
+
+    frames: int = 1
+    longest: int | None = None
+
+    def propose(self, situation, horizon, count, generator) -> list[tuple[str, ...]]:
+        long = torch.randint(0, 2, (count,), generator=generator).tolist()
+        return [("forward",) * (3 if one else 1) for one in long]
+
+
+def test_a_walk_that_is_done_waits_for_the_others_without_acting(place, walks):
+    place.first.body = Body()
+    views = Store(walks)[0].read(range(12)).observations
+    settings, policy = PracticeSettings(walks=3, actions=16, execute=3, explore=0.0, batch=3), OneOrThree()
+    found = list(practise(place, (policy, policy), views, settings, 1))
+    assert sum(walk.blocked for walk in found) > 0
+    assert [len(walk.actions) + walk.blocked for walk in found] == [16] * 3
+
+
 def test_practice_follows_from_its_seed_and_does_not_change_the_memory(place, walks):
     memory = place.first.memory
     views, before = Store(walks)[0].read(range(12)).observations, memory.tensors()
@@ -78,6 +101,11 @@ def test_practice_follows_from_its_seed_and_does_not_change_the_memory(place, wa
     assert all(a.seen.rgb.equal(b.seen.rgb) for a, b in zip(first, again, strict=True))
     assert [walk.actions for walk in first] != [walk.actions for walk in other]
     assert all(tensor.equal(before[name]) for name, tensor in memory.tensors().items())
+
+
+def test_figures_of_episodes_are_means_of_those_that_are_finite():
+    records = [{"figures": {"spl": spl, "end_metres": metres}} for spl, metres in ((0.1, 2.0), (0.2, float("inf")))]
+    assert mean_figures(records) == {"spl": pytest.approx(0.15, rel=1e-12), "end_metres": 2.0}
 
 
 def test_a_round_leaves_walks_that_say_where_they_were_walked_and_a_policy_that_learned(learn, policy_run, tmp_path):
@@ -102,7 +130,7 @@ def test_without_a_known_camera_height_nothing_stops_a_walk_unless_it_is_asked_f
         learning = prepare(replace(plan, body=body), tmp_path / str(body))
         place = open_place(learning)
         place.begin([learning.views[:1]], [0])
-        free = place.act([["forward"] * 16])[0].free
+        free = place.act({0: ["forward"] * 16})[0].free
         assert free.all() == (body is None)
 
 
