@@ -8,6 +8,7 @@ consistency (Lai et al. 2018), and compared with what the video shows on return.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -19,9 +20,12 @@ from persist_cli.metrics.networks import network_weights, run_network
 from persist_cli.metrics.return_views import match_views
 from persist_cli.metrics.src import no_match, no_return
 
+LEAST_SEEN = 0.25  # share of the view: with less there is little to compare, and LPIPS, 0 where nothing is, is too good
+
 VIEWS = (
-    "at each frame that returns to an earlier pose over more than one predicted clip, against the generated frame of "
-    "its first visit, brought into the view by true depth and poses"
+    "at each frame that returns to an earlier pose over more than one predicted clip and sees there again at least "
+    f"{LEAST_SEEN:.0%} of its view, against the generated frame of its first visit, brought into the view by true "
+    "depth and poses"
 )
 
 
@@ -39,10 +43,9 @@ class PsnrOwn(FrameMetric):
         return no_return(setup) or no_match(setup)
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """The ratio at each frame that returns, NaN at the others."""
+        """The ratio at each frame that returns and sees enough again, NaN at the others."""
         figures = torch.full((len(prediction.rgb),), math.nan, dtype=torch.float64)
-        for frame, first in prediction.returns:
-            visit, known = first_visit(prediction, frame, first)
+        for frame, visit, known in seen_again(prediction):
             error = (prediction.rgb[frame].double() - visit).square()[known].mean()
             figures[frame] = (10 * torch.log10(255.0**2 / error)).clamp_max(100.0)
         return figures
@@ -66,11 +69,11 @@ class LpipsOwn(LpipsAlex):
         return no_return(setup) or no_match(setup) or LpipsAlex().obstacle(setup)
 
     def measure(self, prediction: Prediction) -> Float[Tensor, " frame"]:
-        """The distance at each frame that returns, NaN at the others."""
+        """The distance at each frame that returns and sees enough again, NaN at the others."""
         figures = torch.full((len(prediction.rgb),), math.nan, dtype=torch.float64)
-        frames, pairs = [frame for frame, _ in prediction.returns], []
-        for frame, first in prediction.returns:
-            visit, known = first_visit(prediction, frame, first)
+        frames, pairs = [], []
+        for frame, visit, known in seen_again(prediction):
+            frames.append(frame)
             truth = prediction.truth.rgb[frame].cpu().double()
             pairs.append([torch.where(known[..., None], image, truth) for image in (prediction.rgb[frame], visit)])
         if pairs:
@@ -80,6 +83,16 @@ class LpipsOwn(LpipsAlex):
                 lambda one, two: perceptual_distance(weights, self.network, one, two), *images
             )
         return figures
+
+
+def seen_again(
+    prediction: Prediction,
+) -> Iterator[tuple[int, Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]]:
+    """Each frame that returns and sees enough again: its number, and what ``first_visit`` gives of it."""
+    for frame, first in prediction.returns:
+        visit, known = first_visit(prediction, frame, first)
+        if known.double().mean() >= LEAST_SEEN:
+            yield frame, visit, known
 
 
 def first_visit(

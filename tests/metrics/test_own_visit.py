@@ -49,6 +49,22 @@ def test_a_view_is_matched_with_itself_pixel_by_pixel():
     assert torch.allclose(match.sample(image), image, atol=1e-6)
 
 
+def turned_by(degrees):
+    """A video of a turn away and a return that is off by an angle; its last frame is not what it showed first."""
+    truth = observe_room(np.stack([look((0.0, 1.3, 0.2), yaw, 0.0) for yaw in (0.0, 180.0, degrees)]))
+    return Prediction(255 - truth.rgb, truth.depth, truth, torch.tensor([-1, -1, 0]))
+
+
+def test_a_return_that_sees_little_or_nothing_of_its_first_visit_has_no_figure():
+    shares = [float(match_views(turned_by(angle).truth, 2, 0).known.double().mean()) for angle in (20.0, 60.0, 180.0)]
+    assert shares[0] > 0.5
+    assert 0 < shares[1] < 0.25
+    assert shares[2] == 0
+    for metric in (PSNR, LPIPS) if cached_weight("lpips-alex") else (PSNR,):
+        defined = [bool(metric.measure(turned_by(angle)).isfinite()[2]) for angle in (20.0, 60.0, 180.0)]
+        assert defined == [True, False, False]
+
+
 def test_returns_within_one_predicted_clip_do_not_count():
     clip = replace(there_and_back(), clip_frames=4)
     assert PSNR.measure(clip).isfinite().tolist() == [False] * 6 + [True]
