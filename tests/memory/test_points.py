@@ -1,5 +1,7 @@
 """A point cloud: points with the features of their pixels, which reads sample evenly and nothing pools."""
 
+from dataclasses import replace
+
 import torch
 
 from persist_cli.api.geometry import project
@@ -85,9 +87,33 @@ def test_moving_the_worlds_origin_moves_the_tokens_and_changes_nothing_else():
     torch.testing.assert_close(here.positions + shift[:3, 3], there.positions)
 
 
-def test_ranks_of_different_features_differ():
-    features = torch.randn(1000, 32, generator=torch.Generator().manual_seed(0))
-    assert len(ranks(features).unique()) == 1000
+def test_ranks_differ_where_any_feature_the_colour_or_the_place_in_the_frame_does():
+    features = torch.ones(1000, 32)
+    features[:, 31] = torch.arange(1000)
+    colors, plain = torch.zeros(1000, 3, dtype=torch.uint8), torch.ones(1000, 32)
+    assert len(ranks(features, colors).unique()) == 1000
+    colors[:, 2] = torch.arange(1000) % 250
+    assert len(ranks(plain, colors).unique()) == 250
+    assert len(ranks(plain, colors, torch.arange(1000)[:, None]).unique()) == 1000
+    swapped = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
+    assert len(ranks(swapped, colors[:2]).unique()) == 2
+
+
+def test_a_sample_of_a_plain_wall_is_spread_over_it():
+    frame = room_walk(1)
+    wall = replace(frame, rgb=torch.full_like(frame.rgb, 90), depth=torch.full_like(frame.depth, 2.0))
+    pixels, _ = project(cloud(wall, stride=2).read(wall.cameras, 100).positions[None], wall.cameras)
+    quarters = (pixels[0, :, 0] >= 32).long() + 2 * (pixels[0, :, 1] >= 24).long()
+    assert torch.bincount(quarters, minlength=4).min() >= 12
+
+
+def test_a_file_without_ranks_is_ranked_by_features_and_colours():
+    frames = room_walk(2)
+    memory, restored = cloud(frames), cloud()
+    restored.restore({name: tensor for name, tensor in memory.tensors().items() if name != "ranks"})
+    stored = restored.tensors()
+    assert torch.equal(stored["positions"], memory.tensors()["positions"])
+    assert torch.equal(stored["ranks"], ranks(stored["features"], stored["colors"]))
 
 
 def test_imagined_points_change_no_observed_one_and_give_way_to_observations_near_them():

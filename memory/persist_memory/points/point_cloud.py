@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, UInt8
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 from torch.nn import functional
@@ -30,6 +30,8 @@ from persist_memory.validation import (
 
 MIXERS = (-7046029254386353131, 6364136223846793005)  # odd numbers of 64 bits, whose products spread over all bits
 
+RANKS = "ranks"  # the tensor with the rank of each point in a read's order
+
 
 @dataclass(frozen=True)
 class PointCloudSettings:
@@ -37,8 +39,9 @@ class PointCloudSettings:
 
     Args:
         stride: step between the rows, and between the columns, of the pixels that become points.
-        spread: metres; an imagined point is not kept within this distance of an observed one along an axis, nor where
-            an observed point hides it. Points are drawn this large.
+        spread: metres; the edge of the cells of a fixed grid in which an imagined point gives way to an observed one.
+            So a nearer one across the border of two cells stays, and where the borders lie depends on the world's
+            origin. Nor is an imagined point kept where an observed one, drawn this large, hides it.
         max_depth: largest depth in metres; pixels that are farther are left out, none with ``None``.
     """
 
@@ -52,7 +55,8 @@ class PointCloud(Memory):
 
     A place that was seen from ten frames has ten points. A read takes the points in view; where these are more than
     the budget it takes some at random, evenly from all, always the same ones: each point's rank is a hash of its
-    features. Points that another surface hides are taken too, as by the grid.
+    features and colour, and of where it was in its frame and how far away. Points that another surface hides are taken
+    too, as by the grid.
     """
 
     settings_type = PointCloudSettings
@@ -85,7 +89,7 @@ class PointCloud(Memory):
             return MemoryTokens.empty(self.encoder.channels)
         seen = in_any_view(self._stored["positions"], cameras.to(self._stored["positions"].device))
         visible = seen.nonzero()[:, 0]
-        chosen = visible[ranks(self._stored["features"][visible]).argsort(stable=True)[:budget]]
+        chosen = visible[self._stored[RANKS][visible].argsort(stable=True)[:budget]]
         tokens = {name: tensor[chosen] for name, tensor in self._stored.items()}
         return MemoryTokens.of(tokens["features"], tokens["positions"], tokens["colors"], tokens[ORIGINS])
 
@@ -96,11 +100,13 @@ class PointCloud(Memory):
         return copy
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return positions, features, colours and origins, sorted by position."""
+        """Return positions, features, colours, origins and ranks, sorted by position."""
         return dict(self._stored)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Replace all points by those of ``tensors``, which ``tensors()`` gave.
+
+        Files of earlier versions have no ranks; those of their points are hashes of features and colours alone.
 
         Raises:
             CheckpointError: when they are not tensors of this memory; then the cloud stays as it was.
@@ -114,8 +120,10 @@ class PointCloud(Memory):
                 "colors": (torch.uint8, (None, 3)),
                 ORIGINS: (torch.uint8, (None,)),
             }
+            expected |= {RANKS: (torch.int64, (None,))} if RANKS in tensors else {}
             check_tensors(tensors, expected, where)
             check_origins(tensors, where)
+            tensors = {RANKS: ranks(tensors["features"], tensors["colors"])} | tensors
         self._stored = {}
         self._absorb(tensors)
 
@@ -153,8 +161,11 @@ class PointCloud(Memory):
         features = self.encoder.encode(frames.rgb).to(device, torch.float32)
         places = unproject(frames.depth, frames.cameras)[:, rows[:, None], columns]
         colors = frames.rgb[:, rows[:, None], columns]
+        pixels = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1).expand(*depth.shape, 2)
+        seen_at = torch.cat([pixels[valid], float_bits(depth[valid][:, None])], dim=1)
         values = {"positions": places[valid], "features": upsampled(features, frames, rows, columns)[valid]}
-        return values | {"colors": colors[valid], ORIGINS: origins_like(places[valid], origin)}
+        values |= {"colors": colors[valid], ORIGINS: origins_like(places[valid], origin)}
+        return values | {RANKS: ranks(values["features"], values["colors"], seen_at)}
 
     def _absorb(self, added: dict[str, Tensor]) -> None:
         """Add points, in the order of their positions, each once; observed ones replace imagined ones near them."""
@@ -181,11 +192,28 @@ def distinct_order(rows: Float[Tensor, "row number"]) -> Int64[Tensor, " distinc
     return numbers.new_full((int(inverse.max()) + 1,), len(rows)).scatter_reduce(0, inverse, numbers, "amin")
 
 
-def ranks(features: Float[Tensor, "point channel"]) -> Int64[Tensor, " point"]:
-    """A hash of each point's features, which no move of the world and no order of writing changes."""
-    bits = features.contiguous().view(torch.int32).long()
-    mixed = (bits[:, :8] * MIXERS[0]).sum(dim=1)
+def ranks(
+    features: Float[Tensor, "point channel"],
+    colors: UInt8[Tensor, "point 3"],
+    seen_at: Int64[Tensor, "point number"] | None = None,
+) -> Int64[Tensor, " point"]:
+    """A hash of each point, which no move of the world and no order of writing changes.
+
+    Args:
+        features: features of the points.
+        colors: their colours.
+        seen_at: pixel and depth of each in the frame that it was seen in, which tell points of one plain wall apart.
+    """
+    parts = [float_bits(features), colors.long()] + ([] if seen_at is None else [seen_at])
+    numbers = torch.cat(parts, dim=1)
+    factors = numbers.new_full((numbers.shape[1],), MIXERS[0]).cumprod(0)  # odd, too: powers that wrap around
+    mixed = (numbers * factors).sum(dim=1)
     return (mixed ^ (mixed >> 29)) * MIXERS[1]
+
+
+def float_bits(values: Float[Tensor, "point number"]) -> Int64[Tensor, "point number"]:
+    """The bits of float32 numbers as whole numbers."""
+    return values.float().contiguous().view(torch.int32).long()
 
 
 def in_any_view(positions: Float[Tensor, "point 3"], cameras: Cameras) -> Bool[Tensor, " point"]:
