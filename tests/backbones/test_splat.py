@@ -56,6 +56,12 @@ def test_tokens_as_near_as_each_other_are_averaged():
     assert draw([on_ray(4, 4, 2.0)] * 3, [1.0, 2.0, 6.0])[0, 4, 4] == 3
 
 
+@pytest.mark.parametrize(("most", "edge"), [(1, 1), (2, 3), (4, 5), (5, 5)])
+def test_a_large_token_has_the_largest_edge_or_one_pixel_more_where_that_is_even(most, edge):
+    coverage = draw([on_ray(4, 4, 2.0)], [1.0], size=100.0, most=most)[1]
+    assert coverage.sum() == edge**2
+
+
 def test_a_token_is_as_large_as_it_appears():
     # a square of 1 m seen from 2 m at a focal length of 5.6 px is 2.8 px wide: it covers the middles of 3 × 3 pixels
     near = draw([on_ray(4, 3, 2.0)], [1.0], size=1.0, most=7)[1]

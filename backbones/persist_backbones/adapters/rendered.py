@@ -43,7 +43,8 @@ class RenderedSettings(AttentionSettings):
 
     Args:
         token_size: edge in metres of the square that a token is drawn as, somewhat more than the edge of a cell.
-        splat_pixels: the largest edge of a drawn token in pixels; 1 draws points.
+        splat_pixels: largest edge of a drawn token in pixels, plus 1 / ``supersampling`` where ``splat_pixels`` ×
+            ``supersampling`` is even: with 9 and 2 it is 9.5. 1 draws points only where ``supersampling`` is 1.
         supersampling: number n of an antialiased drawing, in which a pixel is the mean of n × n that are drawn.
         head_width: hidden channels of the layers that correct the prediction by the rendered views.
         head_layers: number of those layers that look at neighbouring latent pixels.

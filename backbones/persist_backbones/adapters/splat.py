@@ -98,7 +98,8 @@ def rasterize(
         mask: false for padding.
         views: cameras ``[batch, frame]`` of the canvas's size in pixels.
         token_size: edge of the square in metres, facing the camera.
-        most: largest edge of a square in pixels.
+        most: limit of a square's size: it reaches at most ``most // 2`` pixels to each side of the one of its middle.
+            So its edge is at most ``most`` pixels where that is odd, and one more where it is even.
     """
     samples, frames = views.world_from_camera.shape[:2]
     pixels = frames * views.height * views.width
