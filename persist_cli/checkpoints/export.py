@@ -350,8 +350,9 @@ def _without_absolute_paths(text: str, where: str) -> str:
     values = parse_yaml_mapping(text, where)
     data: dict[str, Any] = values.get("data") or {}
     settings: dict[str, Any] = (values.get("backbone") or {}).get("settings") or {}
+    memory: dict[str, Any] = (values.get("memory") or {}).get("settings") or {}
     places = [(values, "base"), (values, "adapter_from"), (values.get("distill") or {}, "teacher"), (data, "path")]
-    for owner, key in (*places, (settings, "pretrained"), (settings, "prompt_embedding")):
+    for owner, key in (*places, (settings, "pretrained"), (settings, "prompt_embedding"), (memory, "model")):
         if key in owner:
             owner[key] = _last_part(owner[key])
     return yaml.safe_dump(values, sort_keys=False)

@@ -11,7 +11,9 @@ import yaml
 
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
 from persist_cli.api.inference import CONSISTENCY
+from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.lineage import RECIPE
+from persist_cli.checkpoints.scene_models import with_absolute_model
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
@@ -63,6 +65,17 @@ def adapter_memory(checkpoint: Checkpoint, adapter: str) -> MemoryConfig:
     """The choice of the memory that an adapter of the checkpoint reads."""
     path = checkpoint.adapter_folder(adapter) / "memory.json"
     return parse_settings(MemoryConfig, read_json(path), str(path))
+
+
+def with_scene_paths(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values of a recipe, with the place of the model that imagines in its scenes absolute."""
+    memory = values.get("memory")
+    if not isinstance(memory, Mapping) or not isinstance(memory.get("settings"), Mapping):
+        return dict(values)
+    name = memory.get("name")
+    if not isinstance(name, str) or not issubclass(load_plugin("memory", name), Scene):
+        return dict(values)
+    return {**values, "memory": {**memory, "settings": with_absolute_model(memory["settings"])}}
 
 
 def with_adapter(values: Mapping[str, Any]) -> dict[str, Any]:

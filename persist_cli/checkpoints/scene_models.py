@@ -5,6 +5,7 @@ A run's folder stands for its newest checkpoint, and the name ``scene`` for the 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -105,6 +106,20 @@ def find_scene_model(path: str | Path) -> TrainedSceneModel:
     return TrainedSceneModel(
         card.folder, card.name, card.plugin, card.settings, stage, card.fingerprint, card.training_scenes
     )  # fmt: skip
+
+
+def with_absolute_model(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a scene with the place of its model absolute, so that they hold in every folder.
+
+    A name that leads to nothing here, such as that of the packaged model, stays as it is.
+
+    Args:
+        settings: of a scene; without a model they stay as they are.
+    """
+    model = settings.get("model")
+    if not isinstance(model, str) or not Path(model).exists():
+        return dict(settings)
+    return {**settings, "model": str(Path(model).absolute())}
 
 
 def is_scene_model(path: Path) -> bool:

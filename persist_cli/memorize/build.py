@@ -152,7 +152,16 @@ def _save_and_print(
             say(f"settings and encoder: those of {extra['settings_of']}")
         say(f"memory: {out}\nmap: {map_file}")
         if "start" in extra:
-            say(f"walk in it: persist rollout --start {extra['start']} --memory {out} --actions ...")
+            say(walking_words(memory, out, extra["start"]))
+
+
+def walking_words(memory: Memory, out: Path, start: str) -> str:
+    """Return the command that walks in the memory of a picture, and what its checkpoint must have."""
+    reads = "draws scenes" if isinstance(memory, Scene) else f"reads {memory.name}"
+    return (
+        f"walk in it: persist rollout CHECKPOINT --start {start} --memory {out} --actions ...\n"
+        f"CHECKPOINT is a world model with an adapter that {reads}"
+    )
 
 
 def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -10,7 +10,9 @@ from typing import Any
 import yaml
 
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
+from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory
+from persist_cli.checkpoints.scene_models import with_absolute_model
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
@@ -60,16 +62,16 @@ def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]
     if reference and memories and (plan.memory is None or plan.memory in memories):
         return adapter_of(reference, plan.memory)
     settings, name = plugin_settings(plan.settings), plan.memory or USUAL
-    encoder = plan.encoder or load_plugin("memory", name).usual_encoder
-    return MemoryConfig(name, settings["memory"], encoder, settings["encoder"]), None
+    kind = load_plugin("memory", name)
+    own_settings = with_absolute_model(settings["memory"]) if issubclass(kind, Scene) else settings["memory"]
+    return MemoryConfig(name, own_settings, plan.encoder or kind.usual_encoder, settings["encoder"]), None
 
 
 def _with_model(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
     """The configuration of a scene that imagines with the plan's model; else it is as without one."""
     rest = replace(plan, model=None, memory=plan.memory or SCENE)
     config, origin = resolve_memory_config(rest)
-    model = str(Path(str(plan.model)).absolute()) if Path(str(plan.model)).exists() else plan.model
-    return replace(config, settings=config.settings | {"model": model}), origin
+    return replace(config, settings=with_absolute_model(config.settings | {"model": plan.model})), origin
 
 
 def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig, str]:

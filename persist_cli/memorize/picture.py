@@ -14,7 +14,7 @@ from persist_cli.api.ground import Body
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.images import crop_resize
 from persist_cli.data.importers.readers import read_color
-from persist_cli.data.store import SUFFIX, write_trajectory
+from persist_cli.data.store import SUFFIX, Store, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.memorize.depth_model import estimate_depth
 
@@ -55,6 +55,8 @@ def is_picture(text: str) -> bool:
 def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
     """Write a data set of one frame, seen by a level camera 1.25 m above the world's origin, and return its folder.
 
+    Other pictures that were written there are removed, since frame 0 of the folder is where a walk starts.
+
     Raises:
         DataError: one line, when picture or depth cannot be read, do not fit, or there is no depth.
     """
@@ -77,7 +79,11 @@ def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
     info = TrajectoryInfo(f"picture/{picture.stem}", matrix, height, width, UP, walking_actions(), source)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])  # level, towards -z
     pose[1, 3] = HEIGHT
-    write_trajectory(folder / f"{picture.stem}{SUFFIX}", info, [Frame(rgb, depth, pose)])
+    written = folder / f"{picture.stem}{SUFFIX}"
+    write_trajectory(written, info, [Frame(rgb, depth, pose)])
+    for other in Store(folder):
+        if other.path != written and other.info.source.get("format") == source["format"]:
+            other.path.unlink()
     return folder
 
 

@@ -38,6 +38,7 @@ from persist_cli.checkpoints.load import (
     start_backbone,
     starts_from_random_codec,
     with_adapter,
+    with_scene_paths,
 )
 from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import find_scene_model
@@ -105,7 +106,7 @@ def run_finetune(plan: FinetunePlan) -> None:
     values = apply_overrides(read_recipe(plan.recipe), plan.overrides)
     if plan.data:
         values = apply_overrides(values, [f"data.path={json.dumps([str(folder) for folder in plan.data])}"])
-    recipe = make_recipe(with_adapter(values), plan.recipe)
+    recipe = make_recipe(with_scene_paths(with_adapter(values)), plan.recipe)
     if not recipe.data.path:
         raise RecipeError(f"{plan.recipe}: no data set; give --data DIR")
     run = plan.out or Path("runs") / Path(plan.recipe).stem
@@ -141,7 +142,8 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
         raise PersistError(f"{run}: holds a run already; go on with --resume or choose another --out")
     path = run / "recipe.yaml"
     values = parse_yaml_mapping(path.read_text(encoding="utf-8"), str(path))
-    before = to_plain(make_recipe(values, str(path)))  # settings that the run's version did not have get their defaults
+    # settings that the run's version did not have get their defaults
+    before = to_plain(make_recipe(with_scene_paths(values), str(path)))
     found_by_weights = known_hashes(run).keys() & distilled(recipe).keys()
     changeable = changeable_on_resume() | found_by_weights
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]

@@ -11,7 +11,7 @@ from persist_cli.api.geometry import unproject
 from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.data.reference import parse_reference
 from persist_cli.memorize.memory_file import load_memory
-from tests.memorize.test_memorize import failure, memorize
+from tests.memorize.test_memorize import failure, memorize, succeed
 from tests.support.cell_rooms import FORM
 from tests.support.micro_scenes import micro_model
 from tests.support.rooms import Room, look
@@ -81,6 +81,36 @@ def test_frames_of_data_are_completed_too_and_their_map_shows_what_is_imagined(m
     assert result["memory"] == "scene"
     assert result["imagined"] > result["observed"] > 50
     assert out.with_suffix(".png").is_file()
+
+
+def test_a_second_picture_takes_the_place_of_the_first_one(hall, tmp_path, capsys):
+    other = tmp_path / "another.png"
+    other.write_bytes((hall / "hall.png").read_bytes())
+    arguments = ("--memory", "scene", "--depth", hall / "hall.npy", "--out", tmp_path / "scene.safetensors")
+    for picture in (other, hall / "hall.png"):
+        start = memorize(capsys, picture, *arguments)["start"]
+    assert start == f"{tmp_path}/scene.frame#hall:0"
+    assert [path.name for path in (tmp_path / "scene.frame").iterdir()] == ["hall.parquet"]
+
+
+def test_the_command_that_walks_in_a_picture_names_a_checkpoint(hall, tmp_path, capsys):
+    out = tmp_path / "hall.safetensors"
+    succeed(hall / "hall.png", "--memory", "scene", "--depth", hall / "hall.npy", "--out", out)
+    text = capsys.readouterr().out.replace("\n", " ")
+    assert "persist rollout CHECKPOINT --start" in text
+    assert "CHECKPOINT is a world model with an adapter that draws scenes" in text
+
+
+@pytest.mark.parametrize("option", ["--set memory.model={}", "--model {}"])
+def test_a_scene_finds_its_model_from_every_folder(hall, model, tmp_path, capsys, monkeypatch, option):
+    out = tmp_path / "hall.safetensors"
+    monkeypatch.chdir(model.parent)
+    chosen = ("--memory", "scene", *option.format(model.name).split())
+    memorize(capsys, hall / "hall.png", "--depth", hall / "hall.npy", *chosen, "--out", out)
+    monkeypatch.chdir(tmp_path)
+    scene = load_memory(out)
+    assert scene.wanted_model == str(model)
+    assert scene.complete(seed=1) > 0
 
 
 def test_a_picture_is_not_replaced_by_the_map_of_its_scene(hall, tmp_path, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -74,12 +75,13 @@ def test_a_renderer_is_trained_on_with_what_a_model_imagines(renderer, scene_mod
     recipe.write_text(f"extends: houses-64-stage2-scene-imagined\nbase: {stage1}\nadapter_from: {renderer}\n")
     small = ["training.steps=2", "training.batch=2", "training.workers=0", "training.warmup=0", "training.cooldown=0"]
     small += ["data.clip_frames=[]"]  # this codec folds time
-    imagines = [f"memory.settings.model={scene_model}", "memory.settings.steps=1", "data.true_cells=0"]
+    imagines = [f"memory.settings.model={os.path.relpath(scene_model)}", "memory.settings.steps=1", "data.true_cells=0"]
     cache = ["--cache", tmp_path / "cache", "data.clips_per_trajectory=1"]
     result = persist("finetune", recipe, "--data", cells, "--out", tmp_path / "run", *small, *imagines, *cache)
     assert result.code == 0, result.err
     memory = adapter_memory(find_checkpoint(tmp_path / "run"), "scene")
-    assert memory.settings["model"] == str(scene_model)
+    assert Path(memory.settings["model"]).is_absolute()
+    assert Path(memory.settings["model"]).samefile(scene_model)
     assert memory.settings["palette"] == list(FORM.palette)
 
 
