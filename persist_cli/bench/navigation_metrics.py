@@ -7,6 +7,8 @@ those of evo (``evo_ape`` and ``evo_rpe`` with ``--pose_relation trans_part``, n
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,7 +59,7 @@ class WalkRecord:
     """What an agent did in the true scene.
 
     Args:
-        distances: geodesic metres to the goal at the start and after every action; infinite without a way.
+        distances: geodesic metres to the goal at the start and after every action; infinite where no way is known.
         metres: length of the way that it walked.
         collisions: number of actions that the scene refused.
         stopped: whether it stopped by itself, rather than when its actions were used up.
@@ -105,9 +107,18 @@ def spl(walk: WalkRecord, shortest: float) -> float:
 
 
 def soft_spl(walk: WalkRecord, shortest: float) -> float:
-    """Return SoftSPL: max(0, 1 − d / l) · l / max(l, p), with d the metres to the goal at the end."""
-    progress = max(0.0, 1.0 - walk.distances[-1] / shortest)
+    """Return SoftSPL: max(0, 1 − d / d₀) · l / max(l, p), with d the metres to the goal at the end, d₀ at the start.
+
+    l is no measure of progress: it is the length of the way of fewest actions, which may be longer or shorter than d₀.
+    """
+    start, end = walk.distances[0], walk.distances[-1]
+    progress = max(0.0, 1.0 - end / start) if 0 < start < math.inf else float(end == 0)
     return progress * shortest / max(shortest, walk.metres)
+
+
+def way_metres(places: Sequence[Sequence[float]]) -> float:
+    """Return the length of a way through places on the ground."""
+    return sum(math.dist(*pair) for pair in itertools.pairwise(places))
 
 
 def collision_rate(walk: WalkRecord) -> float:
@@ -127,6 +138,7 @@ def closed_loop_figures(walk: WalkRecord, shortest: float) -> dict[str, float]:
         "collisions": float(walk.collisions),
         "collisions_per_action": collision_rate(walk),
         "actions": float(walk.actions),
+        "start_metres": walk.distances[0],
         "end_metres": walk.distances[-1],
     }
 

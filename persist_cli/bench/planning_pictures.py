@@ -111,4 +111,6 @@ def end_words(closed: Mapping[str, Any]) -> str:
     """Return how an episode ended."""
     figures = closed["figures"]
     result = "success" if figures["success"] else closed["ended"]
-    return f"{result}, {figures['end_metres']:.1f} m left, {figures['actions']:.0f} actions"
+    end = figures["end_metres"]
+    left = "no way to the goal known" if end is None else f"{end:.1f} m left"
+    return f"{result}, {left}, {figures['actions']:.0f} actions"

@@ -10,10 +10,11 @@ import numpy as np
 
 from persist_cli.bench.episodes import Episode
 from persist_cli.bench.figure_text import FigureColumn
-from persist_cli.bench.navigation_metrics import SUCCESS_METRES
+from persist_cli.bench.navigation_metrics import SUCCESS_METRES, WalkRecord, soft_spl, way_metres
 from persist_cli.bench.plan_bench import PlanningBench
 from persist_cli.bench.rows import FORGETFUL, NO_MEMORY, POLICY_WALK, RETRIEVAL, SIMULATOR, WALK, PlanningRow
 from persist_cli.bench.stop_rules import AT_PLACE
+from persist_cli.bench.true_scene import TrueScene
 from persist_cli.evaluate.provenance import checkpoint_json, environment, weight_hashes, weight_sources
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, Draws, Figure, difference, mean_figure
 from persist_cli.io.command_line import running_command
@@ -40,7 +41,9 @@ COLUMNS: Final = {
         "success", "higher", True, f"the agent stopped within {SUCCESS_METRES:g} m (geodesic) of the goal", "closed"
     ),
     "spl": Column("SPL", "higher", True, "S · l / max(l, p): S success, l shortest way, p its way, metres", "closed"),
-    "soft_spl": Column("SoftSPL", "higher", True, "max(0, 1 − d / l) · l / max(l, p): d metres left", "closed"),
+    "soft_spl": Column(
+        "SoftSPL", "higher", True, "max(0, 1 − d / d₀) · l / max(l, p): d metres left, d₀ at the start", "closed"
+    ),
     "reached": Column(
         "oracle success", "higher", True,
         f"it was within {SUCCESS_METRES:g} m at any time, as if it were told when to stop", "closed",
@@ -108,7 +111,7 @@ def groups(episodes: Sequence[Episode]) -> Iterator[Group]:
 def results_json(bench: PlanningBench, processes: int) -> dict[str, Any]:
     """Return the results and all that is needed to measure them again, as JSON values."""
     episodes = bench.episodes.episodes
-    records = {row.name: [bench.journal.read(row, episode) for episode in episodes] for row in bench.rows}
+    records = read_records(bench)
     tables = [table_json(group, episodes, bench.rows, records) for group in groups(episodes)]
     return {
         "format": FORMAT,
@@ -127,6 +130,29 @@ def results_json(bench: PlanningBench, processes: int) -> dict[str, Any]:
         "environment": environment(processes),
         "command": running_command(),
     }  # fmt: skip
+
+
+def read_records(bench: PlanningBench) -> dict[str, list[dict[str, Any]]]:
+    """Return what happened in every episode, by row; figures that were once defined otherwise are made again."""
+    records: dict[str, list[dict[str, Any]]] = {row.name: [] for row in bench.rows}
+    for episode in bench.episodes.episodes:
+        scene = None
+        for row in bench.rows:
+            records[row.name].append(record := bench.journal.read(row, episode))
+            closed = record["closed"]
+            if closed is not None and "start_metres" not in closed["figures"]:
+                scene = scene or TrueScene(bench.simulator, episode)
+                closed["figures"] |= measured_again(closed, scene)
+    return records
+
+
+def measured_again(closed: Mapping[str, Any], scene: TrueScene) -> dict[str, float]:
+    """Return the figures of a closed loop that an older persist left out or measured otherwise."""
+    start, last = (scene.geodesic.metres(tuple(closed["places"][number])) for number in (0, -1))
+    end = closed["figures"]["end_metres"]
+    end = last if end is None else end  # it was infinite where no free cell lay beside the agent
+    walk = WalkRecord([start, end], way_metres(closed["places"]), len(closed["refused"]), stopped=False)
+    return {"start_metres": start, "end_metres": end, "soft_spl": soft_spl(walk, scene.episode.metres)}
 
 
 def settings_json(bench: PlanningBench) -> dict[str, Any]:

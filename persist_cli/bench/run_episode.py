@@ -17,6 +17,7 @@ from persist_cli.bench.navigation_metrics import (
     closed_loop_figures,
     relative_error,
     similarity,
+    way_metres,
 )
 from persist_cli.bench.navigator import Decision, Navigator
 from persist_cli.bench.stop_rules import StopRule
@@ -157,8 +158,7 @@ def run_closed_loop(scene: TrueScene, navigator: Navigator, stop: StopRule, sett
     """
     trace = Trace([scene.distance], [scene.simulator.agent[0]])
     ended = ClosedLoop(scene, navigator, stop, settings, trace).run()
-    metres = sum(math.dist(*pair) for pair in zip(trace.places, trace.places[1:], strict=False))
-    walk = WalkRecord(trace.distances, metres, len(trace.refused), ended != OUT_OF_ACTIONS)
+    walk = WalkRecord(trace.distances, way_metres(trace.places), len(trace.refused), ended != OUT_OF_ACTIONS)
     return trace.to_json(ended, closed_loop_figures(walk, scene.episode.metres), navigator.writing)
 
 

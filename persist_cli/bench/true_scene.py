@@ -60,14 +60,14 @@ class Geodesic:
         self._distances = self._grid.distances(goal)
 
     def metres(self, ground: Ground) -> float:
-        """Return the metres from a place, infinite without a way."""
+        """Return the metres from a place; where no way of the grid leads away from it, by the nearest way of all."""
         straight = math.dist(ground, self._goal)
         parts = max(1, math.ceil(straight / FINE))
         (x, z), (to_x, to_z) = ground, self._goal
         ways = [(x + n / parts * (to_x - x), z + n / parts * (to_z - z)) for n in range(parts + 1)]
         if all(map(self._simulator.is_free, ways)):
             return straight
-        return self._grid.remaining(ground, self._distances)
+        return self._grid.metres(ground, self._distances)
 
 
 class TrueScene:

@@ -178,11 +178,7 @@ class OpenHouse:
         """Metres from a place to a goal: straight, or along the ways that ``distances`` has."""
         if self.task.distance == "straight":
             return math.dist(ground, goal)
-        metres = self._grid.remaining(ground, distances)
-        if math.isfinite(metres):
-            return metres
-        # a free place so narrow that no free cell lies beside it: by the nearest way of all
-        return min(length + math.dist(ground, self._grid.place(cell)) for cell, length in distances.items())
+        return self._grid.metres(ground, distances)
 
 
 class SimulatedHouse(HouseEnv):

@@ -262,9 +262,12 @@ def train(learning: Learning, number: int) -> None:
 
 
 def evaluate(learning: Learning, number: int) -> None:
-    """Run the episodes with the policy after a round, unless that is done."""
+    """Run the episodes with the policy after a round, unless that is done.
+
+    An older persist measured SoftSPL otherwise and kept no metres of the start: then they are run again.
+    """
     file = learning.folder(number) / "episodes.json"
-    if not learning.episodes or file.is_file():
+    if not learning.episodes or (file.is_file() and "start_metres" in read_json(file)["figures"]):
         return
     assert learning.simulator is not None
     policy = open_policy(str(learning.policy(number).folder))

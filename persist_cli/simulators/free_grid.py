@@ -69,6 +69,16 @@ class FreeGrid:
         """Metres from a place to the goal of ``distances``, infinite without a way."""
         return min((distances.get(cell, math.inf) + offset for cell, offset in self.around(ground)), default=math.inf)
 
+    def metres(self, ground: Ground, distances: dict[Cell, float]) -> float:
+        """Metres from a place to the goal of ``distances``, infinite only where there are none.
+
+        A free place may be so narrow that no free cell lies beside it: then by the nearest way of all.
+        """
+        metres = self.remaining(ground, distances)
+        if math.isfinite(metres):
+            return metres
+        return min((way + math.dist(ground, self.place(cell)) for cell, way in distances.items()), default=math.inf)
+
     def _neighbours(self, cell: Cell) -> Iterator[tuple[Cell, float]]:
         """Free cells beside a cell, and diagonal ones when no corner stands in between."""
         i, j = cell

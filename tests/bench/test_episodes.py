@@ -105,6 +105,16 @@ def test_a_wall_makes_the_way_longer_than_the_straight_line(small_world: MiniWor
     assert any(straight + 1 < way < math.inf for way, straight in lengths)
 
 
+def test_a_place_beside_no_free_cell_is_measured_by_the_nearest_way_of_all(small_world: MiniWorld) -> None:
+    small_world.open_scene(1_000_002)
+    low, high = small_world.bounds
+    middle = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
+    goal = next(place for i in range(9) if small_world.is_free(place := (middle[0] + 0.1 * i, middle[1])))
+    geodesic, outside = Geodesic(small_world, goal), (high[0] + 1.0, goal[1])  # as far from all cells as a narrow gap
+    assert 1 < geodesic.metres(outside) < math.inf
+    assert geodesic.metres(outside) >= math.dist(outside, goal)
+
+
 def test_a_file_of_episodes_reads_back(episodes: EpisodeSet, tmp_path: Path) -> None:
     episodes.write(tmp_path / "episodes.json")
     assert read_episodes(tmp_path / "episodes.json") == episodes

@@ -85,6 +85,12 @@ def test_soft_spl_pays_the_part_of_the_way_that_was_made_good() -> None:
     assert soft_spl(walk(4.0, math.inf), 4.0) == 0.0
 
 
+@pytest.mark.parametrize("shortest", [3.75, 4.0, 4.5])
+def test_who_never_moves_gets_no_soft_spl_however_long_the_way_of_fewest_actions_is(shortest: float) -> None:
+    assert soft_spl(walk(4.0, metres=0.0), shortest) == 0.0
+    assert soft_spl(walk(4.0, 0.0, metres=shortest), shortest) == 1.0
+
+
 def test_collisions_are_counted_for_each_action() -> None:
     assert collision_rate(walk(3.0, 3.0, 3.0, 2.0, 1.0, collisions=2)) == pytest.approx(0.5)
     assert collision_rate(walk(3.0)) == 0.0

@@ -15,6 +15,7 @@ from persist_cli.api.ground import Cover
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
 from persist_cli.bench.plan_bench import check_scenes, trained_on
+from persist_cli.bench.planning_pictures import end_words
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.errors import DataError
@@ -154,6 +155,23 @@ def test_what_cem_did_before_it_forgot_plans_that_were_done_is_refused(bench: Be
     del record["version"]
     file.write_text(json.dumps(record))
     assert "was run when cem still judged the end of a plan that was done; delete this folder" in bench(*options).err
+
+
+def test_soft_spl_of_older_records_is_made_again_from_what_they_hold(bench: Bench, tmp_path: Path) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--patience", 1, "--rows", "random", "--json")
+    now = json.loads(bench(*options).out)["tables"][0]["rows"]["random"]
+    for file in (tmp_path / "bench/parts/random").iterdir():
+        record = json.loads(file.read_text())
+        del record["closed"]["figures"]["start_metres"]
+        record["closed"]["figures"]["soft_spl"] = 0.9
+        file.write_text(json.dumps(record))
+    again = json.loads(bench(*options).out)["tables"][0]["rows"]["random"]
+    assert again["soft_spl"]["mean"] == pytest.approx(now["soft_spl"]["mean"], abs=1e-3) != 0.9
+
+
+def test_an_episode_that_ended_where_no_way_is_known_can_be_told() -> None:
+    figures = {"success": 0.0, "end_metres": None, "actions": 4.0}
+    assert end_words({"figures": figures, "ended": "stopped"}) == "stopped, no way to the goal known, 4 actions"
 
 
 def test_figures_of_an_agent_that_was_given_more_are_refused(bench: Bench, tmp_path: Path) -> None:
