@@ -7,7 +7,8 @@ choices that were made for another. It stops and goes on like ``make table1``: w
 with another base, other data, steps or clips it refuses.
 
 ``OUT/choices.json`` has what was chosen and every trial, ``choices.md`` the same as a table, and ``OUT/recipes`` has a
-recipe for each memory with what was chosen. They are written anew after each figure.
+recipe for each memory with what was chosen. They are written anew after each figure, and say of which split the houses
+are; houses of the test split are refused.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from typing import Any, Final
 import yaml
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.errors import PersistError, hint
+from persist_cli.data.store import Store
+from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.report.result_file import read_results
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.recipe import EXTENDS, apply_overrides, make_recipe, read_recipe
@@ -245,8 +247,29 @@ def trials_of(plan: Plan, memory: str) -> Iterator[list[Trial]]:
         yield trials
 
 
-def choice_json(memory: str, trials: Sequence[Trial]) -> dict[str, Any]:
-    """What was chosen for a memory, why, and every trial, as JSON values."""
+def splits_of(folders: Sequence[Path]) -> list[str]:
+    """The splits that the houses of some folders are of; without those of houses that do not say it.
+
+    Raises:
+        DataError: when a house is of the test split, since figures on it would flatter what is chosen by it.
+    """
+    splits = {file.path: file.info.source.get("split") for folder in folders for file in Store(folder)}
+    for path, split in splits.items():
+        if split == "test":
+            raise DataError(
+                f"{path}: of the test split, by which nothing may be chosen; collect with --split validation"
+            )
+    return sorted({str(split) for split in splits.values() if split})
+
+
+def houses_text(houses: int, splits: Sequence[str]) -> str:
+    """So many houses and their splits in words, as in ``12 houses of the split validation``."""
+    named = f"of the split{'s' * (len(splits) > 1)} {' and '.join(splits)}" if splits else "of unknown split"
+    return f"{houses} houses {named}"
+
+
+def choice_json(memory: str, trials: Sequence[Trial], splits: Sequence[str]) -> dict[str, Any]:
+    """What was chosen for a memory, why, on houses of which splits, and every trial, as JSON values."""
     best = best_of(trials)
     others = [trial for trial in trials if trial is not best]
     reason = f"the only one that was measured, {CRITERION} {best.cost:.4f}"
@@ -259,14 +282,15 @@ def choice_json(memory: str, trials: Sequence[Trial]) -> dict[str, Any]:
         "overrides": list(best.settings.overrides),
         "sampling": asdict(best.sampling),
         "cost": best.figures[CRITERION],
-        "reason": f"{reason} ({best.clips} clips of {best.houses} validation houses)",
+        "chosen_on": houses_text(best.houses, splits),
+        "reason": f"{reason} ({best.clips} clips of {houses_text(best.houses, splits)})",
         "trials": [asdict(trial) for trial in trials],
     }
 
 
-def write_choices(plan: Plan, choices: Mapping[str, Any]) -> None:
+def write_choices(plan: Plan, choices: Mapping[str, Any], splits: Sequence[str]) -> None:
     """Write what is chosen so far as JSON, as a table and as recipes."""
-    described = {"base": plan.base, "steps": plan.steps, "by": CRITERION, "split": "validation"}
+    described = {"base": plan.base, "steps": plan.steps, "by": CRITERION, "splits": [*splits]}
     folders = {"data": [*map(str, plan.data)], "validation": [*map(str, plan.validation)]}
     write_json(plan.out / CHOICES, described | folders | {"memories": dict(choices)})
     write_text(plan.out / "choices.md", table_text(choices))
@@ -274,9 +298,7 @@ def write_choices(plan: Plan, choices: Mapping[str, Any]) -> None:
         path = recipe_file(plan.out, memory)
         path.parent.mkdir(parents=True, exist_ok=True)
         values = apply_overrides({EXTENDS: choice["recipe"]}, choice["overrides"])
-        write_text(
-            path, f"# chosen on validation houses: {choice['reason']}\n{yaml.safe_dump(values, sort_keys=False)}"
-        )
+        write_text(path, f"# chosen: {choice['reason']}\n{yaml.safe_dump(values, sort_keys=False)}")
 
 
 def recipe_file(out: Path, memory: str) -> Path:
@@ -332,16 +354,17 @@ def run_choose(plan: Plan) -> None:
     """Make the choices of every memory, one after the other.
 
     Raises:
-        PersistError: when the folder holds figures of another plan.
+        PersistError: when the folder holds figures of another plan, or a house is of the test split.
     """
     keep_plan(plan.out, identity(plan))
     for line in preparations(plan):
         run_line(line)
+    splits = splits_of(plan.validation)
     choices: dict[str, Any] = {}
     for memory in plan.memories:
         for trials in trials_of(plan, memory):
-            choices[memory] = choice_json(memory, trials)
-            write_choices(plan, choices)
+            choices[memory] = choice_json(memory, trials, splits)
+            write_choices(plan, choices, splits)
     say(f"\n{table_text(choices)}")
 
 

@@ -14,6 +14,7 @@ import typer.main
 from persist_cli.api.backbone import Sampling
 from persist_cli.checkpoints.save import write_card
 from persist_cli.cli.app import app
+from persist_cli.data.store import write_trajectory
 from persist_cli.errors import PersistError
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.reproduce import choose
@@ -36,6 +37,7 @@ from persist_cli.reproduce.choose import (
     train_command,
 )
 from tests.support.example_results import example_results
+from tests.support.rooms import Room, walk
 
 HOUSES = (Path("runs/houses"),)
 
@@ -80,6 +82,12 @@ def test_the_lowest_cost_is_chosen_and_of_equal_ones_the_first() -> None:
     assert best_of([trial("a", 0.3), trial("b", 0.2), trial("c", 0.2), trial("d", None)]).name == "b"
 
 
+def write_house(folder: Path, source: dict[str, Any]) -> None:
+    """Write a trajectory of two frames that comes from there."""
+    room = Room(16, 16)
+    write_trajectory(folder / "room.parquet", replace(room.info, source=source), room.frames(walk(2)))
+
+
 @pytest.fixture
 def measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[str]]:
     """A folder in which evaluations find the lower LPIPS the more a clip is guided, and the commands that ran."""
@@ -89,6 +97,8 @@ def measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, lis
     def run(line: str) -> None:
         lines.append(line)
         words = shlex.split(line)
+        if words[0] == "collect":
+            write_house(Path(words[words.index("--out") + 1]), {"split": words[words.index("--split") + 1]})
         if words[0] != "eval":
             return
         results = example_results(clips=8)
@@ -116,7 +126,27 @@ def test_settings_are_chosen_before_sampling_and_all_is_written(measured: tuple[
     trained = {shlex.split(line)[shlex.split(line).index("--out") + 1] for line in lines if line.startswith("finetune")}
     assert trained == {str(out / "runs/snapshots" / name) for name in TRIALS["snapshots"]}
     assert "**canvas-64x64**" in (out / "choices.md").read_text()
-    assert "validation houses" in choice["reason"]
+    assert "houses of the split validation)" in choice["reason"]
+    assert "houses of the split validation)" in recipe_file(out, "snapshots").read_text()
+    assert json.loads((out / "choices.json").read_text())["splits"] == ["validation"]
+
+
+@pytest.mark.parametrize(
+    ("source", "words"), [({"split": "train"}, "3 houses of the split train"), ({}, "3 houses of unknown split")]
+)
+def test_the_split_is_that_of_the_data(measured: tuple[Path, list[str]], source: dict[str, Any], words: str) -> None:
+    out, _ = measured
+    write_house(out / "own", source)
+    run_choose(replace(plan(out, "none"), validation=(out / "own",)))
+    assert json.loads((out / "choices.json").read_text())["memories"]["none"]["chosen_on"] == words
+
+
+def test_nothing_is_chosen_on_houses_of_the_test_split(measured: tuple[Path, list[str]]) -> None:
+    out, lines = measured
+    write_house(out / "own", {"split": "test"})
+    with pytest.raises(PersistError, match=r"room.parquet: of the test split.*collect with --split validation"):
+        run_choose(replace(plan(out, "none"), validation=(out / "own",)))
+    assert not [line for line in lines if line.startswith(("finetune", "eval"))]
 
 
 def test_the_recipe_that_is_written_has_what_was_chosen(measured: tuple[Path, list[str]]) -> None:
