@@ -99,6 +99,8 @@ class Recipe:
             frozen), ``policy`` (an agent that acts in the model, by itself), ``scene-codec`` or ``scene`` (a model that
             imagines scenes: the codec of its cells, and then the rest).
         description: one line for ``persist recipes``.
+        chosen_on: the data on which its settings were chosen, as in ``20 houses of the split validation``, for readers
+            of its figures; empty where that is not known.
         base: run or checkpoint to start from, ``None`` for none.
         backbone: the video model; not for policies and models of scenes.
         memory: the memory that the adapter reads, stage 2 only.
@@ -116,6 +118,7 @@ class Recipe:
 
     stage: Stage
     description: str = ""
+    chosen_on: str = ""
     base: str | None = None
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     memory: MemoryConfig | None = None

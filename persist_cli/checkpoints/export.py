@@ -21,6 +21,7 @@ from persist_cli.checkpoints.lineage import (
     ADAPTERS,
     RECIPE,
     RECIPES,
+    adapter_recipe,
     save_stage_recipes,
     stage_recipes,
     training_scenes,
@@ -338,11 +339,8 @@ def _recipes(base: Checkpoint, adapters: dict[str, AdapterSource]) -> dict[str, 
     """
     recipes = stage_recipes(base.base_folder)
     for name, adapter in adapters.items():
-        folder = adapter.checkpoint.folder
-        for path in (folder / RECIPES / ADAPTERS / f"{adapter.adapter}.yaml", folder / RECIPE):
-            if path.is_file():
-                recipes[f"{ADAPTERS}/{name}.yaml"] = path.read_text(encoding="utf-8")
-                break
+        text = adapter_recipe(adapter.checkpoint, adapter.adapter)
+        recipes |= {f"{ADAPTERS}/{name}.yaml": text} if text is not None else {}
     return {name: _without_absolute_paths(text, name) for name, text in recipes.items()}
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, find_checkpoint
+from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, find_checkpoint, read_card
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.store import Store
@@ -41,6 +41,29 @@ def stage_recipes(folder: Path) -> dict[str, str]:
         if not base:
             warn(f"{path}: its base {values['base']} is not there any more, so the recipe of that is not kept")
     return recipes | {_free_name("codec" if values.get("stage") == "codec" else "stage1", recipes): text}
+
+
+def adapter_recipe(checkpoint: Checkpoint, adapter: str) -> str | None:
+    """Text of the recipe that an adapter of a run or of an export was trained with; ``None`` where it is not kept."""
+    kept = checkpoint.folder / RECIPES / ADAPTERS / f"{adapter}.yaml"
+    path = kept if kept.is_file() else checkpoint.folder / RECIPE
+    return path.read_text(encoding="utf-8") if path.is_file() else None
+
+
+def chosen_on(checkpoint: Checkpoint) -> str | None:
+    """The data on which the settings of a checkpoint were chosen, as its card or the recipes of its adapters say.
+
+    ``None`` when that is not known of all adapters.
+    """
+    card = read_card(checkpoint.folder).get("chosen_on")
+    if isinstance(card, str):
+        return card
+    recipes = {name: adapter_recipe(checkpoint, name) for name in checkpoint.adapters}
+    known = {name: parse_yaml_mapping(text or "{}", name).get("chosen_on") for name, text in recipes.items()}
+    if not all(known.values()):
+        return None
+    words = {str(value) for value in known.values()}
+    return "; ".join(f"{name}: {value}" for name, value in known.items()) if len(words) > 1 else next(iter(words), None)
 
 
 def save_stage_recipes(folder: Path, recipes: dict[str, str]) -> None:

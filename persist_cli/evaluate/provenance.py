@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from persist_cli import __version__
-from persist_cli.api.checkpoint import Checkpoint, read_card
+from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.checkpoints import lineage
 from persist_cli.data.held_out import was_trained_on
 from persist_cli.evaluate.cases import Case
@@ -55,12 +55,11 @@ def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str,
 
     The number may change between runs: it depends on which earlier checkpoints and data sets can still be read.
     ``evaluated`` names those of them that the cases show. ``chosen_on`` says on which data the settings were chosen,
-    where the card does.
+    where card or recipe does.
     """
     scenes = lineage.training_scenes(checkpoint)
-    chosen_on = read_card(checkpoint.folder).get("chosen_on")
     return {
-        "chosen_on": chosen_on if isinstance(chosen_on, str) else None,
+        "chosen_on": lineage.chosen_on(checkpoint),
         "training_scenes": {
             "known": len(scenes.names),
             "complete": scenes.complete,

@@ -297,7 +297,7 @@ def write_choices(plan: Plan, choices: Mapping[str, Any], splits: Sequence[str])
     for memory, choice in choices.items():
         path = recipe_file(plan.out, memory)
         path.parent.mkdir(parents=True, exist_ok=True)
-        values = apply_overrides({EXTENDS: choice["recipe"]}, choice["overrides"])
+        values = apply_overrides({EXTENDS: choice["recipe"], "chosen_on": choice["chosen_on"]}, choice["overrides"])
         write_text(path, f"# chosen: {choice['reason']}\n{yaml.safe_dump(values, sort_keys=False)}")
 
 

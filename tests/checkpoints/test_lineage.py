@@ -8,10 +8,11 @@ import shutil
 import pytest
 
 from persist_cli.api.checkpoint import TrainingScenes, find_checkpoint
-from persist_cli.checkpoints.lineage import stage_recipes, training_scenes
+from persist_cli.checkpoints.lineage import chosen_on, stage_recipes, training_scenes
 from persist_cli.evaluate.provenance import checkpoint_json, scenes_json
 from persist_cli.evaluate.provenance import training_scenes as scenes_to_avoid
 from tests.support.damage import without_sums
+from tests.support.export_runs import write_runs
 from tests.support.micro_runs import stage
 
 ROOMS = TrainingScenes(frozenset({"room-0", "room-1"}))
@@ -43,6 +44,20 @@ def test_scenes_of_all_bases_are_known_after_runs_and_data_are_removed(persist, 
         scenes.append(training_scenes(find_checkpoint(tmp_path / name)))
         shutil.rmtree(data)
     assert scenes == [ROOMS, ROOMS]  # the codec was trained on both
+
+
+def test_the_data_that_settings_were_chosen_on_are_those_in_the_recipes_of_all_adapters(persist, tmp_path):
+    runs = write_runs(tmp_path / "runs")
+    for name, houses in (("voxel", 8), ("none", 9)):
+        recipe = without_sums(runs / name) / "recipe.yaml"
+        recipe.write_text(f"chosen_on: {houses} houses of the split validation\n")
+    assert chosen_on(find_checkpoint(runs / "voxel")) == "8 houses of the split validation"
+    export = ["export", runs / "stage1", runs / "voxel", runs / "none"]
+    assert persist(*export, "--out", tmp_path / "two").code == 0
+    told = "none: 9 houses of the split validation; voxel: 8 houses of the split validation"
+    assert chosen_on(find_checkpoint(tmp_path / "two")) == told
+    assert persist(*export, f"canvas={runs / 'canvas'}", "--out", tmp_path / "three").code == 0
+    assert chosen_on(find_checkpoint(tmp_path / "three")) is None
 
 
 def test_an_adapters_scenes_are_also_those_of_its_base(persist, codec, halves, tmp_path):

@@ -157,6 +157,7 @@ def test_the_recipe_that_is_written_has_what_was_chosen(measured: tuple[Path, li
     assert recipe.memory.settings["grid"] == [64, 64]
     assert recipe.memory.encoder == "patches"
     assert recipe.adapter["token_budget"] == 32768
+    assert recipe.chosen_on.endswith("houses of the split validation")
 
 
 def test_what_was_measured_is_not_measured_again(measured: tuple[Path, list[str]]) -> None:

@@ -214,8 +214,8 @@ def test_each_impossible_run_ends_in_one_line(persist, walks, codec, stage1, tmp
     for arguments, cause in (
         (stage("stage1", walks, codec), "holds a run already"),
         (
-            stage("codec", walks, codec, "--resume", *MICRO_SETTINGS, "training.learning_rate=1"),
-            "training.learning_rate changed",
+            stage("codec", walks, codec, "--resume", *MICRO_SETTINGS, "training.learning_rate=1", "chosen_on=8 houses"),
+            "another recipe; training.learning_rate changed",
         ),
         (stage("stage1", walks, tmp_path / "a", f"base={tmp_path}"), "no checkpoint there"),
         (stage("stage1", walks, tmp_path / "a", "base=zai-org/CogVideoX-2b"), "backbone.settings.pretrained=zai-org/"),

@@ -116,8 +116,8 @@ def _choices(results: EvalResults) -> Answer:
     unknown = [record.name for record in results.checkpoints if not record.chosen_on]
     if unknown:
         lines.append(
-            f"on which data cells, head and sampling of {', '.join(dict.fromkeys(unknown))} were chosen is not in the "
-            "card: if on these scenes, the figures flatter"
+            "neither card nor recipe says on which data cells, head and sampling of "
+            f"{', '.join(dict.fromkeys(unknown))} were chosen: if on these scenes, the figures flatter"
         )
     return Answer("What was chosen, and on which data?", tuple(lines), bool(unknown))
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from persist_cli.api.checkpoint import Checkpoint
-from persist_cli.checkpoints.lineage import ADAPTERS, RECIPE, RECIPES, stage_recipes
+from persist_cli.checkpoints.lineage import ADAPTERS, adapter_recipe, stage_recipes
 from persist_cli.errors import CheckpointError
 from persist_cli.evaluate.journal import first_difference
 from persist_cli.recipe import parse_yaml_mapping
 
-OWN = ("base", "description")  # keys of a recipe that may differ between training seeds
+OWN = ("base", "description", "chosen_on")  # keys of a recipe that may differ between training seeds
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,8 @@ def training_of(checkpoint: Checkpoint, adapter: str | None) -> Training:
     """How the base of a checkpoint, and one of its adapters, were trained."""
     texts = dict(stage_recipes(checkpoint.base_folder))
     if adapter is not None:
-        kept = checkpoint.folder / RECIPES / ADAPTERS / f"{adapter}.yaml"
-        path = kept if kept.is_file() else checkpoint.folder / RECIPE
-        texts |= {ADAPTERS: path.read_text(encoding="utf-8")} if path.is_file() else {}
+        text = adapter_recipe(checkpoint, adapter)
+        texts |= {ADAPTERS: text} if text is not None else {}
     schedule: dict[str, Any] = {}
     seeds = []
     for name, text in texts.items():

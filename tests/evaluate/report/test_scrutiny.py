@@ -28,7 +28,7 @@ def test_results_say_what_was_not_recorded_instead_of_nothing():
     assert "the data does not say of which split it is" in known["Which clips?"].lines
     assert "training scenes unknown" in known["Were the models trained on them?"].lines[0]
     assert known["Sharp, or only near on average?"].lines == ("not measured: --metrics psnr,sharpness",)
-    assert "is not in the card" in known["What was chosen, and on which data?"].lines[-1]
+    assert "neither card nor recipe says" in known["What was chosen, and on which data?"].lines[-1]
     assert known["Were the models trained on them?"].doubt
 
 
