@@ -18,11 +18,12 @@ from persist_cli.api.checkpoint import PLAIN, find_checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, read_episodes
+from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
+from persist_cli.io.settings import parse_settings
 from persist_cli.learn.evaluation import evaluate_policy, mean_figures
 from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
 from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
@@ -31,6 +32,7 @@ from persist_cli.planning.true_futures import open_again
 from persist_cli.plugins import make_policy
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
+from persist_cli.recipe import apply_overrides, make_recipe
 from persist_cli.rollout.camera_path import RolloutPlan
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.train.finetune import FinetunePlan, run_finetune
@@ -38,6 +40,7 @@ from persist_cli.viewing.console import add_task, print_json, print_table, progr
 from persist_cli.viewing.curve import Curve, draw_curves
 
 PLAN: Final = "plan.json"
+WALKS: Final = "walks.json"  # of a round whose walks are done
 RESULTS: Final = "learn.json"
 CURVE: Final = "success.png"
 FIGURES: Final = ("success", "reached", "spl", "soft_spl", "collisions_per_action", "end_metres")
@@ -121,11 +124,12 @@ def run_learn(plan: LearnPlan, out: Path, as_json: bool) -> None:
         PersistError: one line for whatever does not fit.
     """
     learning = prepare(plan, out)
-    place: PracticePlace | None = None
+    walked = [(learning.folder(number) / WALKS).is_file() for number in range(1, plan.rounds + 1)]
+    place = None if all(walked) else open_place(learning)  # fails, if it does, before anything is written
+    keep_plan(learning)
     evaluate(learning, 0)
     for number in range(1, plan.rounds + 1):
-        if not (learning.folder(number) / "walks.json").is_file():
-            place = place or open_place(learning)
+        if place is not None and not walked[number - 1]:
             walk(learning, place, number)
         train(learning, number)
         evaluate(learning, number)
@@ -137,7 +141,7 @@ def run_learn(plan: LearnPlan, out: Path, as_json: bool) -> None:
 
 
 def prepare(plan: LearnPlan, out: Path) -> Learning:
-    """Check everything that can be checked before anything is imagined."""
+    """Check everything that can be checked before the model is loaded, and write nothing."""
     check_folder(out)
     if plan.inside not in (MODEL, SIMULATOR):
         raise PersistError(f"--inside {plan.inside!r}: a policy practises inside the {MODEL} or the {SIMULATOR}")
@@ -150,32 +154,44 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     common_reference(sources)
     info = sources[0].file.info
     views = Observations.concatenate([source.file.read(list(source.frames)).observations for source in sources])
-    episodes = [] if plan.episodes is None else episodes_of(plan.episodes, info)
-    simulator = None
-    if episodes or plan.inside == SIMULATOR:
-        simulator = open_simulator(plan, info)
+    simulator = None if plan.episodes is None and plan.inside == MODEL else open_simulator(plan, info)
+    episodes = [] if plan.episodes is None or simulator is None else episodes_of(plan.episodes, info, simulator)
     check_horizon(plan, begin)
-    check_plan(plan, out, begin)
-    return Learning(plan, out, info, views, begin, simulator, episodes)
+    make_recipe(apply_overrides(recipe_of_round(plan, begin, 1), plan.training), "--set")
+    learning = Learning(plan, out, info, views, begin, simulator, episodes)
+    check_plan(learning)
+    return learning
 
 
-def check_plan(plan: LearnPlan, out: Path, begin: TrainedPolicy) -> None:
-    """Write down what is to be learned, or raise ``PersistError`` when the folder holds another learning."""
-    identity = asdict(plan) | {"policy": begin.fingerprint, "checkpoint": None, "episodes": None, "rounds": None}
+def identity(learning: Learning) -> dict[str, Any]:
+    """Return JSON values of all that changes what is learned: a learning with equal values goes on."""
+    plan = learning.plan
+    values = asdict(plan) | {
+        "policy": learning.begin.fingerprint, "checkpoint": None, "episodes": None, "rounds": None,
+    }  # fmt: skip
     if plan.inside == MODEL:
-        identity["checkpoint"] = find_checkpoint(plan.checkpoint).fingerprint
+        values["checkpoint"] = find_checkpoint(plan.checkpoint).fingerprint
     if plan.episodes is not None:
-        identity["episodes"] = file_sha256(plan.episodes)
-    identity = json.loads(json.dumps(identity, default=str))
-    file = out / PLAN
+        values["episodes"] = file_sha256(plan.episodes)
+    return dict(json.loads(json.dumps(values, default=str)))
+
+
+def check_plan(learning: Learning) -> None:
+    """Raise ``PersistError`` when the folder holds another learning."""
+    file = learning.out / PLAN
     if not file.is_file():
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(file, identity)
         return
-    stored = read_json(file)
-    changed = sorted(key for key in identity if stored.get(key) != identity[key])
+    stored, now = read_json(file), identity(learning)
+    changed = sorted(key for key in now if stored.get(key) != now[key])
     if changed:
-        raise PersistError(f"{out}: holds a learning with another {', '.join(changed)}; take another --out")
+        raise PersistError(f"{learning.out}: holds a learning with another {', '.join(changed)}; take another --out")
+
+
+def keep_plan(learning: Learning) -> None:
+    """Write down what is learned, unless that is done."""
+    if not (learning.out / PLAN).is_file():
+        learning.out.mkdir(parents=True, exist_ok=True)
+        write_json(learning.out / PLAN, identity(learning))
 
 
 def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
@@ -189,14 +205,37 @@ def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
         )
 
 
-def episodes_of(file: Path, info: TrajectoryInfo) -> list[Episode]:
-    """Return the episodes of a file that are in the scene of the views."""
-    found = [episode for episode in read_episodes(file).episodes if episode.scene_name == info.scene]
+def episodes_of(file: Path, info: TrajectoryInfo, simulator: Simulator) -> list[Episode]:
+    """Return the episodes of a file that are in the scene of the views.
+
+    Args:
+        file: of episodes.
+        info: of the views.
+        simulator: of the views, in which the episodes are run.
+
+    Raises:
+        DataError: when there is none, or their simulator is another one or has another agent.
+    """
+    read = read_episodes(file)
+    check_agent(file, read, simulator)
+    found = [episode for episode in read.episodes if episode.scene_name == info.scene]
     if not found:
         raise DataError(
             f"{file}: no episode in scene {info.scene!r}, which the views show; draw some with its --scenes"
         )
     return found
+
+
+def check_agent(file: Path, episodes: EpisodeSet, simulator: Simulator) -> None:
+    """Raise ``DataError`` when the agent of some episodes is another than that of the views' simulator."""
+    if episodes.simulator != simulator.name:
+        raise DataError(f"{file}: episodes of simulator {episodes.simulator!r}, the views are of {simulator.name!r}")
+    drawn = asdict(parse_settings(simulator.settings_type, episodes.settings, str(file)))
+    ours = asdict(simulator.settings)
+    other = [name for name in drawn if drawn[name] != ours[name]]
+    if other:
+        theirs, own = (" and ".join(f"{name} {values[name]}" for name in other) for values in (drawn, ours))
+        raise DataError(f"{file}: episodes with {theirs}, the views were collected with {own}; make both with the same")
 
 
 def open_simulator(plan: LearnPlan, info: TrajectoryInfo) -> Simulator:
@@ -241,19 +280,23 @@ def walk(learning: Learning, place: PracticePlace, number: int) -> None:
             write_trajectory(folder / f"walk-{index:05d}.parquet", info, one.frames())
             bar.advance(task)
     counts = {"walks": settings.walks, "actions": actions, "blocked": blocked, "goals": goals}
-    write_json(learning.folder(number) / "walks.json", counts)
+    write_json(learning.folder(number) / WALKS, counts)
 
 
-def train(learning: Learning, number: int) -> None:
-    """Fine-tune the policy of the round before on the walks of all rounds so far."""
-    run, before = learning.folder(number) / "policy", learning.policy(number - 1)
-    plan = learning.plan
-    recipe = {
+def recipe_of_round(plan: LearnPlan, before: TrainedPolicy, number: int) -> dict[str, Any]:
+    """Return the plain values of the recipe by which the policy of the round before is fine-tuned."""
+    return {
         "stage": "policy", "description": f"round {number} of a policy that practises", "base": str(before.folder),
         "policy": {"name": before.policy, "settings": before.settings}, "data": {"detour": DETOUR},
         "training": {"steps": plan.steps, "seed": plan.seed, "precision": "no", "learning_rate": 1e-4, "warmup": 20,
                      "batch": 64, "ema": 0.99},
     }  # fmt: skip
+
+
+def train(learning: Learning, number: int) -> None:
+    """Fine-tune the policy of the round before on the walks of all rounds so far."""
+    run, plan = learning.folder(number) / "policy", learning.plan
+    recipe = recipe_of_round(plan, learning.policy(number - 1), number)
     file = learning.folder(number) / "policy.yaml"
     if not file.is_file():
         write_text(file, yaml.safe_dump(recipe, sort_keys=False))
@@ -284,7 +327,7 @@ def summary(learning: Learning) -> dict[str, Any]:
         folder = learning.folder(number)
         row: dict[str, Any] = {"round": number}
         if number:
-            row["practice"] = read_json(folder / "walks.json")
+            row["practice"] = read_json(folder / WALKS)
             walked += row["practice"]["actions"] + row["practice"]["blocked"]
         if learning.episodes:
             row["figures"] = read_json(folder / "episodes.json")["figures"]

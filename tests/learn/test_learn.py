@@ -161,6 +161,9 @@ def test_a_folder_with_another_learning_is_refused(learn):
         ("--inside", "dream", "a policy practises inside the model or the simulator"),
         ("--inside", "simulator", "of no simulator; leave --episodes and --inside simulator out"),
         ("--policy", "nowhere/policy", "no trained policy there"),
+        ("--adapter", "voxle", "no memory adapter 'voxle' in it; it has voxel"),
+        ("--sampler", "dim", "unknown sampler 'dim'"),
+        ("--set", "training.bach=3", "--set: unknown key 'training.bach', did you mean 'training.batch'?"),
         (
             "--actions",
             "7",
