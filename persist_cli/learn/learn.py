@@ -6,7 +6,9 @@ in the true scene. What is done is not done again, so a stopped run goes on.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -124,20 +126,28 @@ def run_learn(plan: LearnPlan, out: Path, as_json: bool) -> None:
         PersistError: one line for whatever does not fit.
     """
     learning = prepare(plan, out)
-    walked = [(learning.folder(number) / WALKS).is_file() for number in range(1, plan.rounds + 1)]
-    place = None if all(walked) else open_place(learning)  # fails, if it does, before anything is written
-    keep_plan(learning)
-    evaluate(learning, 0)
-    for number in range(1, plan.rounds + 1):
-        if place is not None and not walked[number - 1]:
-            walk(learning, place, number)
-        train(learning, number)
-        evaluate(learning, number)
+    # the lines of each training are no part of the JSON
+    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        run_rounds(learning)
     results = summary(learning)
     write_json(out / RESULTS, results)
     if learning.episodes:
         draw_curves(success_curves(results), "actions of practice", "share of episodes", out / CURVE, False)
     report(learning, results, as_json)
+
+
+def run_rounds(learning: Learning) -> None:
+    """Run all rounds that are not done yet."""
+    rounds = range(1, learning.plan.rounds + 1)
+    walked = {number for number in rounds if (learning.folder(number) / WALKS).is_file()}
+    place = None if len(walked) == len(rounds) else open_place(learning)  # whatever does not fit there ends it here
+    keep_plan(learning)
+    evaluate(learning, 0)
+    for number in rounds:
+        if place is not None and number not in walked:
+            walk(learning, place, number)
+        train(learning, number)
+        evaluate(learning, number)
 
 
 def prepare(plan: LearnPlan, out: Path) -> Learning:

@@ -1,0 +1,91 @@
+"""Practice and evaluation in the true house, a small one of MiniWorld."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from persist_cli.api.observations import Frame
+from persist_cli.bench.episodes import EpisodeSet
+from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
+from persist_cli.data.store import Store, write_trajectory
+from persist_cli.simulators.miniworld import MiniWorld
+from tests.conftest import CommandResult
+from tests.support.miniworlds import make_world
+
+HOUSE = 1_000_001  # of the test split, with one room
+
+SIZE = {"height": 32, "width": 32}
+
+
+@pytest.fixture(scope="module")
+def world() -> MiniWorld:
+    return make_world(**SIZE)
+
+
+@pytest.fixture(scope="module")
+def episodes(world: MiniWorld, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of one episode."""
+    search, file = (
+        EpisodeSearch(bins=(8,), each=1, walk_frames=4),
+        tmp_path_factory.mktemp("episodes") / "episodes.json",
+    )
+    found = [episode for scene in find_episodes(world, [HOUSE], search) for episode in scene][:1]
+    EpisodeSet(simulator="miniworld", settings=SIZE, split="test", seed=0, episodes=found).write(file)
+    return file
+
+
+def turned_views(world: MiniWorld, episodes: Path) -> Iterator[Frame]:
+    """What the agent sees while it turns at the start of the episode."""
+    at = EpisodeSet.model_validate_json(episodes.read_text()).episodes[0].start
+    world.open_scene(HOUSE)
+    world.place(at.ground, at.heading)
+    for number in range(8):
+        frame = world.observe()
+        yield Frame(frame.rgb, frame.depth, frame.world_from_camera, "left" if number < 7 else None, float(number))
+        world.act("left")
+
+
+@pytest.fixture
+def learn(persist, world, episodes, policy_run, tmp_path) -> Callable[..., CommandResult]:
+    """Runs a short learning in the true house, with results in ``out``."""
+    short = ["--walks", 2, "--actions", 10, "--execute", 5, "--training-steps", 1, "--rounds", 1, "--patience", 1]
+    training = ["--set", "training.batch=2", "--set", "training.workers=0", "--inside", "simulator", "--json"]
+
+    def run(simulator: MiniWorld = world) -> CommandResult:
+        simulator.open_scene(HOUSE)
+        views, out = tmp_path / "views.parquet", tmp_path / "out"
+        write_trajectory(views, simulator.info, turned_views(simulator, episodes))
+        given = ["--views", f"{tmp_path}#views", "--policy", policy_run, "--episodes", episodes, "--out", out]
+        return persist("learn", *given, *short, *training)
+
+    return run
+
+
+def test_a_learning_that_was_stopped_before_its_last_evaluation_ends_as_one_that_was_not(learn, tmp_path):
+    whole = learn()
+    assert whole.code == 0, whole.err
+    results = json.loads(whole.out)
+    assert [row["walked"] for row in results["rounds"]] == [0, 20]
+    assert all(0 <= row["figures"]["spl"] <= row["figures"]["success"] <= 1 for row in results["rounds"])
+    walks = tmp_path / "out/round-01/walks"
+    assert Store(walks)[0].info.source["practice"] == {"simulator": "miniworld"}
+    written = [file.stat().st_mtime_ns for file in walks.iterdir()]
+    for file in ("round-01/episodes.json", "learn.json", "success.png"):
+        (tmp_path / "out" / file).unlink()
+    again = json.loads(learn().out)
+    for row in (*results["rounds"], *again["rounds"]):
+        row["figures"].pop("seconds_per_decision")
+    assert again == results
+    assert [file.stat().st_mtime_ns for file in walks.iterdir()] == written
+    assert (tmp_path / "out/success.png").is_file()
+
+
+def test_episodes_of_another_agent_than_that_of_the_views_are_refused(learn, tmp_path):
+    result = learn(make_world(**SIZE, step=0.4, turn=30.0))
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert "with step 0.25 and turn 15.0, the views were collected with step 0.4 and turn 30.0" in result.err
+    assert not (tmp_path / "out").exists()
