@@ -17,6 +17,26 @@ def test_the_cells_of_a_frame_cover_all_its_pixels():
     assert covered(memory.points().positions, 0.1, view.cameras).all()
 
 
+@pytest.mark.parametrize("cell", [(0.25, 1.0, 0.25), (0.125, 1.0, 0.125), (0.5, 0.25, 0.5)])
+def test_high_and_flat_cells_of_a_frame_cover_all_its_pixels_too(cell):
+    view = observe([look((0.0, 1.3, 0.0), 20.0, -10.0)], 64, 64)
+    memory = written_memory("voxel", view, cell=cell)
+    assert covered_by_blocks(memory.known_blocks(view.cameras), memory.lattice.across, view.cameras).all()
+
+
+def test_a_high_cell_covers_no_more_than_its_height():
+    view = observe([look((0.0, 1.4, 0.0), 0.0)], 96, 128)
+    ahead = unproject(torch.full((1, 96, 128), 2.0), view.cameras)[0, 48, 64]
+    depth = torch.zeros(1, 96, 128)
+    depth[0, 48, 64] = 2.0
+    memory = written_memory("voxel", type(view)(view.rgb, depth, view.cameras), cell=(0.25, 1.0, 0.25))
+    [known] = covered_by_blocks(memory.known_blocks(view.cameras), 0.25, view.cameras)
+    focal, [middle] = float(view.cameras.intrinsics[0, 1, 1]), memory.points().positions
+    assert focal * 0.9 / 2.2 < known.any(1).sum() < focal * 1.6 / 1.8
+    assert known.any(0).sum() < focal * 0.6 / 1.8
+    assert float((middle - ahead).abs().max()) < 0.6
+
+
 def test_a_cell_is_drawn_as_large_as_it_is_seen_and_one_behind_the_camera_is_not_drawn():
     cameras = observe([look((0.0, 1.4, 0.0), 0.0)], 96, 128).cameras
     ahead = unproject(torch.full((1, 96, 128), 1.0), cameras)[0, 48, 64]

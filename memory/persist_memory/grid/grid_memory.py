@@ -195,7 +195,10 @@ class GridMemory(Memory):
         return max(self.lattice.across, feature_across(self.encoder, cameras, distance))
 
     def known_blocks(self, cameras: Cameras) -> CellBlocks:
-        """Return the cells that imagined frames of some cameras do not change, in blocks of 8 × 8 × 8."""
+        """Return the cells that imagined frames of some cameras do not change, in blocks of 8 × 8 × 8.
+
+        A cell that is higher than wide is drawn as several, one above the other.
+        """
         blocks, starts, counts = self.grid.blocks()
         size = self.lattice.extent.to(self.grid.device)
         middles = (blocks * BLOCK + 0.5 * (BLOCK - 1)).double() * size
@@ -204,11 +207,13 @@ class GridMemory(Memory):
             positions = ranges(starts[chosen], counts[chosen])
             if self.settings.imagined == "merge":
                 positions = positions[self.grid.values(ORIGINS, positions) >= Origin.OBSERVED]
-            return self._in_world(self._centers(self.grid.keys[positions]))
+            centers = self._centers(self.grid.keys[positions])
+            return self._in_world((centers[:, None] + parts).flatten(0, 1))
 
-        radius = 0.5 * (BLOCK - 1) * float(size.norm())
+        parts = self.lattice.parts.to(self.grid.device)
+        radius = 0.5 * (BLOCK - 1) * float(size.norm()) + float(parts.norm(dim=1).amax())
         distances = block_distances(blocks, self.lattice, self.views(cameras))
-        return CellBlocks(self._in_world(middles), radius, counts, distances, cells)
+        return CellBlocks(self._in_world(middles), radius, counts * len(parts), distances, cells)
 
     def _unknown(self, imagined: Observations) -> Observations:
         """Imagined frames without the depth of what is not written: see ``GridSettings``."""

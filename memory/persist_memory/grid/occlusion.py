@@ -30,7 +30,7 @@ class CellBlocks:
     Args:
         centers: middles of the blocks, world metres, float64.
         radius: metres from the middle of a block within which the centres of its cells lie.
-        counts: number of cells of each.
+        counts: number of cells of each; a cell that is drawn as several counts as so many.
         distances: metres from each camera, infinite where a block does not reach into its view.
         cells: gives the centres of the cells of some blocks, world metres, float64.
     """

@@ -83,6 +83,14 @@ class Lattice:
             extent[1] = 0.0
         return extent
 
+    @property
+    def parts(self) -> Float[Tensor, "part 3"]:
+        """Where in a cell, from its centre, its parts lie: together as high as the cell, each at most ``across``."""
+        counts = (self.extent / self.across - 1e-6).ceil().clamp(min=1).long().tolist()
+        sides = self.extent / torch.tensor(counts)
+        steps = [torch.arange(count, dtype=torch.float64) - (count - 1) / 2 for count in counts]
+        return torch.cartesian_prod(*steps) * sides
+
     def rise(self, world_up: Sequence[float]) -> float:
         """Return the metres of height that a cell stands for; infinite where all heights fall into one cell."""
         up = torch.tensor(list(world_up), dtype=torch.float64)
