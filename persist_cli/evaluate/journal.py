@@ -120,10 +120,8 @@ class Journal:
         """Whether it is kept which row has which number; earlier versions did not keep it."""
         return (self.folder / ROWS).is_file()
 
-    def check_rows(self, names: Sequence[str]) -> None:
-        """Keep the names of the rows by number; raise ``PersistError`` when the numbers stand for other rows."""
-        if self.names_rows:
-            check_same(read_json(self.folder / ROWS), list(names), f"{self.folder.parent}: holds other rows")
+    def name_rows(self, names: Sequence[str]) -> None:
+        """Keep the names of the rows by number; they may hold folders of checkpoints, which may be moved later."""
         write_json(self.folder / ROWS, list(names))
 
     def has(self, part: Unit | ExampleClip) -> bool:

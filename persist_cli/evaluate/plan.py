@@ -173,7 +173,7 @@ def prepare(
     controls = build_control_rows(models, checkpoints, config, protocol, cases)
     rows = [*models, *controls.rows]
     if processes.main:
-        journal.check_rows([row.name for row in rows])
+        journal.name_rows([row.name for row in rows])
         warn_of_clips(cases, checkpoints, search)
     for row in [*rows, *(row for row, _ in controls.missing)]:
         row.has_depth = not (row.uses_model and row.base.fingerprint in bases.depthless)
