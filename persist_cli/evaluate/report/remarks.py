@@ -175,11 +175,15 @@ def known_scenes(record: CheckpointRecord) -> str:
 
 
 def all_left_out(results: EvalResults) -> dict[str, list[str]]:
-    """What all tables leave out, by the reason."""
+    """What all tables leave out, by the reason; what only some of them leave out, with the name of each."""
     merged: dict[str, list[str]] = {}
-    for table in compact_tables(results):
+    tables = compact_tables(results)
+    left_out = [{name for names in table.left_out.values() for name in names} for table in tables]
+    everywhere = set.intersection(*left_out) if left_out else set()
+    for table in tables:
         for reason, names in table.left_out.items():
-            merged[reason] = list(dict.fromkeys([*merged.get(reason, []), *names]))
+            told = [name if name in everywhere else f"{name} of {table.view.name}" for name in names]
+            merged[reason] = list(dict.fromkeys([*merged.get(reason, []), *told]))
     return merged
 
 

@@ -79,6 +79,14 @@ def test_the_tables_of_several_domains_are_one_table_under_their_names(monkeypat
     assert "3 clips: too few for an interval" in text
 
 
+def test_a_column_that_one_table_alone_leaves_out_is_named_with_that_table(monkeypatch):
+    results = example_results()
+    results["tables"].append(copy.deepcopy(results["tables"][0]) | {"name": "vizdoom"})
+    for row in results["tables"][1]["rows"].values():
+        row["columns"]["ssim"] = {"na": "too small"}
+    assert "left out: SSIM of vizdoom (too small)" in printed(monkeypatch, results, 160)
+
+
 @pytest.mark.parametrize("length", [35, 70])
 def test_a_long_row_name_goes_on_in_the_next_line_of_one_table(monkeypatch, length):
     name = f"voxel ({'runs/' * length}"[:length]
