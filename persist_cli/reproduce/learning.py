@@ -3,7 +3,7 @@
 ``python -m persist_cli.reproduce.learning OUT`` draws episodes in held-out houses, collects a
 short exploring walk in each as its given views, and lets the policy learn there by ``persist learn``: inside the model
 with each memory, and in the true house with as many actions and training steps. It stops and goes on like
-``make table1``.
+``make table1``; a folder of another model, policy, houses, views or options is refused.
 
 ``OUT/learning.json`` has success before and after with intervals over houses, ``learning.md`` the table.
 """
@@ -11,24 +11,38 @@ with each memory, and in the true house with as many actions and training steps.
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from persist_cli.api.checkpoint import SHOWN, find_checkpoint
 from persist_cli.bench.episodes import read_episodes
+from persist_cli.bench.rows import NO_MEMORY
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
-from persist_cli.evaluate.statistics import Draws, difference, mean_figure
+from persist_cli.evaluate.provenance import checkpoint_json
+from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, difference, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.learn.learn import FIGURES, RESULTS
+from persist_cli.policies.trained import find_policy, packaged_policy
 from persist_cli.reproduce.commands import run_line
+from persist_cli.reproduce.plan_file import PLAN, keep_plan
 from persist_cli.viewing.console import say
 
 SIMULATOR: Final = "simulator"
+
+EPISODES: Final = "episodes.json"
+
+VIEWS: Final = "views"
+
+CHANGE: Final = "after − before"
+
+ADVANTAGE: Final = "after − after with the memory compared with"
 
 
 @dataclass(frozen=True)
@@ -64,32 +78,84 @@ class Plan:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Run what is not done yet and write the table anew after each house."""
+    """Run what is not done yet and write the table anew after each house.
+
+    Raises:
+        PersistError: when the folder holds what was learned with another model, policy, houses, views or options.
+    """
     plan = parse(arguments)
-    episodes = plan.out / "episodes.json"
-    if not episodes.is_file():
-        run_line(f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {plan.houses} --out {episodes}")
-    run_line(f"collect miniworld --out {plan.out / 'views'} --scenes {plan.scenes} --frames {plan.views} --split test")
-    scenes = sorted(read_episodes(episodes).scenes)
+    described = identity(plan)
+    keep_identity(plan, described)
+    for line in preparations(plan):
+        run_line(line)
+    scenes = sorted(read_episodes(plan.out / EPISODES).scenes)
+    names = {file.info.scene: file.name for file in Store(plan.out / VIEWS)}
     for scene in scenes:
         for memory in plan.memories:
-            learn(plan, scene, memory)
-        write_results(plan, scenes)
+            if not is_learned(plan, scene, memory):
+                run_line(learning_line(plan, scene, names[scene], memory))
+        write_results(plan, scenes, described)
     say(f"written to {plan.out / 'learning.md'}")
 
 
-def learn(plan: Plan, scene: str, memory: str) -> None:
-    """Let the policy learn in one house, unless it has."""
-    out = folder_of(plan, scene, memory)
-    if (out / RESULTS).is_file() and len(read_json(out / RESULTS)["rounds"]) > plan.rounds:
-        return
-    views = next(file.name for file in Store(plan.out / "views") if file.info.scene == scene)
-    inside = "--inside simulator" if memory == SIMULATOR else f"--adapter {memory}"
-    named = f"--policy {plan.policy} " if plan.policy else ""
-    run_line(
-        f"learn {plan.model} --views {plan.out / 'views'}#{views} {named}{inside} "
-        f"--episodes {plan.out / 'episodes.json'} --rounds {plan.rounds} --out {out} {plan.options}".strip()
-    )
+def identity(plan: Plan) -> dict[str, Any]:
+    """Return JSON values of all that changes a figure; memories may be added, and rounds.
+
+    Raises:
+        CheckpointError: when model or policy are not there.
+    """
+    policy = packaged_policy() if plan.policy is None else find_policy(Path(plan.policy))
+    model = checkpoint_json(find_checkpoint(Path(plan.model)))
+    return {
+        "model": {"path": plan.model, "fingerprint": model["fingerprint"], "adapters": model["adapters"]},
+        "policy": {"path": plan.policy or "that comes with the package", "fingerprint": policy.fingerprint},
+        "scenes": plan.scenes, "views": plan.views, "options": plan.options,
+    }  # fmt: skip
+
+
+def keep_identity(plan: Plan, described: Mapping[str, Any]) -> None:
+    """Write down what is learned, or raise ``PersistError`` when the folder holds something else.
+
+    As long as nothing was learned only the houses and views are fixed: a mistyped option can be mended.
+    """
+    path = plan.out / PLAN
+    if path.is_file() and not any(plan.out.glob(f"learned/*/*/{PLAN}")):
+        stored = read_json(path)
+        write_json(path, {**described, "scenes": stored["scenes"], "views": stored["views"]})
+    keep_plan(plan.out, described, EPISODES)
+
+
+def preparations(plan: Plan) -> Iterator[str]:
+    """Yield the commands that draw the episodes, unless they are drawn, and collect the given views."""
+    home = shlex.quote(str(plan.out))
+    if not (plan.out / EPISODES).is_file():
+        yield f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {plan.houses} --out {home}/{EPISODES}"
+    yield f"collect miniworld --out {home}/{VIEWS} --scenes {plan.scenes} --frames {plan.views} --split test"
+
+
+def is_learned(plan: Plan, scene: str, memory: str) -> bool:
+    """Whether the policy has learned in a house for as many rounds."""
+    results = folder_of(plan, scene, memory) / RESULTS
+    return results.is_file() and len(read_json(results)["rounds"]) > plan.rounds
+
+
+def learning_line(plan: Plan, scene: str, views: str, memory: str) -> str:
+    """Return the command that lets the policy learn in one house.
+
+    Args:
+        plan: what is learned and where.
+        scene: name of the house.
+        views: name of its trajectory of given views.
+        memory: an adapter, or ``simulator``.
+    """
+    home, out = shlex.quote(str(plan.out)), shlex.quote(str(folder_of(plan, scene, memory)))
+    given = shlex.quote(f"{plan.out / VIEWS}#{views}")
+    policy = f"--policy {shlex.quote(plan.policy)} " if plan.policy else ""
+    inside = "--inside simulator" if memory == SIMULATOR else f"--adapter {shlex.quote(memory)}"
+    return (
+        f"learn {shlex.quote(plan.model)} --views {given} {policy}{inside} --episodes {home}/{EPISODES} "
+        f"--rounds {plan.rounds} --out {out} {plan.options}"
+    ).strip()
 
 
 def folder_of(plan: Plan, scene: str, memory: str) -> Path:
@@ -97,20 +163,32 @@ def folder_of(plan: Plan, scene: str, memory: str) -> Path:
     return plan.out / "learned" / memory / scene.replace("/", "-")
 
 
-def write_results(plan: Plan, scenes: Sequence[str]) -> None:
-    """Write ``learning.json`` and ``learning.md`` from the houses in which every memory has learned."""
+def write_results(plan: Plan, scenes: Sequence[str], described: Mapping[str, Any]) -> None:
+    """Write ``learning.json`` and ``learning.md`` from the houses in which every memory has learned.
+
+    Args:
+        plan: what is learned and where.
+        scenes: names of the houses.
+        described: the plan's identity.
+    """
     files = {memory: [folder_of(plan, scene, memory) / RESULTS for scene in scenes] for memory in plan.memories}
-    done = [number for number in range(len(scenes)) if all(own[number].is_file() for own in files.values())]
+    done = [scene for scene in scenes if all(is_learned(plan, scene, memory) for memory in plan.memories)]
     if not done:
         return
-    rows = {memory: [read_json(own[number]) for number in done] for memory, own in files.items()}
-    results = {"houses": len(done), "rounds": plan.rounds, "memories": summarise(rows, plan.rounds)}
+    rows = {
+        memory: [read_json(file) for scene, file in zip(scenes, own, strict=True) if scene in done]
+        for memory, own in files.items()
+    }
+    results = {"plan": dict(described), "houses": len(done), "rounds": plan.rounds} | summarise(rows, plan.rounds)
     write_json(plan.out / "learning.json", results)
     write_text(plan.out / "learning.md", table(results))
 
 
-def summarise(rows: dict[str, list[dict[str, Any]]], rounds: int) -> dict[str, Any]:
-    """Return the means before and after with the paired differences, over houses of equal weight.
+def summarise(rows: Mapping[str, Sequence[dict[str, Any]]], rounds: int) -> dict[str, Any]:
+    """Return the means before and after with paired differences, over houses of equal weight, as JSON values.
+
+    ``compared with`` names the memory from whose figures after learning those of the others are subtracted: ``none``,
+    or the first one where it is not among them.
 
     Args:
         rows: for each memory the results of every house.
@@ -123,19 +201,20 @@ def summarise(rows: dict[str, list[dict[str, Any]]], rounds: int) -> dict[str, A
         }
         for memory, results in rows.items()
     }
-    first = next(iter(figures.values()))
-    return {
+    reference = NO_MEMORY if NO_MEMORY in figures else next(iter(figures))
+    memories = {
         memory: {
             name: {
                 "before": before.to_json(),
                 "after": after.to_json(),
-                "after − before": difference(after, before),
-                "after − the first memory's": difference(after, first[name][1]),
+                CHANGE: difference(after, before),
+                ADVANTAGE: None if memory == reference else difference(after, figures[reference][name][1]),
             }
             for name, (before, after) in own.items()
         }
         for memory, own in figures.items()
     }
+    return {"compared with": reference, "memories": memories}
 
 
 def values(results: Sequence[dict[str, Any]], name: str, number: int) -> np.ndarray[Any, Any]:
@@ -143,26 +222,39 @@ def values(results: Sequence[dict[str, Any]], name: str, number: int) -> np.ndar
     return np.array([[[result["rounds"][number]["figures"][name] for result in results]]], dtype=np.float64)
 
 
-def table(results: dict[str, Any]) -> str:
+def table(results: Mapping[str, Any]) -> str:
     """Return the results as a Markdown table."""
+    plan, other = results["plan"], results["compared with"]
     lines = [
-        f"{results['houses']} houses, {results['rounds']} rounds; means over houses with 95 % intervals over houses.",
+        f"{results['houses']} houses, {results['rounds']} rounds; means over houses, in brackets 95 % intervals over "
+        f"houses, from {LEAST_UNITS} on. {'; '.join(f'{key}: {named(plan[key])}' for key in ('model', 'policy'))}.",
         "",
-        "| practice inside | figure | before | after | after − before |",
-        "|---|---|---|---|---|",
+        f"| practice inside | figure | before | after | after − before | after − after with {other} |",
+        "|---|---|---|---|---|---|",
     ]
     for memory, figures in results["memories"].items():
         for name, cell in figures.items():
-            change = cell["after − before"] or {}
-            ends = [change.get(key) for key in ("mean", "low", "high")]
-            text = "–" if ends[0] is None else f"{ends[0]:+.3f}"
-            text += "" if ends[1] is None else f" [{ends[1]:+.3f}, {ends[2]:+.3f}]"
-            lines.append(f"| {memory} | {name} | {cell['before']['mean']:.3f} | {cell['after']['mean']:.3f} | {text} |")
+            means = (figure_text(cell[when], "") for when in ("before", "after"))
+            changes = (figure_text(cell[what] or {}, "+") for what in (CHANGE, ADVANTAGE))
+            lines.append(f"| {memory} | {name} | {' | '.join([*means, *changes])} |")
     return "\n".join(lines) + "\n"
 
 
+def named(weights: Mapping[str, Any]) -> str:
+    """Return the place of a model or policy with the first digits of the hash of its weights."""
+    return f"{weights['path']} ({weights['fingerprint'][:SHOWN]})"
+
+
+def figure_text(figure: Mapping[str, Any], sign: str) -> str:
+    """Return a mean with its interval where there is one; ``sign`` is that of the format."""
+    mean, low, high = (figure.get(key) for key in ("mean", "low", "high"))
+    if mean is None:
+        return "–"
+    return f"{mean:{sign}.3f}" + ("" if low is None else f" [{low:{sign}.3f}, {high:{sign}.3f}]")
+
+
 def parse(arguments: Sequence[str]) -> Plan:
-    """Return the plan of a command line."""
+    """Return the plan of a command line; ``PersistError`` when nothing would be learned."""
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.learning", description=__doc__)
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/learning"))
     parser.add_argument("--model", default="reference", help="checkpoint of the world model")
@@ -175,6 +267,8 @@ def parse(arguments: Sequence[str]) -> Plan:
     parser.add_argument("--options", default="", help="further options of persist learn")
     given = parser.parse_args(arguments)
     memories = [name.strip() for name in given.memories.split(",") if name.strip()]
+    if not memories or min(given.houses, given.views, given.rounds) < 1:
+        raise PersistError("--memories, --houses, --views and --rounds must be at least one each")
     return Plan(
         given.out, given.model, given.policy, memories, given.houses, given.first, given.views, given.rounds,
         given.options,

@@ -14,21 +14,22 @@ from persist_cli.io.files import plain, read_json, write_json
 PLAN: Final = "plan.json"
 
 
-def keep_plan(out: Path, values: Mapping[str, Any]) -> None:
+def keep_plan(out: Path, values: Mapping[str, Any], results: str = "eval/**/metrics.json") -> None:
     """Write ``OUT/plan.json``, or check that what is there says the same.
 
     Args:
-        out: folder of the trials, with their figures in ``OUT/eval``.
+        out: folder of the trials.
         values: all that changes a figure, as JSON values.
+        results: pattern of files in it of which the plan tells what they are of.
 
     Raises:
-        PersistError: when the folder holds figures of another plan, or figures without a plan.
+        PersistError: when the folder holds results of another plan, or results without a plan.
     """
     path, now = out / PLAN, plain(values)
     if path.is_file():
         check_same(read_json(path), now, f"{out}: holds trials of another plan")
-    elif any(out.glob("eval/**/metrics.json")):
-        raise PersistError(f"{out}: holds figures but no {PLAN}, which says of what; choose another OUT or delete it")
+    elif any(out.glob(results)):
+        raise PersistError(f"{out}: holds results but no {PLAN}, which says of what; choose another OUT or delete it")
     out.mkdir(parents=True, exist_ok=True)
     write_json(path, now)
 

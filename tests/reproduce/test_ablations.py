@@ -169,5 +169,5 @@ def test_samples_and_recipes_may_be_added(begun):
 def test_figures_without_a_plan_are_not_taken_for_those_of_this_one(begun):
     plan, _ = begun
     (plan.out / "plan.json").unlink()
-    with pytest.raises(PersistError, match=r"holds figures but no plan.json"):
+    with pytest.raises(PersistError, match=r"holds results but no plan.json"):
         run_ablations(plan)
