@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from persist_cli.api.ground import GroundMap
+from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.policy import Goal, GoalKind
 from persist_cli.io.settings import NoSettings
 
@@ -50,6 +50,10 @@ class Cost(ABC):
     def missing(cls) -> str:
         """Say what must be fetched or installed before this cost can be used; empty when nothing is missing."""
         return ""
+
+    def of_body(self, body: Body) -> Cost:
+        """Return the cost of an agent with a body; the same unless the cost measures where the body fits."""
+        return self
 
     @abstractmethod
     def measure(self, futures: Futures, goal: Goal, ground: GroundMap) -> Float[Tensor, "candidate frame"]:

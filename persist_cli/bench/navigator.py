@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -108,12 +108,13 @@ class Navigator:
     def __init__(
         self, row: PlanningRow, parts: RowParts, settings: PlanSettings, scene: TrueScene, horizon: int
     ) -> None:
-        self.row, self.parts, self.settings = row, parts, settings
         self.info, self.seed = scene.info, scene.episode.seed
+        body = body_of(self.info)
+        cost = None if parts.cost is None else parts.cost.of_body(body)
+        self.row, self.parts, self.settings = row, replace(parts, cost=cost), settings
         self.seen = scene.look()
         walk = scene.walk() if row.walk else self.seen[:0]
         self.goal = retrieved(scene.goal, walk, parts.cost) if row.retrieves else told_goal(scene.goal, row)
-        body = body_of(self.info)
         self.ground = GroundMapper(self.info.world_up, body)
         self.world = make_world(parts, walk, self.seen, self.info, self.seed)
         self.ground.add(walk)

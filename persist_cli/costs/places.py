@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -37,16 +37,16 @@ class GeodesicSettings:
 
     Args:
         unknown: how many metres a metre over ground that was never seen counts; at least 1.
-        radius: metres of the agent's body.
+        radius: metres of the agent's body; ``None`` for what the data tell of it.
     """
 
     unknown: float = 2.0
-    radius: float = Body.radius
+    radius: float | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.unknown < float("inf"):
             raise ValueError(f"unknown {self.unknown:g} is a factor of metres; it must be at least 1")
-        if not 0 <= self.radius < float("inf"):
+        if self.radius is not None and not 0 <= self.radius < float("inf"):
             raise ValueError(f"radius {self.radius:g} m must not be negative")
 
 
@@ -69,6 +69,14 @@ class GeodesicCost(Cost):
         super().__init__(settings)
         self._last: tuple[GroundMap, Tensor, Distances] | None = None  # map, goal, and the distances to it
 
+    def of_body(self, body: Body) -> GeodesicCost:
+        """Return the cost with the body's radius, unless the settings have one."""
+        if self.settings.radius is not None:
+            return self
+        cost = GeodesicCost(replace(self.settings, radius=body.radius))
+        cost.name = self.name
+        return cost
+
     def measure(self, futures: Futures, goal: Goal, ground: GroundMap) -> Float[Tensor, "candidate frame"]:
         """Return the metres that are left from each frame; ``PersistError`` when the goal has no place."""
         places, there = ground_places(futures, goal, ground, self.name)
@@ -81,7 +89,8 @@ class GeodesicCost(Cost):
             if known is ground and torch.equal(there, goal) and holds(distances.ground, places):
                 return distances
         large = holding(ground, torch.cat([goal[None], places]), ROOM)
-        distances = distances_to(large, goal[None], self.settings.radius, self.settings.unknown)
+        radius = Body.radius if self.settings.radius is None else self.settings.radius
+        distances = distances_to(large, goal[None], radius, self.settings.unknown)
         self._last = ground, goal, distances
         return distances
 

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 import torch
 
 from persist_cli.api.actions import Action, ActionVocabulary
-from persist_cli.api.ground import Body, Cover
+from persist_cli.api.ground import Cover
 from persist_cli.api.policy import Policy, Situation
 from persist_cli.errors import PersistError
+from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.navigation.ways import way_is_free
 
 
@@ -76,12 +77,13 @@ class StraightPolicy(Policy):
     def _walk(self, situation: Situation, horizon: int, generator: torch.Generator) -> tuple[str, ...]:
         vocabulary, up = situation.info.vocabulary, torch.tensor(situation.info.world_up, dtype=torch.float64)
         ahead, turns = gait(vocabulary)
+        radius = body_of(situation.info).radius
         pose, side = situation.seen.cameras.world_from_camera[-1].double(), None
         names: list[str] = []
         for _ in range(horizon):
             moved = vocabulary.move(pose, ahead.name, up)
             start, end = situation.ground.places(torch.stack([pose[:3, 3], moved[:3, 3]]))[:, None]
-            if int(way_is_free(situation.ground, start, end, Body().radius)) != Cover.OCCUPIED:
+            if int(way_is_free(situation.ground, start, end, radius)) != Cover.OCCUPIED:
                 pose, side = moved, None
                 names.append(ahead.name)
                 continue

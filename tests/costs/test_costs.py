@@ -1,13 +1,14 @@
 """Costs on random weights, and on places that can be computed by hand."""
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from persist_cli.api.cost import Futures
-from persist_cli.api.ground import Cover, GroundMap, ground_axes
+from persist_cli.api.ground import Body, Cover, GroundMap, ground_axes
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
 from persist_cli.metrics import METRICS, dreamsim
@@ -123,6 +124,18 @@ def test_the_geodesic_cost_leads_round_a_wall_and_counts_unknown_ground_more():
     unseen = GroundMap(torch.zeros_like(ground.states), ground.origin, ground.spacing, ground.axes)
     over_unknown = make_cost("geodesic", {"unknown": 3.0}).measure(futures, goal, unseen)
     assert over_unknown[:, 0].tolist() == pytest.approx([6.0, 3.0], abs=0.3)
+
+
+def test_the_geodesic_cost_takes_the_radius_of_the_body_unless_it_has_its_own():
+    states = torch.full((40, 40), int(Cover.FREE), dtype=torch.uint8)
+    states[:18, 20] = states[22:, 20] = int(Cover.OCCUPIED)  # a gap of 0.4 m between walls
+    ground = GroundMap(states, (0.0, 0.0), 0.1, ground_axes((0.0, 0.0, 1.0)))
+    goal, futures = Goal(None, torch.tensor([3.0, 2.0, 1.2]), "room"), futures_at((1.0, 2.0, 1.2))
+    slim, wide = (make_cost("geodesic", {}).of_body(Body(radius)) for radius in (0.1, 0.4))
+    assert float(slim.measure(futures, goal, ground)) < 2.2
+    assert float(wide.measure(futures, goal, ground)) == math.inf
+    kept = make_cost("geodesic", {"radius": 0.1}).of_body(Body(0.4))
+    assert float(kept.measure(futures, goal, ground)) < 2.2
 
 
 def test_the_geodesic_cost_knows_places_off_the_map_and_ways_that_are_shut():

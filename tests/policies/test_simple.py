@@ -80,6 +80,15 @@ def test_straight_turns_before_a_wall_until_the_way_is_free():
         assert len(set(turns)) == 1
 
 
+def test_straight_keeps_the_body_that_the_data_tell_away_from_a_wall():
+    here = situation(wall_ahead(0.75))
+    wide = dataclasses.replace(here, info=dataclasses.replace(here.info, source={"radius": 0.45}))
+    first = [make_policy("straight", {}).propose(one, 1, 8, draw()) for one in (here, wide)]
+    assert first[0] == [("forward",)] * 8
+    second = make_policy("straight", {}).propose(wide, 2, 8, draw())
+    assert {way[1] for way in second} == {"left", "right"}  # the second step would bring it into the wall
+
+
 def test_a_moved_world_origin_does_not_change_where_straight_turns():
     here, move = situation(wall_ahead(0.75)), torch.tensor([0.5, 0.0, -1.5], dtype=torch.float64)
     poses = here.seen.cameras.world_from_camera.clone()
