@@ -61,6 +61,11 @@ class GroundMap:
         """Return world positions in metres as places on the ground axes, float64."""
         return (positions.double() @ self.axes.T)[..., :2]
 
+    def known_places(self) -> Float[Tensor, "square 2"]:
+        """Return the middles of all squares of which something is known, as places on the ground axes, float64."""
+        squares = (self.states != Cover.UNKNOWN).nonzero().flip(1)
+        return (squares + 0.5) * self.spacing + torch.tensor(self.origin, dtype=torch.float64)
+
     def at(self, places: Float[Tensor, "*batch 2"]) -> UInt8[Tensor, "*batch"]:
         """Return the ``Cover`` at places on the ground axes; ``UNKNOWN`` outside of the map."""
         rows, columns = self.states.shape

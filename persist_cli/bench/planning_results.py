@@ -140,6 +140,8 @@ def read_records(bench: PlanningBench) -> dict[str, list[dict[str, Any]]]:
         for row in bench.rows:
             records[row.name].append(record := bench.journal.read(row, episode))
             closed = record["closed"]
+            if closed is not None and not bench.cost.sees:
+                closed["figures"]["frames_per_decision"] = 0.0  # older persists counted what was judged by its pose
             if closed is not None and "start_metres" not in closed["figures"]:
                 scene = scene or TrueScene(bench.simulator, episode)
                 closed["figures"] |= measured_again(closed, scene)

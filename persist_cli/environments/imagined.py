@@ -22,7 +22,7 @@ from persist_cli.environments.goals import Goals, KnownGround, PosedFrames, find
 from persist_cli.environments.task import Attempt, TaskSettings, View
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.io.settings import parse_settings
-from persist_cli.navigation.ground_mapper import GroundMapper, body_of, tells_body
+from persist_cli.navigation.ground_mapper import GroundMapper, body_of, knows_floor
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
@@ -156,9 +156,9 @@ class ImaginedScenes(Scenes):
     def _map(self, settings: ImaginedSettings) -> GroundMap:
         """What is known of the ground: from the memory or the frames that it was made of, and the start frames.
 
-        Nothing is known where the height of the camera is not, since the floor itself could seem to be in the way.
+        Nothing is known where the height of the camera is not; see ``knows_floor``.
         """
-        if self.first.body is None and not tells_body(self.info):
+        if not knows_floor(self.info, self.first.body):
             return GroundMap.empty(self.info.world_up)
         body = body_of(self.info)
         mapper = GroundMapper(self.info.world_up, body)

@@ -62,6 +62,14 @@ def tells_body(info: TrajectoryInfo) -> bool:
     return "simulator" in info.source or "camera_height" in info.source
 
 
+def knows_floor(info: TrajectoryInfo, body: Body | None) -> bool:
+    """Return whether a map of the ground can be made: the data tell the camera's height, or the agent has a body.
+
+    Else nothing is known of the ground, since the floor itself could seem to be in the way.
+    """
+    return body is not None or tells_body(info)
+
+
 def body_of(info: TrajectoryInfo) -> Body:
     """Return the body of a trajectory's agent, with the camera height and radius that its source tells.
 

@@ -10,16 +10,18 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from persist_cli.api.ground import ground_axes
+from persist_cli.api.ground import GroundMap, ground_axes
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal
 from persist_cli.data.images import crop_resize, decode_rgb
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import DataError
+from persist_cli.rollout.world_model import Agent
 from persist_cli.viewing.console import warn
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 PLACE = re.compile(rf"^\s*{NUMBER}(?:\s*,\s*{NUMBER}){{1,2}}\s*$", re.IGNORECASE)
+FARTHEST = 50.0  # metres from all that is known to a place; ways so far over unknown ground take all memory
 FORMS = "an image file, a frame DATA#trajectory:frame, or a place x,y or x,y,z"
 
 
@@ -42,6 +44,30 @@ def read_goal(text: str, now: Observations, info: TrajectoryInfo) -> Goal:
     if "#" in text:
         return frame_goal(text, info)
     return Goal(fitted(image_of(text), info, text), None, info.scene)
+
+
+def check_near(text: str, goal: Goal, agent: Agent, ground: GroundMap) -> None:
+    """Raise ``DataError`` when a place is farther than ``FARTHEST`` from all that an agent knows.
+
+    Args:
+        text: the goal as the user wrote it.
+        goal: any goal; one without a place is never too far.
+        agent: knows where it stands and what its memory holds.
+        ground: what it knows to be free or occupied.
+    """
+    if goal.position is None:
+        return
+    here = agent.now.cameras.centers[-1:]
+    known = [ground.places(here.cpu()), ground.known_places()]
+    if agent.memory is not None:
+        known.append(ground.places(agent.memory.points().positions.cpu()))
+    metres = float((torch.cat(known) - ground.places(goal.position.cpu())).norm(dim=1).min())
+    if metres > FARTHEST:
+        x, y = ground.places(here.cpu())[0].tolist()
+        raise DataError(
+            f"--goal {text}: {metres:.0f} m from all that is known, which is too far to plan a way; name a place "
+            f"within {FARTHEST:g} m of it (the start is at {x:.1f},{y:.1f})"
+        )
 
 
 def place_of(numbers: list[float], now: Observations, info: TrajectoryInfo) -> Float[Tensor, " 3"]:

@@ -24,7 +24,7 @@ class Budget:
     """The most that a plan may take; ``None`` for no bound.
 
     Args:
-        frames: imagined frames, counted as actions of candidates.
+        frames: imagined frames, one for each action of a candidate; counted too where the cost looks at poses alone.
         seconds: of judging.
     """
 
@@ -74,7 +74,7 @@ class Judge:
         over: ``last`` judges the last frame of each candidate, ``best`` the one that costs least.
         budget: the most that may be spent; at least one batch is judged.
         batch: candidates imagined together.
-        on_batch: is told how many frames each batch imagined.
+        on_batch: is told how many actions each batch had.
     """
 
     model: FutureModel
@@ -86,10 +86,15 @@ class Judge:
     batch: int = 20
     on_batch: Callable[[int], object] | None = None
     judged: dict[tuple[str, ...], Candidate] = field(default_factory=dict, init=False)
-    frames: int = field(default=0, init=False)  # imagined so far
+    actions: int = field(default=0, init=False)  # judged so far
     seconds: float = field(default=0.0, init=False)  # spent so far
     exhausted: bool = field(default=False, init=False)  # whether candidates were left out for lack of budget
-    _rate: float = field(default=0.0, init=False)  # seconds a frame in the last batch
+    _rate: float = field(default=0.0, init=False)  # seconds an action in the last batch
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that were imagined so far: none for a cost that looks at poses alone."""
+        return self.actions if self.cost.sees else 0
 
     def judge(self, candidates: Sequence[Sequence[str]], number: int) -> list[Candidate]:
         """Return the judged candidates of a round, in their order, without those that the budget does not allow.
@@ -113,7 +118,7 @@ class Judge:
 
     def _allowed(self, candidates: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
         """Return as many of a batch's candidates as the budget allows."""
-        left = math.inf if self.budget.frames is None else self.budget.frames - self.frames
+        left = math.inf if self.budget.frames is None else self.budget.frames - self.actions
         if self.budget.seconds is not None and self._rate:
             left = min(left, (self.budget.seconds - self.seconds) / self._rate)
         allowed, spent = [], 0
@@ -137,11 +142,11 @@ class Judge:
         for row, names in enumerate(candidates):
             best = len(names) if self.over == "last" else min(int(frame[row]) + 1, len(names))
             self.judged[names] = Candidate(names, float(least[row]), best, imagined.walks[row], number)
-        frames, seconds = sum(map(len, candidates)), time.monotonic() - begun
-        self.frames, self.seconds = self.frames + frames, self.seconds + seconds
-        self._rate = seconds / max(frames, 1)
+        actions, seconds = sum(map(len, candidates)), time.monotonic() - begun
+        self.actions, self.seconds = self.actions + actions, self.seconds + seconds
+        self._rate = seconds / max(actions, 1)
         if self.on_batch is not None:
-            self.on_batch(frames)
+            self.on_batch(actions)
 
     def check(self, costs: Float[Tensor, "candidate frame"], candidates: Sequence[Sequence[str]]) -> None:
         """Raise ``PersistError`` when a cost is NaN, naming the first such candidate."""

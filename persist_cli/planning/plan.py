@@ -14,8 +14,9 @@ import torch
 from persist_cli.api.actions import format_actions
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.cost import Cost
+from persist_cli.api.ground import GroundMap
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.api.observations import Observations, Trajectory
+from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.data.cameras import unfamiliar_view
@@ -24,9 +25,9 @@ from persist_cli.errors import PersistError, hint
 from persist_cli.io.files import check_folder
 from persist_cli.io.settings import parse_settings
 from persist_cli.memorize.memory_config import plugin_settings
-from persist_cli.navigation.ground_mapper import body_of
+from persist_cli.navigation.ground_mapper import body_of, knows_floor
 from persist_cli.planning.futures import Over, WorldFutures
-from persist_cli.planning.goal import read_goal
+from persist_cli.planning.goal import check_near, read_goal
 from persist_cli.planning.judge import Budget, Judge, check_goal
 from persist_cli.planning.outputs import Planned, write_plan
 from persist_cli.planning.planners import Cem, CemSettings, OnRound, Plan, Rank, RankSettings, action_names
@@ -35,7 +36,7 @@ from persist_cli.policies.open_policy import open_policy
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.surroundings import Surroundings
-from persist_cli.rollout.world_model import WorldModel
+from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, warn
 
 METHODS = {"rank": RankSettings, "cem": CemSettings}
@@ -151,7 +152,7 @@ def plan_parts(options: PlanOptions) -> PlanParts:
     action_names(vocabulary, options.actions)
     goal = read_goal(options.goal, start.observations, start.info)
     name = options.cost or ("lpips" if goal.rgb is not None else "geodesic")
-    cost = make_cost(name, settings["cost"])
+    cost = make_cost(name, settings["cost"]).of_body(body_of(start.info))
     check_goal(goal, cost, policy)
     first = max(0, reference.frame + 1 - (policy.frames if policy is not None else 1))
     seen = file.read(range(first, reference.frame + 1)).observations
@@ -196,7 +197,8 @@ def open_model(checkpoint: Checkpoint, adapter: str | None, options: PlanOptions
 def make_plan(model: WorldModel, parts: PlanParts, options: PlanOptions) -> Planned:
     """Plan from the start frame, with a progress bar that shows each round's best cost."""
     agent, info = model.agents[0], parts.start.info
-    ground = Surroundings(body_of(info), agent.now, info, agent.memory).map()
+    ground = known_ground(agent, info)
+    check_near(options.goal, parts.goal, agent, ground)
     futures = WorldFutures(model, ground, agent.body)
     judge = Judge(futures, parts.cost, parts.goal, ground, parts.over, parts.budget, options.batch)
     situation = Situation(parts.seen, info, parts.goal, ground)
@@ -206,16 +208,24 @@ def make_plan(model: WorldModel, parts: PlanParts, options: PlanOptions) -> Plan
     return Planned(plan, parts.goal, parts.cost, ground, futures)
 
 
+def known_ground(agent: Agent, info: TrajectoryInfo) -> GroundMap:
+    """Return what an agent knows of the ground: nothing where nobody knows how far below its camera the floor lies."""
+    if not knows_floor(info, agent.body):
+        return GroundMap.empty(info.world_up)
+    return Surroundings(body_of(info), agent.now, info, agent.memory).map()
+
+
 @contextmanager
 def shown_progress(parts: PlanParts, judge: Judge) -> Iterator[OnRound]:
-    """Show within the block how many frames are imagined, and the best cost after each round."""
+    """Show within the block how many frames are imagined or poses judged, and the best cost after each round."""
     settings = parts.planner.settings
     total = settings.rounds * settings.candidates * settings.horizon
     if parts.budget.frames is not None:
         total = min(total, parts.budget.frames)
     with progress() as bar:
-        task = add_task(bar, "planning", total, "frames", f"round 1 of {settings.rounds}")
-        judge.on_batch = lambda frames: bar.update(task, advance=frames)
+        unit = "frames" if parts.cost.sees else "actions"
+        task = add_task(bar, "planning", total, unit, f"round 1 of {settings.rounds}")
+        judge.on_batch = lambda actions: bar.update(task, advance=actions)
 
         def on_round(number: int, cost: float) -> None:
             bar.update(task, note=f"round {number} of {settings.rounds}, best cost {cost:.4g}")
@@ -248,6 +258,9 @@ def describe(
         "policy": policy,
         "cost": {"name": parts.cost.name, "settings": dataclasses.asdict(parts.cost.settings), "over": options.over},
         "budget": dataclasses.asdict(parts.budget),
+        "step": options.step,
+        "turn": options.turn,
+        "batch": options.batch,
         "body": model.agents[0].body is not None,
         "seed": options.seed,
         "sampling": dataclasses.asdict(model.sampling),
@@ -277,9 +290,11 @@ def show(planned: Planned, record: dict[str, Any], out: Path) -> None:
     print_table(title, ["rank", "cost", "true cost", "round", "blocked", "actions"], rows)
     rounds = "1 round" if plan.rounds == 1 else f"{plan.rounds} rounds"
     say(f"chosen: {format_actions(plan.actions) or 'stay here'}")
+    what = f"{len(plan.candidates)} videos, {plan.frames} imagined frames"
+    if not planned.cost.sees:
+        what = f"{len(plan.candidates)} candidates of {plan.judged} actions, judged by their poses alone,"
     say(
-        f"{len(plan.candidates)} videos, {plan.frames} imagined frames in {plan.seconds:.1f} s "
-        f"({rounds}{', ended by the budget' if plan.exhausted else ''}), "
+        f"{what} in {plan.seconds:.1f} s ({rounds}{', ended by the budget' if plan.exhausted else ''}), "
         f"{planned.futures.model.sampling.words}; written to {out}"
     )
     unknown = record["truth"]["unknown"]

@@ -26,13 +26,15 @@ class Plan:
     Args:
         candidates: all that were judged, the first to be judged first.
         rounds: number of rounds begun.
-        frames: imagined frames.
+        judged: actions of all candidates together, which a budget of frames counts.
+        frames: imagined frames; none where the cost looks at poses alone.
         seconds: of judging.
         exhausted: whether the budget ended it.
     """
 
     candidates: list[Candidate]
     rounds: int
+    judged: int
     frames: int
     seconds: float
     exhausted: bool
@@ -300,4 +302,4 @@ def finished(judge: Judge, rounds: int) -> Plan:
     """Return the plan of all that was judged; a round for which no budget was left does not count."""
     candidates = list(judge.judged.values())
     begun = max(candidate.round for candidate in candidates) if judge.exhausted else rounds
-    return Plan(candidates, begun, judge.frames, judge.seconds, judge.exhausted)
+    return Plan(candidates, begun, judge.actions, judge.frames, judge.seconds, judge.exhausted)

@@ -1,14 +1,18 @@
 """``persist plan`` on micro models: what it leaves, and what it refuses."""
 
 import json
+import math
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from persist_cli.api.ground import ground_axes
 from persist_cli.viewing.video import read_video
 from tests.support.micro_runs import SIZE
 from tests.support.packages import install
+from tests.support.rooms import UP, Room, look
 
 SMALL = ("--steps", 1, "--candidates", 6, "--rounds", 2, "--horizon", 3)
 
@@ -64,6 +68,20 @@ def test_a_ranked_policy_towards_a_place_on_the_map(plan, tmp_path):
     assert record["goal"]["kinds"] == ["place"]
 
 
+def test_in_a_capture_ways_are_straight_as_nobody_knows_the_floor_that_could_be_in_the_way(plan, tmp_path):
+    (tmp_path / "low").mkdir()
+    low = Room(SIZE, SIZE).write(tmp_path / "low/low.parquet", np.stack([look((-2.0, 0.7, -0.5), -90.0)] * 2))
+    options = ("--cost", "geodesic", "--set", "cost.unknown=1", "--batch", 5, "--step", 0.2, "--turn", 30)
+    result = plan(*options, start=f"{low.parent}#0:0", goal="1.0,0.5")
+    assert result.code == 0, result.err
+    record = json.loads((tmp_path / "plan/plan.json").read_text())
+    for candidate in record["candidates"]:
+        place = ground_axes(UP) @ torch.tensor(candidate["final_pose"], dtype=torch.float64)[:3, 3]
+        straight = math.dist(place[:2].tolist(), (1.0, 0.5))
+        assert straight - 0.1 < candidate["cost"] < 1.1 * straight + 0.1
+    assert (record["step"], record["turn"], record["batch"]) == (0.2, 30.0, 5)
+
+
 def test_a_policy_sees_the_frames_before_the_start(plan, walks, site, tmp_path):
     counts = """
         from persist_cli.api.policy import Policy
@@ -85,7 +103,9 @@ def test_a_model_without_memory_plans_with_the_paths_alone_on_its_map(plan, tmp_
     result = plan("--cost", "distance", "--over", "best", "--adapter", "stage1", "--no-body", "--frames", 12)
     assert result.code == 0, result.err
     record = json.loads((tmp_path / "plan/plan.json").read_text())
-    assert (record["adapter"], record["imagined_frames"], record["ended_by_budget"]) == (None, 12, True)
+    assert (record["adapter"], record["judged_actions"], record["ended_by_budget"]) == (None, 12, True)
+    assert (record["imagined_videos"], record["imagined_frames"]) == (0, 0)
+    assert "4 candidates of 12 actions, judged by their poses alone, in" in result.out
     assert "ended by the budget" in result.out
     assert (tmp_path / "plan/map.png").stat().st_size > 0
 
@@ -138,6 +158,7 @@ def test_options_that_cannot_be_used_are_one_line_and_leave_nothing(plan, tmp_pa
         ("missing.png", (), "--goal missing.png: no such image; give an image file, a frame DATA#trajectory:frame"),
         ("{tmp}/text.png", (), "not a whole image"),
         ("1.0,2.0", ("--cost", "lpips"), "cost 'lpips' needs the image of the goal, which has none; give an image"),
+        ("300,0", (), "m from all that is known, which is too far to plan a way; name a place within 50 m of it (the"),
         ("{tmp}/goal.png", PLACE, "cost 'distance' needs the place of the goal, which has none; give a place"),
     ],
 )

@@ -14,6 +14,7 @@ from persist_cli.planning.futures import WorldFutures
 from persist_cli.planning.judge import Budget, Judge, check_goal
 from persist_cli.planning.planners import Cem, CemSettings, Rank, RankSettings, draw, frequencies
 from persist_cli.plugins import make_cost, make_policy
+from tests.support.pixel_cost import PixelCost
 
 AHEAD = ("forward",) * 4
 
@@ -54,9 +55,18 @@ def test_what_was_judged_is_not_imagined_again(judge):
     one = judge()
     first = one.judge([["left"], ["right"], ["left"]], 1)
     assert [candidate.actions for candidate in first] == [("left",), ("right",)]
-    assert one.frames == 2
+    assert one.actions == 2
     assert one.judge([["left"]], 2)[0].round == 1
-    assert one.frames == 2
+    assert one.actions == 2
+
+
+def test_frames_that_nobody_imagined_are_not_counted_but_use_up_a_budget(judge, situation):
+    one = judge(budget=Budget(8))
+    plan = Rank(make_policy("random", {}), RankSettings(4, 5)).plan(situation, one, seeded())
+    assert (plan.frames, plan.judged, plan.exhausted) == (0, 8, True)
+    pixels = dataclasses.replace(judge(), cost=PixelCost(None), goal=Goal(situation.seen.rgb[0], None, "room"))
+    plan = Rank(make_policy("random", {}), RankSettings(2, 1)).plan(situation, pixels, seeded())
+    assert (plan.frames, plan.judged) == (2, 2)
 
 
 def test_costs_do_not_depend_on_the_batch(judge):
@@ -96,7 +106,7 @@ def test_later_rounds_draw_what_the_elites_did(judge, situation):
         for number in (1, 2)
     ]
     assert means[1] < means[0]
-    assert plan.frames < 5 * 60 * 4  # as the distributions narrow, sequences come again
+    assert plan.judged < 5 * 60 * 4  # as the distributions narrow, sequences come again
 
 
 def test_a_policy_proposes_half_of_the_first_round(judge, situation):
@@ -151,7 +161,7 @@ def test_ranking_takes_the_proposal_of_least_cost(judge, situation):
 def test_a_budget_of_frames_is_kept_to_the_frame(judge, situation):
     plan = Cem(CemSettings(horizon=4, candidates=30, rounds=6)).plan(situation, judge(budget=Budget(50)), seeded())
     assert plan.exhausted
-    assert plan.frames == 48
+    assert plan.judged == 48
     with pytest.raises(PersistError, match="a budget of 3 frames does not suffice for one candidate of 4 actions"):
         Cem(CemSettings(horizon=4)).plan(situation, judge(budget=Budget(3)), seeded())
 
