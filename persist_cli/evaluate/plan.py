@@ -142,11 +142,7 @@ def prepare(
         plan = replace(plan, memories=default_memories(checkpoints))
     plan, loader = plan.without_repeats(), BackboneLoader(plan.placement)
     sampling = common_sampling(checkpoints, plan.sampling, plan.protocol)
-    config = RowConfig(
-        plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named, plan.training_seeds,
-        {memory: replace(sampling, **own.requested()) for memory, own in plan.sampling_of.items()},
-    )  # fmt: skip
-    config.check()
+    config = row_config(plan, sampling)
     check_choices(plan)
     protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
     with busy("loading the models"):
@@ -180,6 +176,16 @@ def prepare(
     clip_frames = bases.frames_per_clip - 1
     suites = [MetricSuite(metrics, make_setup(cases, row.has_depth, clip_frames)) for row in rows]
     return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
+
+
+def row_config(plan: EvalPlan, sampling: Sampling) -> RowConfig:
+    """Which rows are built and how they are sampled; raises ``PersistError`` for what cannot be."""
+    config = RowConfig(
+        plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named, plan.training_seeds,
+        {memory: replace(sampling, **own.requested()) for memory, own in plan.sampling_of.items()},
+    )  # fmt: skip
+    config.check()
+    return config
 
 
 def check_choices(plan: EvalPlan) -> None:
