@@ -23,6 +23,7 @@ from persist_cli.environments.task import Attempt, TaskSettings, View
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.io.settings import parse_settings
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of, knows_floor
+from persist_cli.navigation.routes import check_within_reach
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
@@ -97,8 +98,17 @@ class ImaginedScenes(Scenes):
         self.known = KnownGround(self._map(settings), body_of(info).radius, settings)
         free = Goals(self.known.free_places(self.starts.positions), info.scene, (info.height, info.width))
         self.goals = find_goals(settings.goal, free, settings.observe_goal)
+        if not isinstance(settings.goal, str):
+            self._check_place()
         self._agents = [self.first] * count
         self._goals = [0] * count
+
+    def _check_place(self) -> None:
+        """Raise ``DataError`` when the goal is a place farther away than ways are looked for."""
+        memory = self.first.memory
+        known = [self.starts.positions, *([] if memory is None else [memory.points().positions])]
+        name = f"goal {tuple(self.goals.positions[0].tolist())}"
+        check_within_reach(name, self.goals.positions[0], self.known.ground, known)
 
     def begin(self, number: int, draws: np.random.Generator, options: Mapping[str, Any]) -> Attempt:
         """Draw a start, a goal and the seed of the noise; there are no options."""

@@ -14,8 +14,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from persist_cli.api.ground import Cover, GroundMap
+from persist_cli.errors import DataError
 
 SNAP = 0.5  # metres from a place within which the nearest walkable square stands for it
+FARTHEST = 50.0  # metres from all that is known to a place; a search over so much unknown ground takes all memory
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # row and column of half of a square's neighbours
 
 
@@ -57,6 +59,27 @@ class Distances:
         metres = torch.full(inside.shape, math.inf, dtype=torch.float64)
         metres[inside] = self.metres[row[inside], column[inside]]
         return metres
+
+
+def check_within_reach(
+    name: str, position: Float[Tensor, " 3"], ground: GroundMap, known: Sequence[Float[Tensor, "_ 3"]]
+) -> None:
+    """Raise ``DataError`` when a place is farther than ``FARTHEST`` metres on the ground from all that is known.
+
+    Args:
+        name: of the place, in the error.
+        position: of the place, world metres.
+        ground: what is known to be free or occupied.
+        known: further positions that are known, world metres; the first is where an agent stands.
+    """
+    places = [ground.places(positions.cpu()) for positions in known]
+    metres = float((torch.cat([*places, ground.known_places()]) - ground.places(position.cpu())).norm(dim=1).min())
+    if metres > FARTHEST:
+        x, y = places[0][0].tolist()
+        raise DataError(
+            f"{name}: {metres:.0f} m from all that is known, which is too far to plan a way; name a place within "
+            f"{FARTHEST:g} m of it (the start is at {x:.1f},{y:.1f})"
+        )
 
 
 def walkable(ground: GroundMap, radius: float, unknown: bool = False) -> Bool[Tensor, "row column"]:

@@ -16,12 +16,12 @@ from persist_cli.api.policy import Goal
 from persist_cli.data.images import crop_resize, decode_rgb
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import DataError
+from persist_cli.navigation.routes import check_within_reach
 from persist_cli.rollout.world_model import Agent
 from persist_cli.viewing.console import warn
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 PLACE = re.compile(rf"^\s*{NUMBER}(?:\s*,\s*{NUMBER}){{1,2}}\s*$", re.IGNORECASE)
-FARTHEST = 50.0  # metres from all that is known to a place; ways so far over unknown ground take all memory
 FORMS = "an image file, a frame DATA#trajectory:frame, or a place x,y or x,y,z"
 
 
@@ -47,7 +47,7 @@ def read_goal(text: str, now: Observations, info: TrajectoryInfo) -> Goal:
 
 
 def check_near(text: str, goal: Goal, agent: Agent, ground: GroundMap) -> None:
-    """Raise ``DataError`` when a place is farther than ``FARTHEST`` from all that an agent knows.
+    """Raise ``DataError`` when a place is too far from all that an agent knows; see ``check_within_reach``.
 
     Args:
         text: the goal as the user wrote it.
@@ -55,19 +55,9 @@ def check_near(text: str, goal: Goal, agent: Agent, ground: GroundMap) -> None:
         agent: knows where it stands and what its memory holds.
         ground: what it knows to be free or occupied.
     """
-    if goal.position is None:
-        return
-    here = agent.now.cameras.centers[-1:]
-    known = [ground.places(here.cpu()), ground.known_places()]
-    if agent.memory is not None:
-        known.append(ground.places(agent.memory.points().positions.cpu()))
-    metres = float((torch.cat(known) - ground.places(goal.position.cpu())).norm(dim=1).min())
-    if metres > FARTHEST:
-        x, y = ground.places(here.cpu())[0].tolist()
-        raise DataError(
-            f"--goal {text}: {metres:.0f} m from all that is known, which is too far to plan a way; name a place "
-            f"within {FARTHEST:g} m of it (the start is at {x:.1f},{y:.1f})"
-        )
+    if goal.position is not None:
+        known = [agent.now.cameras.centers, *([] if agent.memory is None else [agent.memory.points().positions])]
+        check_within_reach(f"--goal {text}", goal.position, ground, known)
 
 
 def place_of(numbers: list[float], now: Observations, info: TrajectoryInfo) -> Float[Tensor, " 3"]:

@@ -171,6 +171,10 @@ def test_settings_that_do_not_go_together_are_one_line(settings, walks, tmp_path
         ({"goal": f"{walks}#1:0"}, "is of scene 'room-1', and the start of 'room-0'"),
         ({"memory": f"{walks}#1:0-6"}, "is of scene 'room-1', and the start of 'room-0'"),
         ({"goal": [0.0, 1.3, 0.0]}, "a place has no image; give observe_goal='place'"),
+        (
+            {"goal": [0.0, 1.3, 200.0], "observe_goal": "place"},
+            r"\(0.0, 1.3, 200.0\): \d+ m from all that is known",
+        ),
         ({"goal": str(picture)}, "an image does not say where it was taken"),
         ({"goal": "random", "observe_goal": "place"}, "no free ground is known"),  # the room tells no height
         ({"adapter": "stage1"}, "without a memory adapter it cannot read"),
