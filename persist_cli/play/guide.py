@@ -155,6 +155,9 @@ class Guide:
         views = world.branches(len(poses))
         length = views.clip_frames - 1
         ways = [now.at(pose.expand(length, 4, 4)) for pose in poses]
+        agent = views.agents[0]
+        if agent.memory is not None:  # a copy that the views share: one house for all, imagined once
+            agent.memory.foresee([views.clip_path(agent, way) for way in ways])
         clips = views.recall(range(len(ways)), ways, [(None,) * length] * len(ways))
         rgb, depth = views.denoise_frame(clips, [length] * len(ways))
         free = torch.ones(len(ways), 1, dtype=torch.bool)

@@ -17,6 +17,7 @@ from tests.play.test_collisions import FORWARD, LEFT, play_in_room
 from tests.support.pixel_cost import PixelCost
 from tests.support.room_worlds import room_views, room_world
 from tests.support.rooms import UP, look
+from tests.support.scene_worlds import unseen_world
 
 
 def guided(play: Play, monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
@@ -110,3 +111,13 @@ def test_a_plan_without_a_goal_is_refused():
     play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
     with pytest.raises(PersistError, match="there is no goal picture yet"):
         play.plan()
+
+
+def test_a_planner_in_a_scene_compares_places_of_one_house_and_leaves_the_scene_as_it_was():
+    world, scene = unseen_world(size=32)
+    before, model = scene.cells, scene.model()
+    model.windows = 0
+    guide = Guide(Goal(world.agents[0].now.rgb[0], None, "room"), PixelCost(None), 0)
+    assert [guide.decide(world) for _ in range(2)] == [None, None]  # two parts of a decision, six places each
+    assert scene.cells is before
+    assert 0 < model.windows < 6

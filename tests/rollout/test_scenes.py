@@ -3,15 +3,12 @@
 import pytest
 import torch
 
-from persist_cli.api.cells import FREE, Box, CellOrigin
-from persist_cli.api.scene_model import Given
+from persist_cli.api.cells import CellOrigin
 from persist_cli.rollout.world_model import Agent
 from tests.support.cell_rooms import BOX_CELLS, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
-from tests.support.room_views import observe
 from tests.support.room_worlds import BODY
-from tests.support.rooms import look
-from tests.support.scene_worlds import scene_world
+from tests.support.scene_worlds import scene_world, unseen_world
 
 BEFORE_BOX = (4, 4, 5), (9, 4, 5)  # 1.25 m before the box, level
 
@@ -59,31 +56,6 @@ def test_in_a_branch_an_interaction_changes_its_own_scene_alone():
     held = [agent.scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any() for agent in branches.agents]
     assert [bool(one) for one in held] == [False, True]
     assert bool(scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any())
-
-
-class FewWalls(DrawnWalls):
-    """Unknown cells are free but for a few walls by the seed, in a colour by place, so that windows differ."""
-
-    def sample(self, samples, steps):
-        classes, colors = samples.classes.clone(), samples.colors.clone()
-        walls = torch.rand(classes.shape[1:3], generator=torch.Generator().manual_seed(int(samples.seeds[0]))) < 0.03
-        drawn = torch.where(walls, WALL, FREE)[None, ..., None].expand(classes.shape).to(classes.dtype)
-        unknown = samples.given == Given.NOTHING
-        classes[unknown], colors[unknown] = drawn[unknown], 150
-        return classes, colors
-
-
-def unseen_world(write=True):
-    """A world whose agent comes to see what its scene must imagine, and that scene."""
-    scene = empty_scene(FewWalls(), foresight=3.0)
-    scene.complete(Box((-1.9, 0, -1.9), (1.9, 2.7, 1.9)), seed=5)
-    world = scene_world(scene, look_camera())
-    world.agents[0].write = write
-    return world, world.agents[0].scene
-
-
-def look_camera():
-    return observe([look((0.0, 1.3, 0.0), 20.0, -10.0)], 64, 64).cameras
 
 
 def test_a_branch_of_a_scene_imagines_the_same_whatever_the_others_do():

@@ -412,7 +412,10 @@ class GridScene(Scene):
     def _foresee(self, path: Cameras) -> None:
         """Imagine windows around the cameras of a path until none sees an unknown cell."""
         imagination = self._imagination()
-        for number in range(len(path)):
+        _, [places] = distinct_cameras([path])
+        for number, place in enumerate(places.tolist()):
+            if place in places[:number]:  # a clip repeats its last camera
+                continue
             camera = path[number : number + 1]
             corner = imagination.around(self._number_at(camera.centers[0]))
             window = self._store.box.box(corner, imagination.model.form.shape)
