@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from persist_cli.api.checkpoint import reference_checkpoint
+from persist_cli.api.checkpoint import PLAIN, reference_checkpoint
 from persist_cli.data.reference import data_folder
 from persist_cli.evaluate.aggregate import Table, row_results
 from persist_cli.evaluate.cases import Case, cases_json, counts
@@ -24,6 +24,7 @@ from persist_cli.evaluate.report.result_file import check_results
 from persist_cli.evaluate.report.scrutiny import scrutiny_json
 from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
+from persist_cli.evaluate.rows.model_rows import ModelRow
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
 from persist_cli.evaluate.windows import SHOWN, window_bounds
 from persist_cli.io.command_line import running_command
@@ -99,6 +100,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
             "sampler": run.sampling.sampler,
             "memory_guidance": run.sampling.memory_guidance,
             "context_noise": run.sampling.context_noise,
+            "sampling_of": own_samplings(run),
             "seeds": list(range(run.plan.seeds)),
             "batch": run.plan.batch,
         }
@@ -134,6 +136,12 @@ def splits_of(cases: Sequence[Case], folder: str) -> dict[str, str]:
     """The split of each trajectory of a folder that the cases use, where the data says it."""
     infos = {case.trajectory: case.file.info for case in cases if case.data == folder}
     return {name: str(info.source["split"]) for name, info in infos.items() if info.source.get("split")}
+
+
+def own_samplings(run: Evaluation) -> dict[str, dict[str, Any]]:
+    """The sampling of each memory whose rows are sampled in another way than the others, as JSON values."""
+    rows = [row for row in run.rows if isinstance(row, ModelRow) and row.sampling != run.sampling]
+    return {row.adapter or PLAIN: dataclasses.asdict(row.sampling) for row in rows}
 
 
 def sampling_origin(run: Evaluation) -> str:

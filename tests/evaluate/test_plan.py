@@ -166,6 +166,11 @@ def test_one_memory_may_be_sampled_in_its_own_way(persist, held_out, tmp_path):
     rows = read_json(tmp_path / "own/metrics.json")["tables"][0]["rows"]
     assert rows["voxel"]["definition"].endswith("; 2 steps of ddim with guidance 1.5")
     assert "steps" not in rows["stage1"]["definition"]
+    assert list(read_json(tmp_path / "own/metrics.json")["sampling"]["sampling_of"]) == ["voxel"]
+    told = (tmp_path / "own/tables.md").read_text()
+    assert "models were sampled with 1 step of ddim unless the row says otherwise" in told
+    assert "voxel was sampled with 2 steps of ddim, guidance over memory 1.5" in told
+    assert "all models were sampled with 1 step of ddim," in (tmp_path / "same/tables.md").read_text()
     assert "holds another evaluation" in refused(persist, *asked, "--out", tmp_path / "own")
 
 

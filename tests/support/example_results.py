@@ -88,7 +88,7 @@ def example_results(clips: int = 6, frames: int = 9, rows: dict[str, str] = ROWS
     table = {name: row(name, kind, gains[name], clips, frames) for name, kind in rows.items()}
     return {
         "format": "persist-evaluation", "version": 1, "measured": measured(clips, frames, metrics),
-        "sampling": {"steps": 50, "sampler": "ddim", "seeds": [0, 1, 2], "batch": 8},
+        "sampling": {"steps": 50, "sampler": "ddim", "sampling_of": {}, "seeds": [0, 1, 2], "batch": 8},
         "environment": {"persist": "0.3.0", "python": "3.11.2", "torch": "2.13.0", "platform": "Linux", "device": "cpu",
                         "packages": {"diffusers": "0.42.1", "numpy": "2.4.6"}, "processes": 2},
         "command": ["persist", "eval", "runs/voxel", "--data", "runs/houses test", "--memories", "none,voxel"],

@@ -31,7 +31,7 @@ def differing_notes(a: EvalResults, b: EvalResults) -> list[str]:
     prints_a, prints_b = _fingerprints(a), _fingerprints(b)
     rows_a, rows_b = _definitions(a), _definitions(b)
     return [
-        *_unequal_items("", a.sampling.model_dump(exclude={"batch"}), b.sampling.model_dump(exclude={"batch"})),
+        *_unequal_items("", _sampling(a), _sampling(b)),
         *_unequal_items("", _versions(a), _versions(b)),
         *_unequal("checkpoints", ", ".join(prints_a) or "none", ", ".join(prints_b) or "none"),
         *_unequal_items("checkpoint ", prints_a, prints_b, common=True),
@@ -133,6 +133,11 @@ def _weighted_columns(results: EvalResults) -> dict[str, bool]:
 
 def _fingerprints(results: EvalResults) -> dict[str, str]:
     return {checkpoint.name: checkpoint.fingerprint[:DIGEST_LENGTH] for checkpoint in results.checkpoints}
+
+
+def _sampling(results: EvalResults) -> dict[str, Any]:
+    """The sampling of all rows; where some have one of their own, their definitions say it."""
+    return results.sampling.model_dump(exclude={"batch", "sampling_of"})
 
 
 def _definitions(results: EvalResults) -> dict[str, str]:

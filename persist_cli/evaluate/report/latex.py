@@ -11,6 +11,7 @@ from persist_cli.evaluate.report.remarks import (
     drawn_units,
     left_out_line,
     new_poses_line,
+    other_samplings,
     sampling_line,
     too_few_lines,
     without_command,
@@ -97,7 +98,7 @@ def _caption(results: EvalResults, table: CompactTable) -> str:
     clips += f", {counted(view.units, 'scenes')}" * (view.unit == "scenes")
     notes = [f"({number}) {without_command(note)}" for number, note in view.notes.items()]
     deviation = f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "one sampling seed"
-    sampled = f"; {sampling_line(results)}" if sampling_line(results) else ""
+    sampled = "".join(f"; {line}" for line in (sampling_line(results), *other_samplings(results)) if line)
     text = f"{protocol.title or protocol.name}{domain}: {clips}; {deviation}{sampled}"
     return escape(" ".join(f"{sentence}." for sentence in [text, *notes]))
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from persist_cli.api.checkpoint import name_ranges, run_folder
-from persist_cli.evaluate.report.result_file import CheckpointRecord, EvalResults
+from persist_cli.evaluate.report.result_file import CheckpointRecord, EvalResults, SamplingSettings
 from persist_cli.evaluate.report.tables import MARK, CompactTable, TableView, compact_tables
 from persist_cli.evaluate.statistics import LEAST_MODELS, LEAST_UNITS
 
@@ -36,10 +36,25 @@ def seed_legend(results: EvalResults) -> str:
 
 
 def sampling_line(results: EvalResults) -> str:
-    """How the models' clips were sampled in this protocol; empty when the results do not say."""
+    """How the models' clips were sampled in this protocol; empty when the results do not say.
+
+    Results of earlier versions do not say here whether some rows were sampled otherwise, so the line leaves it open.
+    """
     sampling = results.sampling
     if not sampling.steps:
         return ""
+    return f"{_sampled(sampling)}{'' if sampling.sampling_of == {} else ' unless the row says otherwise'}"
+
+
+def other_samplings(results: EvalResults) -> list[str]:
+    """Each memory whose rows were sampled in another way than ``sampling_line`` says, and in which."""
+    own = results.sampling.sampling_of or {}
+    return [f"{memory} was sampled with {_sampled(sampling)}" for memory, sampling in own.items()]
+
+
+def _sampled(sampling: SamplingSettings) -> str:
+    if not sampling.steps:
+        return "unknown steps"
     guidance = "" if sampling.memory_guidance in (None, 1.0) else f", guidance over memory {sampling.memory_guidance:g}"
     noise = f", declared context noise {sampling.context_noise:g}" if sampling.context_noise else ""
     return f"{counted(sampling.steps, 'steps')} of {sampling.sampler}{guidance}{noise}"

@@ -253,14 +253,24 @@ class CheckpointRecord(ResultModel):
     chosen_on: str | None = None
 
 
-class SamplingRecord(ResultModel):
-    """The sampling of every row of a model, and who chose it."""
+class SamplingSettings(ResultModel):
+    """How clips were sampled."""
 
-    chosen: str = ""
     steps: int | None = None
     sampler: str | None = None
     memory_guidance: float | None = None
     context_noise: float = 0.0
+
+
+class SamplingRecord(SamplingSettings):
+    """The sampling of the rows of models, and who chose it.
+
+    ``sampling_of`` has that of the memories whose rows are sampled in another way. Results of earlier versions, where
+    it is ``None``, say it in the rows' definitions alone.
+    """
+
+    chosen: str = ""
+    sampling_of: dict[str, SamplingSettings] | None = None
     dtype: str | None = None
     tiling: bool = False
     seeds: list[int] = []

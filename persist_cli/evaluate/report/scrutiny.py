@@ -11,6 +11,7 @@ from persist_cli.evaluate.report.remarks import (
     contamination_lines,
     counted,
     new_poses_line,
+    other_samplings,
     sampling_line,
     training_seed_line,
     unknown_scenes_lines,
@@ -111,7 +112,9 @@ def _choices(results: EvalResults) -> Answer:
     sampled = sampling_line(results)
     if not sampled:
         return Answer("What was chosen, and on which data?", ())
-    lines = [f"all models were sampled with {sampled}, {results.sampling.chosen or 'of unknown origin'}"]
+    everyone = "all models" if results.sampling.sampling_of == {} else "models"
+    lines = [f"{everyone} were sampled with {sampled}, {results.sampling.chosen or 'of unknown origin'}"]
+    lines += other_samplings(results)
     lines += [f"{record.name}: {record.chosen_on}" for record in results.checkpoints if record.chosen_on]
     unknown = [record.name for record in results.checkpoints if not record.chosen_on]
     if unknown:

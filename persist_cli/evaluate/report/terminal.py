@@ -15,6 +15,7 @@ from persist_cli.evaluate.report.remarks import (
     difference_legend,
     left_out_line,
     new_poses_line,
+    other_samplings,
     sampling_line,
     too_few_lines,
     training_seed_line,
@@ -103,6 +104,7 @@ def lines_below(results: EvalResults, table: TerminalTable) -> list[str]:
         *(f"{mark}: {note}" for number, note in sorted(notes.items()) if (mark := f"n/a ({number})") in shown),
         *([left_out] if left_out else []),
         *([reads_line(results)] if reads_line(results) else []),
+        *other_samplings(results),
         *([seeds] if (seeds := training_seed_line(results)) else []),
         *(f"warning: {line}" for line in contamination_lines(results)),
     ]

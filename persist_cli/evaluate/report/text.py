@@ -13,6 +13,7 @@ from persist_cli.evaluate.report.remarks import (
     figure_legend,
     left_out_line,
     new_poses_line,
+    other_samplings,
     sampling_line,
     too_few_lines,
     training_seed_line,
@@ -32,6 +33,7 @@ def table_text(results: Mapping[str, Any] | EvalResults) -> str:
     blocks += [f"**Warning:** {_plain(line)}" for line in contamination_lines(checked)]
     sampled = sampling_line(checked)
     blocks += [_plain(f"{checked.measured.protocol.name} was sampled with {sampled}.")] if sampled else []
+    blocks += [_plain(f"{line}.") for line in other_samplings(checked)]
     legends = dict.fromkeys(figure_legend(checked, table) for table in compact_tables(checked))
     blocks += [_plain(legend) for legend in legends]
     for name, rows, columns, cell_text in _text_tables(checked):

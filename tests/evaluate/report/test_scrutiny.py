@@ -6,6 +6,7 @@ from persist_cli.evaluate.report.page import write_report
 from persist_cli.evaluate.report.pictures import Pictures
 from persist_cli.evaluate.report.result_file import check_results
 from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
+from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.windows import window_bounds
 from tests.support.example_results import example_results
@@ -112,3 +113,22 @@ def test_windows_of_results_that_do_not_say_their_frames_are_numbered():
     voxel(results)["windows"] = {"psnr": [21.0, 18.5, 17.0]}
     (table,) = windows_tables(check_results(results, "example"))
     assert table[1] == ["row", "window 1", "window 2", "window 3"]
+
+
+def test_every_form_of_the_results_names_the_memories_that_were_sampled_otherwise(tmp_path, capsys):
+    results = example_results()
+    results["sampling"]["sampling_of"] = {"voxel": {"steps": 10, "sampler": "unipc", "memory_guidance": 2.0}}
+    write_report(results, Pictures(), tmp_path)
+    print_results(results)
+    pages = [(tmp_path / name).read_text() for name in ("report.html", "table.tex", "table.md")]
+    for text in (*pages, capsys.readouterr().out):
+        words = " ".join(text.split())
+        assert "50 steps of ddim unless the row says otherwise" in words
+        assert "voxel was sampled with 10 steps of unipc, guidance over memory 2" in words
+        assert "all models were sampled" not in words
+
+
+def test_results_of_an_earlier_version_do_not_claim_that_all_rows_were_sampled_alike():
+    known = answers(lambda results: results["sampling"].pop("sampling_of"))["What was chosen, and on which data?"]
+    assert known.lines[0].startswith("models were sampled with 50 steps of ddim unless the row says otherwise, of")
+    assert answers()["What was chosen, and on which data?"].lines[0].startswith("all models were sampled with")
