@@ -77,7 +77,8 @@ class EpisodeSource:
         """
         if self.file is None:
             return {"scenes": asdict(self.scenes), "search": asdict(self.search)}
-        values = read_episodes(self.file).chosen(self.bins).model_dump(mode="json")
+        # without what the file leaves unset, so that a later persist knows the episodes of an earlier one again
+        values = read_episodes(self.file).chosen(self.bins).model_dump(mode="json", exclude_unset=True)
         return {"sha256": hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()}
 
     def episodes(self) -> EpisodeSet:

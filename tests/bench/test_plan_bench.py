@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Cover
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
-from persist_cli.bench.plan_bench import check_scenes, trained_on
+from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, trained_on
 from persist_cli.bench.planning_pictures import end_words
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
@@ -122,6 +123,16 @@ def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     refused = bench(*options, "--rows", "random", "--horizon", 5)
     assert refused.code == 1
     assert "holds another benchmark (planning horizon: 8, now 5)" in refused.err
+
+
+def test_a_file_of_episodes_is_known_by_what_it_holds_whatever_a_later_persist_adds(
+    episodes: EpisodeSet, tmp_path: Path
+) -> None:
+    file, held = tmp_path / "episodes.json", episodes.model_dump(mode="json")
+    del held["goal_gap"]  # came later
+    file.write_text(json.dumps(held))
+    digest = hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest()
+    assert EpisodeSource.of(file, "0:1", None, 1).identity() == {"sha256": digest}
 
 
 def test_rows_with_a_model_can_be_added_to_a_benchmark_begun_without_one(bench: Bench, voxel: Path) -> None:
