@@ -69,16 +69,19 @@ class EpisodeSource:
             file, CollectPlan("miniworld", scenes, split="test"), search, None if bins is None else tuple(bins)
         )
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self, unset: bool = False) -> dict[str, Any]:
         """Return JSON values that are equal for equal episodes.
+
+        Args:
+            unset: whether what the file leaves unset counts, too, as in benchmarks that an older persist began. Without
+                it a later persist knows the episodes of an earlier one again.
 
         Raises:
             DataError: when the file is missing or damaged.
         """
         if self.file is None:
             return {"scenes": asdict(self.scenes), "search": asdict(self.search)}
-        # without what the file leaves unset, so that a later persist knows the episodes of an earlier one again
-        values = read_episodes(self.file).chosen(self.bins).model_dump(mode="json", exclude_unset=True)
+        values = read_episodes(self.file).chosen(self.bins).model_dump(mode="json", exclude_unset=not unset)
         return {"sha256": hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()}
 
     def episodes(self) -> EpisodeSet:
@@ -184,11 +187,13 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     journal = PlanningJournal(out)
     if processes.main:
         values = identity(plan, cost, checkpoint)
+        if journal.begun and journal.identity()["episodes"] == plan.source.identity(unset=True):
+            values["episodes"] = journal.identity()["episodes"]
         journal.check(values)
         episodes = journal.episodes() if journal.begun else plan.source.episodes()
         if checkpoint is not None:
             check_model(checkpoint, rows, episodes)
-        if not journal.begun or (checkpoint is not None and not journal.names_model()):
+        if not journal.begun or (checkpoint is not None and not journal.identity().get("checkpoint")):
             check_scenes(episodes, trained_on(checkpoint, plan.policy), plan.allow_training_scenes)
         journal.begin(values, episodes)
     processes.wait()

@@ -45,14 +45,14 @@ class PlanningJournal:
     def check(self, identity: dict[str, Any]) -> None:
         """Raise ``PersistError`` when the folder holds another benchmark than this one."""
         if self.begun:
-            earlier = read_json(self.parts / IDENTITY)
+            earlier = self.identity()
             both = completed(earlier, identity), completed(identity, earlier)
             check_same(*both, f"{self.out}: holds another benchmark")
         remove_leftovers(self.parts)
 
-    def names_model(self) -> bool:
-        """Whether the benchmark that was begun has a world model already."""
-        return read_json(self.parts / IDENTITY).get("checkpoint") is not None
+    def identity(self) -> dict[str, Any]:
+        """What the rows of the benchmark that was begun share."""
+        return dict(read_json(self.parts / IDENTITY))
 
     def begin(self, identity: dict[str, Any], episodes: EpisodeSet) -> None:
         """Keep what is measured, on which episodes; the world model of a benchmark that had none is added."""
@@ -60,7 +60,7 @@ class PlanningJournal:
             episodes.write(self.out / EPISODES)
             write_json(self.parts / IDENTITY, identity)
             return
-        earlier = read_json(self.parts / IDENTITY)
+        earlier = self.identity()
         if completed(earlier, identity) != earlier:
             write_json(self.parts / IDENTITY, completed(earlier, identity))
 

@@ -135,6 +135,23 @@ def test_a_file_of_episodes_is_known_by_what_it_holds_whatever_a_later_persist_a
     assert EpisodeSource.of(file, "0:1", None, 1).identity() == {"sha256": digest}
 
 
+def test_a_benchmark_that_named_its_episodes_with_what_the_file_leaves_unset_goes_on(
+    bench: Bench, tmp_path: Path
+) -> None:
+    file, options = tmp_path / "episodes.json", ("--cost", "distance", "--loops", "closed", "--rows", "straight")
+    held = json.loads(file.read_text())
+    del held["goal_gap"]
+    file.write_text(json.dumps(held))
+    assert bench(*options, "--patience", 1).code == 0
+    plan = tmp_path / "bench/parts/plan.json"
+    source, values = EpisodeSource.of(file, "0:1", None, 1), json.loads(plan.read_text())
+    assert values["episodes"] == source.identity() != source.identity(unset=True)
+    plan.write_text(json.dumps(values | {"episodes": source.identity(unset=True)}))
+    assert bench(*options, "--patience", 1).code == 0
+    file.write_text(json.dumps(held | {"goal_gap": 1.0}))
+    assert "holds another benchmark (episodes sha256" in bench(*options, "--patience", 1).err
+
+
 def test_rows_with_a_model_can_be_added_to_a_benchmark_begun_without_one(bench: Bench, voxel: Path) -> None:
     options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--memories", "none")
     assert bench(*options, "--rows", "random").code == 0
