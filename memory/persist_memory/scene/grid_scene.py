@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, Self
+from dataclasses import replace
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from persist_cli.api.actions import Action
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cell_rays import first_surfaces, sheet_cells
-from persist_cli.api.cells import COMMON, SOLID, Box, CellForm, CellGrid, CellOrigin
+from persist_cli.api.cells import SOLID, Box, CellForm, CellGrid, CellOrigin
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.geometry import camera_rays
 from persist_cli.api.ground import Body, ground_axes
@@ -41,53 +40,8 @@ from persist_memory.scene.imagination import (
     windows_over,
 )
 from persist_memory.scene.interaction import LOAD, Load, Reached, changed_cells, reached_box, read_load
+from persist_memory.scene.settings import GridSceneSettings
 from persist_memory.validation import check_mergeable, check_observations
-
-
-@dataclass(frozen=True)
-class GridSceneSettings:
-    """The cells of a scene, how they are read, and what imagines the unknown ones.
-
-    Args:
-        size: edge of a cell in metres.
-        palette: names of the classes, the first three free, solid and outside; a scene model has its own.
-        floor: height of the floor in metres along up. The windows of a scene model begin there.
-        farthest: metres of depth beyond which what frames show is not believed.
-        layers: surfaces along each ray that a read returns, one behind the other.
-        stride: pixels from ray to ray of a read; it is larger where the first surfaces are more than the budget.
-        unknown: whether rays of a read go through cells of which nothing is known, or end there.
-        writes_imagined: whether frames that a video model imagined fill unknown cells; they are renderings of the
-            scene, so by default it takes nothing from them.
-        model: folder of the scene model that imagines unknown cells; none without one.
-        steps: denoising steps of the scene model.
-        seed: seed of what is imagined while an agent walks.
-        foresight: metres of depth up to which what an agent will see is imagined before it looks.
-        evolution: whether things are picked up, dropped and toggled by rules, or as the scene model says.
-        carries: metres along each axis of the largest thing that can be picked up.
-        toggles: classes of the things that can be toggled.
-    """
-
-    size: PositiveFloat = 0.25
-    palette: tuple[str, ...] = COMMON
-    floor: float = 0.0
-    farthest: PositiveFloat = 10.0
-    layers: PositiveInt = 2
-    stride: PositiveInt = 1
-    unknown: Literal["clear", "ends"] = "clear"
-    writes_imagined: bool = False
-    model: str | None = None
-    steps: PositiveInt = 10
-    seed: NonNegativeInt = 0
-    foresight: NonNegativeFloat = 8.0
-    evolution: Literal["rules", "model"] = "rules"
-    carries: PositiveFloat = 0.75
-    toggles: tuple[str, ...] = ("solid", "box")
-
-    def __post_init__(self) -> None:
-        if self.palette[: len(COMMON)] != COMMON or len(set(self.palette)) < len(self.palette):
-            raise ValueError(f"palette must begin with {', '.join(COMMON)} and name no class twice")
-        if len(self.palette) > 256:
-            raise ValueError(f"palette has {len(self.palette)} classes; a cell can have 256")
 
 
 class GridScene(Scene):
