@@ -173,7 +173,7 @@ class Session:
                     await self.socket.send_bytes(message)
                 else:
                     await self.socket.send_text(message.to_json())
-        except TimeoutError as error:
+        except (TimeoutError, RuntimeError) as error:  # uvicorn raises the latter when it closed the socket itself
             raise WebSocketDisconnect(GOING_AWAY) from error
 
     async def _say_why(self, errors: Iterable[BaseException | None]) -> None:
@@ -190,7 +190,7 @@ class Session:
             async with asyncio.timeout(CLOSE_SECONDS):
                 await self.socket.send_text(messages.Error(text=one_line(text), ended=True).to_json())
                 await self.socket.close(code)
-        except (WebSocketDisconnect, WebSocketDisconnected, TimeoutError):
+        except (WebSocketDisconnect, WebSocketDisconnected, TimeoutError, RuntimeError):
             return
 
 
