@@ -222,10 +222,15 @@ class Table:
         first = differences.get(next(iter(figures)))
         return figure.to_json() | {"difference": first, "differences": differences}
 
+    @cached_property
+    def own_obstacles(self) -> dict[bool, dict[str, str]]:
+        """Reasons why metrics cannot be measured of these clips alone, by whether a row gives depth and by name."""
+        setups = {depth: make_setup(self.cases, depth, self.run.clip_frames) for depth in (True, False)}
+        return {depth: MetricSuite(self.run.metrics, setup).obstacles for depth, setup in setups.items()}
+
     def obstacles(self, results: RowResults) -> dict[str, str]:
         """Reasons why metrics cannot be measured of a row, or of the clips of this table alone, by name."""
-        setup = make_setup(self.cases, results.suite.setup.generated_depth, self.run.clip_frames)
-        return MetricSuite(self.run.metrics, setup).obstacles | results.suite.obstacles
+        return self.own_obstacles[results.suite.setup.generated_depth] | results.suite.obstacles
 
     def figures(self, results: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""
