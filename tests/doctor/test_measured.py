@@ -66,10 +66,14 @@ def check(runs: Sequence[Run]) -> None:
         assert estimate(run) == pytest.approx(measured, rel=WITHIN), run[2]
 
 
-def test_estimates_hold_for_a_tiny_model_with_and_without_gradient_checkpointing(walks_of):
+@pytest.mark.parametrize(
+    "change",  # activations then take most of the memory
+    [["training.batch=4"], pytest.param(["training.batch=2", CHECKPOINTING], marks=pytest.mark.slow)],
+    ids=["plain", "checkpointing"],
+)
+def test_estimates_hold_for_a_tiny_model(walks_of, change):
     data, settings = walks_of(64)
-    changes = ["training.batch=2", CHECKPOINTING], ["training.batch=4"]  # activations then take most of the memory
-    check([("tiny-stage1", data, [*settings, *PLAIN, *change]) for change in changes])
+    check([("tiny-stage1", data, [*settings, *PLAIN, *change])])
 
 
 @pytest.mark.slow

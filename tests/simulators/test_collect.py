@@ -22,8 +22,8 @@ from persist_cli.simulators.collect import FIRST_SEED, SPLIT_SCENES, CollectPlan
 from tests.support.miniworlds import make_world
 
 SMALL = CollectPlan("miniworld", "0:3", frames=6, size="16x24")
-EIGHT = CollectPlan("miniworld", "0:8", frames=12, size="32x32")
-COMMAND = "collect miniworld --scenes 0:8 --frames 12 --size 32x32 --workers"
+FIVE = CollectPlan("miniworld", "0:5", frames=12, size="32x32")
+COMMAND = "collect miniworld --scenes 0:5 --frames 12 --size 32x32 --workers"
 
 
 def persist(arguments: str, out: Path) -> subprocess.Popen[str]:
@@ -34,7 +34,7 @@ def persist(arguments: str, out: Path) -> subprocess.Popen[str]:
 
 def start_and_wait_for_a_scene(out: Path) -> subprocess.Popen[str]:
     """A run of sixty scenes that has finished its first."""
-    process = persist(COMMAND.replace("0:8", "0:60") + " 1", out)
+    process = persist(COMMAND.replace("0:5", "0:60") + " 1", out)
     while process.poll() is None and not list(out.glob("house-*.parquet")):
         time.sleep(0.05)
     assert process.poll() is None, process.communicate()
@@ -184,14 +184,14 @@ def test_a_camera_that_the_simulator_does_not_allow_is_refused_by_the_name_of_it
 def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
     make_world()
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    run_collect(EIGHT, whole, 1, json=True)
+    run_collect(FIVE, whole, 1, json=True)
     process = persist(f"{COMMAND} 2", killed)
     while process.poll() is None and not (len(list(killed.glob("house-*"))) > 1 and list(killed.glob(".partial-*"))):
         time.sleep(0.005)
     process.kill()  # some are whole, another is not
     assert process.wait() == -signal.SIGKILL
-    assert 1 < len(list(killed.glob("house-*"))) < 8
-    run_collect(EIGHT, killed, 1, json=True)
+    assert 1 < len(list(killed.glob("house-*"))) < 5
+    run_collect(FIVE, killed, 1, json=True)
     assert contents(killed) == contents(whole)
 
 

@@ -119,7 +119,7 @@ def uninterrupted(walks, codec, tmp_path_factory):
     return run
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_run_killed_at_a_random_moment_resumes_and_ends_like_an_uninterrupted_one(
     persist, uninterrupted, walks, codec, tmp_path, seed
 ):

@@ -69,15 +69,13 @@ def largest_difference(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor
     return max(float((one[name].float() - two[name].float()).abs().max()) for name in one if one[name].numel())
 
 
-def train_by_one(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[..., list[str]]:
-    """Train both stages by one process, as ``one-1`` and ``one-2``; returns what makes the arguments of other runs."""
+def arguments_in(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callable[..., list[str]]:
+    """What makes the arguments of a training of either stage whose run lies in ``folder``."""
 
     def of(number: str, name: str, *changes: str) -> list[str]:
         base = f"base={codec if number == 'stage1' else stage1}"
         return stage(number, walks, folder / name, base, BATCH, f"training.clip={CLIP}", *changes)
 
-    run_persist(*of("stage1", "one-1"))
-    run_persist(*of("stage2-voxel", "one-2"))
     return of
 
 
@@ -85,7 +83,9 @@ def train_by_one(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callab
 def runs(walks, codec, stage1, tmp_path_factory):
     """Runs of one process and of two, some of them resumed by one process and by two in turn."""
     folder = tmp_path_factory.mktemp("pair")
-    of = train_by_one(folder, walks, codec, stage1)
+    of = arguments_in(folder, walks, codec, stage1)
+    run_persist(*of("stage1", "one-1"))
+    run_persist(*of("stage2-voxel", "one-2"))
     low_rank = [f"base={stage1}", "lora.rank=2"]
     run_persist(*of("stage1", "one-lora", *low_rank))
     run_persist(*of("stage2-voxel", "one-few", FEW))
@@ -94,11 +94,8 @@ def runs(walks, codec, stage1, tmp_path_factory):
     run_persist(*of("stage1", "one-distilled", *distil))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
-    first += [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-parts", "training.steps=1"), **how) for kind, how in KINDS.items()]
-    first += [job(*of("stage2-voxel", f"{kind}-cheap", *CHEAP), **how) for kind, how in KINDS.items()]
     first.append(job(*of("stage1", "fsdp-lora", *low_rank), **FSDP))
-    first.append(job(*of("stage1", "fsdp-offloaded", BF16), **FSDP, FSDP_OFFLOAD_PARAMS="true"))
     cached = [FEW, "--cache", str(folder / "cache")]
     first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
     first.append(job(*of("stage2-voxel", "ddp-own", *OWN)))
@@ -117,6 +114,17 @@ def runs(walks, codec, stage1, tmp_path_factory):
     run_persist(*of("stage2-voxel", "one-warm", *cached))
     (folder / "wrong.txt").write_text(f"{ended[-1][0]} {ended[-1][1]}")
     return folder
+
+
+@pytest.fixture(scope="module")
+def savings(runs, walks, codec, stage1):
+    """The runs, with those of two processes that save memory or compute in bf16."""
+    of = arguments_in(runs, walks, codec, stage1)
+    jobs = [job(*of("stage1", f"{kind}-bf16", BF16), **how) for kind, how in KINDS.items()]
+    jobs += [job(*of("stage2-voxel", f"{kind}-cheap", *CHEAP), **how) for kind, how in KINDS.items()]
+    jobs.append(job(*of("stage1", "fsdp-offloaded", BF16), **FSDP, FSDP_OFFLOAD_PARAMS="true"))
+    assert [code for code, _ in run_in_two(runs, *jobs)] == [0] * len(jobs)
+    return runs
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -164,20 +172,22 @@ def test_a_sharded_run_saves_a_whole_model(runs):
     assert not any(parameter.is_meta for parameter in backbone.parameters())
 
 
-def test_sharded_training_in_bf16_is_like_that_with_ddp(runs):
-    exact, ddp, fsdp = (losses(runs / name) for name in ("one-1", "ddp-bf16", "fsdp-bf16"))
+@pytest.mark.slow
+def test_sharded_training_in_bf16_is_like_that_with_ddp(savings):
+    exact, ddp, fsdp = (losses(savings / name) for name in ("one-1", "ddp-bf16", "fsdp-bf16"))
     assert ddp == pytest.approx(exact, rel=1e-2)
     assert fsdp == pytest.approx(ddp, rel=2e-3)
-    weights = saved_model(runs / "fsdp-bf16")
-    assert losses(runs / "fsdp-offloaded") == fsdp
-    assert largest_difference(saved_model(runs / "fsdp-offloaded"), weights) == 0
+    weights = saved_model(savings / "fsdp-bf16")
+    assert losses(savings / "fsdp-offloaded") == fsdp
+    assert largest_difference(saved_model(savings / "fsdp-offloaded"), weights) == 0
     assert {weight.dtype for weight in weights.values()} == {torch.float32}
 
 
-def test_memory_savings_train_nearly_alike_sharded_and_not(runs):
+@pytest.mark.slow
+def test_memory_savings_train_nearly_alike_sharded_and_not(savings):
     """Gradient checkpointing, frozen weights in bf16 and averages on the CPU at once."""
-    assert losses(runs / "ddp-cheap") == pytest.approx(losses(runs / "one-2"), rel=1e-2)
-    assert losses(runs / "fsdp-cheap") == pytest.approx(losses(runs / "ddp-cheap"), rel=2e-3)
+    assert losses(savings / "ddp-cheap") == pytest.approx(losses(savings / "one-2"), rel=1e-2)
+    assert losses(savings / "fsdp-cheap") == pytest.approx(losses(savings / "ddp-cheap"), rel=2e-3)
 
 
 def test_lora_trains_sharded_as_in_one_process(runs):
