@@ -7,7 +7,7 @@ import dataclasses
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,8 +17,10 @@ import yaml
 from persist_cli import __version__
 from persist_cli.api.checkpoint import CARD, PLAIN, STEP, Checkpoint, find_checkpoint, lora_base
 from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.lineage import (
     ADAPTERS,
+    MEMORY_FILE,
     RECIPE,
     RECIPES,
     adapter_recipe,
@@ -26,9 +28,9 @@ from persist_cli.checkpoints.lineage import (
     stage_recipes,
     training_scenes,
 )
-from persist_cli.checkpoints.load import empty_backbone, load_backbone, warn_of_plain
+from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_backbone, warn_of_plain
 from persist_cli.checkpoints.save import base_files, fingerprint, hash_weights, write_card
-from persist_cli.checkpoints.scene_models import find_scene_model, is_scene_model, write_scene_card
+from persist_cli.checkpoints.scene_models import BESIDE, PACKAGED, find_scene_model, is_scene_model, write_scene_card
 from persist_cli.errors import CheckpointError, PersistError, hint
 from persist_cli.io.files import (
     check_folder,
@@ -42,6 +44,7 @@ from persist_cli.io.files import (
 )
 from persist_cli.io.sha256sums import SUMS, read_sums, write_sums
 from persist_cli.policies.trained import find_policy, is_policy, write_policy_card
+from persist_cli.plugins import load_plugin
 from persist_cli.recipe import parse_yaml_mapping
 from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
@@ -157,13 +160,18 @@ def _network_folder(plan: ExportPlan, source: Path, network: str, out: Path) -> 
             f"{plan.checkpoint}: {network} has no adapters and no sampling; give --dtype and --out alone"
         )
     with folder_aside(out) as folder:
-        for weights in sorted(source.glob("*.safetensors")):
-            _convert(weights, folder / weights.name, PRECISIONS[plan.dtype])
-        recipe = source / RECIPE
-        if recipe.is_file():
-            write_text(folder / RECIPE, _without_absolute_paths(recipe.read_text(encoding="utf-8"), str(recipe)))
+        _copy_network(source, folder, PRECISIONS[plan.dtype])
         yield folder
         write_sums(folder)
+
+
+def _copy_network(source: Path, folder: Path, dtype: torch.dtype) -> None:
+    """Write the weights and the recipe of a network into a folder."""
+    for weights in sorted(source.glob("*.safetensors")):
+        _convert(weights, folder / weights.name, dtype)
+    recipe = source / RECIPE
+    if recipe.is_file():
+        write_text(folder / RECIPE, _without_absolute_paths(recipe.read_text(encoding="utf-8"), str(recipe)))
 
 
 def _summed_files(folder: Path) -> dict[str, dict[str, Any]]:
@@ -282,7 +290,27 @@ def _write_checkpoint(folder: Path, base: Checkpoint, adapters: dict[str, Adapte
                 _convert(source, target, dtype) if source.suffix == ".safetensors" else _copy(source, target)
             except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
                 raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
+    for name, adapter in adapters.items():
+        _put_scene_model_beside(adapter, folder / ADAPTERS / name, dtype)
     save_stage_recipes(folder, _recipes(base, adapters))
+
+
+def _put_scene_model_beside(adapter: AdapterSource, folder: Path, dtype: torch.dtype) -> None:
+    """Write the model that imagines in an adapter's scenes beside it, because its place is of one machine alone.
+
+    Raises:
+        CheckpointError: when that model is not there.
+    """
+    memory = adapter_memory(adapter.checkpoint, adapter.adapter)
+    place = memory.settings.get("model")
+    if not issubclass(load_plugin("memory", memory.name), Scene) or place in (None, PACKAGED):
+        return
+    model, beside = find_scene_model(place), folder / BESIDE
+    beside.mkdir()
+    _copy_network(model.folder, beside, dtype)
+    write_scene_card(beside, model.plugin, model.settings, model.stage, model.training_scenes)
+    write_sums(beside)
+    write_json(folder / MEMORY_FILE, asdict(replace(memory, settings=memory.settings | {"model": BESIDE})))
 
 
 @contextlib.contextmanager

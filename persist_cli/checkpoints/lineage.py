@@ -21,6 +21,8 @@ RECIPES: Final = "recipes"  # the folder with those of the stages before
 
 ADAPTERS: Final = "adapters"  # the folder of an export's adapters, and in its folder of recipes that of theirs
 
+MEMORY_FILE: Final = "memory.json"  # the memory that an adapter reads, in its folder
+
 
 def stage_recipes(folder: Path) -> dict[str, str]:
     """Texts of the recipes behind a base by file name: ``codec.yaml``, ``stage1.yaml``, ``stage1-2.yaml``, ….

@@ -12,8 +12,8 @@ import yaml
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.scene import Scene
-from persist_cli.checkpoints.lineage import RECIPE
-from persist_cli.checkpoints.scene_models import with_absolute_model
+from persist_cli.checkpoints.lineage import MEMORY_FILE, RECIPE
+from persist_cli.checkpoints.scene_models import with_absolute_model, with_model_beside
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
@@ -63,8 +63,10 @@ def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None
 
 def adapter_memory(checkpoint: Checkpoint, adapter: str) -> MemoryConfig:
     """The choice of the memory that an adapter of the checkpoint reads."""
-    path = checkpoint.adapter_folder(adapter) / "memory.json"
-    return parse_settings(MemoryConfig, read_json(path), str(path))
+    folder = checkpoint.adapter_folder(adapter)
+    path = folder / MEMORY_FILE
+    config = parse_settings(MemoryConfig, read_json(path), str(path))
+    return dataclasses.replace(config, settings=with_model_beside(config.settings, folder))
 
 
 def with_scene_paths(values: Mapping[str, Any]) -> dict[str, Any]:

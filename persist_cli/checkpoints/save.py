@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.api.checkpoint import CARD, REFERENCE, STARTED_FROM, VERSION, Checkpoint, TrainingScenes
+from persist_cli.checkpoints.lineage import MEMORY_FILE
 from persist_cli.io.files import bundled_folder, write_json
 from persist_cli.io.sha256sums import hash_files, write_sums
 from persist_cli.recipe import MemoryConfig
@@ -92,7 +93,7 @@ def save_adapter(
     adapter = folder / "adapters" / memory.name
     adapter.mkdir(parents=True)
     backbone.save_adapter(adapter)
-    write_json(adapter / "memory.json", dataclasses.asdict(memory))
+    write_json(adapter / MEMORY_FILE, dataclasses.asdict(memory))
     write_card(folder, pointer_to(base.base_folder, base.fingerprint, home) | own_sampling(backbone), scenes)
     write_sums(folder)
 

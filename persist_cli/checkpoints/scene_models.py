@@ -20,6 +20,7 @@ from persist_cli.io.sha256sums import check_sums, write_sums
 from persist_cli.plugins import make_scene_model
 
 PACKAGED: Final = "scene"  # names the model that comes with the package, and its folder
+BESIDE: Final = "scene-model"  # names, in an exported adapter, the folder of the model that imagines in its scenes
 TRAIN: Final = "persist finetune houses-64-scene --data DATA --out runs/scene base=CODEC_RUN"
 SCENE: Final = CardKind(SCENE_CARD, "persist-scene-model", "scene", "model of scenes", TRAIN)
 
@@ -120,6 +121,19 @@ def with_absolute_model(settings: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(model, str) or not Path(model).exists():
         return dict(settings)
     return {**settings, "model": str(Path(model).absolute())}
+
+
+def with_model_beside(settings: Mapping[str, Any], adapter: Path) -> dict[str, Any]:
+    """Return the settings of a memory with the place of the model that was exported beside its adapter, if one was.
+
+    Args:
+        settings: of the memory that the adapter reads.
+        adapter: the adapter's folder.
+    """
+    beside = adapter / BESIDE
+    if settings.get("model") != BESIDE or not beside.is_dir():
+        return dict(settings)
+    return {**settings, "model": str(beside.absolute())}
 
 
 def is_scene_model(path: Path) -> bool:

@@ -3,7 +3,8 @@
     python tests/benchmarks/bench_plan.py --data runs/houses-test --starts 8 --out runs/plan-speed
 
 Prints two tables, asserts nothing; ``--out`` keeps them as ``plan.json``. The first gives seconds of one decision of 60
-candidates of 8 actions: reading the memory, denoising, decoding the last frames or all, and the cost. Beside the wall's
+candidates of 8 actions: reading the memory, denoising, decoding the last frames or all, and the cost, each for as many
+candidates at once as the first of ``--batches``; then whole decisions by the size of the batch. Beside the wall's
 seconds stand those of the processor, which do not grow when other programs run. The second gives for each sampling the
 rank correlation of the candidates' costs with those of the last sampling and, where the data is a simulator's, with the
 true costs. Without ``--data`` it is the sample houses, without ``--checkpoint`` the reference model.
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with torch.no_grad():
         decisions = [decision(backbone, factory, file, cost, options, n) for n, file in enumerate(files)]
         WorldFutures(decisions[0].model, decisions[0].ground).imagine([("left",)], "last")  # a warm-up
-        times = [] if options.no_times else stage_times(decisions[0], cost)
+        times = [] if options.no_times else stage_times(decisions[0], cost, options.batches[0])
         times += [] if options.no_times else batch_times(decisions[0], cost, options.batches)
         correlations = compare_samplings(decisions, cost, options.samplings) if options.samplings[1:] else []
     show(times, correlations, options)
@@ -150,11 +151,12 @@ def timed(run: Callable[[], Any]) -> tuple[dict[str, float], Any]:
     return {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - processor}, result
 
 
-def stage_times(one: Decision, cost: Cost) -> list[dict[str, Any]]:
-    """Seconds of the parts of judging all candidates in one batch."""
+def stage_times(one: Decision, cost: Cost, size: int) -> list[dict[str, Any]]:
+    """Seconds of the parts of judging one batch, the first ``size`` candidates."""
     model, futures = one.model, WorldFutures(one.model, one.ground, body_of(one.model.agents[0].info))
-    begun, branches = timed(lambda: model.branches(len(one.candidates)))
-    walking, imagined = timed(lambda: futures.imagine(one.candidates, "last", sees=False))
+    batch = one.candidates[:size]
+    begun, branches = timed(lambda: model.branches(len(batch)))
+    walking, imagined = timed(lambda: futures.imagine(batch, "last", sees=False))
     agent, backbone = model.agents[0], model.backbone
     ways = [agent.now.cameras.at(walk.poses) for walk in imagined.walks]
     none = [(None,) * len(way) for way in ways]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from persist_cli.api.cells import FREE, SOLID, CellOrigin
+from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellOrigin
 from persist_cli.api.geometry import project
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Origin
@@ -98,6 +98,22 @@ def test_neither_the_order_of_writing_nor_saving_changes_a_cell(tmp_path):
     parts = scene(frames[:3])
     parts.merge(scene(frames[3:]))
     assert same(memory, parts)
+
+
+def test_what_is_outside_of_the_rooms_stays_so_when_scenes_are_merged():
+    """Whichever of the two knows it: one that has the true cells, or one that saw nothing solid there."""
+    room = cell_room()
+    truth, seen = named_scene(), named_scene()
+    outside = torch.zeros_like(room.known)
+    outside[0, 0] = True  # a corner where walls meet
+    room.classes[outside] = OUTSIDE
+    room.colors[outside] = 0
+    truth.add(room)
+    seen.add(replace(room, classes=torch.where(outside, FREE, room.classes)))
+    for first, second in ((truth, truth), (truth, seen), (seen, truth)):
+        merged = first.copy()
+        merged.merge(second)
+        assert torch.equal(merged.cells.box(room.corner, room.shape).classes, room.classes)
 
 
 def test_depth_that_is_missing_says_nothing_but_where_the_camera_is():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.simulators.house_cells import FORM as HOUSES
 from tests.support.cell_houses import FORM
 from tests.support.cell_walks import write_with_cells
+from tests.support.damage import without_sums
 from tests.support.micro_runs import run_persist, stage
 from tests.support.micro_scenes import MICRO_SCENE
 
@@ -51,6 +53,20 @@ def scene_model(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def imagining(renderer: Path, scene_model: Path, cells: Path, stage1: Path, tmp_path_factory) -> Path:
+    """The renderer, trained on with what the model of scenes imagines, whose place is given relative."""
+    folder = tmp_path_factory.mktemp("imagining")
+    recipe = folder / "recipe.yaml"
+    recipe.write_text(f"extends: houses-64-stage2-scene-imagined\nbase: {stage1}\nadapter_from: {renderer}\n")
+    small = ["training.steps=2", "training.batch=2", "training.workers=0", "training.warmup=0", "training.cooldown=0"]
+    small += ["data.clip_frames=[]"]  # this codec folds time
+    imagines = [f"memory.settings.model={os.path.relpath(scene_model)}", "memory.settings.steps=1", "data.true_cells=0"]
+    cache = ["--cache", folder / "cache", "data.clips_per_trajectory=1"]
+    run_persist(*map(str, ["finetune", recipe, "--data", cells, "--out", folder / "run", *small, *imagines, *cache]))
+    return folder / "run"
+
+
 def test_a_renderer_trained_on_true_cells_is_evaluated_on_its_own_scene_and_on_the_true_one(
     renderer, held_out_cells, tmp_path, persist
 ):
@@ -70,19 +86,39 @@ def test_true_cells_as_a_control_need_a_scene(voxel, held_out_cells, persist, tm
     assert "the control 'true-cells' needs a scene among --memories" in result.err
 
 
-def test_a_renderer_is_trained_on_with_what_a_model_imagines(renderer, scene_model, cells, stage1, tmp_path, persist):
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(f"extends: houses-64-stage2-scene-imagined\nbase: {stage1}\nadapter_from: {renderer}\n")
-    small = ["training.steps=2", "training.batch=2", "training.workers=0", "training.warmup=0", "training.cooldown=0"]
-    small += ["data.clip_frames=[]"]  # this codec folds time
-    imagines = [f"memory.settings.model={os.path.relpath(scene_model)}", "memory.settings.steps=1", "data.true_cells=0"]
-    cache = ["--cache", tmp_path / "cache", "data.clips_per_trajectory=1"]
-    result = persist("finetune", recipe, "--data", cells, "--out", tmp_path / "run", *small, *imagines, *cache)
-    assert result.code == 0, result.err
-    memory = adapter_memory(find_checkpoint(tmp_path / "run"), "scene")
+def test_a_renderer_is_trained_on_with_what_a_model_imagines(imagining, scene_model):
+    memory = adapter_memory(find_checkpoint(imagining), "scene")
     assert Path(memory.settings["model"]).is_absolute()
     assert Path(memory.settings["model"]).samefile(scene_model)
     assert memory.settings["palette"] == list(FORM.palette)
+
+
+def test_an_export_takes_along_the_model_that_imagines(imagining, scene_model, stage1, cells, persist, tmp_path):
+    made = persist("export", stage1, imagining, "--dtype", "bfloat16", "--out", tmp_path / "first")
+    assert made.code == 0, made.err
+    made = persist("export", tmp_path / "first", "--out", tmp_path / "made")  # of an export is as good as of runs
+    assert made.code == 0, made.err
+    shutil.rmtree(tmp_path / "first")
+    moved = (tmp_path / "made").rename(tmp_path / "moved")
+    assert str(scene_model) not in (moved / "adapters/scene/memory.json").read_text()
+    place = adapter_memory(find_checkpoint(moved), "scene").settings["model"]
+    assert Path(place).samefile(moved / "adapters/scene/scene-model")
+    start = ["--start", f"{cells}#0:0", "--actions", "left", "--out", tmp_path / "rollout"]
+    walked = persist("rollout", moved, *start, "--adapter", "scene", "--verify")
+    assert walked.code == 0, walked.err
+
+
+def test_an_export_whose_model_of_scenes_is_gone_ends_in_one_line(imagining, stage1, persist, tmp_path):
+    run = shutil.copytree(imagining, tmp_path / "run")
+    step = next(run.glob("step-*"))
+    without_sums(step)
+    path = without_sums(step / "model") / "adapters/scene/memory.json"
+    values = json.loads(path.read_text())
+    values["settings"]["model"] = str(tmp_path / "gone")
+    path.write_text(json.dumps(values))
+    result = persist("export", stage1, run, "--out", tmp_path / "export")
+    assert (result.code, result.err.strip().splitlines()[-1].count(str(tmp_path / "gone"))) == (1, 1), result.err
+    assert not (tmp_path / "export").exists()
 
 
 def test_another_size_of_cells_for_a_renderer_that_is_trained_on_is_refused(renderer, cells, stage1, persist, tmp_path):

@@ -144,7 +144,7 @@ class CellStore:
         self._decide(touched)
 
     def _decide(self, numbers: Int64[Tensor, "cell 3"]) -> None:
-        """Let the votes say what cells hold that have some and are not edited; a solid cell keeps its class."""
+        """Let the votes say what cells hold that have some and are not edited; solid and outside ones keep their class."""
         columns = self.columns
         chosen = torch.zeros_like(columns[ORIGINS], dtype=torch.bool)
         chosen[self.places(numbers)] = True
@@ -153,7 +153,8 @@ class CellStore:
         hits, passes, sums, was = (columns[name][at] for name in ("hits", "passes", "sums", "classes"))
         solid = (hits > 0) & (hits >= passes)
         named = (was != FREE) & (was != OUTSIDE) & (columns[ORIGINS][at] > 0)
-        columns["classes"][at] = torch.where(solid, torch.where(named, was, SOLID), FREE).to(torch.uint8)
+        empty = torch.where((was == OUTSIDE) & (columns[ORIGINS][at] == CellOrigin.OBSERVED), OUTSIDE, FREE)
+        columns["classes"][at] = torch.where(solid, torch.where(named, was, SOLID), empty).to(torch.uint8)
         count = sums[:, 3:].clamp_min(1)
         mean = (2 * sums[:, :3] + count) // (2 * count)
         columns["colors"][at] = torch.where(solid[:, None], mean, 0).to(torch.uint8)
@@ -213,6 +214,7 @@ class CellStore:
         named = self.columns["classes"][part] > OUTSIDE
         kept = higher & observed & (theirs.classes == SOLID) & named & (mine > 0)  # as when frames are written
         learned = both & (self.columns["classes"][part] <= SOLID) & (theirs.classes > OUTSIDE)
+        learned |= both & (self.columns["classes"][part] == FREE) & (theirs.classes == OUTSIDE)
         for name in CONTENT:
             taken = (higher & ~kept) | learned if name == "classes" else higher
             self.columns[name][part][taken] = other.columns[name].to(self.device)[taken]
