@@ -24,7 +24,7 @@ from persist_cli.api.observations import Observations
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_edits import Edit, Insert, Paint, Remove
 from persist_cli.bench.figure_text import FigureColumn
-from persist_cli.bench.scenes.rendering import Renderer, RendererLoader, rendered_rows, scene_row
+from persist_cli.bench.scenes.rendering import RenderedRow, Renderer, RendererLoader, rendered_rows, scene_row
 from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBench
 from persist_cli.bench.scenes.views import View
 from persist_cli.data.reference import parse_reference
@@ -87,18 +87,24 @@ class EditTrial:
 
 
 def run_edits(bench: SceneBench, plan: RenderingPlan) -> None:
-    """Make and render the edits that the journal lacks."""
-    todo = [number for number in range(bench.plan.edits) if not bench.journal.has(PART, f"edit {number}")]
+    """Make the edits that the journal lacks, and render them by the first of the adapters that draw scenes."""
+    row = scene_row(rendered_rows(plan))
+    todo = [number for number in range(bench.plan.edits) if not bench.journal.has(PART, edit_name(row, number))]
     if not todo:
         return
-    renderer = RendererLoader(bench, plan).load(scene_row(rendered_rows(plan)))
+    renderer = RendererLoader(bench, plan).load(row)
     with progress() as bar:
         task = add_task(bar, "editing scenes", len(todo), "edits")
         for number in todo:
             trial = draw_edit(bench, renderer, number)
             record = {"scene": None} if trial is None else judge_edit(bench, renderer, trial, number)
-            bench.journal.write(PART, f"edit {number}", record)
+            bench.journal.write(PART, edit_name(row, number), record)
             bar.advance(task)
+
+
+def edit_name(row: RenderedRow, number: int) -> str:
+    """Return the name of an edit in the journal; edits that another adapter draws have other names."""
+    return f"edit {number}, {row.adapter}"
 
 
 def draw_edit(bench: SceneBench, renderer: Renderer, number: int) -> EditTrial | None:
@@ -213,15 +219,17 @@ def shows(picture: Tensor, drawn: list[Tensor], mask: Tensor) -> bool:
     return bool((color - after).norm() < (color - before).norm())
 
 
-def edits_json(bench: SceneBench) -> dict[str, Any]:
+def edits_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     """Return the figures over all edits and over each kind, as JSON values."""
-    records = [bench.journal.read(PART, f"edit {number}") for number in range(bench.plan.edits)]
+    row = scene_row(rendered_rows(plan))
+    records = [bench.journal.read(PART, edit_name(row, number)) for number in range(bench.plan.edits)]
     found = [record for record in records if record["scene"] is not None]
     if len(found) < len(records):
         warn(f"{len(records) - len(found)} of {len(records)} edits: no place was found that a clip comes to see")
     groups = {"all": found} | {kind: [one for one in found if one["kind"] == kind] for kind in KINDS}
     return {
         "columns": {name: column.definition for name, column in COLUMNS.items()},
+        "adapter": row.adapter,
         "wanted": len(records),
         "rows": {name: kind_figures(chosen) | {"count": len(chosen)} for name, chosen in groups.items() if chosen},
     }

@@ -102,7 +102,7 @@ def results_json(bench: SceneBench) -> dict[str, Any]:
     if "return" in bench.plan.parts and rendering is not None:
         results["return"] = return_json(bench, rendering)
     if "edits" in bench.plan.parts and rendering is not None:
-        results["edits"] = edits_json(bench)
+        results["edits"] = edits_json(bench, rendering)
     return results
 
 

@@ -81,8 +81,9 @@ def other_tables(results: Mapping[str, Any]) -> list[Table]:
         title = f"{part['steps']} frames out and as many back, from {len(part['views'])} images"
         found.append(part_table(title, "row", part["rows"], return_part.COLUMNS))
     if "edits" in results:
-        rows = {f"{name} ({row['count']})": row for name, row in results["edits"]["rows"].items()}
-        found.append(part_table("Random edits", "edits", rows, edit_part.COLUMNS))
+        part = results["edits"]
+        rows = {f"{name} ({row['count']})": row for name, row in part["rows"].items()}
+        found.append(part_table(f"Random edits, drawn by {part['adapter']!r}", "edits", rows, edit_part.COLUMNS))
     if "speed" in results:
         part = results["speed"]
         title = f"Cost of a completion, {part['threads']} threads"

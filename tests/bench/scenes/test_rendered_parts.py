@@ -55,6 +55,8 @@ def test_each_memory_is_a_row_and_a_scene_has_one_with_true_cells(measured: Path
 
 def test_edits_are_rendered_and_counted_by_kind(measured: Path) -> None:
     part = json.loads((measured / "metrics.json").read_text())["edits"]
+    assert part["adapter"] == "scene"
+    assert "Random edits, drawn by 'scene'" in (measured / "tables.md").read_text()
     assert part["wanted"] == 3
     assert part["rows"]["all"]["count"] == sum(row["count"] for name, row in part["rows"].items() if name != "all") > 0
     assert part["rows"]["all"]["outside"]["mean"] >= 0
