@@ -144,7 +144,7 @@ class CellStore:
         self._decide(touched)
 
     def _decide(self, numbers: Int64[Tensor, "cell 3"]) -> None:
-        """Let the votes say what cells hold that have some and are not edited; solid and outside ones keep their class."""
+        """Let the votes say what cells hold; edited ones take none, solid and outside ones stay as they were."""
         columns = self.columns
         chosen = torch.zeros_like(columns[ORIGINS], dtype=torch.bool)
         chosen[self.places(numbers)] = True
