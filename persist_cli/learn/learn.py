@@ -7,6 +7,7 @@ in the true scene. What is done is not done again, so a stopped run goes on.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import sys
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError, PersistError
+from persist_cli.evaluate.journal import check_same
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
 from persist_cli.io.settings import parse_settings
 from persist_cli.learn.evaluation import evaluate_policy, mean_figures
@@ -178,6 +180,7 @@ def identity(learning: Learning) -> dict[str, Any]:
     plan = learning.plan
     values = asdict(plan) | {
         "policy": learning.begin.fingerprint, "checkpoint": None, "episodes": None, "rounds": None,
+        "views": {"path": plan.views, "fingerprint": digest(learning.views)},
     }  # fmt: skip
     if plan.inside == MODEL:
         values["checkpoint"] = find_checkpoint(plan.checkpoint).fingerprint
@@ -186,15 +189,17 @@ def identity(learning: Learning) -> dict[str, Any]:
     return dict(json.loads(json.dumps(values, default=str)))
 
 
+def digest(views: Observations) -> str:
+    """Return a hash of frames and poses."""
+    tensors = (views.rgb, views.depth, views.cameras.world_from_camera)
+    return hashlib.sha256(b"".join(tensor.contiguous().numpy().tobytes() for tensor in tensors)).hexdigest()
+
+
 def check_plan(learning: Learning) -> None:
     """Raise ``PersistError`` when the folder holds another learning."""
     file = learning.out / PLAN
-    if not file.is_file():
-        return
-    stored, now = read_json(file), identity(learning)
-    changed = sorted(key for key in now if stored.get(key) != now[key])
-    if changed:
-        raise PersistError(f"{learning.out}: holds a learning with another {', '.join(changed)}; take another --out")
+    if file.is_file():
+        check_same(read_json(file), identity(learning), f"{learning.out}: holds another learning")
 
 
 def keep_plan(learning: Learning) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -39,9 +41,8 @@ def learn(persist, walks, policy_run, voxel, tmp_path) -> Callable[..., CommandR
     short = ["--walks", "3", "--actions", "10", "--execute", "4", "--training-steps", "2", "--rounds", "1"]
     training = ["--set", "training.batch=2", "--set", "training.workers=0"]
 
-    def run(out: str, *more: str) -> CommandResult:
-        views, folder = f"{walks}#0:0-12", tmp_path / out
-        given = ["learn", voxel, "--views", views, "--policy", policy_run, "--out", folder]
+    def run(out: str, *more: str, data: Path = walks, frames: str = "0-12") -> CommandResult:
+        given = ["learn", voxel, "--views", f"{data}#0:{frames}", "--policy", policy_run, "--out", tmp_path / out]
         return persist(*given, *ONE_STEP, *short, *training, *more)
 
     return run
@@ -152,7 +153,14 @@ def test_a_folder_with_another_learning_is_refused(learn):
     assert learn("out").code == 0
     result = learn("out", "--seed", "5")
     assert result.code == 1
-    assert result.err.endswith("holds a learning with another seed; take another --out\n")
+    assert result.err.endswith("holds another learning (seed: 0, now 5); choose another --out or delete it\n")
+
+
+def test_a_learning_goes_on_with_views_that_were_moved_and_with_no_others(learn, walks, tmp_path):
+    assert learn("out").code == 0
+    assert learn("out", data=shutil.copytree(walks, tmp_path / "moved")).code == 0
+    result = learn("out", frames="1-13")
+    assert (result.code, "holds another learning (views fingerprint: " in result.err) == (1, True), result.err
 
 
 @pytest.mark.parametrize(
