@@ -74,7 +74,7 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
     for rows in (f"{ALONE},rank-16,rank-16-walk", f"{ALONE},rank-8,rank-16,rank-16-walk"):
         yield f"{plan} {LOOP} --rows {rows} --memories {MEMORIES} {_to(home, 'lpips')}"
     ranked = f"--policy {shlex.quote(figures.trained)} --rows policy,rank-8,rank-16,rank-16-walk --memories {MEMORIES}"
-    yield f"{bench} --loops closed {ranked} {_to(home, 'trained')}"
+    yield f"{bench} {ranked} {_to(home, 'trained')}"
     for choice in ("no-keep", "no-approach"):
         yield f"{plan} {LOOP} --{choice} --loops closed --rows rank-16 --memories simulator,voxel {_to(home, choice)}"
     if not (figures.out / "collisions.json").is_file():
