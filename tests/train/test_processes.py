@@ -79,13 +79,18 @@ def arguments_in(folder: Path, walks: Path, codec: Path, stage1: Path) -> Callab
     return of
 
 
+def train_by_one(of: Callable[..., list[str]]) -> None:
+    """Train both stages by one process, as ``one-1`` and ``one-2``."""
+    run_persist(*of("stage1", "one-1"))
+    run_persist(*of("stage2-voxel", "one-2"))
+
+
 @pytest.fixture(scope="module")
 def runs(walks, codec, stage1, tmp_path_factory):
     """Runs of one process and of two, some of them resumed by one process and by two in turn."""
     folder = tmp_path_factory.mktemp("pair")
     of = arguments_in(folder, walks, codec, stage1)
-    run_persist(*of("stage1", "one-1"))
-    run_persist(*of("stage2-voxel", "one-2"))
+    train_by_one(of)
     low_rank = [f"base={stage1}", "lora.rank=2"]
     run_persist(*of("stage1", "one-lora", *low_rank))
     run_persist(*of("stage2-voxel", "one-few", FEW))

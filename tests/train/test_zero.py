@@ -9,7 +9,7 @@ import torch
 
 from tests.support.micro_runs import losses, run_persist, run_result, stage
 from tests.support.two_processes import job, run_in_two
-from tests.train.test_processes import BF16, NEAR, largest_difference, saved_model, train_by_one
+from tests.train.test_processes import BF16, NEAR, arguments_in, largest_difference, saved_model, train_by_one
 
 KINDS = {f"zero{number}": {"ACCELERATE_USE_DEEPSPEED": "true", "ACCELERATE_DEEPSPEED_ZERO_STAGE": number}
          for number in ("1", "2")}  # fmt: skip
@@ -21,7 +21,8 @@ needs_deepspeed = pytest.mark.skipif(importlib.util.find_spec("deepspeed") is No
 def runs(walks, codec, stage1, tmp_path_factory):
     """Runs of one process, of two with ZeRO 1 and 2, and one resumed by one process and by two in turn."""
     folder = tmp_path_factory.mktemp("zero")
-    of = train_by_one(folder, walks, codec, stage1)
+    of = arguments_in(folder, walks, codec, stage1)
+    train_by_one(of)
     first = [job(*of("stage1", "zero1-1"), **KINDS["zero1"])]
     first += [job(*of("stage2-voxel", "zero2-2", "training.accumulation=2"), **KINDS["zero2"])]
     first += [job(*of("stage1", "zero2-bf16", BF16), **KINDS["zero2"])]
