@@ -219,6 +219,8 @@ def show(times: Sequence[dict[str, Any]], correlations: Sequence[dict[str, Any]]
     sampling = options.samplings[0].words
     rows = [[row["part"], f"{row['seconds']:.2f}", f"{row['cpu_seconds']:.2f}"] for row in times]
     print_table(f"seconds with {sampling}", ["part", "wall", "processor"], rows)
+    if not correlations:
+        return
     reference = options.samplings[-1].words
     print_table(
         f"rank correlation of {options.cost} over {options.candidates} candidates, mean of the starts",
