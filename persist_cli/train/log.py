@@ -45,17 +45,21 @@ class StepLog:
     def draw(self, path: Path) -> None:
         """Draw the loss as PNG: each step in grey and the running mean over a twentieth of the run, on a log scale."""
         from matplotlib.figure import Figure
+        from matplotlib.ticker import LogLocator, NullFormatter
 
         if not self.rows:
             return
         steps, losses = [row["step"] for row in self.rows], [row["loss"] for row in self.rows]
-        figure = Figure(figsize=(7, 4), layout="constrained")
-        axes = figure.subplots()
+        figure = Figure(figsize=(7, 4))
+        axes = figure.add_axes((0.11, 0.13, 0.87, 0.84))  # a layout that matplotlib finds takes as long as the drawing
         axes.plot(steps, losses, color="0.8", linewidth=0.8, label="step")
         window = max(1, len(losses) // 20)
         mean = np.convolve(losses, np.ones(window) / window, mode="valid")
         axes.plot(steps[window - 1 :], mean, color="tab:blue", label=f"mean of {window}")
         axes.set(xlabel="optimizer step", ylabel="loss", yscale="log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.legend()
         with written_aside(path) as aside:
             figure.savefig(aside, format="png", dpi=120)
