@@ -31,6 +31,7 @@ MOST_POSES = 6000  # that a search looks at before it takes the best way so far
 
 MOVES = ("forward", "backward", "left", "right")
 
+Array = np.ndarray[Any, Any]
 Key = tuple[int, int, int]  # of poses that the search holds for one: two cells and a heading
 
 
@@ -47,24 +48,34 @@ class VisitedPoses:
 
     def __init__(self) -> None:
         self._poses: list[tuple[float, float, float]] = []
+        self._columns: tuple[Array, Array, Array] | None = None  # of _poses, until another pose is added
 
     def add(self, pose: Pose) -> None:
         """Add a pose."""
         self._poses.append((*pose.ground, pose.heading))
+        self._columns = None
 
     def is_near(self, pose: Pose) -> bool:
         """Whether a pose is near one of these, as ``near_poses`` says, with a margin for rounding."""
-        return self._any_within(pose, MARGIN * NEAR_METRES, MARGIN * NEAR_DEGREES)
+        return _near(*self._apart(pose))
 
     def cost(self, pose: Pose) -> float:
         """The actions that it is worth not to take a pose: because it is near one of these, or far from all."""
-        known = self._any_within(pose, KNOWN_METRES, KNOWN_DEGREES)
-        return NEAR_COST * self.is_near(pose) + UNKNOWN_COST * (not known)
+        metres, turned = self._apart(pose)
+        known = bool(((metres < KNOWN_METRES) & (turned < math.radians(KNOWN_DEGREES))).any())
+        return NEAR_COST * _near(metres, turned) + UNKNOWN_COST * (not known)
 
-    def _any_within(self, pose: Pose, metres: float, degrees: float) -> bool:
-        x, z, heading = np.array(self._poses).T
-        apart = np.hypot(x - pose.ground[0], z - pose.ground[1])
-        return bool(((apart < metres) & (angles(heading, pose.heading) < math.radians(degrees))).any())
+    def _apart(self, pose: Pose) -> tuple[Array, Array]:
+        """Metres and radians between each of these poses and another one."""
+        if self._columns is None:
+            x, z, heading = np.array(self._poses).T
+            self._columns = x, z, heading
+        x, z, heading = self._columns
+        return np.hypot(x - pose.ground[0], z - pose.ground[1]), angles(heading, pose.heading)
+
+
+def _near(metres: Array, turned: Array) -> bool:
+    return bool(((metres < MARGIN * NEAR_METRES) & (turned < math.radians(MARGIN * NEAR_DEGREES))).any())
 
 
 class WayBack:
@@ -86,6 +97,7 @@ class WayBack:
         self._blocked: set[tuple[Key, str]] = set()
         self._free: dict[Ground, bool] = {}
         self._costs: dict[tuple[Ground, int], float] = {}  # until another pose is visited
+        self._metres: dict[Ground, float] = {}  # to the start
         self.visited = VisitedPoses()
         self.visited.add(self._start)
 
@@ -158,7 +170,9 @@ class WayBack:
 
     def _remaining(self, pose: Pose) -> float:
         """Actions of the shortest way to the start; far away where the grid knows no way."""
-        metres = self._grid.remaining(pose.ground, self._distances)
+        if pose.ground not in self._metres:
+            self._metres[pose.ground] = self._grid.remaining(pose.ground, self._distances)
+        metres = self._metres[pose.ground]
         return 1e6 if math.isinf(metres) else metres / self._step
 
     def _arrived(self, pose: Pose) -> bool:
