@@ -10,9 +10,12 @@ import contextlib
 import dataclasses
 import importlib
 import inspect
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -85,8 +88,7 @@ class Plugin:
 
 def list_plugins(kind: str) -> list[Plugin]:
     """All installed plugins of a kind, sorted by name; none is imported."""
-    plugins = {_describe(kind, entry) for entry in entry_points(group=KINDS[kind].group)}
-    return sorted(plugins, key=lambda plugin: (plugin.name, plugin.package))
+    return list(_list_plugins(kind, _places()))
 
 
 def find_plugin(kind: str, name: str) -> Plugin:
@@ -104,6 +106,20 @@ def find_plugin(kind: str, name: str) -> Plugin:
         packages = " and ".join(plugin.package for plugin in plugins)
         raise PluginError(f"{kind} {name!r} is claimed by {packages}; uninstall one of them")
     return plugins[0]
+
+
+def _places() -> tuple[tuple[str, int], ...]:
+    """Where packages are installed, and when one was last added or removed there."""
+    folders = (folder for folder in map(Path, sys.path) if folder.is_dir())
+    return tuple((str(folder), folder.stat().st_mtime_ns) for folder in folders)
+
+
+@lru_cache(maxsize=len(KINDS))
+def _list_plugins(kind: str, places: tuple[tuple[str, int], ...]) -> tuple[Plugin, ...]:
+    """As ``list_plugins``, once for as long as the places are the same: it reads the metadata of all packages."""
+    del places
+    plugins = {_describe(kind, entry) for entry in entry_points(group=KINDS[kind].group)}
+    return tuple(sorted(plugins, key=lambda plugin: (plugin.name, plugin.package)))
 
 
 def load_plugin(kind: str, name: str) -> type[Any]:
