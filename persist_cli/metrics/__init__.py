@@ -1,5 +1,6 @@
 """Metrics of generated videos, each with a name and a definition that is printed beside its figures."""
 
+from persist_cli.metrics.camera_control import RotationError, TranslationError
 from persist_cli.metrics.depth import AbsRel, Delta1, Rmse
 from persist_cli.metrics.dreamsim import DreamSim
 from persist_cli.metrics.drift import Drift
@@ -16,6 +17,7 @@ METRICS: dict[str, Metric] = {
     metric.name: metric
     for metric in (
         Psnr(), Sharpness(), Grain(), Ssim(), LpipsAlex(), LpipsVgg(), DreamSim(), Fvd(), KernelDistance(), Src(),
-        SrcPatch(), SrcAway(), PsnrOwn(), LpipsOwn(), AbsRel(), Rmse(), Delta1(), Drift(),
+        SrcPatch(), SrcAway(), PsnrOwn(), LpipsOwn(), AbsRel(), Rmse(), Delta1(), Drift(), RotationError(),
+        TranslationError(),
     )
 }  # fmt: skip

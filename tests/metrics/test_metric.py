@@ -17,7 +17,7 @@ from tests.support.predictions import prediction, random_frames, setup, still_ca
 def test_every_metric_has_a_name_a_title_and_a_definition_of_one_line():
     columns = (
         "psnr sharpness grain ssim lpips-alex lpips-vgg dreamsim fvd kd-dinov2 src src-patch src-away psnr-own "
-        "lpips-own absrel rmse delta1 drift"
+        "lpips-own absrel rmse delta1 drift rot-error trans-error"
     )
     assert " ".join(METRICS) == columns
     for name, metric in METRICS.items():
@@ -35,6 +35,9 @@ def test_metrics_without_their_weights_name_the_command_that_fetches_them(tmp_pa
         obstacle = metric.obstacle(setup(unseen_scenes=2))
         assert bool(obstacle) == bool(metric.weights), name
         assert obstacle is None or f"persist weights fetch {metric.weights[0]}" in obstacle
+
+
+CAMERA = ("rot-error", "trans-error")
 
 
 def test_importing_the_metrics_imports_no_network_and_no_heavy_library():
@@ -68,7 +71,7 @@ def test_a_rollout_is_compared_by_the_frame_metrics_that_can_be_measured(tmp_pat
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path))
     start, truth = there_and_back().truth[:1], there_and_back().truth[1:]
     figures = compare(start, replace(truth, depth=truth.depth * 1.1), truth)
-    assert list(figures) == ["psnr", "sharpness", "grain", "ssim", "absrel", "rmse", "delta1", "drift"]
+    assert list(figures) == ["psnr", "sharpness", "grain", "ssim", "absrel", "rmse", "delta1", "drift", *CAMERA]
     assert figures["psnr"] == [100.0] * 6
     assert figures["absrel"] == pytest.approx([0.1] * 6, rel=1e-5)
     assert "drift" not in compare(start, truth, replace(truth, depth=torch.zeros_like(truth.depth)))
