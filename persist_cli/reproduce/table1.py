@@ -155,8 +155,9 @@ def memory_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
 def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
     """The command lines of all tables of the runs in ``out``.
 
-    Each memory is sampled as was chosen for it. In the tables of equal information and of forms all rows are sampled
-    alike: what was chosen was chosen for the winner's recipe, which would have the advantage.
+    Each memory is sampled as was chosen for it. In the tables of equal information, of forms and without depth all
+    rows are sampled alike: what was chosen was chosen for the winner's recipe, which would have the advantage, and on a
+    model with depth.
     """
     home, runs = shlex.quote(str(out)), tables(out, tuple(CHOSEN), chosen)
     revisit = revisit_options(out)
@@ -171,7 +172,7 @@ def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
         table(out, "forms", forms, f"{alike(('voxel',))} {revisit} --controls codec --metrics {METRICS}"),
         table(
             out, "without-depth", without_depth,
-            f"{named(WITHOUT_DEPTH, chosen)} {revisit} --controls codec --metrics psnr,ssim,lpips-alex",
+            f"{alike(WITHOUT_DEPTH)} {revisit} --controls codec --metrics psnr,ssim,lpips-alex",
         ),
         table(
             out, "seeds", seeds,
