@@ -38,6 +38,8 @@ SIMULATOR: Final = "simulator"
 
 EPISODES: Final = "episodes.json"
 
+EACH: Final = 2  # episodes a house and kind: 8 actions away, 16 in sight, 16 hidden
+
 VIEWS: Final = "views"
 
 CHANGE: Final = "after − before"
@@ -129,7 +131,7 @@ def preparations(plan: Plan) -> Iterator[str]:
     """Yield the commands that draw the episodes, unless they are drawn, and collect the given views."""
     home = shlex.quote(str(plan.out))
     if not (plan.out / EPISODES).is_file():
-        yield f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {plan.houses} --out {home}/{EPISODES}"
+        yield f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {EACH * plan.houses} --out {home}/{EPISODES}"
     yield f"collect miniworld --out {home}/{VIEWS} --scenes {plan.scenes} --frames {plan.views} --split test"
 
 
