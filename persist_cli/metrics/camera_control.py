@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.api.cameras import invert_rigid
 from persist_cli.api.geometry import pose_differences
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
 from persist_cli.metrics.odometry import SIGHTED, TURNS, camera_motions
@@ -69,6 +70,6 @@ def errors(prediction: Prediction) -> Float[Tensor, "2 frame"]:
     figures = torch.full((2, len(frames)), math.nan, dtype=torch.float64)
     if len(frames) > 1:
         poses = frames.cameras.world_from_camera.double()
-        asked = torch.linalg.inv(poses[:-1]) @ poses[1:]
+        asked = invert_rigid(poses[:-1]) @ poses[1:]
         figures[:, 1:] = torch.stack(pose_differences(camera_motions(frames), asked))
     return figures

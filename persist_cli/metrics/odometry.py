@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from persist_cli.api.cameras import Cameras
+from persist_cli.api.cameras import invert_rigid
 from persist_cli.api.geometry import small_motions, unproject
 from persist_cli.api.observations import Observations
 
 LEVELS = {16: 6, 32: 4, 64: 2}  # pixels along the longer side, coarse to fine, and rounds of Gauss-Newton
 KEPT = 9, 3  # starts that go on at their costs, and after a few rounds
-TRIALS = 3
+TRIALS = 3  # so many
 SIGHTED = 0.25  # share of a frame's pixels that the other must see, or nothing is known of the motion
 
 COLOR, DEPTH = 0.1, 0.1  # of a channel's range and of the depth: a pixel that is so far off counts half
@@ -69,8 +69,7 @@ def camera_motions(frames: Observations) -> Float[Tensor, "step 4 4"]:
     motions, costs = _from_starts(pairs, start_motions(pairs), LEVELS[min(LEVELS)])
     for side, rounds in list(LEVELS.items())[1:]:
         motions, costs = align(make_pairs(at_size(frames, side)), motions, rounds)
-    inverse: Tensor = torch.linalg.inv(motions)
-    return torch.where(costs.isfinite()[:, None, None], inverse, math.nan)
+    return torch.where(costs.isfinite()[:, None, None], invert_rigid(motions), math.nan)
 
 
 def _from_starts(pairs: Pairs, starts: Float[Tensor, "pair start 4 4"], rounds: int) -> tuple[Tensor, Tensor]:
@@ -95,12 +94,7 @@ def at_size(frames: Observations, side: int) -> Observations:
 
 def make_pairs(frames: Observations) -> Pairs:
     """Each frame but the last with the one that follows."""
-    own = Cameras(
-        torch.eye(4, dtype=torch.float64).expand(len(frames.depth), 4, 4),
-        frames.cameras.intrinsics.double(),
-        frames.cameras.height,
-        frames.cameras.width,
-    )
+    own = frames.cameras.at(torch.eye(4, dtype=torch.float64).expand(len(frames), 4, 4))
     known = frames.depth > LEAST_DEPTH
     inverse = torch.where(known, 1 / frames.depth.clamp_min(LEAST_DEPTH), 0.0)
     images = torch.cat([frames.rgb.permute(0, 3, 1, 2) / 255, inverse[:, None]], dim=1)
@@ -110,7 +104,7 @@ def make_pairs(frames: Observations) -> Pairs:
         values=images[:-1].flatten(2).transpose(1, 2),
         known=known[:-1].flatten(1),
         images=torch.cat([images, known[:, None].double(), right, down], dim=1)[1:],
-        intrinsics=own.intrinsics[1:],
+        intrinsics=own.intrinsics[1:].double(),
     )
 
 
@@ -125,8 +119,7 @@ def start_motions(pairs: Pairs) -> Float[Tensor, "pair start 4 4"]:
     poses = small_motions(torch.stack([zeros] * 3, -1), torch.stack([zeros, turns.flatten().deg2rad(), zeros], -1))
     poses = poses.expand(len(depth), -1, 4, 4).clone()
     poses[..., :3, 3] = poses[..., :3, 2] * (depth[:, None] * steps.flatten())[..., None]
-    inverse: Tensor = torch.linalg.inv(poses)
-    return inverse
+    return invert_rigid(poses)
 
 
 def align(
