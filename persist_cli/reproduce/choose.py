@@ -40,23 +40,6 @@ METRICS: Final = {"psnr": "PSNR", "psnr-last": "last frame", "lpips-alex": "LPIP
 CRITERION: Final = "lpips-alex"  # lower is better; by PSNR the blurriest would be chosen
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What a trial trains.
-
-    Args:
-        overrides: settings on top of the recipe.
-        form: end of the recipe's name, ``-rendered`` for that of another form of the adapter.
-    """
-
-    overrides: tuple[str, ...] = ()
-    form: str = ""
-
-    def recipe(self, memory: str) -> str:
-        """The name of the recipe for a memory."""
-        return f"{RECIPE}{memory}{self.form}"
-
-
 def cells(edge: float, axes: int, drawn: float, budget: int) -> tuple[str, ...]:
     """The settings of a map with cells of an edge in metres, drawn somewhat larger."""
     size = f"memory.settings.cell={[edge] * axes}"
@@ -73,35 +56,28 @@ def frames(count: int, patch: int) -> tuple[str, ...]:
     return f"memory.settings.count={count}", f"adapter.token_budget={count}", f"adapter.frame_patch={patch}"
 
 
-RENDERED: Final = "-rendered"
 WIDER: Final = ("adapter.head_width=192",)
 
-# for each memory what is tried: form, resolution and head where it has them
-TRIALS: Final[dict[str, dict[str, Settings]]] = {
-    "none": {"canvas": Settings(), "rendered": Settings(form=RENDERED)},
+# for each memory what is tried on top of its recipe: resolution, and the head where it has one
+TRIALS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
+    "none": {"learned-tokens": ()},
     "voxel": {
-        "canvas-6cm": Settings(cells(0.0625, 3, 0.09, 16384)),
-        "canvas-3cm": Settings(cells(0.03, 3, 0.05, 65536)),
-        "rendered-6cm": Settings(cells(0.0625, 3, 0.09, 16384), RENDERED),
-        "rendered-2cm": Settings(cells(0.02, 3, 0.03, 131072), RENDERED),
-        "rendered-2cm-wider-head": Settings(cells(0.02, 3, 0.03, 131072) + WIDER, RENDERED),
+        "6cm": cells(0.0625, 3, 0.09, 16384),
+        "2cm": cells(0.02, 3, 0.03, 131072),
+        "2cm-wider-head": cells(0.02, 3, 0.03, 131072) + WIDER,
     },
     "map2d": {
-        "canvas-6cm": Settings(cells(0.0625, 2, 0.09, 16384)),
-        "canvas-12cm": Settings(cells(0.125, 2, 0.18, 16384)),
-        "rendered-6cm": Settings(cells(0.0625, 2, 0.09, 16384), RENDERED),
-        "rendered-2cm": Settings(cells(0.02, 2, 0.03, 131072), RENDERED),
-        "rendered-6cm-wider-head": Settings(cells(0.0625, 2, 0.09, 16384) + WIDER, RENDERED),
+        "6cm": cells(0.0625, 2, 0.09, 16384),
+        "2cm": cells(0.02, 2, 0.03, 131072),
+        "6cm-wider-head": cells(0.0625, 2, 0.09, 16384) + WIDER,
     },
     "snapshots": {
-        "canvas-32x32": Settings(images(32, 0.12, 16384)),
-        "canvas-64x64": Settings(images(64, 0.09, 32768)),
-        "rendered-32x32": Settings(images(32, 0.12, 16384), RENDERED),
-        "rendered-64x64": Settings(images(64, 0.06, 131072), RENDERED),
-        "rendered-64x64-wider-head": Settings(images(64, 0.06, 131072) + WIDER, RENDERED),
+        "32x32": images(32, 0.12, 16384),
+        "64x64": images(64, 0.06, 131072),
+        "64x64-wider-head": images(64, 0.06, 131072) + WIDER,
     },
-    "views": {"4-frames": Settings(frames(4, 1)), "16-frames": Settings(frames(16, 2))},
-    "context": {"4-frames": Settings(frames(4, 1)), "16-frames": Settings(frames(16, 2))},
+    "views": {"4-frames": frames(4, 1), "16-frames": frames(16, 2)},
+    "context": {"4-frames": frames(4, 1), "16-frames": frames(16, 2)},
 }
 
 FIRST: Final = Sampling(4, "unipc", 1.0)  # of the trials of settings
@@ -138,7 +114,7 @@ class Trial:
 
     Args:
         name: name of the settings.
-        settings: what was trained.
+        overrides: settings on top of the memory's recipe.
         sampling: how clips were sampled.
         figures: mean of each column of ``METRICS``.
         clips: number of clips.
@@ -146,7 +122,7 @@ class Trial:
     """
 
     name: str
-    settings: Settings
+    overrides: tuple[str, ...]
     sampling: Sampling
     figures: dict[str, float | None]
     clips: int
@@ -188,12 +164,11 @@ def train_command(plan: Plan, memory: str, name: str) -> str:
     """The command line that trains a memory with the settings of a trial, on from where it stopped."""
     data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.data)
     cooldown = plan.steps // 3
-    trial = TRIALS[memory][name]
-    settings = [*trial.overrides, f"training.steps={plan.steps}", f"training.cooldown={cooldown}"]
+    settings = [*TRIALS[memory][name], f"training.steps={plan.steps}", f"training.cooldown={cooldown}"]
     changes = shlex.join([f"base={plan.base}", *settings])
     cache = shlex.quote(str(plan.out / "cache"))
     run = shlex.quote(str(run_folder(plan, memory, name)))
-    return f"finetune {trial.recipe(memory)} {data} --out {run} --resume --cache {cache} {changes}"
+    return f"finetune {RECIPE}{memory} {data} --out {run} --resume --cache {cache} {changes}"
 
 
 def eval_command(plan: Plan, memory: str, name: str, sampling: Sampling) -> str:
@@ -277,9 +252,9 @@ def choice_json(memory: str, trials: Sequence[Trial], splits: Sequence[str]) -> 
         second = best_of(others)
         reason = f"lowest {CRITERION} of {len(trials)}, {best.cost:.4f}; next is {second}: {second.cost:.4f}"
     return {
-        "recipe": best.settings.recipe(memory),
+        "recipe": f"{RECIPE}{memory}",
         "name": best.name,
-        "overrides": list(best.settings.overrides),
+        "overrides": list(best.overrides),
         "sampling": asdict(best.sampling),
         "cost": best.figures[CRITERION],
         "chosen_on": houses_text(best.houses, splits),
@@ -396,8 +371,7 @@ def main() -> None:
     try:
         memories = memories_of(options.memories)
         for memory in memories:
-            for settings in TRIALS[memory].values():
-                make_recipe(read_recipe(settings.recipe(memory)), settings.recipe(memory))
+            make_recipe(read_recipe(f"{RECIPE}{memory}"), f"{RECIPE}{memory}")
         run_choose(
             Plan(options.out, options.base, tuple(options.data), validation, memories, options.steps, options.clips)
         )

@@ -20,9 +20,9 @@ from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.reproduce import choose
 from persist_cli.reproduce.choose import (
     FIRST,
+    RECIPE,
     TRIALS,
     Plan,
-    Settings,
     Trial,
     best_of,
     chosen_costs,
@@ -50,10 +50,10 @@ def plan(out: Path, *memories: str) -> Plan:
 @pytest.mark.parametrize("memory", TRIALS)
 def test_every_trial_is_a_recipe_and_commands_that_persist_takes(memory: str, tmp_path: Path) -> None:
     asked = plan(tmp_path / "two words", memory)
-    for name, settings in TRIALS[memory].items():
-        recipe = make_recipe(apply_overrides(read_recipe(settings.recipe(memory)), settings.overrides), name)
+    for name, overrides in TRIALS[memory].items():
+        recipe = make_recipe(apply_overrides(read_recipe(f"{RECIPE}{memory}"), overrides), name)
         assert recipe.memory is not None
-        assert (recipe.memory.name, name.partition("-")[0] in (recipe.adapter["form"], "4", "16")) == (memory, True)
+        assert recipe.memory.name == memory
         for line in (
             *preparations(asked),
             train_command(asked, memory, name),
@@ -70,14 +70,14 @@ def test_only_validation_houses_are_measured(tmp_path: Path) -> None:
     asked = plan(tmp_path)
     collected = [line for line in preparations(asked) if line.startswith("collect")]
     assert all("--split validation" in line for line in collected)
-    words = shlex.split(eval_command(asked, "voxel", "canvas-6cm", FIRST))
+    words = shlex.split(eval_command(asked, "voxel", "6cm", FIRST))
     data = [words[place + 1] for place, word in enumerate(words) if word == "--data"]
     assert data == [*map(str, asked.validation)]
 
 
 def test_the_lowest_cost_is_chosen_and_of_equal_ones_the_first() -> None:
     def trial(name: str, cost: float | None) -> Trial:
-        return Trial(name, Settings(), FIRST, {"lpips-alex": cost}, 8, 4)
+        return Trial(name, (), FIRST, {"lpips-alex": cost}, 8, 4)
 
     assert best_of([trial("a", 0.3), trial("b", 0.2), trial("c", 0.2), trial("d", None)]).name == "b"
 
@@ -119,13 +119,13 @@ def test_settings_are_chosen_before_sampling_and_all_is_written(measured: tuple[
     out, lines = measured
     run_choose(plan(out, "snapshots"))
     choice = json.loads((out / "choices.json").read_text())["memories"]["snapshots"]
-    assert (choice["name"], choice["sampling"]["memory_guidance"]) == ("canvas-64x64", 2.0)
+    assert (choice["name"], choice["sampling"]["memory_guidance"]) == ("64x64", 2.0)
     assert chosen_sampling(out) == {"snapshots": Sampling(4, "unipc", 2.0)}
     assert chosen_costs(out) == {"snapshots": pytest.approx(0.25)}
     assert len(choice["trials"]) == len(TRIALS["snapshots"]) + 2 + 4
     trained = {shlex.split(line)[shlex.split(line).index("--out") + 1] for line in lines if line.startswith("finetune")}
     assert trained == {str(out / "runs/snapshots" / name) for name in TRIALS["snapshots"]}
-    assert "**canvas-64x64**" in (out / "choices.md").read_text()
+    assert "**64x64**" in (out / "choices.md").read_text()
     assert "houses of the split validation)" in choice["reason"]
     assert "houses of the split validation)" in recipe_file(out, "snapshots").read_text()
     assert json.loads((out / "choices.json").read_text())["splits"] == ["validation"]
@@ -156,7 +156,7 @@ def test_the_recipe_that_is_written_has_what_was_chosen(measured: tuple[Path, li
     assert recipe.memory is not None
     assert recipe.memory.settings["grid"] == [64, 64]
     assert recipe.memory.encoder == "patches"
-    assert recipe.adapter["token_budget"] == 32768
+    assert recipe.adapter["token_budget"] == 131072
     assert recipe.chosen_on.endswith("houses of the split validation")
 
 
@@ -166,7 +166,7 @@ def test_what_was_measured_is_not_measured_again(measured: tuple[Path, list[str]
     before = len(lines)
     run_choose(plan(out, "none"))
     assert [line for line in lines[before:] if line.startswith(("finetune", "eval"))] == []
-    assert result_folder(plan(out), "none", "canvas", FIRST).is_dir()
+    assert result_folder(plan(out), "none", "learned-tokens", FIRST).is_dir()
 
 
 CHANGES = [{"steps": 7}, {"clips": 8}, {"validation": HOUSES}, {"data": (Path("other"),)}]

@@ -76,7 +76,7 @@ def test_every_setting_has_a_meaning_and_every_meaning_a_setting(kind):
 def test_a_setting_is_shown_with_what_it_allows_and_the_default_that_it_differs_from():
     text = " ".join(line.strip(" #") for line in shown("houses-64-stage2-voxel").splitlines())
     assert "optimizer steps; a whole number of at least 1; default 1000 steps: 1500" in text
-    assert "three numbers above 0; default [0.25, 1.0, 0.25] cell: [0.0625, 0.0625, 0.0625]" in text
+    assert "three numbers above 0; default [0.25, 1.0, 0.25] cell: [0.02, 0.02, 0.02]" in text
     assert "processes that read data; a whole number of at least 0 workers: 1" in text
 
 
