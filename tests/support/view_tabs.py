@@ -17,6 +17,7 @@ from websockets.typing import Origin, Subprotocol
 
 PATIENCE = 60.0  # seconds in which a busy machine answers
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
+ALL_READ: dict[str, Any] = {"max_size": None, "max_queue": None}  # else 16 unread messages hold up its pongs: it closes
 
 
 def until(happened: Callable[[], bool]) -> None:
@@ -32,7 +33,7 @@ def open_socket(address: str, origin: str | None = "", host: str = "") -> Client
     own = urlsplit(address)
     raw = socket.create_connection((own.hostname, own.port))
     named = None if origin is None else Origin(origin or address.rstrip("/"))
-    return connect(f"ws://{host or own.netloc}/", sock=raw, origin=named, subprotocols=[PROTOCOL], max_size=None)
+    return connect(f"ws://{host or own.netloc}/", sock=raw, origin=named, subprotocols=[PROTOCOL], **ALL_READ)
 
 
 @dataclass

@@ -99,7 +99,8 @@ def test_the_button_takes_one_rectangle_and_pressed_again_none(page, tab):
     pressed._arm()
     tab.rectangle((0.0, 0.0), (1.0, 1.0))
     until(lambda: len(page.session.selection) > 0 and pressed._armed is None)
-    page.session.selection = ()
+    with page.lock:  # what was selected is shown
+        page.session.selection = ()
     pressed._arm()
     pressed._arm()
     tab.rectangle((0.0, 0.0), (1.0, 1.0))
