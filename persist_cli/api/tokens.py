@@ -24,6 +24,8 @@ class MemoryTokens:
         mask: true for tokens, false for padding.
         colors: uint8 RGB, 0…255, of the surface at each token; ``None`` for a memory that knows no colours.
         origins: the ``Origin`` of each token, 0 for padding; without it all are observed.
+        distances: float32 metres from which each token's surface was seen, where several times the nearest of them;
+            ``None`` for a memory that does not know them.
         images: uint8 RGB, 0…255, of tokens that are frames; ``None`` for points.
         world_from_camera: the pose of each image, float64, metres.
         intrinsics: the intrinsics of each image in its pixels, float64.
@@ -37,6 +39,7 @@ class MemoryTokens:
     mask: Bool[Tensor, "*batch token"]
     colors: UInt8[Tensor, "*batch token 3"] | None = None
     origins: UInt8[Tensor, "*batch token"] = None  # type: ignore[assignment]  # set below
+    distances: Float[Tensor, "*batch token"] | None = None
     images: UInt8[Tensor, "*batch token height width 3"] | None = None
     world_from_camera: Float[Tensor, "*batch token 4 4"] | None = None
     intrinsics: Float[Tensor, "*batch token 3 3"] | None = None
@@ -75,21 +78,24 @@ class MemoryTokens:
         positions: Float[Tensor, "token 3"],
         colors: UInt8[Tensor, "token 3"] | None = None,
         origins: UInt8[Tensor, " token"] | None = None,
+        distances: Float[Tensor, " token"] | None = None,
     ) -> MemoryTokens:
-        """Return tokens of one sample without padding; positions are in world metres."""
+        """Return tokens of one sample without padding; positions and distances are in world metres."""
         mask = torch.ones(len(features), dtype=torch.bool, device=features.device)
-        return MemoryTokens(features.float(), positions.double(), mask, colors, origins)  # type: ignore[arg-type]
+        distances = None if distances is None else distances.float()
+        return MemoryTokens(features.float(), positions.double(), mask, colors, origins, distances)  # type: ignore[arg-type]
 
     @staticmethod
     def empty(channels: int) -> MemoryTokens:
         """Return one sample without tokens, whose features would have ``channels`` channels."""
-        return MemoryTokens.of(torch.zeros(0, channels), torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+        colors, distances = torch.zeros(0, 3, dtype=torch.uint8), torch.zeros(0)
+        return MemoryTokens.of(torch.zeros(0, channels), torch.zeros(0, 3), colors, distances=distances)
 
     @staticmethod
     def stack(samples: Sequence[MemoryTokens]) -> MemoryTokens:
         """Return a batch of unbatched samples, padded to the longest one and to at least one token.
 
-        The batch has colours when all its samples have them; all samples or none are rendered.
+        The batch has colours, and distances, when all its samples have them; all samples or none are rendered.
         """
         width = max(1, *(len(sample) for sample in samples))
         parts = [sample.tensors() for sample in samples]

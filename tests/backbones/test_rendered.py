@@ -74,6 +74,26 @@ def test_an_antialiased_pixel_is_the_mean_of_what_is_drawn_in_it_and_covered_by_
     assert views.covered[0, 0].sum() == 0.5
 
 
+def two_at_a_pixel(behind, distances=None):
+    """Tokens of grey 100 and, some metres behind it, of grey 200."""
+    place = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 3.0 + behind]], dtype=torch.float64).expand(2, 2, 3)
+    colors = torch.tensor([[100] * 3, [200] * 3], dtype=torch.uint8).expand(2, 2, 3)
+    tokens = MemoryTokens(torch.zeros(2, 2, CHANNELS), place, torch.ones(2, 2).bool(), colors)
+    return tokens if distances is None else dataclasses.replace(tokens, distances=torch.tensor([distances] * 2))
+
+
+@pytest.mark.parametrize(
+    ("behind", "distances", "grey", "depth"),
+    [(0.2, None, 100, 3.0), (0.04, None, 150, 3.02), (0.04, [1.0, 2.0], 120, 3.008), (0.2, [2.0, 0.0], 100, 3.0)],
+    ids=["hidden", "one surface", "seen from twice as far", "hidden, though seen from nearer"],
+)
+def test_tokens_of_one_surface_are_drawn_as_their_mean_by_how_near_they_were_seen(behind, distances, grey, depth):
+    clips = random_clips()
+    views = render_views(two_at_a_pixel(behind, distances), clips.cameras, POINTS)
+    assert (views.rgb[:, 0] == grey).all()
+    assert torch.allclose(views.depth[:, 0], torch.tensor(depth))
+
+
 def test_holes_are_filled_from_around_them_and_count_as_holes():
     clips = random_clips()
     views = render_views(wall(), clips.cameras, POINTS)

@@ -39,6 +39,17 @@ def test_a_read_gives_at_most_the_budget_and_no_token_for_a_budget_of_zero(name)
     assert len(memory.read(observations.cameras, 0)) == 0
 
 
+@pytest.mark.parametrize("name", ["voxel", "map2d", "snapshots"])
+def test_tokens_tell_from_how_near_their_surfaces_were_seen(name):
+    far, near = observe([look((0.0, 1.4, 1.0), 0.0)]), observe([look((0.0, 1.4, 0.5), 0.0)])
+    memory = written_memory(name, far)
+    seen = memory.read(far.cameras, 1000).distances
+    assert far.depth.min() - 0.01 < seen.min() < seen.max() < far.depth.max() + 0.01
+    memory.write(near)
+    assert memory.read(far.cameras, 1000).distances.max() < seen.max() + 0.01
+    assert near.depth.min() - 0.01 < memory.read(near.cameras, 1000).distances.min() < seen.min() - 0.3
+
+
 @pytest.mark.parametrize("name", MEMORIES)
 def test_a_restored_memory_is_equal_to_the_bit_and_so_is_what_is_written_afterwards(name):
     observations = room_walk()

@@ -18,15 +18,15 @@ from typing import Any, Literal, NamedTuple, Self
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64, Shaped, UInt8
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, Encode, NoiseLevel, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import NEAR, Adapter, Encode, NoiseLevel, PreparedMemory, VideoShape
 from persist_backbones.adapters.canvas import CanvasHead
 from persist_backbones.adapters.memory_block import AttentionSettings
 from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
 from persist_backbones.adapters.projected import ProjectedAdapter, ProjectedMemory, ProjectedSettings, image_places
-from persist_backbones.adapters.splat import Splats, coarser, hide_covered, rasterize, splat
+from persist_backbones.adapters.splat import Splats, coarser, hide_covered, rasterize, weighted_means
 from persist_backbones.noise_levels import add_level
 from persist_backbones.tensors import fold_frames, fold_patches, push_pull, zero_init
 from persist_cli.api.cameras import Cameras
@@ -45,6 +45,8 @@ class RenderedSettings(AttentionSettings):
         token_size: edge in metres of the square that a token is drawn as, somewhat more than the edge of a cell.
         splat_pixels: largest edge of a drawn token in pixels, plus 1 / ``supersampling`` where ``splat_pixels`` ×
             ``supersampling`` is even: with 9 and 2 it is 9.5. 1 draws points only where ``supersampling`` is 1.
+        thickness: metres behind the nearest token at a pixel in which tokens are of the same surface: their mean is
+            drawn, in which those count more that were seen from nearer.
         supersampling: number n of an antialiased drawing, in which a pixel is the mean of n × n that are drawn.
         head_width: hidden channels of the layers that correct the prediction by the rendered views.
         head_layers: number of those layers that look at neighbouring latent pixels.
@@ -66,6 +68,7 @@ class RenderedSettings(AttentionSettings):
     token_budget: PositiveInt = 65536
     token_size: PositiveFloat = 0.03
     splat_pixels: PositiveInt = 9
+    thickness: NonNegativeFloat = 0.05
     supersampling: PositiveInt = 2
     head_width: PositiveInt = 96
     head_layers: PositiveInt = 2
@@ -119,17 +122,32 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSetti
     views = cameras.resized(cameras.height * finer, cameras.width * finer)
     shape = (*cameras.world_from_camera.shape[:2], views.height, views.width)
     drawn_pixels = rasterize(tokens.positions, tokens.mask, views, settings.token_size, settings.splat_pixels * finer)
-    splats, _ = hide_covered(drawn_pixels, math.prod(shape))
+    splats, _ = hide_covered(drawn_pixels, math.prod(shape), settings.thickness)
     shown = torch.zeros_like(tokens.mask).flatten().index_fill(0, splats.token, True).view_as(tokens.mask)
-    observed = (tokens.origins == Origin.OBSERVED)[..., None].float()
-    drawn = splat(torch.cat([tokens.colors.float(), observed], dim=-1), splats, shape)
-    color, observed, covered, logs = drawn.split([3, 1, 1, 1], dim=2)
-    parts = torch.cat([color, logs.exp(), observed, torch.ones_like(covered)], dim=2) * covered
-    sums = F.avg_pool2d(parts.flatten(0, 1), finer)
+    sums = F.avg_pool2d(_surfaces(tokens, splats, shape).flatten(0, 1), finer)
     pictures, observed, covered = sums.split([4, 1, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     origins = torch.cat([observed, covered - observed], dim=1).unflatten(0, shape[:2])
     return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown, drawn_pixels)
+
+
+def _surfaces(
+    tokens: MemoryTokens, splats: Splats, shape: tuple[int, int, int, int]
+) -> Float[Tensor, "batch frame 6 height width"]:
+    """Return colour, depth, whether it was observed, and 1 of the surface at each pixel; zeros where there is none.
+
+    Of its splats those that were seen from nearer count more: a pixel from half the distance shows a quarter of the
+    area, and counts as the four that would cover what the other shows.
+    """
+    assert tokens.colors is not None
+    columns = [tokens.colors.float(), (tokens.origins == Origin.OBSERVED)[..., None].float()]
+    color, observed = torch.cat(columns, dim=-1).flatten(0, 1).index_select(0, splats.token).split([3, 1], dim=1)
+    values = torch.cat([color, splats.depth[:, None].float(), observed, torch.ones_like(observed)], dim=1)
+    distances = torch.ones_like(tokens.mask, dtype=torch.float32) if tokens.distances is None else tokens.distances
+    weights = distances.clamp_min(NEAR).square().reciprocal().flatten().index_select(0, splats.token)
+    means = weighted_means(values, weights, splats, math.prod(shape))
+    result: Tensor = means.unflatten(0, shape).permute(0, 1, 4, 2, 3)
+    return result
 
 
 def tokens_not_shown(tokens: MemoryTokens, shown: Bool[Tensor, "batch token"], cameras: Cameras, most: int) -> Tensor:
@@ -311,7 +329,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
     def rendering(self) -> Mapping[str, Any]:
         """Return the settings that ``render`` depends on."""
         settings = self.settings
-        names = ["token_size", "splat_pixels", "supersampling", "attention_tokens"]
+        names = ["token_size", "splat_pixels", "thickness", "supersampling", "attention_tokens"]
         names += ["layers", "layer_gap", "layer_scale", "classes"] if settings.layers else []
         return {name: getattr(settings, name) for name in names}
 

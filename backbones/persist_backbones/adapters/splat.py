@@ -30,15 +30,16 @@ class Splats(NamedTuple):
     depth: Float[Tensor, " splat"]
 
 
-def hide_covered(splats: Splats, pixels: int) -> tuple[Splats, Float[Tensor, " pixel"]]:
+def hide_covered(splats: Splats, pixels: int, thickness: float = 0.0) -> tuple[Splats, Float[Tensor, " pixel"]]:
     """Return the splats at the depth of the nearest at their pixel, and that depth at each pixel, infinite without any.
 
     Args:
         splats: the pixels that the tokens cover.
         pixels: number of pixels of all frames of the batch.
+        thickness: metres behind the nearest that are at its depth still.
     """
     nearest = nearest_at(splats.pixel, splats.depth, pixels)
-    visible = splats.depth <= nearest[splats.pixel] * (1 + TIE)
+    visible = splats.depth <= nearest[splats.pixel] * (1 + TIE) + thickness
     return Splats(*(column[visible] for column in splats)), nearest
 
 
@@ -68,6 +69,23 @@ def splat(
     )
     result: Tensor = canvas.unflatten(0, shape).permute(0, 1, 4, 2, 3)
     return result
+
+
+def weighted_means(
+    values: Float[Tensor, "splat channel"], weights: Float[Tensor, " splat"], splats: Splats, pixels: int
+) -> Float[Tensor, "pixel channel"]:
+    """Return the weighted mean of the values of all splats of each pixel; zeros where there is none.
+
+    Args:
+        values: values of each splat.
+        weights: weights above zero; only their ratios at a pixel count.
+        splats: the pixels that tokens cover.
+        pixels: number of pixels of all frames of the batch.
+    """
+    largest = weights.new_zeros(pixels).scatter_reduce(0, splats.pixel, weights, "amax")
+    shares = weights / largest[splats.pixel]  # no sum overflows or vanishes
+    total = values.new_zeros(pixels, values.shape[1]).index_add(0, splats.pixel, values * shares[:, None])
+    return total / shares.new_zeros(pixels).index_add(0, splats.pixel, shares).clamp_min(1e-6)[:, None]
 
 
 def coarser(splats: Splats, size: tuple[int, int], coarse: tuple[int, int]) -> Splats:

@@ -30,6 +30,7 @@ from persist_memory.grid.pooling import (
     max_pool,
     sum_pool,
     unpack_colors,
+    unpack_depths,
 )
 from persist_memory.grid.storage import BLOCK, LIMIT, SparseGrid, ValueColumn, pack, unpack
 from persist_memory.grid.visibility import Views, block_distances, nearest_cells, ranges
@@ -246,8 +247,9 @@ class GridMemory(Memory):
             features = features / self.grid.values("counts", cells)[:, None]
         centers = self._centers(self.grid.keys[cells])
         centers[:, 1] = self.heights(centers, cameras)
-        colors, origins = unpack_colors(self.grid.values("colors", cells)), self.grid.values(ORIGINS, cells)
-        return MemoryTokens.of(features, self._in_world(centers), colors, origins.clamp(max=Origin.OBSERVED))
+        nearest, origins = self.grid.values("colors", cells), self.grid.values(ORIGINS, cells)
+        colors, distances = unpack_colors(nearest), unpack_depths(nearest)
+        return MemoryTokens.of(features, self._in_world(centers), colors, origins.clamp(max=Origin.OBSERVED), distances)
 
     def _centers(self, keys: Tensor) -> Float[Tensor, "cell 3"]:
         """The cells' centres in the grid's axes, metres."""

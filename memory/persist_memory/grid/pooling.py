@@ -186,6 +186,11 @@ def unpack_colors(packed: Int64[Tensor, " pixel"]) -> UInt8[Tensor, "pixel 3"]:
     return torch.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], dim=-1).to(torch.uint8)
 
 
+def unpack_depths(packed: Int64[Tensor, " pixel"]) -> Float[Tensor, " pixel"]:
+    """The depth in metres of what ``pack_colors`` gave."""
+    return (packed >> 24).float() / 1000
+
+
 class RunFeatures:
     """The upsampled features of runs at both their ends.
 

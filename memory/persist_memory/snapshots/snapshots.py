@@ -198,7 +198,7 @@ class Snapshots(Memory):
         chosen = store[numbers.to(centers.device)]
         placed = chosen.depth > 0
         origins = self._origins(store)[numbers.to(centers.device)][:, None].expand_as(placed)
-        parts = (chosen.features, chosen.points, chosen.colors, origins)
+        parts = (chosen.features, chosen.points, chosen.colors, origins, chosen.depth)
         return MemoryTokens.of(*(part[placed][:budget] for part in parts))
 
     def _origins(self, store: SnapshotStore) -> UInt8[Tensor, " snapshot"]:
