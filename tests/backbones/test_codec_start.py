@@ -74,3 +74,14 @@ def test_a_codec_without_room_for_it_is_refused(vae: dict) -> None:
     backbone = micro(vae=vae, codec_start="components")
     with pytest.raises(CheckpointError, match="codec_start components needs a VAE of one block"):
         backbone.begin_stage("codec", [random_clips(1)])
+
+
+def test_the_weight_of_a_channel_is_what_it_changes_in_decoded_pixels() -> None:
+    clips, backbone = smooth_clips(2), micro(**WIDER, codec_start="components").eval()
+    backbone.begin_stage("codec", [clips])
+    squares = F.pixel_unshuffle(backbone.codec.images(clips.rgb, clips.depth).transpose(1, 2).flatten(0, 1), 4)
+    wanted = Components.of(squares.permute(0, 2, 3, 1).flatten(0, 2), backbone.codec.channels).scales ** -2
+    weights = backbone.codec.pixel_weights()
+    assert weights.mean().item() == pytest.approx(1)
+    assert torch.allclose(weights, wanted / wanted.mean(), rtol=0.3)
+    assert weights.max() > 3 * weights.min()

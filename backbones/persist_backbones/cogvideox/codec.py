@@ -23,6 +23,7 @@ from persist_cli.errors import CheckpointError
 
 HALF_RANGE = 2.0  # the depth in metres whose code is 0
 NEAREST = 0.05  # metres; a nearer decoded depth counts as missing
+IMPULSE = 5  # latent pixels along the edge of the image in which the middle one is changed
 MOST_VALUES = 2**30  # of a convolution's input that diffusers' CogVideoXSafeConv3d does not split
 
 
@@ -184,6 +185,7 @@ class Codec(nn.Module):
         check_vae(vae)
         self.vae = vae
         self._fingerprint: tuple[object, str] | None = None  # state of the VAE, and its hash
+        self._pixel_weights: Tensor | None = None
         if self.framewise:
             make_framewise(vae)
 
@@ -255,6 +257,17 @@ class Codec(nn.Module):
         stacked = torch.cat(parts).transpose(1, 2) / self.vae.config.scaling_factor
         color, *grey = self.images_of(stacked).float().chunk(len(parts))
         return color, decode_depth(grey[0].mean(dim=1)) if depth else torch.zeros_like(color[:, 0])
+
+    @torch.no_grad()
+    def pixel_weights(self) -> Float[Tensor, " channel"]:
+        """Return the squared change of decoded pixels by each channel about latents of zero; their mean is 1."""
+        if self._pixel_weights is None:
+            latents = torch.zeros(self.channels + 1, self.channels, 1, IMPULSE, IMPULSE, device=self.vae.device)
+            latents[range(self.channels), range(self.channels), 0, IMPULSE // 2, IMPULSE // 2] = 1.0
+            images = self.images_of(latents / self.vae.config.scaling_factor).float()
+            changes = (images[:-1] - images[-1]).square().sum(dim=(1, 2, 3, 4))
+            self._pixel_weights = changes / changes.mean()
+        return self._pixel_weights
 
     def posterior(self, images: Float[Tensor, "stacked 3 frame height width"]) -> DiagonalGaussianDistribution:
         """Return the distribution of the unscaled latents ``[stacked, channel, latent_frame, rows, columns]``."""

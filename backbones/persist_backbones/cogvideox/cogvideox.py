@@ -112,7 +112,13 @@ class CogVideoX(AdaptedBackbone):
         # weigh
         weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
         error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
-        return loss_parts(error, self.settings.depth)
+        return loss_parts(error * self.channel_weights(), self.settings.depth)
+
+    def channel_weights(self) -> Float[Tensor, "channel 1 1"]:
+        """Return the weight of the error of each channel of latents of RGB and depth; their mean is 1."""
+        if self.settings.channel_weights == "equal":
+            return torch.ones(2 * self.codec.channels, 1, 1, device=self.device)
+        return self.codec.pixel_weights().repeat(2)[:, None, None].to(self.device)
 
     def predict_noised(self, clips: Clips, generators: list[torch.Generator]) -> NoisedPrediction:
         """Predict from the clips' latents with noise of a random level, each sample's from its own generator."""
