@@ -97,13 +97,13 @@ def fetch_command() -> str:
 
 
 POLICIES: Mapping[str, str] = {  # by policy the scenes of each split
-    "path": "0:4000", "explore": "4000:7500", "loop": "7500:8000",
+    "path": "0:1600", "explore": "4000:5400",
 }  # fmt: skip
 HELD_OUT: Mapping[str, str] = {"path": "0:40", "explore": "40:70", "loop": "70:100"}
 
 
 def collect_commands(out: Path) -> list[str]:
-    """The command lines that collect 8,000 training houses of 100 frames, and the held-out ones."""
+    """The command lines that collect 3,000 training houses of 100 frames, and the held-out ones."""
     home = shlex.quote(str(out))
     train = [
         f"{COLLECT} --out {home}/houses/{policy} --scenes {scenes} --frames 100 --policy {policy}"

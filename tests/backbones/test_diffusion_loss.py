@@ -34,7 +34,7 @@ def test_the_loss_of_an_error_is_the_same_for_velocities_and_clean_latents(weigh
 
 def test_errors_of_channels_count_equally_or_by_what_they_change_in_pixels() -> None:
     clips = random_clips(2)
-    backbones = [micro(prediction="v_prediction", channel_weights=kind) for kind in ("equal", "pixels")]
+    backbones = [micro(prediction="v_prediction", channel_weights=kind) for kind in ("equal", "pixels", "root-pixels")]
     predicted, target, *_ = backbones[0].predict_noised(clips, sample_generators(clips.seeds))
     errors = (predicted - target).square().mean(dim=(0, 1, 3, 4))
     weights = torch.stack([backbone.channel_weights().flatten() for backbone in backbones])
@@ -42,6 +42,7 @@ def test_errors_of_channels_count_equally_or_by_what_they_change_in_pixels() -> 
     assert weights[0].eq(1).all()
     assert torch.equal(weights[1, :4], weights[1, 4:])
     assert weights[1].max() > 1.1 * weights[1].min()
+    assert torch.allclose(weights[2], weights[1].sqrt() / weights[1].sqrt().mean())
     assert torch.allclose(torch.stack(losses), (weights * errors).mean(dim=1), rtol=1e-4)
 
 

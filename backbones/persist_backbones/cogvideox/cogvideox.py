@@ -118,7 +118,10 @@ class CogVideoX(AdaptedBackbone):
         """Return the weight of the error of each channel of latents of RGB and depth; their mean is 1."""
         if self.settings.channel_weights == "equal":
             return torch.ones(2 * self.codec.channels, 1, 1, device=self.device)
-        return self.codec.pixel_weights().repeat(2)[:, None, None].to(self.device)
+        weights = self.codec.pixel_weights()
+        if self.settings.channel_weights == "root-pixels":
+            weights = weights.sqrt() / weights.sqrt().mean()
+        return weights.repeat(2)[:, None, None].to(self.device)
 
     def predict_noised(self, clips: Clips, generators: list[torch.Generator]) -> NoisedPrediction:
         """Predict from the clips' latents with noise of a random level, each sample's from its own generator."""

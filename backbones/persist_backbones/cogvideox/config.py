@@ -122,9 +122,10 @@ class CogVideoXSettings:
             strong as the latents themselves; the model is told the level. 0 for neither.
         weighting: weighting of errors: ``uniform``, ``min-snr`` or ``min-snr-plus-one``.
         snr_gamma: γ of the weighting by min-SNR.
-        channel_weights: of the errors of a latent pixel's channels: ``equal``, or in ``pixels``, the change of the
-            decoded image by each. Where some channels change the image a hundred times as much as others, a loss of
-            equal weights leaves errors in them that are small for latents and large to the eye.
+        channel_weights: of the errors of a latent pixel's channels: ``equal``, or in ``pixels``, the squared change of
+            the decoded image by each, or ``root-pixels``, between the two. Where some channels change the image a
+            hundred times as much as others, a loss of equal weights leaves errors in them that are small for latents
+            and large to the eye.
         kl_weight: weight of the codec's latent prior in its loss.
         codec_window: frames (a valid number of ``frames``, or 1), height and width of the random windows that the codec
             is trained on; a quarter of the pixels costs a quarter of the time.
@@ -151,7 +152,7 @@ class CogVideoXSettings:
     image_noise: NonNegativeFloat = 0.0
     weighting: Weighting = "uniform"
     snr_gamma: PositiveFloat = 5.0
-    channel_weights: Literal["equal", "pixels"] = "equal"
+    channel_weights: Literal["equal", "root-pixels", "pixels"] = "equal"
     kl_weight: NonNegativeFloat = 1e-6
     codec_window: tuple[int, PositiveInt, PositiveInt] | None = None
     codec_start: Literal["random", "components"] = "random"
