@@ -29,8 +29,7 @@ FIXED = ("nwm",)  # memories as their recipes are: of the paper's NWM nothing is
 FORMS = ("cross", "projected", "canvas", "canvas-head", "rendered")  # the same map, another way to the video
 EQUAL = ("voxel", "map2d", "snapshots", "views", "context")  # memories of equal information
 WITHOUT_DEPTH = ("none", "context", "views", "voxel")  # on a model that never saw depth; voxel reads it all the same
-SEEDS = 3  # trainings of none, voxel and the best other, each on a third of the steps
-SEED_SCHEDULE = "training.steps=500 training.cooldown=200"
+SEEDS = 3  # trainings of none, voxel and the best other
 
 SAMPLING = "--steps 4 --sampler unipc --guidance 1.5"  # of the packaged model; chosen in a trial on eight clips
 COMMON = "--steps 4 --sampler unipc --guidance 1"  # where nothing was chosen, or for another recipe than those compared
@@ -82,7 +81,8 @@ def base_commands(out: Path) -> list[str]:
 
 def choice_plan(out: Path) -> choose.Plan:
     """The choices that are made between the video model and the memories."""
-    data, validation = (tuple(out / part / policy for policy in POLICIES) for part in ("houses", "validation"))
+    data = tuple(out / "houses" / policy for policy in POLICIES)
+    validation = tuple(out / "validation" / policy for policy in HELD_OUT)
     return choose.Plan(out / "choices", str(out / "stage1"), data, validation, CHOSEN)
 
 
@@ -145,8 +145,7 @@ def memory_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
         *(f"finetune houses-64-forms-{form} {stage2} --out {home}/forms-{form}" for form in FORMS),
         *(f"finetune houses-64-stage2-{name}-rgb {without_depth} --out {home}/{name}-rgb" for name in WITHOUT_DEPTH),
         *(
-            f"finetune {recipes[memory]} {stage2} --out {home}/seeds/{memory}-{seed} training.seed={seed} "
-            f"{SEED_SCHEDULE}"
+            f"finetune {recipes[memory]} {stage2} --out {home}/seeds/{memory}-{seed} training.seed={seed}"
             for memory, seed in seeded
         ),
     ]
