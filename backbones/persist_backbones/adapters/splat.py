@@ -106,7 +106,7 @@ def rasterize(
     positions: Float[Tensor, "batch token 3"],
     mask: Bool[Tensor, "batch token"],
     views: Cameras,
-    token_size: float,
+    token_size: float | Float[Tensor, "batch token"],
     most: int,
 ) -> Splats:
     """Find the pixels that tokens cover: the pixel of their middle, and all that their square covers.
@@ -115,7 +115,7 @@ def rasterize(
         positions: world metres.
         mask: false for padding.
         views: cameras ``[batch, frame]`` of the canvas's size in pixels.
-        token_size: edge of the square in metres, facing the camera.
+        token_size: edge of the square in metres, facing the camera; one for all, or each token's own.
         most: limit of a square's size: it reaches at most ``most // 2`` pixels to each side of the one of its middle.
             So its edge is at most ``most`` pixels where that is odd, and one more where it is even.
     """
@@ -125,13 +125,16 @@ def rasterize(
     for sample in range(samples):  # one at a time: the data of one clip fits into the processor's cache
         cameras = Cameras(views.world_from_camera[sample], views.intrinsics[sample], views.height, views.width)
         present = mask[sample].nonzero()[:, 0]
-        splats = _rasterize_clip(positions[sample, present], cameras, token_size, most // 2)
+        sizes = token_size[sample, present] if isinstance(token_size, Tensor) else token_size
+        splats = _rasterize_clip(positions[sample, present], cameras, sizes, most // 2)
         token = sample * positions.shape[1] + present[splats.token]
         parts.append(Splats(sample * pixels + splats.pixel, token, splats.depth))
     return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
-def _rasterize_clip(positions: Float[Tensor, "token 3"], views: Cameras, token_size: float, reach: int) -> Splats:
+def _rasterize_clip(
+    positions: Float[Tensor, "token 3"], views: Cameras, token_size: float | Float[Tensor, " token"], reach: int
+) -> Splats:
     """Return the splats in one clip's views, with squares of at most ``reach`` pixels to each side of their middle."""
     middles, depth = project(positions.expand(len(views.world_from_camera), -1, -1), views)
     size = middles.new_tensor([views.width, views.height])
@@ -139,7 +142,8 @@ def _rasterize_clip(positions: Float[Tensor, "token 3"], views: Cameras, token_s
     frame, token = close.nonzero(as_tuple=True)
     middle, depth = middles[frame, token], depth[frame, token]
     focal = views.intrinsics.double().diagonal(dim1=-2, dim2=-1)[frame, :2]
-    half = 0.5 * token_size * focal / depth[:, None]
+    sizes = token_size[token, None] if isinstance(token_size, Tensor) else token_size
+    half = 0.5 * sizes * focal / depth[:, None]
     center = (middle + SNAP).floor()
     first = (middle - half - 0.5 + SNAP).ceil().minimum(center).maximum(center - reach).clamp_min(0)
     last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).minimum(size - 1)

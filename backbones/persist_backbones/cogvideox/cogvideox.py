@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -34,8 +35,8 @@ from persist_backbones.cogvideox.diffusion import (
     prediction_target,
     sample_generators,
 )
+from persist_backbones.cogvideox.given_view import render_given
 from persist_backbones.cogvideox.inputs import (
-    ClipShape,
     camera_latents,
     camera_tokens,
     check_clip_frames,
@@ -62,6 +63,7 @@ from persist_backbones.cogvideox.parts import (
 )
 from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_backbones.noise_levels import add_level, draw_levels
+from persist_backbones.tensors import fold_frames
 from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.clips import ClipLatents
@@ -142,9 +144,8 @@ class CogVideoX(AdaptedBackbone):
         # encode
         latents = clips.latents or self.encode(clips)
         image_noise = draw_levels(generators, self.settings.image_noise)
-        given = latents.image if not image_noise.any() else add_level(latents.image, image_noise, generators)
         shape = self.shape.of(clips)
-        image = self.image_condition(given, shape)
+        image = self.image_condition(latents.image, clips, image_noise, generators)
         clean = shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
         # noise
         timesteps = draw(generators).to(self.device)
@@ -281,11 +282,43 @@ class CogVideoX(AdaptedBackbone):
 
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Encode the clips' first frames as the image condition, float32 also for a model in lower precision."""
-        return self.image_condition(self.codec.encode(*clips.first_frames()).float(), self.shape.of(clips))
+        return self.image_condition(self.codec.encode(*clips.first_frames()).float(), clips)
 
-    def image_condition(self, first: Float[Tensor, "batch 1 channel height width"], shape: ClipShape) -> Tensor:
-        """Scale latents of the first frame alone for the model, and add zeros for the other latent frames of a clip."""
-        return shape.image_condition(first if self.codec.image_scale == 1 else first * self.codec.image_scale)
+    def image_condition(
+        self,
+        first: Float[Tensor, "batch 1 channel height width"],
+        clips: Clips,
+        noise: Float[Tensor, " batch"] | None = None,
+        generators: list[torch.Generator] | None = None,
+    ) -> Float[Tensor, "batch frame channel height width"]:
+        """Return latents of what is known of each frame, scaled for the model: of the first one, or of its views too.
+
+        Args:
+            first: latents of the first frames alone.
+            clips: their cameras.
+            noise: level of the noise on each sample's latents.
+            generators: generators of the noise, one a sample.
+        """
+        known = first if self.settings.given == "alone" else self.given_views(first, clips)
+        if noise is not None and noise.any():
+            assert generators is not None
+            known = add_level(known, noise, generators) * known.any(dim=2, keepdim=True)
+        known = known if self.codec.image_scale == 1 else known * self.codec.image_scale
+        return self.shape.of(clips).image_condition(known)
+
+    @torch.no_grad()
+    def given_views(
+        self, first: Float[Tensor, "batch 1 channel height width"], clips: Clips
+    ) -> Float[Tensor, "batch frame channel height width"]:
+        """Return latents of what first frames show in all views of their clips, zeros where they show nothing."""
+        colors, depth = self.codec.decode_images(first.float())
+        samples = len(clips.seeds)
+        rgb, metres = (part.expand(samples, *part.shape[1:]) for part in (to_uint8(colors)[:, 0], depth[:, 0].float()))
+        views = render_given(rgb, metres, clips.cameras)
+        shares = F.avg_pool2d(views.covered.flatten(0, 1), self.codec.spatial).unflatten(0, views.covered.shape[:2])
+        shown = fold_frames(shares, self.codec.temporal).any(dim=2, keepdim=True)
+        latents = self.codec.encode(views.rgb, views.depth).to(first) * shown
+        return torch.cat([first.expand(samples, -1, -1, -1, -1), latents[:, 1:]], dim=1)
 
     def conditions(
         self,

@@ -118,6 +118,8 @@ class CogVideoXSettings:
             parameters, whose clips have no depth (0) after the given frame.
         prediction: what the model predicts: ``v_prediction`` for velocities, like CogVideoX, or ``sample`` for clean
             latents; by default that of the preset or of the pretrained weights, which cannot be loaded with any other.
+        given: what the image condition holds for the frames to come: nothing (``alone``, as in CogVideoX), or what the
+            given frame shows in their views, moved there by its depth and their cameras (``rendered``).
         image_noise: largest level of the noise that training adds to the latents of the given frame, where 1 is as
             strong as the latents themselves; the model is told the level. 0 for neither.
         weighting: weighting of errors: ``uniform``, ``min-snr`` or ``min-snr-plus-one``.
@@ -149,6 +151,7 @@ class CogVideoXSettings:
     rays: Literal["correct", "printed"] = "correct"
     depth: bool = True
     prediction: Prediction | None = None
+    given: Literal["alone", "rendered"] = "alone"
     image_noise: NonNegativeFloat = 0.0
     weighting: Weighting = "uniform"
     snr_gamma: PositiveFloat = 5.0

@@ -80,11 +80,12 @@ class ClipShape:
         return latents[:, self.padded_frames - self.frames :]
 
     def image_condition(
-        self, first: Float[Tensor, "batch 1 channel height width"]
+        self, known: Float[Tensor, "batch known channel height width"]
     ) -> Float[Tensor, "batch padded_frame channel height width"]:
-        """Put latents of the first frame alone at the first of ``padded_frames`` places, zeros at all others."""
-        zeros = first.new_zeros(first.shape[0], self.padded_frames - 1, *first.shape[2:])
-        return torch.cat([first, zeros], dim=1)
+        """Put latents of the first frame at the first of ``padded_frames`` places, others at the last, zeros else."""
+        first, others = known[:, :1], known[:, 1:]
+        zeros = first.new_zeros(first.shape[0], self.padded_frames - known.shape[1], *first.shape[2:])
+        return torch.cat([first, zeros, others], dim=1)
 
 
 def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
@@ -99,6 +100,8 @@ def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
         raise CheckpointError(
             f"a transformer of {config.in_channels} channels does not fit a VAE of {vae.latent_channels}"
         )
+    if settings.given == "rendered" and not settings.depth:
+        raise CheckpointError("given=rendered moves the given frame by its depth, of which depth=false leaves none")
     if config.ofs_embed_dim and config.ofs_embed_dim != config.time_embed_dim:
         raise CheckpointError(
             f"a transformer whose ofs_embed_dim {config.ofs_embed_dim} is not its time_embed_dim "

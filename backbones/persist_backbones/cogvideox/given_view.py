@@ -1,0 +1,78 @@
+"""What the given frame shows in the views of the frames to come: its pixels, moved by depth and cameras.
+
+A video model of few layers hardly learns to move a picture by a camera's motion; told what the given frame shows where,
+it has to invent only what that frame does not show. Such renders of a single RGB-D frame are the condition of
+ViewCrafter (2409.02048), GEN3C (2503.03751) and TrajectoryCrafter (2503.05638).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Final, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from persist_backbones.adapters.splat import hide_covered, rasterize, weighted_means
+from persist_backbones.tensors import push_pull
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.geometry import unproject
+
+FINER: Final = 2  # pixels that are drawn along the edge of a pixel of a view
+SPREAD: Final = 1.5  # edge of a drawn point in pixels of the given frame, so that a floor seen at a slant has no holes
+MOST: Final = 9  # pixels of a view along the edge of a drawn point, at most
+THICKNESS: Final = 0.05  # metres behind the nearest point that are of the same surface
+
+
+class GivenViews(NamedTuple):
+    """What given frames show in the views of their clips; holes are filled from around them.
+
+    Args:
+        rgb: uint8 RGB; the first frame is the given one.
+        depth: planar z in metres.
+        covered: share of each pixel that shows what was given, 0 in holes.
+    """
+
+    rgb: UInt8[Tensor, "batch frame height width 3"]
+    depth: Float[Tensor, "batch frame height width"]
+    covered: Float[Tensor, "batch frame 1 height width"]
+
+
+def render_given(
+    rgb: UInt8[Tensor, "batch height width 3"], depth: Float[Tensor, "batch height width"], cameras: Cameras
+) -> GivenViews:
+    """Draw given frames with a z-buffer into all views of their clips; missing depth draws nothing.
+
+    Args:
+        rgb: the given frames.
+        depth: their planar z in metres, 0 where it is missing.
+        cameras: axes ``batch frame``; the first one of a clip is that of its given frame.
+    """
+    batch, frames = cameras.world_from_camera.shape[:2]
+    first = _views(cameras, slice(0, 1))
+    present = (depth > 0).flatten(1)
+    views = _views(cameras, slice(1, None)).resized(cameras.height * FINER, cameras.width * FINER)
+    shape = (batch, frames - 1, views.height, views.width)
+    sizes = SPREAD * depth.double() / first.intrinsics.double()[:, :1, 0, 0, None]
+    splats = rasterize(unproject(depth[:, None], first).flatten(1, 3), present, views, sizes.flatten(1), MOST * FINER)
+    visible, _ = hide_covered(splats, math.prod(shape), THICKNESS)
+    colors = rgb.flatten(0, 2).float().index_select(0, visible.token)
+    values = torch.cat([colors, visible.depth[:, None].float(), torch.ones_like(colors[:, :1])], dim=1)
+    means = weighted_means(values, torch.ones_like(values[:, 0]), visible, math.prod(shape))
+    drawn = F.avg_pool2d(means.unflatten(0, shape).movedim(-1, 2).flatten(0, 1), FINER)
+    pictures, covered = drawn.split([4, 1], dim=1)
+    filled = push_pull(pictures, covered).unflatten(0, shape[:2])
+    return GivenViews(
+        torch.cat([rgb[:, None], filled[:, :, :3].movedim(2, -1).round().to(torch.uint8)], dim=1),
+        torch.cat([depth[:, None], filled[:, :, 3].to(depth)], dim=1),
+        torch.cat([torch.ones_like(covered[:batch, None]), covered.unflatten(0, shape[:2])], dim=1),
+    )
+
+
+def _views(cameras: Cameras, frames: slice) -> Cameras:
+    """Return the cameras of some frames of each clip."""
+    poses, intrinsics = cameras.world_from_camera[:, frames], cameras.intrinsics[:, frames]
+    return dataclasses.replace(cameras, world_from_camera=poses, intrinsics=intrinsics)
