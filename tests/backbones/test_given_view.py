@@ -1,11 +1,12 @@
 """The given frame, moved into the views of the frames to come (``backbone.settings.given=rendered``)."""
 
 import dataclasses
+from functools import partial
 
 import pytest
 import torch
 
-from persist_backbones.cogvideox.diffusion import sample_generators
+from persist_backbones.cogvideox.diffusion import draw_timesteps, sample_generators
 from persist_backbones.cogvideox.given_view import render_given
 from persist_cli.api.backbone import Sampling
 from persist_cli.errors import CheckpointError
@@ -32,7 +33,8 @@ def standing(clips):
 
 def condition(backbone, clips):
     """The image condition of clips, from the latents of their first frames."""
-    return backbone.image_condition(backbone.encode(clips).image, clips)
+    known = backbone.known_latents(backbone.encode(clips).image, clips)
+    return backbone.image_condition(known, backbone.shape.of(clips))
 
 
 def test_the_given_frame_is_the_first_view_and_is_seen_again_from_where_it_was_taken():
@@ -109,13 +111,14 @@ def test_training_on_kept_latents_is_training_on_images():
 
 
 def test_noise_on_the_given_frame_is_on_its_views_too_and_not_where_it_shows_nothing():
-    backbone, clips = micro(given="rendered"), random_clips()
-    first, level = backbone.encode(clips).image, torch.tensor([0.5, 0.0])
-    noisy = backbone.image_condition(first, clips, level, sample_generators(clips.seeds))
-    clean = condition(backbone, clips)
-    assert torch.equal(noisy[1], clean[1])
-    assert (noisy[0] - clean[0]).std(dim=(1, 2, 3)).gt(0).all()
-    assert torch.equal(noisy.any(dim=2), clean.any(dim=2))
+    clean, noisy = micro(given="rendered"), micro(given="rendered", image_noise=0.5)
+    clips = random_clips()
+    images = []
+    for backbone in (clean, noisy):
+        generators = sample_generators(clips.seeds)
+        images.append(backbone.add_noise(clips, generators, partial(draw_timesteps, backbone.scheduler)).image)
+    assert (images[0] - images[1])[:, 1:].std(dim=(2, 3, 4)).gt(0).all()
+    assert torch.equal(images[0].any(dim=2), images[1].any(dim=2))
 
 
 def test_a_clip_is_generated_and_its_later_frames_depend_on_the_given_one_and_its_depth():

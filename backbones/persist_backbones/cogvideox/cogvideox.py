@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -35,8 +34,9 @@ from persist_backbones.cogvideox.diffusion import (
     prediction_target,
     sample_generators,
 )
-from persist_backbones.cogvideox.given_view import render_given
+from persist_backbones.cogvideox.given_view import views_of_given
 from persist_backbones.cogvideox.inputs import (
+    ClipShape,
     camera_latents,
     camera_tokens,
     check_clip_frames,
@@ -63,7 +63,6 @@ from persist_backbones.cogvideox.parts import (
 )
 from persist_backbones.cogvideox.prompt import ORIGINS, starting_prompt
 from persist_backbones.noise_levels import add_level, draw_levels
-from persist_backbones.tensors import fold_frames
 from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.clips import ClipLatents
@@ -144,8 +143,10 @@ class CogVideoX(AdaptedBackbone):
         # encode
         latents = clips.latents or self.encode(clips)
         image_noise = draw_levels(generators, self.settings.image_noise)
-        shape = self.shape.of(clips)
-        image = self.image_condition(latents.image, clips, image_noise, generators)
+        shape, known = self.shape.of(clips), self.known_latents(latents.image, clips)
+        if image_noise.any():
+            known = add_level(known, image_noise, generators) * known.any(dim=2, keepdim=True)
+        image = self.image_condition(known, shape)
         clean = shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
         # noise
         timesteps = draw(generators).to(self.device)
@@ -282,43 +283,16 @@ class CogVideoX(AdaptedBackbone):
 
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Encode the clips' first frames as the image condition, float32 also for a model in lower precision."""
-        return self.image_condition(self.codec.encode(*clips.first_frames()).float(), clips)
+        first = self.codec.encode(*clips.first_frames()).float()
+        return self.image_condition(self.known_latents(first, clips), self.shape.of(clips))
 
-    def image_condition(
-        self,
-        first: Float[Tensor, "batch 1 channel height width"],
-        clips: Clips,
-        noise: Float[Tensor, " batch"] | None = None,
-        generators: list[torch.Generator] | None = None,
-    ) -> Float[Tensor, "batch frame channel height width"]:
-        """Return latents of what is known of each frame, scaled for the model: of the first one, or of its views too.
+    def known_latents(self, first: Float[Tensor, "batch 1 channel height width"], clips: Clips) -> Tensor:
+        """Return latents of the first frames alone, or of what they show in all views, as the settings say."""
+        return first if self.settings.given == "alone" else views_of_given(self.codec, first, clips.cameras)
 
-        Args:
-            first: latents of the first frames alone.
-            clips: their cameras.
-            noise: level of the noise on each sample's latents.
-            generators: generators of the noise, one a sample.
-        """
-        known = first if self.settings.given == "alone" else self.given_views(first, clips)
-        if noise is not None and noise.any():
-            assert generators is not None
-            known = add_level(known, noise, generators) * known.any(dim=2, keepdim=True)
-        known = known if self.codec.image_scale == 1 else known * self.codec.image_scale
-        return self.shape.of(clips).image_condition(known)
-
-    @torch.no_grad()
-    def given_views(
-        self, first: Float[Tensor, "batch 1 channel height width"], clips: Clips
-    ) -> Float[Tensor, "batch frame channel height width"]:
-        """Return latents of what first frames show in all views of their clips, zeros where they show nothing."""
-        colors, depth = self.codec.decode_images(first.float())
-        samples = len(clips.seeds)
-        rgb, metres = (part.expand(samples, *part.shape[1:]) for part in (to_uint8(colors)[:, 0], depth[:, 0].float()))
-        views = render_given(rgb, metres, clips.cameras)
-        shares = F.avg_pool2d(views.covered.flatten(0, 1), self.codec.spatial).unflatten(0, views.covered.shape[:2])
-        shown = fold_frames(shares, self.codec.temporal).any(dim=2, keepdim=True)
-        latents = self.codec.encode(views.rgb, views.depth).to(first) * shown
-        return torch.cat([first.expand(samples, -1, -1, -1, -1), latents[:, 1:]], dim=1)
+    def image_condition(self, known: Float[Tensor, "batch known channel height width"], shape: ClipShape) -> Tensor:
+        """Scale latents of what is known for the model, and add zeros for latent frames of which nothing is."""
+        return shape.image_condition(known if self.codec.image_scale == 1 else known * self.codec.image_scale)
 
     def conditions(
         self,

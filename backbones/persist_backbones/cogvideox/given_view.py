@@ -17,7 +17,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_backbones.adapters.splat import hide_covered, rasterize, weighted_means
-from persist_backbones.tensors import push_pull
+from persist_backbones.cogvideox.codec import Codec, to_uint8
+from persist_backbones.tensors import fold_frames, push_pull
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
 
@@ -39,6 +40,27 @@ class GivenViews(NamedTuple):
     rgb: UInt8[Tensor, "batch frame height width 3"]
     depth: Float[Tensor, "batch frame height width"]
     covered: Float[Tensor, "batch frame 1 height width"]
+
+
+@torch.no_grad()
+def views_of_given(
+    codec: Codec, first: Float[Tensor, "batch 1 channel height width"], cameras: Cameras
+) -> Float[Tensor, "batch latent_frame channel height width"]:
+    """Return latents of what given frames show in all views of their clips, zeros where they show nothing.
+
+    Args:
+        codec: the codec of the latents.
+        first: latents of the given frames alone; one of them may serve all clips.
+        cameras: axes ``batch frame``.
+    """
+    colors, depth = codec.decode_images(first.float())
+    samples = len(cameras)
+    rgb, metres = (part.expand(samples, *part.shape[1:]) for part in (to_uint8(colors)[:, 0], depth[:, 0].float()))
+    views = render_given(rgb, metres, cameras)
+    shares = F.avg_pool2d(views.covered.flatten(0, 1), codec.spatial).unflatten(0, views.covered.shape[:2])
+    shown = fold_frames(shares, codec.temporal).any(dim=2, keepdim=True)
+    latents = codec.encode(views.rgb, views.depth).to(first) * shown
+    return torch.cat([first.expand(samples, -1, -1, -1, -1), latents[:, 1:]], dim=1)
 
 
 def render_given(
