@@ -320,9 +320,8 @@ def test_the_results_say_what_each_memory_gave_for_a_clip(uninterrupted):
     rows = tables(uninterrupted)[0]["rows"]
     reads = rows["voxel"]["reads"]
     assert 0 < reads["tokens"] <= 256
-    assert reads["bytes"] == pytest.approx(
-        reads["tokens"] * (32 * 4 + 3 * 4 + 3 + 1)
-    )  # features, place, colour, origin
+    each = 32 * 4 + 3 * 4 + 3 + 1 + 4  # features, place, colour, origin, distance
+    assert reads["bytes"] == pytest.approx(reads["tokens"] * each)
     assert (reads["reads_depth"], reads["distance"]) == (True, 2.5)
     assert reads["resolution"] >= 0.25
     assert rows["stage1"]["reads"] is None
