@@ -14,8 +14,8 @@ from tests.support.play_pages import serving
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 def test_keys_are_measured_at_the_start_and_after_a_walk(walks):
     with serving(micro_walks(walks), Limits(frames_per_second=60)) as served:
-        first, later = measured(ServedPage(served.address, os.getpid()), presses=1, hold=2, after=8)
+        first, later = measured(ServedPage(served.address, os.getpid()), presses=1, hold=2, after=24)
     assert first.presses == later.presses == first.answered == later.answered == 1
     assert 0 < first.latency <= first.latency_95
     assert first.rate > 0
-    assert first.after < 8 <= later.after
+    assert first.after < 24 <= later.after
