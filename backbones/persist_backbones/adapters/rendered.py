@@ -26,7 +26,7 @@ from persist_backbones.adapters.canvas import CanvasHead
 from persist_backbones.adapters.memory_block import AttentionSettings
 from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
 from persist_backbones.adapters.projected import ProjectedAdapter, ProjectedMemory, ProjectedSettings, image_places
-from persist_backbones.adapters.splat import Splats, coarser, hide_covered, rasterize, weighted_means
+from persist_backbones.adapters.splat import Splats, coarser, draw_means, hide_covered, rasterize
 from persist_backbones.noise_levels import add_level
 from persist_backbones.tensors import fold_frames, fold_patches, push_pull, zero_init
 from persist_cli.api.cameras import Cameras
@@ -124,16 +124,15 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSetti
     drawn_pixels = rasterize(tokens.positions, tokens.mask, views, settings.token_size, settings.splat_pixels * finer)
     splats, _ = hide_covered(drawn_pixels, math.prod(shape), settings.thickness)
     shown = torch.zeros_like(tokens.mask).flatten().index_fill(0, splats.token, True).view_as(tokens.mask)
-    sums = F.avg_pool2d(_surfaces(tokens, splats, shape).flatten(0, 1), finer)
-    pictures, observed, covered = sums.split([4, 1, 1], dim=1)
+    pictures, observed, covered = _surfaces(tokens, splats, shape, finer).split([4, 1, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     origins = torch.cat([observed, covered - observed], dim=1).unflatten(0, shape[:2])
     return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown, drawn_pixels)
 
 
 def _surfaces(
-    tokens: MemoryTokens, splats: Splats, shape: tuple[int, int, int, int]
-) -> Float[Tensor, "batch frame 6 height width"]:
+    tokens: MemoryTokens, splats: Splats, shape: tuple[int, int, int, int], finer: int
+) -> Float[Tensor, "view 6 height width"]:
     """Return colour, depth, whether it was observed, and 1 of the surface at each pixel; zeros where there is none.
 
     Of its splats those that were seen from nearer count more: a pixel from half the distance shows a quarter of the
@@ -145,9 +144,7 @@ def _surfaces(
     values = torch.cat([color, splats.depth[:, None].float(), observed, torch.ones_like(observed)], dim=1)
     distances = torch.ones_like(tokens.mask, dtype=torch.float32) if tokens.distances is None else tokens.distances
     weights = distances.clamp_min(NEAR).square().reciprocal().flatten().index_select(0, splats.token)
-    means = weighted_means(values, weights, splats, math.prod(shape))
-    result: Tensor = means.unflatten(0, shape).permute(0, 1, 4, 2, 3)
-    return result
+    return draw_means(values, weights, splats, shape, finer)
 
 
 def tokens_not_shown(tokens: MemoryTokens, shown: Bool[Tensor, "batch token"], cameras: Cameras, most: int) -> Tensor:

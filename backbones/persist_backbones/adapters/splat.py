@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -88,6 +90,26 @@ def weighted_means(
     return total / shares.new_zeros(pixels).index_add(0, splats.pixel, shares).clamp_min(1e-6)[:, None]
 
 
+def draw_means(
+    values: Float[Tensor, "splat channel"],
+    weights: Float[Tensor, " splat"],
+    splats: Splats,
+    shape: tuple[int, int, int, int],
+    finer: int,
+) -> Float[Tensor, "view channel height width"]:
+    """Return the weighted means at each pixel of all views, each the mean of ``finer`` × ``finer`` that are drawn.
+
+    Args:
+        values: values of each splat.
+        weights: weights above zero; only their ratios at a pixel count.
+        splats: the pixels that tokens cover, without those that others hide.
+        shape: batch, frames, height and width that are drawn.
+        finer: pixels that are drawn along the edge of a pixel.
+    """
+    means = weighted_means(values, weights, splats, math.prod(shape))
+    return F.avg_pool2d(means.unflatten(0, shape).permute(0, 1, 4, 2, 3).flatten(0, 1), finer)
+
+
 def coarser(splats: Splats, size: tuple[int, int], coarse: tuple[int, int]) -> Splats:
     """Return the same splats in pixels of a coarser size, of which the finer is a multiple.
 
@@ -121,19 +143,19 @@ def rasterize(
     """
     samples, frames = views.world_from_camera.shape[:2]
     pixels = frames * views.height * views.width
+    sizes = torch.as_tensor(token_size, dtype=torch.float64, device=mask.device).expand(mask.shape)
     parts = []
     for sample in range(samples):  # one at a time: the data of one clip fits into the processor's cache
         cameras = Cameras(views.world_from_camera[sample], views.intrinsics[sample], views.height, views.width)
         present = mask[sample].nonzero()[:, 0]
-        sizes = token_size[sample, present] if isinstance(token_size, Tensor) else token_size
-        splats = _rasterize_clip(positions[sample, present], cameras, sizes, most // 2)
+        splats = _rasterize_clip(positions[sample, present], cameras, sizes[sample, present], most // 2)
         token = sample * positions.shape[1] + present[splats.token]
         parts.append(Splats(sample * pixels + splats.pixel, token, splats.depth))
     return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
 def _rasterize_clip(
-    positions: Float[Tensor, "token 3"], views: Cameras, token_size: float | Float[Tensor, " token"], reach: int
+    positions: Float[Tensor, "token 3"], views: Cameras, sizes: Float[Tensor, " token"], reach: int
 ) -> Splats:
     """Return the splats in one clip's views, with squares of at most ``reach`` pixels to each side of their middle."""
     middles, depth = project(positions.expand(len(views.world_from_camera), -1, -1), views)
@@ -142,8 +164,7 @@ def _rasterize_clip(
     frame, token = close.nonzero(as_tuple=True)
     middle, depth = middles[frame, token], depth[frame, token]
     focal = views.intrinsics.double().diagonal(dim1=-2, dim2=-1)[frame, :2]
-    sizes = token_size[token, None] if isinstance(token_size, Tensor) else token_size
-    half = 0.5 * sizes * focal / depth[:, None]
+    half = 0.5 * sizes[token, None] * focal / depth[:, None]
     center = (middle + SNAP).floor()
     first = (middle - half - 0.5 + SNAP).ceil().minimum(center).maximum(center - reach).clamp_min(0)
     last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).minimum(size - 1)

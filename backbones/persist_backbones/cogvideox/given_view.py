@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from persist_backbones.adapters.splat import hide_covered, rasterize, weighted_means
+from persist_backbones.adapters.splat import draw_means, hide_covered, rasterize
 from persist_backbones.cogvideox.codec import Codec, to_uint8
 from persist_backbones.tensors import fold_frames, push_pull
 from persist_cli.api.cameras import Cameras
@@ -83,8 +83,7 @@ def render_given(
     visible, _ = hide_covered(splats, math.prod(shape), THICKNESS)
     colors = rgb.flatten(0, 2).float().index_select(0, visible.token)
     values = torch.cat([colors, visible.depth[:, None].float(), torch.ones_like(colors[:, :1])], dim=1)
-    means = weighted_means(values, torch.ones_like(values[:, 0]), visible, math.prod(shape))
-    drawn = F.avg_pool2d(means.unflatten(0, shape).movedim(-1, 2).flatten(0, 1), FINER)
+    drawn = draw_means(values, torch.ones_like(values[:, 0]), visible, shape, FINER)
     pictures, covered = drawn.split([4, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     return GivenViews(
