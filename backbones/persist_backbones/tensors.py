@@ -59,6 +59,15 @@ def fold_frames(
     return folded
 
 
+def latent_shares(
+    covered: Float[Tensor, "batch frame channel height width"], spatial: int, temporal: int
+) -> Float[Tensor, "batch latent_frame folded row column"]:
+    """Return the means of a mask's pixels at each latent pixel, with the frames of a latent frame as channels."""
+    shares = F.avg_pool2d(covered.flatten(0, 1), spatial).unflatten(0, covered.shape[:2])
+    folded: Tensor = fold_frames(shares, temporal)
+    return folded
+
+
 def tokens_of(
     latents: Float[Tensor, "batch frame channel row column"],
 ) -> Float[Tensor, "batch token channel"]:

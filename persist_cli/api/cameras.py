@@ -43,7 +43,7 @@ class Cameras:
     def __len__(self) -> int:
         return self.world_from_camera.shape[0]
 
-    def __getitem__(self, index: int | slice | Tensor | list[int]) -> Cameras:
+    def __getitem__(self, index: int | slice | Tensor | list[int] | tuple[slice, slice]) -> Cameras:
         return replace(self, world_from_camera=self.world_from_camera[index], intrinsics=self.intrinsics[index])
 
     def to(self, device: torch.device | str) -> Cameras:

@@ -113,11 +113,7 @@ class Clips:
             self,
             rgb=self.rgb[:, :frames],
             depth=self.depth[:, :frames],
-            cameras=dataclasses.replace(
-                self.cameras,
-                world_from_camera=self.cameras.world_from_camera[:, :frames],
-                intrinsics=self.cameras.intrinsics[:, :frames],
-            ),
+            cameras=self.cameras[:, :frames],
             interactions=[names[: frames - 1] for names in self.interactions],
             tokens=tokens,
             latents=None if latents is None else ClipLatents(cut(latents.video), latents.image),

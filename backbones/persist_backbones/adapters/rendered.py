@@ -28,7 +28,7 @@ from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
 from persist_backbones.adapters.projected import ProjectedAdapter, ProjectedMemory, ProjectedSettings, image_places
 from persist_backbones.adapters.splat import Splats, coarser, draw_means, hide_covered, rasterize
 from persist_backbones.noise_levels import add_level
-from persist_backbones.tensors import fold_frames, fold_patches, push_pull, zero_init
+from persist_backbones.tensors import fold_frames, fold_patches, latent_shares, push_pull, zero_init
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.observations import Origin
 from persist_cli.api.tokens import MemoryTokens
@@ -292,8 +292,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
             return tokens
         settings, spatial = self.settings, self.video.spatial
         views = render_views(tokens, cameras, settings)
-        shares = F.avg_pool2d(views.covered.flatten(0, 1), spatial).unflatten(0, views.covered.shape[:2])
-        mask = fold_frames(shares, self.video.temporal)
+        mask = latent_shares(views.covered, spatial, self.video.temporal)
         latents = encode(views.rgb, views.depth) * mask.any(dim=2, keepdim=True)
         drawn = [latents, mask.to(latents), *self.peeled(tokens, views)]
         numbers = tokens_not_shown(tokens, views.shown, cameras, settings.attention_tokens)

@@ -7,18 +7,16 @@ ViewCrafter (2409.02048), GEN3C (2503.03751) and TrajectoryCrafter (2503.05638).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Final, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_backbones.adapters.splat import draw_means, hide_covered, rasterize
 from persist_backbones.cogvideox.codec import Codec, to_uint8
-from persist_backbones.tensors import fold_frames, push_pull
+from persist_backbones.tensors import latent_shares, push_pull
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
 
@@ -57,8 +55,7 @@ def views_of_given(
     samples = len(cameras)
     rgb, metres = (part.expand(samples, *part.shape[1:]) for part in (to_uint8(colors)[:, 0], depth[:, 0].float()))
     views = render_given(rgb, metres, cameras)
-    shares = F.avg_pool2d(views.covered.flatten(0, 1), codec.spatial).unflatten(0, views.covered.shape[:2])
-    shown = fold_frames(shares, codec.temporal).any(dim=2, keepdim=True)
+    shown = latent_shares(views.covered, codec.spatial, codec.temporal).any(dim=2, keepdim=True)
     latents = codec.encode(views.rgb, views.depth).to(first) * shown
     return torch.cat([first.expand(samples, -1, -1, -1, -1), latents[:, 1:]], dim=1)
 
@@ -74,9 +71,9 @@ def render_given(
         cameras: axes ``batch frame``; the first one of a clip is that of its given frame.
     """
     batch, frames = cameras.world_from_camera.shape[:2]
-    first = _views(cameras, slice(0, 1))
+    first = cameras[:, :1]
     present = (depth > 0).flatten(1)
-    views = _views(cameras, slice(1, None)).resized(cameras.height * FINER, cameras.width * FINER)
+    views = cameras[:, 1:].resized(cameras.height * FINER, cameras.width * FINER)
     shape = (batch, frames - 1, views.height, views.width)
     sizes = SPREAD * depth.double() / first.intrinsics.double()[:, :1, 0, 0, None]
     splats = rasterize(unproject(depth[:, None], first).flatten(1, 3), present, views, sizes.flatten(1), MOST * FINER)
@@ -91,9 +88,3 @@ def render_given(
         torch.cat([depth[:, None], filled[:, :, 3].to(depth)], dim=1),
         torch.cat([torch.ones_like(covered[:batch, None]), covered.unflatten(0, shape[:2])], dim=1),
     )
-
-
-def _views(cameras: Cameras, frames: slice) -> Cameras:
-    """Return the cameras of some frames of each clip."""
-    poses, intrinsics = cameras.world_from_camera[:, frames], cameras.intrinsics[:, frames]
-    return dataclasses.replace(cameras, world_from_camera=poses, intrinsics=intrinsics)
