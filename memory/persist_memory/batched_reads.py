@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Int64
 from torch import Tensor
 
@@ -26,9 +25,5 @@ def distinct_cameras(paths: Sequence[Cameras]) -> tuple[Cameras, list[Int64[Tens
     Args:
         paths: camera paths of one image size.
     """
-    joined = Cameras.concatenate(paths)
-    rows = torch.cat([joined.world_from_camera.flatten(1), joined.intrinsics.flatten(1)], dim=1)
-    unique, positions = torch.unique(rows, dim=0, return_inverse=True)
-    numbers = torch.arange(len(rows), device=rows.device)
-    first = numbers.new_full((len(unique),), len(rows)).scatter_reduce(0, positions, numbers, "amin")
-    return joined[first], list(positions.split([len(cameras) for cameras in paths]))
+    distinct, positions = Cameras.concatenate(paths).distinct()
+    return distinct, list(positions.split([len(cameras) for cameras in paths]))

@@ -284,6 +284,11 @@ class Backbone(nn.Module, ABC):
         """Whether the adapter in use reads memories whose tokens are whole frames, and no others."""
         return False
 
+    @property
+    def draws_tokens(self) -> bool:
+        """Whether the adapter in use draws tokens into the views of a clip, which other tokens do not change."""
+        return False
+
     def keep_tokens(self, clips: Clips) -> MemoryTokens:
         """Return what the adapter in use needs of the tokens of clips, which a cache keeps; by default all of them."""
         assert clips.tokens is not None

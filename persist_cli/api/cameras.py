@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from persist_cli.errors import DataError
@@ -69,6 +69,17 @@ class Cameras:
         intrinsics[..., 0, 2] -= left
         intrinsics[..., 1, 2] -= top
         return replace(self, intrinsics=intrinsics, height=height, width=width)
+
+    def distinct(self) -> tuple[Cameras, Int64[Tensor, " frame"]]:
+        """Return every distinct camera once, and for each of these, which have the frame axis alone, its number there.
+
+        The distinct ones are in an order of their own.
+        """
+        rows = torch.cat([self.world_from_camera.flatten(1), self.intrinsics.flatten(1)], dim=1)
+        unique, positions = torch.unique(rows, dim=0, return_inverse=True)
+        numbers = torch.arange(len(rows), device=rows.device)
+        first = numbers.new_full((len(unique),), len(rows)).scatter_reduce(0, positions, numbers, "amin")
+        return self[first], positions
 
     @staticmethod
     def stack(paths: Sequence[Cameras]) -> Cameras:

@@ -149,6 +149,13 @@ class Memory(ABC):
         """
         return [self.read(path, budget) for path in cameras]
 
+    def read_together(self, cameras: Sequence[Cameras], budget: int) -> MemoryTokens | None:
+        """Return one sample of all tokens that any of the paths sees, if ``read`` would leave none of them out.
+
+        ``None``, as by default, where a path's tokens depend on the path, or are more than the budget.
+        """
+        return None
+
     def copy(self) -> Self:
         """Return a memory with the same content; writing into one of the two does not change the other."""
         copy = type(self)(self.settings, self.encoder, self.reference)

@@ -63,10 +63,20 @@ class MemoryTokens:
         sizes = [tensor[0].numel() * min(tensor.element_size(), 4) for tensor in parts if len(self)]
         return int(self.mask.sum()) * sum(sizes)
 
+    @property
+    def shared(self) -> bool:
+        """Whether the samples of this batch, more than one, have the same tokens in the same place of the processor."""
+        return len(self.positions) > 1 and self.positions.stride(0) == 0
+
     def tensors(self) -> dict[str, Tensor]:
         """Return all tensors by name, without those that are ``None``; ``MemoryTokens`` takes them back."""
         named = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+    def first(self, count: int) -> MemoryTokens:
+        """Return a batch of the first sample alone, ``count`` times in one place of the processor."""
+        parts = {name: tensor[:1] for name, tensor in self.tensors().items()}
+        return MemoryTokens(**{name: one.expand(count, *one.shape[1:]) for name, one in parts.items()})
 
     def to(self, device: torch.device | str) -> MemoryTokens:
         """Return these tokens on ``device``."""
@@ -95,8 +105,12 @@ class MemoryTokens:
     def stack(samples: Sequence[MemoryTokens]) -> MemoryTokens:
         """Return a batch of unbatched samples, padded to the longest one and to at least one token.
 
-        The batch has colours, and distances, when all its samples have them; all samples or none are rendered.
+        The batch has colours, and distances, when all its samples have them; all samples or none are rendered. A sample
+        that is there several times and is the only one is not copied: see ``shared``.
         """
+        if len(samples[0]) and all(sample is samples[0] for sample in samples):
+            batch = {name: tensor[None] for name, tensor in samples[0].tensors().items()}
+            return MemoryTokens(**batch).first(len(samples))
         width = max(1, *(len(sample) for sample in samples))
         parts = [sample.tensors() for sample in samples]
         rendered = [part.pop("rendered") for part in parts if "rendered" in part]

@@ -407,7 +407,11 @@ class WorldModel:
                 continue
             readers = [number for number, agent in enumerate(agents) if agent.memory is memory]
             wanted = [paths[number] for number in readers]
-            batch = memory.read_batch(wanted, self.backbone.token_budget)
+            together = None
+            if len(readers) > 1 and self.backbone.draws_tokens:
+                together = memory.read_together(wanted, self.backbone.token_budget)
+            shared = [together] * len(readers) if together is not None else None
+            batch = shared or memory.read_batch(wanted, self.backbone.token_budget)
             for number, sample in zip(readers, batch, strict=True):
                 tokens[number] = sample
                 agents[number].reads.append((self.backbone.count_tokens(sample, paths[number]), sample.bytes))

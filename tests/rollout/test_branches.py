@@ -49,6 +49,20 @@ def test_a_branch_imagines_what_a_single_rollout_does(start):
     assert not alike(branched[0], branched[1])
 
 
+def test_branches_whose_views_are_drawn_read_a_map_together_and_imagine_what_a_single_rollout_does(walks):
+    backbone = remembering_model({"form": "rendered", "token_budget": 100_000, "attention_tokens": 0})
+    begin = functools.partial(world_on_walk, backbone, walks)
+    branches = begin(seed=5).branches(3)
+    cameras = [agent.cameras_after(names) for agent, names in zip(branches.agents, ACTIONS, strict=True)]
+    [tokens] = {id(read): read for read in branches.read_memories(branches.agents, cameras)}.values()
+    assert len(tokens) > 100
+    branched = [result.seen for result in begin(seed=5).branches(3).step(ACTIONS)]
+    single = [begin(seed=5).step([names])[0].seen for names in ACTIONS]
+    for one, other in zip(branched, single, strict=True):  # a drawn byte may round the other way
+        assert (one.rgb.int() - other.rgb.int()).abs().amax() <= 1
+        assert torch.allclose(one.depth, other.depth, rtol=0.02)
+
+
 @pytest.mark.parametrize("kind", ["voxel", "map2d", "snapshots"])
 def test_a_branch_reads_the_same_tokens_as_a_single_rollout_to_the_bit(start, kind):
     branches = start(kind).branches(3)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from persist_backbones.cogvideox.cogvideox import CogVideoX
@@ -14,10 +16,10 @@ from persist_cli.rollout.world_model import Agent, WorldModel
 from tests.support.micro_model import micro, shaken
 
 
-def remembering_model(**settings: Any) -> CogVideoX:
+def remembering_model(adapter: Mapping[str, Any] = MappingProxyType({}), **settings: Any) -> CogVideoX:
     """Make a micro model with an adapter for patches, all of whose parts have an effect."""
     backbone = micro(**settings)
-    backbone.add_adapter("voxel", make_encoder("patches", {}).channels, {"width": 16, "heads": 2})
+    backbone.add_adapter("voxel", make_encoder("patches", {}).channels, {"width": 16, "heads": 2} | dict(adapter))
     shaken(backbone)
     return backbone
 

@@ -159,6 +159,7 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
 
     settings_type: ClassVar[type[AdapterSettings]]
     reads_frames: ClassVar[bool] = False  # whether tokens must be whole frames
+    draws_tokens: ClassVar[bool] = False  # whether a token that no view shows changes nothing that is drawn
     settings: AdapterSettings
     blocks: nn.ModuleDict  # the key is the number of the transformer block
     learned: nn.Parameter | None  # the learned tokens

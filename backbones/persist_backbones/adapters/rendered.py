@@ -27,6 +27,7 @@ from persist_backbones.adapters.memory_block import AttentionSettings
 from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
 from persist_backbones.adapters.projected import ProjectedAdapter, ProjectedMemory, ProjectedSettings, image_places
 from persist_backbones.adapters.splat import Splats, coarser, draw_means, hide_covered, rasterize
+from persist_backbones.distinct_views import distinct_views
 from persist_backbones.noise_levels import add_level
 from persist_backbones.tensors import fold_frames, fold_patches, latent_shares, push_pull, zero_init
 from persist_cli.api.cameras import Cameras
@@ -161,6 +162,8 @@ def tokens_not_shown(tokens: MemoryTokens, shown: Bool[Tensor, "batch token"], c
     Returns:
         For each sample ``most`` numbers, -1 where there are fewer such tokens.
     """
+    if not most:
+        return torch.zeros(len(shown), 0, dtype=torch.int64, device=shown.device)
     rows = []
     for sample in range(len(shown)):  # one at a time: the places of all would take much memory
         one = MemoryTokens(*(part[sample : sample + 1] for part in (tokens.features, tokens.positions, tokens.mask)))
@@ -261,6 +264,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
     """
 
     settings_type = RenderedSettings
+    draws_tokens = True
     settings: RenderedSettings
 
     def __init__(self, channels: int, settings: RenderedSettings, video: VideoShape) -> None:
@@ -287,18 +291,32 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         return nn.ModuleDict() if self.attention is None else self.attention.blocks
 
     def render(self, tokens: MemoryTokens, cameras: Cameras, encode: Encode) -> MemoryTokens:
-        """Return latents, mask and layers of the rendered views, float16, with the tokens for attention."""
+        """Return latents, mask and layers of the rendered views, float16, with the tokens for attention.
+
+        Where the clips share their tokens, each distinct view is rendered once, and attention reads tokens that no view
+        of any clip shows.
+        """
         if tokens.rendered is not None:
             return tokens
+        if tokens.shared and self.video.temporal == 1:
+            distinct, numbers = distinct_views(cameras)
+            drawn, shown = self.rendered(tokens.first(len(distinct)), distinct, encode)
+            drawn, shown = drawn.flatten(0, 1)[numbers], shown.any(dim=0).expand(len(numbers), -1)
+        else:
+            drawn, shown = self.rendered(tokens, cameras, encode)
+        attended = tokens_not_shown(tokens, shown, cameras, self.settings.attention_tokens)
+        rest = {name: _chosen(part, attended.clamp_min(0)) for name, part in tokens.tensors().items()}
+        return MemoryTokens(**rest | {"mask": attended >= 0, "rendered": drawn.half()})
+
+    def rendered(
+        self, tokens: MemoryTokens, cameras: Cameras, encode: Encode
+    ) -> tuple[Float[Tensor, "batch frame channel height width"], Bool[Tensor, "batch token"]]:
+        """Return latents, mask and layers of the views, and which tokens any view of their clip shows."""
         settings, spatial = self.settings, self.video.spatial
         views = render_views(tokens, cameras, settings)
         mask = latent_shares(views.covered, spatial, self.video.temporal)
         latents = encode(views.rgb, views.depth) * mask.any(dim=2, keepdim=True)
-        drawn = [latents, mask.to(latents), *self.peeled(tokens, views)]
-        numbers = tokens_not_shown(tokens, views.shown, cameras, settings.attention_tokens)
-        rest = {name: _chosen(part, numbers.clamp_min(0)) for name, part in tokens.tensors().items()}
-        rest |= {"mask": numbers >= 0, "rendered": torch.cat(drawn, dim=2).half()}
-        return MemoryTokens(**rest)
+        return torch.cat([latents, mask.to(latents), *self.peeled(tokens, views)], dim=2), views.shown
 
     def peeled(self, tokens: MemoryTokens, views: Views) -> list[Float[Tensor, "batch frame folded height width"]]:
         """Return the layers of the views folded to the size of latents, none where the adapter has none."""

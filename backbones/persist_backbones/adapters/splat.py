@@ -159,28 +159,40 @@ def _rasterize_clip(
 ) -> Splats:
     """Return the splats in one clip's views, with squares of at most ``reach`` pixels to each side of their middle."""
     middles, depth = project(positions.expand(len(views.world_from_camera), -1, -1), views)
-    size = middles.new_tensor([views.width, views.height])
-    close = ((middles + SNAP >= -reach) & (middles + SNAP < size + reach)).all(-1) & (depth > NEAR)
-    frame, token = close.nonzero(as_tuple=True)
-    middle, depth = middles[frame, token], depth[frame, token]
-    focal = views.intrinsics.double().diagonal(dim1=-2, dim2=-1)[frame, :2]
-    half = 0.5 * sizes[token, None] * focal / depth[:, None]
-    center = (middle + SNAP).floor()
-    first = (middle - half - 0.5 + SNAP).ceil().minimum(center).maximum(center - reach).clamp_min(0)
-    last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).minimum(size - 1)
-    entry, column, row = _pixels_between(first.long(), last.long())
+    axes = [places.contiguous() for places in middles.unbind(-1)]  # columns, rows: one after the other is faster
+    lengths = (views.width, views.height)
+    close = depth > NEAR
+    for places, length in zip(axes, lengths, strict=True):
+        close &= (places + SNAP >= -reach) & (places + SNAP < length + reach)
+    chosen = close.flatten().nonzero()[:, 0]
+    frame, token = chosen // close.shape[1], chosen % close.shape[1]
+    depth = depth.flatten()[chosen]
+    scale = 0.5 * sizes[token] / depth
+    ranges = []
+    for axis, (places, length) in enumerate(zip(axes, lengths, strict=True)):
+        middle, half = places.flatten()[chosen], scale * views.intrinsics.double()[:, axis, axis][frame]
+        center = (middle + SNAP).floor()
+        first = (middle - half - 0.5 + SNAP).ceil().minimum(center).maximum(center - reach).clamp_min(0)
+        last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).clamp_max(length - 1)
+        ranges.append((first.long(), (last - first + 1).clamp_min(0).long()))
+    entry, column, row = _pixels_between(*ranges)
     return Splats((frame[entry] * views.height + row) * views.width + column, token[entry], depth[entry])
 
 
-def _pixels_between(first: Int[Tensor, "square 2"], last: Int[Tensor, "square 2"]) -> tuple[Tensor, Tensor, Tensor]:
+def _pixels_between(
+    columns: tuple[Int[Tensor, " square"], Int[Tensor, " square"]],
+    rows: tuple[Int[Tensor, " square"], Int[Tensor, " square"]],
+) -> tuple[Tensor, Tensor, Tensor]:
     """List every pixel of some rectangles, row by row: the index of its rectangle, its column and its row.
 
     Args:
-        first: column and row of each rectangle's first pixel.
-        last: column and row of its last pixel; a rectangle whose last comes before its first is empty.
+        columns: the first column of each rectangle, and how many it has.
+        rows: the first row of each, and how many it has.
     """
-    width, height = (last - first + 1).clamp_min(0).unbind(-1)
+    (left, width), (top, height) = columns, rows
     count = width * height
     entry = torch.arange(len(count), device=count.device).repeat_interleave(count)
     place = torch.arange(len(entry), device=count.device) - (count.cumsum(0) - count)[entry]
-    return entry, first[entry, 0] + place % width[entry], first[entry, 1] + place // width[entry]
+    width = width[entry]
+    down = place // width
+    return entry, left[entry] + place - down * width, top[entry] + down

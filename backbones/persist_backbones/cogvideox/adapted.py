@@ -58,6 +58,11 @@ class AdaptedBackbone(Backbone):
         """Whether the adapter in use reads whole frames."""
         return self.adapter is not None and self.adapter.reads_frames
 
+    @property
+    def draws_tokens(self) -> bool:
+        """Whether the adapter in use draws tokens into the views of a clip."""
+        return self.adapter is not None and self.adapter.draws_tokens
+
     def count_tokens(self, tokens: MemoryTokens, cameras: Cameras) -> int:
         """Return how many tokens the adapter in use makes of one sample's memory tokens."""
         return super().count_tokens(tokens, cameras) if self.adapter is None else self.adapter.count(tokens, cameras)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from persist_backbones.adapters.splat import draw_means, hide_covered, rasterize
 from persist_backbones.cogvideox.codec import Codec, to_uint8
+from persist_backbones.distinct_views import after, distinct_views
 from persist_backbones.tensors import latent_shares, push_pull
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
@@ -52,12 +53,28 @@ def views_of_given(
         cameras: axes ``batch frame``.
     """
     colors, depth = codec.decode_images(first.float())
-    samples = len(cameras)
-    rgb, metres = (part.expand(samples, *part.shape[1:]) for part in (to_uint8(colors)[:, 0], depth[:, 0].float()))
-    views = render_given(rgb, metres, cameras)
+    rgb, metres = to_uint8(colors)[:, 0], depth[:, 0].float()
+    if len(first) == 1 and codec.framewise:  # each distinct view is drawn and encoded once
+        distinct, numbers = distinct_views(cameras[:, 1:])
+        drawn = _later_latents(codec, rgb, metres, after(cameras[:1, :1], distinct)).flatten(0, 1)[numbers]
+    else:
+        drawn = _later_latents(codec, rgb, metres, cameras)
+    return torch.cat([first.expand(len(cameras), -1, -1, -1, -1), drawn.to(first)], dim=1)
+
+
+def _later_latents(
+    codec: Codec,
+    rgb: UInt8[Tensor, "#batch height width 3"],
+    depth: Float[Tensor, "#batch height width"],
+    cameras: Cameras,
+) -> Float[Tensor, "batch later channel height width"]:
+    """Return latents of what given frames show in the views after the first, zeros where they show nothing."""
+    given = (part.expand(len(cameras), *part.shape[1:]) for part in (rgb, depth))
+    views = render_given(*given, cameras)
     shown = latent_shares(views.covered, codec.spatial, codec.temporal).any(dim=2, keepdim=True)
-    latents = codec.encode(views.rgb, views.depth).to(first) * shown
-    return torch.cat([first.expand(samples, -1, -1, -1, -1), latents[:, 1:]], dim=1)
+    if codec.framewise:  # the given frame is encoded already
+        return codec.encode(views.rgb[:, 1:], views.depth[:, 1:]) * shown[:, 1:]
+    return (codec.encode(views.rgb, views.depth) * shown)[:, 1:]
 
 
 def render_given(
