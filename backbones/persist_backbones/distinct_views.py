@@ -23,8 +23,8 @@ def distinct_views(cameras: Cameras) -> tuple[Cameras, Int64[Tensor, "batch fram
     )
     distinct, numbers = flat.distinct()
     filled = distinct[torch.arange(-(-len(distinct) // frames) * frames, device=numbers.device) % len(distinct)]
-    parts = (part.unflatten(0, (-1, frames)) for part in (filled.world_from_camera, filled.intrinsics))
-    return Cameras(*parts, cameras.height, cameras.width), numbers.view(batch, frames)
+    poses, matrices = (part.unflatten(0, (-1, frames)) for part in (filled.world_from_camera, filled.intrinsics))
+    return Cameras(poses, matrices, cameras.height, cameras.width), numbers.view(batch, frames)
 
 
 def after(first: Cameras, views: Cameras) -> Cameras:

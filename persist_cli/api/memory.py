@@ -150,9 +150,9 @@ class Memory(ABC):
         return [self.read(path, budget) for path in cameras]
 
     def read_together(self, cameras: Sequence[Cameras], budget: int) -> MemoryTokens | None:
-        """Return one sample of all tokens that any of the paths sees, if ``read`` would leave none of them out.
+        """Return one sample of all tokens that any of the paths sees, and perhaps of some beside, in any order.
 
-        ``None``, as by default, where a path's tokens depend on the path, or are more than the budget.
+        ``None``, as by default, where a path's tokens depend on the path, or all of them are more than the budget.
         """
         return None
 

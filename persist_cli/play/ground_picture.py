@@ -20,7 +20,7 @@ from persist_cli.api.cells import CellOrigin
 from persist_cli.api.ground import Cover, GroundMap
 from persist_cli.api.memory import MapPoints
 from persist_cli.play.settings import GroundPose
-from persist_cli.viewing.map import ABOVE_CAMERA, PATH_COLORS, UNSEEN, hatched
+from persist_cli.viewing.map import ABOVE_CAMERA, LEAST_SPREAD, PATH_COLORS, UNSEEN, hatched
 
 MARGIN: Final = 0.5  # metres around all that is drawn
 LEAST: Final = 4.0  # metres of the shorter side at least, so that a single point does not fill the picture
@@ -102,7 +102,7 @@ def backdrop_of_points(points: MapPoints, axes: Float[Tensor, "3 3"], camera_hei
         shown[:] = True
     positions, colors, origins = positions[shown], points.colors.cpu()[shown], points.origins.cpu()[shown]
     low, high = positions[:, :2].amin(0), positions[:, :2].amax(0)
-    side = max(points.spread, float((high - low).max()) / MOST_SQUARES)
+    side = max(points.spread, LEAST_SPREAD, float((high - low).max()) / MOST_SQUARES)
     places = ((positions[:, :2] - low) / side + 0.5).floor().long()
     columns, rows = (places.amax(0) + 1).tolist()
     squares = places[:, 1] * columns + places[:, 0]

@@ -23,6 +23,7 @@ NO_COST = "#9e9e9e"  # where it is not finite
 MARGIN = 0.5  # metres around what is drawn
 AROUND = 2.0  # metres around candidates
 ABOVE_CAMERA = 0.1  # metres over the cameras at which the ceiling is cut away
+LEAST_SPREAD = 0.08  # metres of a point's square: a far floor is seen at places further apart than small cells are
 DOTS_ACROSS = 5  # dots along the side of the square that stands for a point
 MOST_DOTS = 900  # dots along the longer side of the picture
 STRIPE = 6  # dots from one stripe of what is imagined to the next
@@ -204,6 +205,8 @@ def paint(
 ) -> tuple[Array | None, tuple[float, float, float, float] | None]:
     """Return the picture of some points, each square in the colour of the highest point under the ceiling.
 
+    Squares have the size of the points' cells, and at least ``LEAST_SPREAD``.
+
     Observed points are drawn over imagined ones. What is imagined is pale with stripes, and what is edited has coloured
     stripes.
 
@@ -228,7 +231,8 @@ def paint(
     origins = points.origins.cpu().numpy()[visible]
     order = np.lexsort((heights[visible], origins != CellOrigin.IMAGINED))
     colors = points.colors.cpu().numpy()[visible] / 255.0
-    image, extent = _stamp(places[visible][order, :2], np.column_stack([colors, origins])[order], points.spread)
+    spread = max(points.spread, LEAST_SPREAD)
+    image, extent = _stamp(places[visible][order, :2], np.column_stack([colors, origins])[order], spread)
     return hatched(image), extent
 
 

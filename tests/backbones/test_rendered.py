@@ -26,7 +26,7 @@ from tests.support.micro_model import (
 from tests.support.micro_runs import MICRO, SIZE
 
 WIDE = {"token_size": 40.0, "splat_pixels": 199}  # a token that fills every view
-POINTS = RenderedSettings(token_size=0.001, splat_pixels=1, supersampling=1)
+POINTS = RenderedSettings(token_size=0.001, splat_pixels=1, supersampling=1, hole_share=0.0)
 
 
 def own_pixels(clips):

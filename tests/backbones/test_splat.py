@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from persist_backbones.adapters.splat import Splats, rasterize, splat
+from persist_backbones.adapters.splat import Splats, rasterize, splat, without_seen_through
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.cameras import Cameras
 
@@ -112,3 +112,54 @@ def test_with_several_threads_a_drawing_has_the_same_gradient_every_time():
         assert all(torch.equal(gradient(), first) for _ in range(40))
     finally:
         torch.set_num_threads(before)
+
+
+def seen(depths, share=0.5):
+    """The depths that are left of one frame of them, 0 where nothing is seen."""
+    flat = torch.tensor(depths, dtype=torch.float64).flatten()
+    [pixel] = flat.nonzero(as_tuple=True)
+    left = without_seen_through(Splats(pixel, torch.arange(len(pixel)), flat[pixel]), (1, 1, SIDE, SIDE), share)
+    return torch.zeros(SIDE * SIDE, dtype=torch.float64).index_copy(0, left.pixel, left.depth).view(SIDE, SIDE)
+
+
+def with_holes(depth=2.0, behind=5.0):
+    """A wall with a hole in the middle and one at its corner, through which one sees what is behind."""
+    picture = torch.full((SIDE, SIDE), depth)
+    picture[4, 4] = picture[0, 0] = behind
+    return picture.tolist()
+
+
+def test_what_is_seen_through_a_hole_of_a_wall_is_left_out():
+    left = seen(with_holes())
+    assert not left[4, 4]
+    assert not left[0, 0]
+    assert (left == 2).sum() == SIDE * SIDE - 2
+
+
+def test_a_share_of_zero_leaves_holes_as_they_are():
+    assert seen(with_holes(), share=0.0)[4, 4] == 5
+
+
+def test_what_is_hardly_farther_is_the_same_surface():
+    assert seen(with_holes(2.0, 2.1)).all()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_is_behind_the_edge_of_a_wall_stays(turned):
+    picture = torch.full((SIDE, SIDE), 5.0)
+    picture[:, :4] = 2.0
+    picture = picture.T if turned else picture
+    assert torch.equal(seen(picture.tolist()), picture.double())
+
+
+def test_few_points_of_something_near_hide_nothing():
+    picture = torch.full((SIDE, SIDE), 5.0)
+    picture[::3, ::3] = 2.0
+    assert torch.equal(seen(picture.tolist()), picture.double())
+
+
+def test_pixels_without_a_point_are_not_nearer():
+    picture = torch.zeros(SIDE, SIDE)
+    picture[3:6, 3:6] = 5.0
+    picture[3, 3] = 2.0
+    assert torch.equal(seen(picture.tolist()), picture.double())

@@ -30,6 +30,7 @@ from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.cost import Cost
 from persist_cli.api.ground import GroundMap
+from persist_cli.api.inference import InferenceOptions
 from persist_cli.api.policy import Goal
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.reference import sample_data
@@ -74,6 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     checkpoint = find_checkpoint(options.checkpoint or reference_checkpoint())
     adapter = checkpoint.chosen_adapter(options.adapter)
     backbone = load_backbone(checkpoint, adapter=adapter)
+    backbone.prepare_inference(InferenceOptions.of(options.dtype, None))
     factory = None if adapter is None else MemoryFactory.of(adapter_memory(checkpoint, adapter))
     cost = make_cost(options.cost, {})
     files = [file for folder in options.data or [sample_data()] for file in Store(folder)][: options.starts]
@@ -105,6 +107,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--samplings", nargs="+", type=sampling_of, help="STEPS:SAMPLER:GUIDANCE, the last is the reference",
         default=[sampling_of(text) for text in ("1:ddim:1", "2:ddim:1", "4:ddim:1", "4:unipc:1.5", "20:ddim:1")],
     )  # fmt: skip
+    parser.add_argument("--dtype", help="precision of the model, as of `persist plan`")
     parser.add_argument("--out", type=Path, help="folder for plan.json")
     return parser.parse_args(arguments)
 

@@ -45,6 +45,13 @@ def test_the_map_is_transparent_where_there_is_no_point():
     assert image[1, -3, 2] == 1.0
 
 
+def test_small_cells_of_a_floor_seen_from_afar_are_drawn_without_gaps():
+    cells = replace(points(*(((0.075 * number, 0, 0), RED) for number in range(5))), spread=0.02)
+    image, _ = paint(cells, ground_axes(UP), None)
+    [drawn] = {int(row.sum()) for row in image[..., 3] if row.any()}
+    assert drawn in (image.shape[1], image.shape[1] - 1)  # all columns
+
+
 def test_points_are_drawn_even_when_all_are_above_the_cameras():
     image, _ = paint(points(((0, 5.0, 0), RED)), ground_axes(UP), 1.0)
     assert (image[..., 3] > 0).any()

@@ -13,12 +13,12 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64, Shaped, UInt8
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from persist_backbones.adapters.base import NEAR, Adapter, Encode, NoiseLevel, PreparedMemory, VideoShape
@@ -26,7 +26,14 @@ from persist_backbones.adapters.canvas import CanvasHead
 from persist_backbones.adapters.memory_block import AttentionSettings
 from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
 from persist_backbones.adapters.projected import ProjectedAdapter, ProjectedMemory, ProjectedSettings, image_places
-from persist_backbones.adapters.splat import Splats, coarser, draw_means, hide_covered, rasterize
+from persist_backbones.adapters.splat import (
+    Splats,
+    coarser,
+    draw_means,
+    hide_covered,
+    rasterize,
+    without_seen_through,
+)
 from persist_backbones.distinct_views import distinct_views
 from persist_backbones.noise_levels import add_level
 from persist_backbones.tensors import fold_frames, fold_patches, latent_shares, push_pull, zero_init
@@ -46,6 +53,8 @@ class RenderedSettings(AttentionSettings):
         token_size: edge in metres of the square that a token is drawn as, somewhat more than the edge of a cell.
         splat_pixels: largest edge of a drawn token in pixels, plus 1 / ``supersampling`` where ``splat_pixels`` ×
             ``supersampling`` is even: with 9 and 2 it is 9.5. 1 draws points only where ``supersampling`` is 1.
+        hole_share: a pixel that shows something clearly farther than this share of the pixels around it is a hole,
+            through which what is behind a wall would show, and is left out like one without a token; 0 leaves it.
         thickness: metres behind the nearest token at a pixel in which tokens are of the same surface: their mean is
             drawn, in which those count more that were seen from nearer.
         supersampling: number n of an antialiased drawing, in which a pixel is the mean of n × n that are drawn.
@@ -69,6 +78,7 @@ class RenderedSettings(AttentionSettings):
     token_budget: PositiveInt = 65536
     token_size: PositiveFloat = 0.03
     splat_pixels: PositiveInt = 9
+    hole_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     thickness: NonNegativeFloat = 0.05
     supersampling: PositiveInt = 2
     head_width: PositiveInt = 96
@@ -124,6 +134,7 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSetti
     shape = (*cameras.world_from_camera.shape[:2], views.height, views.width)
     drawn_pixels = rasterize(tokens.positions, tokens.mask, views, settings.token_size, settings.splat_pixels * finer)
     splats, _ = hide_covered(drawn_pixels, math.prod(shape), settings.thickness)
+    splats = without_seen_through(splats, shape, settings.hole_share)
     shown = torch.zeros_like(tokens.mask).flatten().index_fill(0, splats.token, True).view_as(tokens.mask)
     pictures, observed, covered = _surfaces(tokens, splats, shape, finer).split([4, 1, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
@@ -343,7 +354,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
     def rendering(self) -> Mapping[str, Any]:
         """Return the settings that ``render`` depends on."""
         settings = self.settings
-        names = ["token_size", "splat_pixels", "thickness", "supersampling", "attention_tokens"]
+        names = ["token_size", "splat_pixels", "hole_share", "thickness", "supersampling", "attention_tokens"]
         names += ["layers", "layer_gap", "layer_scale", "classes"] if settings.layers else []
         return {name: getattr(settings, name) for name in names}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -16,6 +17,10 @@ from persist_cli.api.geometry import nearest_at, project
 
 TIE = 1e-4  # of the depth: a wall seen face on has one depth, up to the rounding of a turned world
 SNAP = 1e-6  # pixels: a token on the border of two pixels falls into the same one despite rounding
+
+
+AROUND = 2  # pixels to each side of a pixel that are looked at to find holes
+NEARER = 0.03, 0.1  # of the depth, and metres: something so much nearer is another surface
 
 
 class Splats(NamedTuple):
@@ -43,6 +48,34 @@ def hide_covered(splats: Splats, pixels: int, thickness: float = 0.0) -> tuple[S
     nearest = nearest_at(splats.pixel, splats.depth, pixels)
     visible = splats.depth <= nearest[splats.pixel] * (1 + TIE) + thickness
     return Splats(*(column[visible] for column in splats)), nearest
+
+
+def without_seen_through(splats: Splats, shape: tuple[int, int, int, int], share: float) -> Splats:
+    """Leave out what is seen through the holes of a nearer surface of points (Pintus, Gobbetti & Agus 2011).
+
+    Such a pixel shows something clearly farther than most pixels around it. At a straight edge of something near, fewer
+    than half of them are nearer.
+
+    Args:
+        splats: the pixels that tokens cover, without those that others hide.
+        shape: batch, frames, height and width that are drawn.
+        share: share of the pixels around from which on a pixel is a hole; 0 leaves nothing out.
+    """
+    if not share:
+        return splats
+    height, width = shape[2:]
+    nearest = nearest_at(splats.pixel, splats.depth.float(), math.prod(shape)).view(-1, height, width)
+    limit = torch.where(nearest.isfinite(), nearest * (1 - NEARER[0]) - NEARER[1], 0.0)
+    around = F.pad(nearest, [AROUND] * 4, value=math.inf)
+    present = F.pad(torch.ones_like(nearest[:1]), [AROUND] * 4)
+    nearer, every = torch.zeros_like(nearest), torch.zeros_like(nearest[:1])
+    for down, right in itertools.product(range(2 * AROUND + 1), repeat=2):
+        window = (slice(None), slice(down, down + height), slice(right, right + width))
+        if (down, right) != (AROUND, AROUND):
+            nearer += around[window] < limit
+            every += present[window]
+    kept = (nearer < share * every).flatten()[splats.pixel]
+    return Splats(*(column[kept] for column in splats))
 
 
 def splat(

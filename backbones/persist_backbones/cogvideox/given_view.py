@@ -69,8 +69,8 @@ def _later_latents(
     cameras: Cameras,
 ) -> Float[Tensor, "batch later channel height width"]:
     """Return latents of what given frames show in the views after the first, zeros where they show nothing."""
-    given = (part.expand(len(cameras), *part.shape[1:]) for part in (rgb, depth))
-    views = render_given(*given, cameras)
+    rgb, depth = (part.expand(len(cameras), *part.shape[1:]) for part in (rgb, depth))
+    views = render_given(rgb, depth, cameras)
     shown = latent_shares(views.covered, codec.spatial, codec.temporal).any(dim=2, keepdim=True)
     if codec.framewise:  # the given frame is encoded already
         return codec.encode(views.rgb[:, 1:], views.depth[:, 1:]) * shown[:, 1:]

@@ -129,14 +129,16 @@ class GridMemory(Memory):
         return [self._tokens(cells, path) for cells, path in zip(positions, paths, strict=True)]
 
     def read_together(self, cameras: Sequence[Cameras], budget: int) -> MemoryTokens | None:
-        """Return the cells that reach into a view of any path, ``None`` if they might be more than the budget."""
+        """Return the cells of all blocks that reach into a view of any path, ``None`` if they are over the budget."""
         paths = [path.to(self.grid.device) for path in cameras]
         if self.lattice.flat or not same_size(paths):  # cells of a flat map stand at a height that a path says
             return None
         distinct, _ = distinct_cameras(paths)
-        everything = torch.arange(len(distinct), device=self.grid.device)
-        [cells] = nearest_cells(self.grid, self.lattice, self.views(distinct), [everything], budget)
-        return self._tokens(cells, distinct) if len(cells) < budget else None
+        blocks, starts, counts = self.grid.blocks()
+        seen = block_distances(blocks, self.lattice, self.views(distinct)).isfinite().any(dim=0)
+        if int(counts[seen].sum()) > budget:
+            return None
+        return self._tokens(ranges(starts[seen], counts[seen]), distinct)
 
     def copy(self) -> Self:
         """Return a map of the same cells; the two share their memory until one of them is written."""
