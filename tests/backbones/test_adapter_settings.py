@@ -16,8 +16,8 @@ FORM_KEYS = {
     "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
     "rendered": {
         "heads", "frequencies", "token_size", "splat_pixels", "hole_share", "thickness", "supersampling", "head_width",
-        "head_layers", "attention_tokens", "layers", "classes", "class_channels", "layer_width", "layer_gap", "layer_scale",
-        "color_error", "depth_error",
+        "head_layers", "attention_tokens", "layers", "classes", "class_channels", "layer_width", "layer_gap",
+        "layer_scale", "color_error", "depth_error",
     },
     "frames": {"heads", "frequencies", "frame_patch"},
 }  # fmt: skip
