@@ -407,15 +407,17 @@ class WorldModel:
                 continue
             readers = [number for number, agent in enumerate(agents) if agent.memory is memory]
             wanted = [paths[number] for number in readers]
-            together = None
-            if len(readers) > 1 and self.backbone.draws_tokens:
-                together = memory.read_together(wanted, self.backbone.token_budget)
-            shared = [together] * len(readers) if together is not None else None
-            batch = shared or memory.read_batch(wanted, self.backbone.token_budget)
-            for number, sample in zip(readers, batch, strict=True):
+            for number, sample in zip(readers, self.read_memory(memory, wanted), strict=True):
                 tokens[number] = sample
                 agents[number].reads.append((self.backbone.count_tokens(sample, paths[number]), sample.bytes))
         return tokens
+
+    def read_memory(self, memory: Memory, paths: Sequence[Cameras]) -> list[MemoryTokens]:
+        """Return a memory's tokens of each path: one sample for all where tokens are drawn and the memory has that."""
+        budget, together = self.backbone.token_budget, None
+        if len(paths) > 1 and self.backbone.draws_tokens:
+            together = memory.read_together(paths, budget)
+        return memory.read_batch(paths, budget) if together is None else [together] * len(paths)
 
 
 def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str]) -> Cameras:
