@@ -66,7 +66,7 @@ class MemoryTokens:
     @property
     def shared(self) -> bool:
         """Whether the samples of this batch, more than one, have the same tokens in the same place of the processor."""
-        return len(self.positions) > 1 and self.positions.stride(0) == 0
+        return len(self.positions) > 1 and all(tensor.stride(0) == 0 for tensor in self.tensors().values())
 
     def tensors(self) -> dict[str, Tensor]:
         """Return all tensors by name, without those that are ``None``; ``MemoryTokens`` takes them back."""
@@ -80,6 +80,8 @@ class MemoryTokens:
 
     def to(self, device: torch.device | str) -> MemoryTokens:
         """Return these tokens on ``device``."""
+        if self.shared:  # moving them would copy every sample
+            return self.first(1).to(device).first(len(self.positions))
         return MemoryTokens(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
 
     @staticmethod

@@ -91,4 +91,6 @@ def test_a_batch_of_one_sample_several_times_is_not_copied():
     batch = MemoryTokens.stack([sample, sample])
     assert batch.features.shape == (2, 7, CHANNELS)
     assert batch.features.untyped_storage().nbytes() == sample.features.untyped_storage().nbytes()
+    assert batch.to("cpu").shared
+    assert torch.equal(batch.to("cpu").positions, batch.positions)
     assert not MemoryTokens.stack([sample]).shared

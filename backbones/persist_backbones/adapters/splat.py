@@ -17,8 +17,6 @@ from persist_cli.api.geometry import nearest_at, project
 
 TIE = 1e-4  # of the depth: a wall seen face on has one depth, up to the rounding of a turned world
 SNAP = 1e-6  # pixels: a token on the border of two pixels falls into the same one despite rounding
-
-
 AROUND = 2  # pixels to each side of a pixel that are looked at to find holes
 NEARER = 0.03, 0.1  # of the depth, and metres: something so much nearer is another surface
 
