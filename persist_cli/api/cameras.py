@@ -70,16 +70,18 @@ class Cameras:
         intrinsics[..., 1, 2] -= top
         return replace(self, intrinsics=intrinsics, height=height, width=width)
 
-    def distinct(self) -> tuple[Cameras, Int64[Tensor, " frame"]]:
-        """Return every distinct camera once, and for each of these, which have the frame axis alone, its number there.
+    def distinct(self) -> tuple[Cameras, Int64[Tensor, "*batch"]]:
+        """Return every distinct camera once, with the frame axis alone, and for each of these its number there.
 
         The distinct ones are in an order of their own.
         """
-        rows = torch.cat([self.world_from_camera.flatten(1), self.intrinsics.flatten(1)], dim=1)
+        poses, matrices = self.world_from_camera.flatten(0, -3), self.intrinsics.flatten(0, -3)
+        rows = torch.cat([poses.flatten(1), matrices.flatten(1)], dim=1)
         unique, positions = torch.unique(rows, dim=0, return_inverse=True)
         numbers = torch.arange(len(rows), device=rows.device)
         first = numbers.new_full((len(unique),), len(rows)).scatter_reduce(0, positions, numbers, "amin")
-        return self[first], positions
+        distinct = replace(self, world_from_camera=poses[first], intrinsics=matrices[first])
+        return distinct, positions.view(self.world_from_camera.shape[:-2])
 
     @staticmethod
     def stack(paths: Sequence[Cameras]) -> Cameras:

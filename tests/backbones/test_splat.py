@@ -118,7 +118,8 @@ def seen(depths, share=0.5):
     """The depths that are left of one frame of them, 0 where nothing is seen."""
     flat = torch.tensor(depths, dtype=torch.float64).flatten()
     [pixel] = flat.nonzero(as_tuple=True)
-    left = without_seen_through(Splats(pixel, torch.arange(len(pixel)), flat[pixel]), (1, 1, SIDE, SIDE), share)
+    nearest = flat.where(flat > 0, torch.inf).view(1, SIDE, SIDE)
+    left = without_seen_through(Splats(pixel, torch.arange(len(pixel)), flat[pixel]), nearest, share)
     return torch.zeros(SIDE * SIDE, dtype=torch.float64).index_copy(0, left.pixel, left.depth).view(SIDE, SIDE)
 
 

@@ -48,7 +48,7 @@ def hide_covered(splats: Splats, pixels: int, thickness: float = 0.0) -> tuple[S
     return Splats(*(column[visible] for column in splats)), nearest
 
 
-def without_seen_through(splats: Splats, shape: tuple[int, int, int, int], share: float) -> Splats:
+def without_seen_through(splats: Splats, nearest: Float[Tensor, "view height width"], share: float) -> Splats:
     """Leave out what is seen through the holes of a nearer surface of points (Pintus, Gobbetti & Agus 2011).
 
     Such a pixel shows something clearly farther than most pixels around it. At a straight edge of something near, fewer
@@ -56,13 +56,13 @@ def without_seen_through(splats: Splats, shape: tuple[int, int, int, int], share
 
     Args:
         splats: the pixels that tokens cover, without those that others hide.
-        shape: batch, frames, height and width that are drawn.
+        nearest: depth of the nearest of them at each pixel, infinite without any.
         share: share of the pixels around from which on a pixel is a hole; 0 leaves nothing out.
     """
     if not share:
         return splats
-    height, width = shape[2:]
-    nearest = nearest_at(splats.pixel, splats.depth.float(), math.prod(shape)).view(-1, height, width)
+    height, width = nearest.shape[1:]
+    nearest = nearest.float()
     limit = torch.where(nearest.isfinite(), nearest * (1 - NEARER[0]) - NEARER[1], 0.0)
     around = F.pad(nearest, [AROUND] * 4, value=math.inf)
     present = F.pad(torch.ones_like(nearest[:1]), [AROUND] * 4)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from persist_backbones.adapters.splat import draw_means, hide_covered, rasterize
 from persist_backbones.cogvideox.codec import Codec, to_uint8
-from persist_backbones.distinct_views import after, distinct_views
+from persist_backbones.distinct_views import distinct_views
 from persist_backbones.tensors import latent_shares, push_pull
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
@@ -56,7 +56,9 @@ def views_of_given(
     rgb, metres = to_uint8(colors)[:, 0], depth[:, 0].float()
     if len(first) == 1 and codec.framewise:  # each distinct view is drawn and encoded once
         distinct, numbers = distinct_views(cameras[:, 1:])
-        drawn = _later_latents(codec, rgb, metres, after(cameras[:1, :1], distinct)).flatten(0, 1)[numbers]
+        given = cameras[0][:1]
+        clips = Cameras.stack([Cameras.concatenate([given, distinct[number]]) for number in range(len(distinct))])
+        drawn = _later_latents(codec, rgb, metres, clips).flatten(0, 1)[numbers]
     else:
         drawn = _later_latents(codec, rgb, metres, cameras)
     return torch.cat([first.expand(len(cameras), -1, -1, -1, -1), drawn.to(first)], dim=1)
