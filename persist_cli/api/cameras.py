@@ -17,6 +17,7 @@ from torch import Tensor
 from persist_cli.errors import DataError
 
 RIGID_TOLERANCE = 1e-2  # real captures store poses with three to four digits
+POSE_DIGITS = 9  # after the point of a pose's numbers; poses that differ only behind them are one
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,12 @@ class Cameras:
     def distinct(self) -> tuple[Cameras, Int64[Tensor, "*batch"]]:
         """Return every distinct camera once, with the frame axis alone, and for each of these its number there.
 
-        The distinct ones are in an order of their own.
+        The distinct ones are in an order of their own. Those that differ by rounding alone, as after the same turns in
+        another order, are one.
         """
         poses, matrices = self.world_from_camera.flatten(0, -3), self.intrinsics.flatten(0, -3)
         rows = torch.cat([poses.flatten(1), matrices.flatten(1)], dim=1)
-        unique, positions = torch.unique(rows, dim=0, return_inverse=True)
+        unique, positions = torch.unique(rows.round(decimals=POSE_DIGITS), dim=0, return_inverse=True)
         numbers = torch.arange(len(rows), device=rows.device)
         first = numbers.new_full((len(unique),), len(rows)).scatter_reduce(0, positions, numbers, "amin")
         distinct = replace(self, world_from_camera=poses[first], intrinsics=matrices[first])

@@ -83,7 +83,7 @@ def find_in_views(
 
 def nearest_at(places: Int64[Tensor, " point"], depth: Float[Tensor, " point"], count: int) -> Float[Tensor, " place"]:
     """Return a z-buffer: the least depth at each of ``count`` places, numbered from 0; infinity where there is none."""
-    return depth.new_full((count,), torch.inf).scatter_reduce(0, places, depth, "amin")
+    return depth.new_full((count,), torch.inf).scatter_reduce_(0, places, depth, "amin")
 
 
 def pose_differences(

@@ -53,7 +53,7 @@ class MemoryTokens:
     def __len__(self) -> int:
         return self.features.shape[-2]
 
-    def __getitem__(self, sample: int) -> MemoryTokens:
+    def __getitem__(self, sample: int | slice) -> MemoryTokens:
         return MemoryTokens(**{name: tensor[sample] for name, tensor in self.tensors().items()})
 
     @property

@@ -46,6 +46,15 @@ def test_every_view_is_there_once_and_found_again():
     assert len(numbers.unique()) == 19
 
 
+def test_views_that_differ_by_rounding_alone_are_one():
+    poses = parting(2, together=9).cameras.world_from_camera.clone()
+    poses[1, :, :3, 3] += 1e-13
+    cameras = dataclasses.replace(parting(2).cameras, world_from_camera=poses)
+    assert len(cameras.distinct()[0]) == 9
+    poses[1, :, :3, 3] += 1e-6
+    assert len(cameras.distinct()[0]) == 18
+
+
 def test_clips_that_share_their_tokens_are_rendered_as_if_each_had_its_own(monkeypatch):
     backbone = with_adapter(micro(**FRAMEWISE), form="rendered", attention_tokens=0)
     clips, tokens = parting(5, together=8), random_tokens(1, 200)
@@ -56,7 +65,7 @@ def test_clips_that_share_their_tokens_are_rendered_as_if_each_had_its_own(monke
     own = backbone.keep_tokens(dataclasses.replace(clips, tokens=copied))
     counts = counting(monkeypatch, rendered, "render_views", 1)
     once = backbone.keep_tokens(dataclasses.replace(clips, tokens=shared))
-    assert counts == [2]  # 8 + 5 views
+    assert sum(counts) == 2  # 8 + 5 views
     assert torch.allclose(once.rendered, own.rendered, atol=2e-3)
     assert own.rendered.any()
 
@@ -81,7 +90,7 @@ def test_a_given_frame_of_several_clips_is_moved_as_if_each_had_its_own(settings
     own = backbone.encode_first(several)
     counts = counting(monkeypatch, given_view, "render_given", 2)
     once = backbone.encode_first(clips)
-    assert counts == [2 if settings else 5]
+    assert sum(counts) == (2 if settings else 5)
     assert torch.allclose(once, own, atol=1e-3)
     assert own[:, 1:].any()
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from persist_backbones.adapters.splat import Splats, rasterize, splat, without_seen_through
+from persist_backbones.adapters.splat import Splats, hide_covered, rasterize, splat
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.cameras import Cameras
 
@@ -118,8 +118,8 @@ def seen(depths, share=0.5):
     """The depths that are left of one frame of them, 0 where nothing is seen."""
     flat = torch.tensor(depths, dtype=torch.float64).flatten()
     [pixel] = flat.nonzero(as_tuple=True)
-    nearest = flat.where(flat > 0, torch.inf).view(1, SIDE, SIDE)
-    left = without_seen_through(Splats(pixel, torch.arange(len(pixel)), flat[pixel]), nearest, share)
+    splats = Splats(pixel, torch.arange(len(pixel)), flat[pixel])
+    left, _ = hide_covered(splats, (1, SIDE, SIDE), hole_share=share)
     return torch.zeros(SIDE * SIDE, dtype=torch.float64).index_copy(0, left.pixel, left.depth).view(SIDE, SIDE)
 
 

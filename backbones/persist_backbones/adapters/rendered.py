@@ -10,7 +10,6 @@ not drawn. Where a memory tells classes, as a scene does, the first surfaces alo
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -32,7 +31,6 @@ from persist_backbones.adapters.splat import (
     draw_means,
     hide_covered,
     rasterize,
-    without_seen_through,
 )
 from persist_backbones.distinct_views import distinct_views
 from persist_backbones.noise_levels import add_level
@@ -133,17 +131,17 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSetti
     views = cameras.resized(cameras.height * finer, cameras.width * finer)
     shape = (*cameras.world_from_camera.shape[:2], views.height, views.width)
     drawn_pixels = rasterize(tokens.positions, tokens.mask, views, settings.token_size, settings.splat_pixels * finer)
-    splats, nearest = hide_covered(drawn_pixels, math.prod(shape), settings.thickness)
-    splats = without_seen_through(splats, nearest.view(-1, *shape[2:]), settings.hole_share)
+    seen = (shape[0] * shape[1], *shape[2:])
+    splats, _ = hide_covered(drawn_pixels, seen, settings.thickness, settings.hole_share)
     shown = torch.zeros_like(tokens.mask).flatten().index_fill(0, splats.token, True).view_as(tokens.mask)
-    pictures, observed, covered = _surfaces(tokens, splats, shape, finer).split([4, 1, 1], dim=1)
+    pictures, observed, covered = _surfaces(tokens, splats, seen, finer).split([4, 1, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     origins = torch.cat([observed, covered - observed], dim=1).unflatten(0, shape[:2])
     return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown, drawn_pixels)
 
 
 def _surfaces(
-    tokens: MemoryTokens, splats: Splats, shape: tuple[int, int, int, int], finer: int
+    tokens: MemoryTokens, splats: Splats, shape: tuple[int, int, int], finer: int
 ) -> Float[Tensor, "view 6 height width"]:
     """Return colour, depth, whether it was observed, and 1 of the surface at each pixel; zeros where there is none.
 
@@ -153,7 +151,7 @@ def _surfaces(
     assert tokens.colors is not None
     columns = [tokens.colors.float(), (tokens.origins == Origin.OBSERVED)[..., None].float()]
     color, observed = torch.cat(columns, dim=-1).flatten(0, 1).index_select(0, splats.token).split([3, 1], dim=1)
-    values = torch.cat([color, splats.depth[:, None].float(), observed, torch.ones_like(observed)], dim=1)
+    values = torch.cat([color, splats.depth[:, None].float(), observed], dim=1)
     distances = torch.ones_like(tokens.mask, dtype=torch.float32) if tokens.distances is None else tokens.distances
     weights = distances.clamp_min(NEAR).square().reciprocal().flatten().index_select(0, splats.token)
     return draw_means(values, weights, splats, shape, finer)
@@ -323,11 +321,17 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         self, tokens: MemoryTokens, cameras: Cameras, encode: Encode
     ) -> tuple[Float[Tensor, "batch frame channel height width"], Bool[Tensor, "batch token"]]:
         """Return latents, mask and layers of the views, and which tokens any view of their clip shows."""
-        settings, spatial = self.settings, self.video.spatial
-        views = render_views(tokens, cameras, settings)
-        mask = latent_shares(views.covered, spatial, self.video.temporal)
-        latents = encode(views.rgb, views.depth) * mask.any(dim=2, keepdim=True)
-        return torch.cat([latents, mask.to(latents), *self.peeled(tokens, views)], dim=2), views.shown
+        clips = [slice(number, number + 1) for number in range(len(tokens.mask))]  # one fits into a processor's cache
+        drawn = zip(*(self.drawn(tokens[clip], cameras[clip]) for clip in clips), strict=True)
+        rgb, depth, mask, shown, *layers = (torch.cat(parts) for parts in drawn)
+        latents = encode(rgb, depth) * mask.any(dim=2, keepdim=True)
+        return torch.cat([latents, mask.to(latents), *layers], dim=2), shown
+
+    def drawn(self, tokens: MemoryTokens, cameras: Cameras) -> tuple[Tensor, ...]:
+        """Return colours and depth of the views, the mask at each latent pixel, which tokens a view shows, layers."""
+        views = render_views(tokens, cameras, self.settings)
+        mask = latent_shares(views.covered, self.video.spatial, self.video.temporal)
+        return views.rgb, views.depth, mask, views.shown, *self.peeled(tokens, views)
 
     def peeled(self, tokens: MemoryTokens, views: Views) -> list[Float[Tensor, "batch frame folded height width"]]:
         """Return the layers of the views folded to the size of latents, none where the adapter has none."""

@@ -35,45 +35,46 @@ class Splats(NamedTuple):
     depth: Float[Tensor, " splat"]
 
 
-def hide_covered(splats: Splats, pixels: int, thickness: float = 0.0) -> tuple[Splats, Float[Tensor, " pixel"]]:
+def hide_covered(
+    splats: Splats, shape: tuple[int, int, int], thickness: float = 0.0, hole_share: float = 0.0
+) -> tuple[Splats, Float[Tensor, "view height width"]]:
     """Return the splats at the depth of the nearest at their pixel, and that depth at each pixel, infinite without any.
 
     Args:
         splats: the pixels that the tokens cover.
-        pixels: number of pixels of all frames of the batch.
+        shape: number of views of the batch, their height and width.
         thickness: metres behind the nearest that are at its depth still.
+        hole_share: leave out pixels that are ``holes`` by this share.
     """
-    nearest = nearest_at(splats.pixel, splats.depth, pixels)
-    visible = splats.depth <= nearest[splats.pixel] * (1 + TIE) + thickness
-    return Splats(*(column[visible] for column in splats)), nearest
+    nearest = nearest_at(splats.pixel, splats.depth, math.prod(shape)).view(shape)
+    limit = nearest * (1 + TIE) + thickness
+    if hole_share:
+        limit.masked_fill_(holes(nearest, hole_share), -math.inf)
+    visible = (splats.depth <= limit.flatten().index_select(0, splats.pixel)).nonzero()[:, 0]
+    return Splats(*(column.index_select(0, visible) for column in splats)), nearest
 
 
-def without_seen_through(splats: Splats, nearest: Float[Tensor, "view height width"], share: float) -> Splats:
-    """Leave out what is seen through the holes of a nearer surface of points (Pintus, Gobbetti & Agus 2011).
+def holes(nearest: Float[Tensor, "view height width"], share: float) -> Bool[Tensor, "view height width"]:
+    """Find the pixels that show what is behind a nearer surface of points (Pintus, Gobbetti & Agus 2011).
 
     Such a pixel shows something clearly farther than most pixels around it. At a straight edge of something near, fewer
     than half of them are nearer.
 
     Args:
-        splats: the pixels that tokens cover, without those that others hide.
-        nearest: depth of the nearest of them at each pixel, infinite without any.
-        share: share of the pixels around from which on a pixel is a hole; 0 leaves nothing out.
+        nearest: depth of the nearest point at each pixel, infinite without any.
+        share: share of the pixels around from which on a pixel is a hole.
     """
-    if not share:
-        return splats
     height, width = nearest.shape[1:]
     nearest = nearest.float()
     limit = torch.where(nearest.isfinite(), nearest * (1 - NEARER[0]) - NEARER[1], 0.0)
     around = F.pad(nearest, [AROUND] * 4, value=math.inf)
-    present = F.pad(torch.ones_like(nearest[:1]), [AROUND] * 4)
-    nearer, every = torch.zeros_like(nearest), torch.zeros_like(nearest[:1])
+    nearer = torch.zeros_like(nearest, dtype=torch.uint8)
     for down, right in itertools.product(range(2 * AROUND + 1), repeat=2):
-        window = (slice(None), slice(down, down + height), slice(right, right + width))
-        if (down, right) != (AROUND, AROUND):
-            nearer += around[window] < limit
-            every += present[window]
-    kept = (nearer < share * every).flatten()[splats.pixel]
-    return Splats(*(column[kept] for column in splats))
+        nearer += around[:, down : down + height, right : right + width] < limit
+    rows, columns = (torch.arange(length, device=nearest.device) for length in (height, width))
+    around_rows = (rows + AROUND).clamp_max(height - 1) - (rows - AROUND).clamp_min(0) + 1
+    around_columns = (columns + AROUND).clamp_max(width - 1) - (columns - AROUND).clamp_min(0) + 1
+    return nearer >= share * (around_rows[:, None] * around_columns - 1)
 
 
 def splat(
@@ -88,8 +89,8 @@ def splat(
         splats: the pixels that the tokens cover.
         shape: batch, frames, height and width of the canvas.
     """
-    visible, nearest = hide_covered(splats, shape[0] * shape[1] * shape[2] * shape[3])
-    pixel, token = visible.pixel, visible.token
+    visible, nearest = hide_covered(splats, (shape[0] * shape[1], *shape[2:]))
+    pixel, token, nearest = visible.pixel, visible.token, nearest.flatten()
     # index_select rather than brackets, whose gradient several threads add up in no fixed order
     drawn = features.flatten(0, 1).index_select(0, token)
     # on CUDA the order of this sum, and so its last bit, is not fixed for three or more tokens at one depth
@@ -104,41 +105,33 @@ def splat(
     return result
 
 
-def weighted_means(
-    values: Float[Tensor, "splat channel"], weights: Float[Tensor, " splat"], splats: Splats, pixels: int
-) -> Float[Tensor, "pixel channel"]:
-    """Return the weighted mean of the values of all splats of each pixel; zeros where there is none.
-
-    Args:
-        values: values of each splat.
-        weights: weights above zero; only their ratios at a pixel count.
-        splats: the pixels that tokens cover.
-        pixels: number of pixels of all frames of the batch.
-    """
-    largest = weights.new_zeros(pixels).scatter_reduce(0, splats.pixel, weights, "amax")
-    shares = weights / largest[splats.pixel]  # no sum overflows or vanishes
-    total = values.new_zeros(pixels, values.shape[1]).index_add(0, splats.pixel, values * shares[:, None])
-    return total / shares.new_zeros(pixels).index_add(0, splats.pixel, shares).clamp_min(1e-6)[:, None]
-
-
 def draw_means(
     values: Float[Tensor, "splat channel"],
-    weights: Float[Tensor, " splat"],
+    weights: Float[Tensor, " splat"] | None,
     splats: Splats,
-    shape: tuple[int, int, int, int],
+    shape: tuple[int, int, int],
     finer: int,
-) -> Float[Tensor, "view channel height width"]:
-    """Return the weighted means at each pixel of all views, each the mean of ``finer`` × ``finer`` that are drawn.
+) -> Float[Tensor, "view channel+1 height width"]:
+    """Draw the weighted means of the values at each pixel, and coverage (0 or 1); zeros where there is no splat.
 
     Args:
         values: values of each splat.
-        weights: weights above zero; only their ratios at a pixel count.
+        weights: weights above zero, of which only the ratios at a pixel count; all are alike without.
         splats: the pixels that tokens cover, without those that others hide.
-        shape: batch, frames, height and width that are drawn.
-        finer: pixels that are drawn along the edge of a pixel.
+        shape: number of views, height and width that are drawn.
+        finer: pixels that are drawn along the edge of a pixel, which is their mean.
     """
-    means = weighted_means(values, weights, splats, math.prod(shape))
-    return F.avg_pool2d(means.unflatten(0, shape).permute(0, 1, 4, 2, 3).flatten(0, 1), finer)
+    parts = torch.cat([values, torch.ones_like(values[:, :1])], dim=1)
+    if weights is not None:
+        largest = weights.new_zeros(math.prod(shape)).scatter_reduce_(0, splats.pixel, weights, "amax")
+        parts *= (weights / largest.index_select(0, splats.pixel))[:, None]  # no sum overflows or vanishes
+    total, weight = (
+        parts.new_zeros(math.prod(shape), parts.shape[1])
+        .index_add_(0, splats.pixel, parts)
+        .split([values.shape[1], 1], dim=1)
+    )
+    means = torch.cat([total / weight.clamp_min(1e-6), (weight > 0).to(total)], dim=1)
+    return F.avg_pool2d(means.unflatten(0, shape).movedim(-1, 1), finer)
 
 
 def coarser(splats: Splats, size: tuple[int, int], coarse: tuple[int, int]) -> Splats:
@@ -197,33 +190,26 @@ def _rasterize_clip(
         close &= (places + SNAP >= -reach) & (places + SNAP < length + reach)
     chosen = close.flatten().nonzero()[:, 0]
     frame, token = chosen // close.shape[1], chosen % close.shape[1]
-    depth = depth.flatten()[chosen]
+    depth = depth.flatten().index_select(0, chosen)
     scale = 0.5 * sizes[token] / depth
     ranges = []
     for axis, (places, length) in enumerate(zip(axes, lengths, strict=True)):
-        middle, half = places.flatten()[chosen], scale * views.intrinsics.double()[:, axis, axis][frame]
+        middle = places.flatten().index_select(0, chosen)
+        half = scale * views.intrinsics.double()[:, axis, axis][frame]
         center = (middle + SNAP).floor()
         first = (middle - half - 0.5 + SNAP).ceil().minimum(center).maximum(center - reach).clamp_min(0)
         last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).clamp_max(length - 1)
         ranges.append((first.long(), (last - first + 1).clamp_min(0).long()))
-    entry, column, row = _pixels_between(*ranges)
-    return Splats((frame[entry] * views.height + row) * views.width + column, token[entry], depth[entry])
+    (left, width), (top, height) = ranges
+    square, row = _counted(frame * views.height + top, height)
+    line, pixel = _counted(row * views.width + left[square], width[square])
+    return Splats(pixel, token[square].index_select(0, line), depth[square].index_select(0, line))
 
 
-def _pixels_between(
-    columns: tuple[Int[Tensor, " square"], Int[Tensor, " square"]],
-    rows: tuple[Int[Tensor, " square"], Int[Tensor, " square"]],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """List every pixel of some rectangles, row by row: the index of its rectangle, its column and its row.
-
-    Args:
-        columns: the first column of each rectangle, and how many it has.
-        rows: the first row of each, and how many it has.
-    """
-    (left, width), (top, height) = columns, rows
-    count = width * height
-    entry = torch.arange(len(count), device=count.device).repeat_interleave(count)
-    place = torch.arange(len(entry), device=count.device) - (count.cumsum(0) - count)[entry]
-    width = width[entry]
-    down = place // width
-    return entry, left[entry] + place - down * width, top[entry] + down
+def _counted(
+    first: Int[Tensor, " range"], count: Int[Tensor, " range"]
+) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"]]:
+    """List all numbers of ranges, of which each has its first number and its count: the range's index, the number."""
+    index = torch.arange(len(count), device=count.device).repeat_interleave(count)
+    offset = first - (count.cumsum(0) - count)
+    return index, torch.arange(len(index), device=count.device) + offset.index_select(0, index)

@@ -7,7 +7,6 @@ ViewCrafter (2409.02048), GEN3C (2503.03751) and TrajectoryCrafter (2503.05638).
 
 from __future__ import annotations
 
-import math
 from typing import Final, NamedTuple
 
 import torch
@@ -72,7 +71,9 @@ def _later_latents(
 ) -> Float[Tensor, "batch later channel height width"]:
     """Return latents of what given frames show in the views after the first, zeros where they show nothing."""
     rgb, depth = (part.expand(len(cameras), *part.shape[1:]) for part in (rgb, depth))
-    views = render_given(rgb, depth, cameras)
+    clips = [slice(number, number + 1) for number in range(len(cameras))]  # one fits into a processor's cache
+    parts = [render_given(rgb[clip], depth[clip], cameras[clip]) for clip in clips]
+    views = GivenViews(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
     shown = latent_shares(views.covered, codec.spatial, codec.temporal).any(dim=2, keepdim=True)
     if codec.framewise:  # the given frame is encoded already
         return codec.encode(views.rgb[:, 1:], views.depth[:, 1:]) * shown[:, 1:]
@@ -96,11 +97,11 @@ def render_given(
     shape = (batch, frames - 1, views.height, views.width)
     sizes = SPREAD * depth.double() / first.intrinsics.double()[:, :1, 0, 0, None]
     splats = rasterize(unproject(depth[:, None], first).flatten(1, 3), present, views, sizes.flatten(1), MOST * FINER)
-    visible, _ = hide_covered(splats, math.prod(shape), THICKNESS)
+    seen = (shape[0] * shape[1], *shape[2:])
+    visible, _ = hide_covered(splats, seen, THICKNESS)
     colors = rgb.flatten(0, 2).float().index_select(0, visible.token)
-    values = torch.cat([colors, visible.depth[:, None].float(), torch.ones_like(colors[:, :1])], dim=1)
-    drawn = draw_means(values, torch.ones_like(values[:, 0]), visible, shape, FINER)
-    pictures, covered = drawn.split([4, 1], dim=1)
+    values = torch.cat([colors, visible.depth[:, None].float()], dim=1)
+    pictures, covered = draw_means(values, None, visible, seen, FINER).split([4, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     return GivenViews(
         torch.cat([rgb[:, None], filled[:, :, :3].movedim(2, -1).round().to(torch.uint8)], dim=1),
