@@ -219,9 +219,9 @@ def regret(costs: np.ndarray, truth: np.ndarray) -> float:
 
 def show(times: Sequence[dict[str, Any]], correlations: Sequence[dict[str, Any]], options: argparse.Namespace) -> None:
     """Print the two tables."""
-    sampling = options.samplings[0].words
-    rows = [[row["part"], f"{row['seconds']:.2f}", f"{row['cpu_seconds']:.2f}"] for row in times]
-    print_table(f"seconds with {sampling}", ["part", "wall", "processor"], rows)
+    if times:
+        rows = [[row["part"], f"{row['seconds']:.2f}", f"{row['cpu_seconds']:.2f}"] for row in times]
+        print_table(f"seconds with {options.samplings[0].words}", ["part", "wall", "processor"], rows)
     if not correlations:
         return
     reference = options.samplings[-1].words
