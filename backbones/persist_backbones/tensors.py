@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -74,6 +75,18 @@ def tokens_of(
     """Flatten the places of all frames in the order of the transformer's video tokens."""
     tokens: Tensor = latents.flatten(3).transpose(2, 3).flatten(1, 2)
     return tokens
+
+
+def clip_by_clip(draw: Callable[..., tuple[Tensor, ...]], *batches: Any, clips: int) -> tuple[Tensor, ...]:
+    """Call a function with one clip of all batches at a time, which fits into a processor's cache; join the results.
+
+    Args:
+        draw: returns tensors with a batch axis of one.
+        batches: what has a batch axis and takes slices: tensors, cameras or tokens.
+        clips: their number.
+    """
+    results = [draw(*(batch[number : number + 1] for batch in batches)) for number in range(clips)]
+    return tuple(torch.cat(parts) for parts in zip(*results, strict=True))
 
 
 def push_pull(

@@ -34,7 +34,7 @@ from persist_backbones.adapters.splat import (
 )
 from persist_backbones.distinct_views import distinct_views
 from persist_backbones.noise_levels import add_level
-from persist_backbones.tensors import fold_frames, fold_patches, latent_shares, push_pull, zero_init
+from persist_backbones.tensors import clip_by_clip, fold_frames, fold_patches, latent_shares, push_pull, zero_init
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.observations import Origin
 from persist_cli.api.tokens import MemoryTokens
@@ -131,17 +131,16 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSetti
     views = cameras.resized(cameras.height * finer, cameras.width * finer)
     shape = (*cameras.world_from_camera.shape[:2], views.height, views.width)
     drawn_pixels = rasterize(tokens.positions, tokens.mask, views, settings.token_size, settings.splat_pixels * finer)
-    seen = (shape[0] * shape[1], *shape[2:])
-    splats, _ = hide_covered(drawn_pixels, seen, settings.thickness, settings.hole_share)
+    splats, _ = hide_covered(drawn_pixels, shape, settings.thickness, settings.hole_share)
     shown = torch.zeros_like(tokens.mask).flatten().index_fill(0, splats.token, True).view_as(tokens.mask)
-    pictures, observed, covered = _surfaces(tokens, splats, seen, finer).split([4, 1, 1], dim=1)
+    pictures, observed, covered = _surfaces(tokens, splats, shape, finer).split([4, 1, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     origins = torch.cat([observed, covered - observed], dim=1).unflatten(0, shape[:2])
     return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown, drawn_pixels)
 
 
 def _surfaces(
-    tokens: MemoryTokens, splats: Splats, shape: tuple[int, int, int], finer: int
+    tokens: MemoryTokens, splats: Splats, shape: tuple[int, ...], finer: int
 ) -> Float[Tensor, "view 6 height width"]:
     """Return colour, depth, whether it was observed, and 1 of the surface at each pixel; zeros where there is none.
 
@@ -321,9 +320,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         self, tokens: MemoryTokens, cameras: Cameras, encode: Encode
     ) -> tuple[Float[Tensor, "batch frame channel height width"], Bool[Tensor, "batch token"]]:
         """Return latents, mask and layers of the views, and which tokens any view of their clip shows."""
-        clips = [slice(number, number + 1) for number in range(len(tokens.mask))]  # one fits into a processor's cache
-        drawn = zip(*(self.drawn(tokens[clip], cameras[clip]) for clip in clips), strict=True)
-        rgb, depth, mask, shown, *layers = (torch.cat(parts) for parts in drawn)
+        rgb, depth, mask, shown, *layers = clip_by_clip(self.drawn, tokens, cameras, clips=len(tokens.mask))
         latents = encode(rgb, depth) * mask.any(dim=2, keepdim=True)
         return torch.cat([latents, mask.to(latents), *layers], dim=2), shown
 

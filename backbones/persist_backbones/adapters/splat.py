@@ -36,17 +36,17 @@ class Splats(NamedTuple):
 
 
 def hide_covered(
-    splats: Splats, shape: tuple[int, int, int], thickness: float = 0.0, hole_share: float = 0.0
+    splats: Splats, shape: tuple[int, ...], thickness: float = 0.0, hole_share: float = 0.0
 ) -> tuple[Splats, Float[Tensor, "view height width"]]:
     """Return the splats at the depth of the nearest at their pixel, and that depth at each pixel, infinite without any.
 
     Args:
         splats: the pixels that the tokens cover.
-        shape: number of views of the batch, their height and width.
+        shape: axes of the views, such as batch and frames, then their height and width.
         thickness: metres behind the nearest that are at its depth still.
         hole_share: leave out pixels that are ``holes`` by this share.
     """
-    nearest = nearest_at(splats.pixel, splats.depth, math.prod(shape)).view(shape)
+    nearest = nearest_at(splats.pixel, splats.depth, math.prod(shape)).view(-1, *shape[-2:])
     limit = nearest * (1 + TIE) + thickness
     if hole_share:
         limit.masked_fill_(holes(nearest, hole_share), -math.inf)
@@ -89,7 +89,7 @@ def splat(
         splats: the pixels that the tokens cover.
         shape: batch, frames, height and width of the canvas.
     """
-    visible, nearest = hide_covered(splats, (shape[0] * shape[1], *shape[2:]))
+    visible, nearest = hide_covered(splats, shape)
     pixel, token, nearest = visible.pixel, visible.token, nearest.flatten()
     # index_select rather than brackets, whose gradient several threads add up in no fixed order
     drawn = features.flatten(0, 1).index_select(0, token)
@@ -109,7 +109,7 @@ def draw_means(
     values: Float[Tensor, "splat channel"],
     weights: Float[Tensor, " splat"] | None,
     splats: Splats,
-    shape: tuple[int, int, int],
+    shape: tuple[int, ...],
     finer: int,
 ) -> Float[Tensor, "view channel+1 height width"]:
     """Draw the weighted means of the values at each pixel, and coverage (0 or 1); zeros where there is no splat.
@@ -118,7 +118,7 @@ def draw_means(
         values: values of each splat.
         weights: weights above zero, of which only the ratios at a pixel count; all are alike without.
         splats: the pixels that tokens cover, without those that others hide.
-        shape: number of views, height and width that are drawn.
+        shape: axes of the views, such as batch and frames, then height and width that are drawn.
         finer: pixels that are drawn along the edge of a pixel, which is their mean.
     """
     parts = torch.cat([values, torch.ones_like(values[:, :1])], dim=1)
@@ -131,7 +131,7 @@ def draw_means(
         .split([values.shape[1], 1], dim=1)
     )
     means = torch.cat([total / weight.clamp_min(1e-6), (weight > 0).to(total)], dim=1)
-    return F.avg_pool2d(means.unflatten(0, shape).movedim(-1, 1), finer)
+    return F.avg_pool2d(means.unflatten(0, (-1, *shape[-2:])).movedim(-1, 1), finer)
 
 
 def coarser(splats: Splats, size: tuple[int, int], coarse: tuple[int, int]) -> Splats:
@@ -170,9 +170,8 @@ def rasterize(
     sizes = torch.as_tensor(token_size, dtype=torch.float64, device=mask.device).expand(mask.shape)
     parts = []
     for sample in range(samples):  # one at a time: the data of one clip fits into the processor's cache
-        cameras = Cameras(views.world_from_camera[sample], views.intrinsics[sample], views.height, views.width)
         present = mask[sample].nonzero()[:, 0]
-        splats = _rasterize_clip(positions[sample, present], cameras, sizes[sample, present], most // 2)
+        splats = _rasterize_clip(positions[sample, present], views[sample], sizes[sample, present], most // 2)
         token = sample * positions.shape[1] + present[splats.token]
         parts.append(Splats(sample * pixels + splats.pixel, token, splats.depth))
     return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))

@@ -16,7 +16,7 @@ from torch import Tensor
 from persist_backbones.adapters.splat import draw_means, hide_covered, rasterize
 from persist_backbones.cogvideox.codec import Codec, to_uint8
 from persist_backbones.distinct_views import distinct_views
-from persist_backbones.tensors import latent_shares, push_pull
+from persist_backbones.tensors import clip_by_clip, latent_shares, push_pull
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
 
@@ -71,9 +71,7 @@ def _later_latents(
 ) -> Float[Tensor, "batch later channel height width"]:
     """Return latents of what given frames show in the views after the first, zeros where they show nothing."""
     rgb, depth = (part.expand(len(cameras), *part.shape[1:]) for part in (rgb, depth))
-    clips = [slice(number, number + 1) for number in range(len(cameras))]  # one fits into a processor's cache
-    parts = [render_given(rgb[clip], depth[clip], cameras[clip]) for clip in clips]
-    views = GivenViews(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    views = GivenViews(*clip_by_clip(render_given, rgb, depth, cameras, clips=len(cameras)))
     shown = latent_shares(views.covered, codec.spatial, codec.temporal).any(dim=2, keepdim=True)
     if codec.framewise:  # the given frame is encoded already
         return codec.encode(views.rgb[:, 1:], views.depth[:, 1:]) * shown[:, 1:]
@@ -97,11 +95,10 @@ def render_given(
     shape = (batch, frames - 1, views.height, views.width)
     sizes = SPREAD * depth.double() / first.intrinsics.double()[:, :1, 0, 0, None]
     splats = rasterize(unproject(depth[:, None], first).flatten(1, 3), present, views, sizes.flatten(1), MOST * FINER)
-    seen = (shape[0] * shape[1], *shape[2:])
-    visible, _ = hide_covered(splats, seen, THICKNESS)
+    visible, _ = hide_covered(splats, shape, THICKNESS)
     colors = rgb.flatten(0, 2).float().index_select(0, visible.token)
     values = torch.cat([colors, visible.depth[:, None].float()], dim=1)
-    pictures, covered = draw_means(values, None, visible, seen, FINER).split([4, 1], dim=1)
+    pictures, covered = draw_means(values, None, visible, shape, FINER).split([4, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     return GivenViews(
         torch.cat([rgb[:, None], filled[:, :, :3].movedim(2, -1).round().to(torch.uint8)], dim=1),
