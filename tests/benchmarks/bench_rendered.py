@@ -106,17 +106,21 @@ class Model:
     """A backbone with a memory configuration, which predicts clips."""
 
     def __init__(self, backbone: Backbone, memory: MemoryConfig, adapter: str, sampling: Sampling) -> None:
-        self.backbone, self.adapter, self.sampling = backbone, adapter, sampling
+        self.backbone, self.memory, self.adapter, self.sampling = backbone, memory, adapter, sampling
         self.factory = MemoryFactory.of(memory)
         self.kept: tuple[int, Memory] = (-1, self.factory.empty)  # type: ignore[assignment]
 
     def tokens(self, example: Example) -> MemoryTokens:
         """The tokens of the memory of the earlier frames, for the clip's cameras."""
         if self.kept[0] != id(example):
-            memory = self.factory.empty(example.info)
-            memory.write(example.earlier)
-            self.kept = id(example), memory
+            self.kept = id(example), self.remembered(example)
         return self.kept[1].read(example.truth.cameras, self.backbone.token_budget)
+
+    def remembered(self, example: Example) -> Memory:
+        """A memory of the earlier frames."""
+        memory = self.factory.empty(example.info)
+        memory.write(example.earlier)
+        return memory
 
     def use(self) -> None:
         """Use this model's adapter."""
