@@ -49,7 +49,8 @@ class TrainingSettings:
         workers: processes that read data.
         threads: CPU threads of torch; 0 leaves the number to torch.
         tracker: where losses are logged beside ``log.jsonl``: ``none`` for nowhere, or ``tensorboard``.
-        optimizer: ``adamw``, or ``adamw-8bit`` of the package bitsandbytes, whose moments take a quarter of the bytes.
+        optimizer: ``adamw``; ``adamw-8bit`` of the package bitsandbytes, whose moments take a quarter of the bytes; or
+            ``muon``: Muon for matrices of at least 128 rows and columns, AdamW for all else.
         gradient_checkpointing: keep only the hidden states between blocks and compute the rest again in the backward
             pass; this takes far fewer bytes and about a third more time.
         compile: compile the blocks with ``torch.compile``; the first steps then take minutes.
@@ -77,7 +78,7 @@ class TrainingSettings:
     workers: Changeable[Count] = 1
     threads: Changeable[Count] = 0
     tracker: Changeable[Literal["none", "tensorboard"]] = "none"
-    optimizer: Literal["adamw", "adamw-8bit"] = "adamw"
+    optimizer: Literal["adamw", "adamw-8bit", "muon"] = "adamw"
     gradient_checkpointing: Changeable[bool] = False
     compile: Changeable[bool] = False
     ema_device: Changeable[Literal["model", "cpu"]] = "model"

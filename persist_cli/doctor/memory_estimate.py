@@ -21,6 +21,7 @@ HALF: Final = 2
 MOMENTS: Final = {
     "adamw": 2 * FLOAT32,
     "adamw-8bit": 2 * (1 + FLOAT32 / 256),  # a byte each, and a scale for every 256
+    "muon": 2 * FLOAT32,  # half of it for the matrices that Muon trains: at most
 }
 
 

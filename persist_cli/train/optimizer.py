@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 from torch import nn
@@ -16,6 +16,8 @@ from persist_cli.training_settings import TrainingSettings
 
 if TYPE_CHECKING:
     from diffusers.training_utils import EMAModel
+
+LEAST_SIDE: Final = 128  # rows and columns of a matrix that Muon trains
 
 COMPILERS = ("c++", "g++", "clang++")  # what torch.compile looks for on a CPU
 
@@ -40,12 +42,14 @@ def requested_savings(settings: TrainingSettings, device: torch.device) -> Memor
 
 
 def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> torch.optim.Optimizer:
-    """AdamW with moments of 32 bits, or of 8 bits for ``adamw-8bit``.
+    """AdamW with moments of 32 bits, or of 8 bits for ``adamw-8bit``; or Muon for the large matrices.
 
     Raises:
-        PersistError: when bitsandbytes, which has the one of 8 bits, is not installed.
+        PersistError: when bitsandbytes, which has the one of 8 bits, is not installed, or no matrix is large.
     """
     rate, decay = settings.learning_rate, settings.weight_decay
+    if settings.optimizer == "muon":
+        return MuonAndAdamW(parameters, rate, decay)
     if settings.optimizer == "adamw":
         return torch.optim.AdamW(parameters, lr=rate, weight_decay=decay)
     try:
@@ -56,6 +60,47 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSetting
         ) from error
     optimizer: torch.optim.Optimizer = AdamW8bit(parameters, lr=rate, weight_decay=decay)
     return optimizer
+
+
+class MuonAndAdamW(torch.optim.Optimizer):
+    """Muon for large matrices, AdamW for all else, in one optimizer with one learning rate.
+
+    Muon (Jordan et al., 2024, https://kellerjordan.github.io/posts/muon) makes the steps of a matrix orthogonal. They
+    are as large as those of AdamW usually are (``match_rms_adamw`` of Liu et al., 2502.16982), so its learning rates
+    serve. Embeddings, output layers of few channels and everything else is for AdamW, as is usual.
+
+    Args:
+        parameters: the trained parameters.
+        rate: learning rate of both.
+        decay: weight decay of both.
+
+    Raises:
+        PersistError: when no parameter is a matrix of ``LEAST_SIDE`` rows and columns.
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter], rate: float, decay: float) -> None:
+        large: list[nn.Parameter] = []
+        others: list[nn.Parameter] = []
+        for parameter in parameters:
+            (large if parameter.ndim == 2 and min(parameter.shape) >= LEAST_SIDE else others).append(parameter)
+        if not large:
+            size = f"{LEAST_SIDE} rows and columns"
+            raise PersistError(f"training.optimizer=muon trains matrices of {size}, and there are none; use adamw")
+        self.parts: list[torch.optim.Optimizer] = [
+            torch.optim.Muon(large, lr=rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
+        ]
+        if others:
+            self.parts.append(torch.optim.AdamW(others, lr=rate, weight_decay=decay))
+        super().__init__([dict(group) for part in self.parts for group in part.param_groups], {})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        """Let both make a step; groups and state are this optimizer's own, which others may have replaced."""
+        loss = None if closure is None else closure()
+        for part, group in zip(self.parts, self.param_groups, strict=True):
+            part.param_groups, part.state = [group], self.state
+            part.step()
+        return loss
 
 
 def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> EMAModel:
