@@ -67,7 +67,7 @@ class MuonAndAdamW(torch.optim.Optimizer):
 
     Muon (Jordan et al., 2024, https://kellerjordan.github.io/posts/muon) makes the steps of a matrix orthogonal. They
     are as large as those of AdamW usually are (``match_rms_adamw`` of Liu et al., 2502.16982), so its learning rates
-    serve. Embeddings, output layers of few channels and everything else is for AdamW, as is usual.
+    serve. Everything else is for AdamW: vectors, convolutions, and matrices with fewer rows or columns.
 
     Args:
         parameters: the trained parameters.

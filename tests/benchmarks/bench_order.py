@@ -36,7 +36,7 @@ MEMORIES = ("none", "map2d", "snapshots", "voxel")
 class AtOneDistance(Model):
     """A model whose memory takes every pixel to be equally far; the given frame keeps its depth."""
 
-    metres = 2.5
+    metres: float
 
     def remembered(self, example: Example) -> Memory:
         """A memory of the earlier frames at one depth."""
@@ -55,7 +55,7 @@ def build_rows(checkpoint: Path, sampling: Sampling, distances: list[float]) -> 
         backbone.load_adapter(name, found.adapter_folder(name))
         rows[name] = Model(backbone, adapter_memory(found, name), name, sampling)
     for metres in distances:
-        row = AtOneDistance(backbone, rows["snapshots"].memory, "snapshots", sampling)
+        row = AtOneDistance(backbone, adapter_memory(found, "snapshots"), "snapshots", sampling)
         row.metres = metres
         rows[f"snapshots, all at {metres:g} m"] = row
     return rows

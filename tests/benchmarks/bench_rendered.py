@@ -106,7 +106,7 @@ class Model:
     """A backbone with a memory configuration, which predicts clips."""
 
     def __init__(self, backbone: Backbone, memory: MemoryConfig, adapter: str, sampling: Sampling) -> None:
-        self.backbone, self.memory, self.adapter, self.sampling = backbone, memory, adapter, sampling
+        self.backbone, self.adapter, self.sampling = backbone, adapter, sampling
         self.factory = MemoryFactory.of(memory)
         self.kept: tuple[int, Memory] = (-1, self.factory.empty)  # type: ignore[assignment]
 
