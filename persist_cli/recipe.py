@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 import yaml
 from pydantic import BeforeValidator
 
-from persist_cli.api.stages import SCENE_STAGES, Distill, Lora, Stage
+from persist_cli.api.stages import SCENE_STAGES, Adversarial, Distill, Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
 from persist_cli.training_settings import CHANGEABLE, DataSettings, TrainingSettings
@@ -110,6 +110,8 @@ class Recipe:
         lora: train a change of low rank instead of all weights of the base, stage 1 only.
         distill: teach a trained model to sample in one or two denoising steps, stages 1 and 2 only; in stage 2 it is
             the adapter of ``adapter_from``.
+        adversarial: train against a discriminator that tells predicted clips from true ones, for few denoising steps
+            without blur; stages 1 and 2 only.
         policy: the policy, stage policy only.
         scene: the model of scenes, stages scene-codec and scene only.
         data: the clips.
@@ -126,6 +128,7 @@ class Recipe:
     adapter_from: str | None = None
     lora: Lora | None = None
     distill: Distill | None = None
+    adversarial: Adversarial | None = None
     policy: PolicyConfig | None = None
     scene: SceneConfig | None = None
     data: DataSettings = field(default_factory=DataSettings)
@@ -299,6 +302,8 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
     if recipe.lora is not None and recipe.stage != "1":
         problems.append("lora is for stage 1 only; leave it out")
+    if recipe.adversarial is not None and (recipe.stage not in ("1", "2") or recipe.distill is not None):
+        problems.append("adversarial is for stages 1 and 2, without distill; leave one out")
     problems += _of_distillation(recipe)
     if not recipe.data.strides or 0 in recipe.data.strides:
         problems.append("data.strides must be whole numbers, at least one and none of them 0")

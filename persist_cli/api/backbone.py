@@ -20,7 +20,7 @@ from persist_cli.api.clips import ClipLatents as ClipLatents
 from persist_cli.api.clips import Clips as Clips
 from persist_cli.api.clips import Interactions as Interactions
 from persist_cli.api.inference import InferenceOptions
-from persist_cli.api.stages import Distill, Lora, MemorySavings, ParameterGroup, Stage
+from persist_cli.api.stages import Adversarial, Distill, Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.setting_docs import Setting
@@ -216,6 +216,20 @@ class Backbone(nn.Module, ABC):
             PersistError: when this backbone cannot be distilled, or not from that teacher.
         """
         raise PersistError(f"backbone {self.name!r} cannot be distilled; leave distill out")
+
+    def train_adversarially(self, settings: Adversarial) -> dict[str, nn.Parameter]:
+        """Let ``forward`` return the loss of adversarial training from now on.
+
+        Args:
+            settings: noise levels, weights and size of the discriminator, which is fresh.
+
+        Returns:
+            The discriminator's parameters by name, which ``trained_parameters`` has too from now on.
+
+        Raises:
+            PersistError: when this backbone cannot be trained so.
+        """
+        raise PersistError(f"backbone {self.name!r} cannot be trained adversarially; leave adversarial out")
 
     def finish_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """End a stage by measuring on some clips what training does not learn, such as a scale; nothing by default."""

@@ -73,6 +73,30 @@ class Distill:
 
 
 @dataclass(frozen=True)
+class Adversarial:
+    """Adversarial training of a model in stages 1 and 2: few denoising steps that leave no blur.
+
+    A discriminator learns to tell the predicted latents of a clip from the true ones, and the model to be taken for
+    true, beside its loss of denoising (ADD, Sauer et al., 2311.17042; APT, Lin et al., 2501.08316). It is kept with the
+    run's state and is not part of the model.
+
+    Args:
+        weight: weight of the loss of not passing for true beside that of denoising.
+        steps: number of denoising steps of the sampler ``ddim`` that the checkpoint asks for when it is sampled; the
+            model is trained at their noise levels alone.
+        learning_rate: of the discriminator; it rises and falls as the model's does.
+        penalty: weight of how steep the discriminator's scores are at true and predicted clips (R1 and R2).
+        width: number of channels of the discriminator's first layer.
+    """
+
+    weight: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.05
+    steps: Annotated[int, Field(ge=1)] = 8
+    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-4
+    penalty: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5
+    width: Annotated[int, Field(ge=1)] = 64
+
+
+@dataclass(frozen=True)
 class Lora:
     """A low-rank change that stage 1 trains instead of all weights (LoRA, Hu et al. 2021).
 

@@ -95,6 +95,7 @@ def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[C
     frozen, half = FROZEN if recipe.stage == "2" else FROZEN_UNSHARDED, training.frozen_precision == "bf16"
     whole = recipe.distill is not None  # each process needs the whole model, with its averages
     can_shard = transformer and training.optimizer == "adamw" and not (half and frozen.unsharded_only) and not whole
+    can_shard = can_shard and recipe.adversarial is None  # a discriminator scores whole clips of a whole model
     fsdp = Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))
     changes: list[tuple[bool, Change]] = [
         (of_a_backbone and not training.vae_slicing, SLICING),

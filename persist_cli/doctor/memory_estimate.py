@@ -157,7 +157,8 @@ class Estimator(ABC):
     def step(self, recipe: Recipe, kind: StepKind) -> Activations:
         """The memory that forward and backward pass take in a step of this kind."""
         training = recipe.training
-        key = (kind, training.precision, training.gradient_checkpointing, training.frozen_precision, recipe.distill)
+        kept = training.precision, training.gradient_checkpointing, training.frozen_precision
+        key = (kind, *kept, recipe.distill, recipe.adversarial)
         if key not in self._steps:
             self._steps[key] = self.copies.activations(recipe, kind, self.encoding(recipe, kind))
         return self._steps[key]

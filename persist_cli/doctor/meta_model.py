@@ -57,6 +57,8 @@ class MetaModel:
             if recipe.memory is not None:
                 channels = MemoryFactory.of(recipe.memory).encoder.channels_by_name
                 add_adapter(backbone, recipe, recipe.memory.name, channels)
+            if recipe.adversarial is not None:
+                backbone.train_adversarially(recipe.adversarial)
         return MetaModel(name, recipe, backbone, channels, base)
 
     def estimator(self) -> BackboneEstimator:

@@ -302,8 +302,9 @@ def report(recipe: Recipe, run: Path, step: int, rate: float) -> None:
     else:
         done = f"trained {step} steps of {recipe.training.batch} samples ({rate:.3g} samples/s)"
         say(f"stage {recipe.stage} {done}; checkpoint in {run}")
-    if recipe.distill is not None:
-        say(f"distilled: its checkpoint asks for {find_checkpoint(run).sampling_with(SamplingOverrides()).words}")
+    if recipe.distill is not None or recipe.adversarial is not None:
+        how = "distilled" if recipe.distill is not None else "trained adversarially"
+        say(f"{how}: its checkpoint asks for {find_checkpoint(run).sampling_with(SamplingOverrides()).words}")
 
 
 def next_command(name: str, recipe: Recipe, run: Path) -> str:

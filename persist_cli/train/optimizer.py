@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import torch
@@ -18,6 +20,10 @@ if TYPE_CHECKING:
     from diffusers.training_utils import EMAModel
 
 LEAST_SIDE: Final = 128  # rows and columns of a matrix that Muon trains
+
+OPPONENT_BETAS: Final = (0.0, 0.99)  # as of StyleGAN's discriminator
+
+SCALE: Final = "scale"  # key of a group of parameters: its learning rate as a multiple of the training's
 
 COMPILERS = ("c++", "g++", "clang++")  # what torch.compile looks for on a CPU
 
@@ -41,12 +47,43 @@ def requested_savings(settings: TrainingSettings, device: torch.device) -> Memor
     )
 
 
-def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> torch.optim.Optimizer:
+@dataclass(frozen=True)
+class Opponent:
+    """What a model is trained against: a network with an AdamW of its own, which keeps no mean of its gradients.
+
+    Args:
+        parameters: its parameters.
+        learning_rate: its learning rate, which rises and falls as the model's does.
+    """
+
+    parameters: Sequence[nn.Parameter]
+    learning_rate: float
+
+
+def make_optimizer(
+    parameters: Iterable[nn.Parameter], settings: TrainingSettings, opponent: Opponent | None = None
+) -> torch.optim.Optimizer:
     """AdamW with moments of 32 bits, or of 8 bits for ``adamw-8bit``; or Muon for the large matrices.
+
+    Args:
+        parameters: all that are trained, those of the opponent too.
+        settings: optimizer, learning rate and weight decay.
+        opponent: what the model is trained against, if anything.
 
     Raises:
         PersistError: when bitsandbytes, which has the one of 8 bits, is not installed, or no matrix is large.
     """
+    if opponent is None:
+        return optimizer_of(parameters, settings)
+    others = {id(parameter) for parameter in opponent.parameters}
+    own = optimizer_of([parameter for parameter in parameters if id(parameter) not in others], settings)
+    against = torch.optim.AdamW(opponent.parameters, betas=OPPONENT_BETAS, weight_decay=0.0)
+    against.param_groups[0][SCALE] = opponent.learning_rate / settings.learning_rate
+    return Together([own, against])
+
+
+def optimizer_of(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> torch.optim.Optimizer:
+    """The optimizer that the settings name; arguments and errors as of ``make_optimizer``."""
     rate, decay = settings.learning_rate, settings.weight_decay
     if settings.optimizer == "muon":
         return MuonAndAdamW(parameters, rate, decay)
@@ -62,7 +99,28 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainingSetting
     return optimizer
 
 
-class MuonAndAdamW(torch.optim.Optimizer):
+class Together(torch.optim.Optimizer):
+    """Several optimizers as one, each with parameters of its own.
+
+    Args:
+        parts: the optimizers.
+    """
+
+    def __init__(self, parts: Sequence[torch.optim.Optimizer]) -> None:
+        self.parts = parts
+        super().__init__([dict(group) for part in parts for group in part.param_groups], {})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        """Let each make a step; groups and state are this optimizer's own, which others may have replaced."""
+        loss, groups = None if closure is None else closure(), iter(self.param_groups)
+        for part in self.parts:
+            part.param_groups, part.state = [*itertools.islice(groups, len(part.param_groups))], self.state
+            part.step()
+        return loss
+
+
+class MuonAndAdamW(Together):
     """Muon for large matrices, AdamW for all else, in one optimizer with one learning rate.
 
     Muon (Jordan et al., 2024, https://kellerjordan.github.io/posts/muon) makes the steps of a matrix orthogonal. They
@@ -86,21 +144,18 @@ class MuonAndAdamW(torch.optim.Optimizer):
         if not large:
             size = f"{LEAST_SIDE} rows and columns"
             raise PersistError(f"training.optimizer=muon trains matrices of {size}, and there are none; use adamw")
-        self.parts: list[torch.optim.Optimizer] = [
+        parts: list[torch.optim.Optimizer] = [
             torch.optim.Muon(large, lr=rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
         ]
         if others:
-            self.parts.append(torch.optim.AdamW(others, lr=rate, weight_decay=decay))
-        super().__init__([dict(group) for part in self.parts for group in part.param_groups], {})
+            parts.append(torch.optim.AdamW(others, lr=rate, weight_decay=decay))
+        super().__init__(parts)
 
-    @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """Let both make a step; groups and state are this optimizer's own, which others may have replaced."""
-        loss = None if closure is None else closure()
-        for part, group in zip(self.parts, self.param_groups, strict=True):
-            part.param_groups, part.state = [group], self.state
-            part.step()
-        return loss
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Give the model's parameters a learning rate, and an opponent's its own in proportion."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate * group.get(SCALE, 1.0)
 
 
 def make_average(parameters: Iterable[nn.Parameter], settings: TrainingSettings) -> EMAModel:

@@ -23,7 +23,7 @@ from persist_cli.recipe import Recipe
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.distillation import Distiller
 from persist_cli.train.distributed import Sharding, uses_zero
-from persist_cli.train.optimizer import requested_savings
+from persist_cli.train.optimizer import Opponent, requested_savings
 from persist_cli.train.own_writes import OwnWrites
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 from persist_cli.train.training_loop import TrainingLoop
@@ -56,6 +56,11 @@ class Trainer(TrainingLoop[Backbone]):
     ) -> None:
         super().__init__(recipe, accelerator)
         self.backbone, self.factory = backbone, factory
+        opponent: Opponent | None = None
+        if recipe.adversarial is not None:
+            check_whole("adversarial", accelerator)
+            discriminator = backbone.train_adversarially(recipe.adversarial)
+            opponent = Opponent([*discriminator.values()], recipe.adversarial.learning_rate)
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         for frames in recipe.data.clip_frames:
             backbone.check_clip_frames(frames)
@@ -75,7 +80,7 @@ class Trainer(TrainingLoop[Backbone]):
             self.own_writes = OwnWrites(self.encoder, WritingNoise.of(recipe.data))
         if recipe.base is None:
             backbone.begin_stage(recipe.stage, self.first_batches(START_BATCHES))
-        self.prepare(backbone, parameters)
+        self.prepare(backbone, parameters, opponent)
         if distiller is not None:
             distiller.begin(self.state.averages(), accelerator.device)
 

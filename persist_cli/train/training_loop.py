@@ -23,7 +23,7 @@ from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
-from persist_cli.train.optimizer import make_average, make_optimizer, update_average
+from persist_cli.train.optimizer import Opponent, make_average, make_optimizer, set_learning_rate, update_average
 from persist_cli.train.state import TrainingState
 from persist_cli.training_settings import TrainingSettings
 from persist_cli.viewing.console import add_task, progress
@@ -76,15 +76,16 @@ class TrainingLoop(ABC, Generic[Model]):
         self.times = StepTimes(accelerator.device, recipe.training.batch, enabled=False)
         self.sharding: Sharding | None = None
 
-    def prepare(self, model: Model, parameters: dict[str, nn.Parameter]) -> None:
+    def prepare(self, model: Model, parameters: dict[str, nn.Parameter], opponent: Opponent | None = None) -> None:
         """Make optimizer, average and state, and let accelerate prepare the model.
 
         Args:
             model: its ``forward`` takes a batch of ``to_batch`` and the stage, and returns the losses.
             parameters: those that are trained, by name.
+            opponent: what the model is trained against, if anything; its parameters are among the others.
         """
         self.whole, settings = model, self.recipe.training
-        optimizer = make_optimizer(parameters.values(), settings)
+        optimizer = make_optimizer(parameters.values(), settings, opponent)
         self.sharding = self.make_sharding()
         self.model, self.optimizer = self.accelerator.prepare(model, optimizer)
         if self.sharding is not None:
@@ -161,8 +162,7 @@ class TrainingLoop(ABC, Generic[Model]):
             PersistError: when the loss is not finite; the parameters are then unchanged.
         """
         settings, accelerator, times = self.recipe.training, self.accelerator, self.times
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(settings, self.state.step)
+        set_learning_rate(self.optimizer, learning_rate(settings, self.state.step))
         totals: dict[str, torch.Tensor] = {}
         for number in range(1, settings.accumulation + 1):
             batch = self.encoded(next(batches))

@@ -34,6 +34,7 @@ STAGES_OF: Final[dict[str, tuple[Stage, ...]]] = {
     "adapter": ("2",),
     "lora": ("1",),
     "distill": ("1", "2"),
+    "adversarial": ("1", "2"),
     **ALONE,
 }
 

@@ -35,7 +35,7 @@ def test_the_loss_of_an_error_is_the_same_for_velocities_and_clean_latents(weigh
 def test_errors_of_channels_count_equally_or_by_what_they_change_in_pixels() -> None:
     clips = random_clips(2)
     backbones = [micro(prediction="v_prediction", channel_weights=kind) for kind in ("equal", "pixels", "root-pixels")]
-    predicted, target, *_ = backbones[0].predict_noised(clips, sample_generators(clips.seeds))
+    predicted, target, _ = backbones[0].predict_noised(clips, sample_generators(clips.seeds))
     errors = (predicted - target).square().mean(dim=(0, 1, 3, 4))
     weights = torch.stack([backbone.channel_weights().flatten() for backbone in backbones])
     losses = [backbone(clips, "1")["loss"] for backbone in backbones]

@@ -95,6 +95,17 @@ def test_a_distillation_holds_the_weights_of_its_teacher_too():
     assert own.average == plain.average  # which the target has
 
 
+def test_a_discriminator_is_counted_with_all_that_its_training_takes():
+    change = "adversarial.width=8"
+    plain, against = estimate(), estimator(change).estimate(micro_meta_model(change).recipe, ONE_GPU)
+    named = estimator(change).backbone.trained_parameters("1")
+    size = sum(parameter.nbytes for name, parameter in named.items() if name.startswith("discriminator."))
+    assert size > 0
+    more = {name: value - plain.to_json()[name] for name, value in against.to_json().items()}
+    assert (more["weights"], more["gradients"], more["optimizer"], more["average"]) == (size, size, 2 * size, size)
+    assert against.activations > plain.activations
+
+
 def test_fsdp_divides_what_is_trained_by_the_number_of_processes():
     whole, shared = estimate(), estimate(launch=Launch(8, True, sharded=True))
     for name in ("optimizer", "gradients", "average"):

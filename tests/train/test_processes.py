@@ -97,6 +97,8 @@ def runs(walks, codec, stage1, tmp_path_factory):
     run_persist(*of("stage2-voxel", "one-own", *OWN))
     distil = [f"base={stage1}", "distill.levels=6", "training.ema=0.99"]
     run_persist(*of("stage1", "one-distilled", *distil))
+    against = [f"base={stage1}", "adversarial.width=8"]
+    run_persist(*of("stage1", "one-against", *against))
     first = [job(*of("stage1", f"{kind}-1"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage2-voxel", f"{kind}-2", "training.accumulation=2"), **how) for kind, how in KINDS.items()]
     first += [job(*of("stage1", f"{kind}-parts", "training.steps=1"), **how) for kind, how in KINDS.items()]
@@ -105,6 +107,7 @@ def runs(walks, codec, stage1, tmp_path_factory):
     first += [job(*of("stage2-voxel", f"{name}-few", *cached)) for name in ("cold", "warm")]
     first.append(job(*of("stage2-voxel", "ddp-own", *OWN)))
     first.append(job(*of("stage1", "ddp-distilled", *distil, "training.accumulation=2")))
+    first.append(job(*of("stage1", "ddp-against", *against)))
     wrong = job(*stage("codec", walks, folder / "codec", *MICRO_SETTINGS), **FSDP)
     ended = run_in_two(folder, *first, job(*of("stage2-voxel", "fsdp-own", *OWN), **FSDP), wrong)
     assert [code for code, _ in ended[:-2]] == [0] * len(first), ended
@@ -143,6 +146,11 @@ def test_two_processes_train_to_the_losses_and_weights_of_one(runs, kind, number
 
 def test_two_processes_write_their_own_predictions_as_one_does(runs):
     assert losses(runs / "ddp-own") == pytest.approx(losses(runs / "one-own"), rel=1e-4)
+
+
+def test_two_processes_train_against_a_discriminator_as_one_does(runs):
+    assert losses(runs / "ddp-against") == pytest.approx(losses(runs / "one-against"), rel=1e-4)
+    assert largest_difference(saved_model(runs / "one-against"), saved_model(runs / "ddp-against")) < NEAR
 
 
 def test_two_processes_distil_as_one_does(runs):

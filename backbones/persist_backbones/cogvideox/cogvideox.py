@@ -22,6 +22,7 @@ from persist_backbones.cogvideox.codec_start import start_as_components
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import (
     SAMPLERS,
+    DrawTimesteps,
     NoisedClips,
     NoisedPrediction,
     SamplingSchedule,
@@ -109,11 +110,14 @@ class CogVideoX(AdaptedBackbone):
             window, kl_weight = self.settings.codec_window, self.settings.kl_weight
             return self.codec.loss(clips.rgb, clips.depth, window, kl_weight, generators)
 
-        predicted, target, _, timesteps = self.predict_noised(clips, generators)
-        # weigh
-        weights = loss_weights(self.scheduler, timesteps, self.settings.weighting, self.settings.snr_gamma)
-        error = (predicted.float() - target.float()).square() * weights[:, None, None, None, None]
-        return loss_parts(error * self.channel_weights(), self.settings.depth)
+        return loss_parts(self.weighted_error(self.predict_noised(clips, generators)), self.settings.depth)
+
+    def weighted_error(self, prediction: NoisedPrediction) -> Float[Tensor, "batch frame channel height width"]:
+        """Return the squared error of a prediction of training, weighted by noise level and channel."""
+        levels = prediction.noised.timesteps
+        weights = loss_weights(self.scheduler, levels, self.settings.weighting, self.settings.snr_gamma)
+        error = (prediction.predicted.float() - prediction.target.float()).square()
+        return error * weights[:, None, None, None, None] * self.channel_weights()
 
     def channel_weights(self) -> Float[Tensor, "channel 1 1"]:
         """Return the weight of the error of each channel of latents of RGB and depth; their mean is 1."""
@@ -124,9 +128,11 @@ class CogVideoX(AdaptedBackbone):
             weights = weights.sqrt() / weights.sqrt().mean()
         return weights.repeat(2)[:, None, None].to(self.device)
 
-    def predict_noised(self, clips: Clips, generators: list[torch.Generator]) -> NoisedPrediction:
-        """Predict from the clips' latents with noise of a random level, each sample's from its own generator."""
-        noised = self.add_noise(clips, generators, partial(draw_timesteps, self.scheduler))
+    def predict_noised(
+        self, clips: Clips, generators: list[torch.Generator], draw: DrawTimesteps | None = None
+    ) -> NoisedPrediction:
+        """Predict from the clips' latents with noise of a random level; the arguments are those of ``add_noise``."""
+        noised = self.add_noise(clips, generators, draw or partial(draw_timesteps, self.scheduler))
         target = prediction_target(self.scheduler, noised.clean, noised.noise, noised.timesteps)
         # condition
         memory = self.memory_condition(clips, generators)
@@ -134,13 +140,10 @@ class CogVideoX(AdaptedBackbone):
         # predict
         with self.transformer.kernel_for_training(noised.noisy):
             predicted = self.predict(noised.noisy.to(noised.image.dtype), noised.image, conditions)
-        return NoisedPrediction(predicted, target, noised.noisy, noised.timesteps)
+        return NoisedPrediction(predicted, target, noised)
 
-    def add_noise(
-        self, clips: Clips, generators: list[torch.Generator], draw: Callable[[list[torch.Generator]], Tensor]
-    ) -> NoisedClips:
+    def add_noise(self, clips: Clips, generators: list[torch.Generator], draw: DrawTimesteps) -> NoisedClips:
         """Add noise to the clips' latents, each sample's from its own generator; ``draw`` draws the timesteps."""
-        # encode
         latents = clips.latents or self.encode(clips)
         image_noise = draw_levels(generators, self.settings.image_noise)
         shape, known = self.shape.of(clips), self.known_latents(latents.image, clips)
@@ -148,7 +151,6 @@ class CogVideoX(AdaptedBackbone):
             known = add_level(known, image_noise, generators) * known.any(dim=2, keepdim=True)
         image = self.image_condition(known, shape)
         clean = shape.pad(latents.video).float()  # in bfloat16 the weakest noise levels would have no noise
-        # noise
         timesteps = draw(generators).to(self.device)
         noise = noise_like(clean, generators)
         noisy = self.scheduler.add_noise(clean, noise, timesteps)
@@ -158,9 +160,7 @@ class CogVideoX(AdaptedBackbone):
     def predict_once(self, clips: Clips) -> tuple[Tensor, Tensor]:
         """Return the clips as predicted in one step from the noise levels of training; see ``Backbone``."""
         generators, clips = sample_generators(clips.seeds), clips.to(self.device)
-        predicted, _, noisy, timesteps = self.predict_noised(clips, generators)
-        latents = noise_level(self.scheduler, timesteps).clean(predicted.float(), noisy.float())
-        shown = self.shape.of(clips).drop_padding(latents)
+        shown = self.shape.of(clips).drop_padding(self.predict_noised(clips, generators).clean(self.scheduler))
         colors, depth = self.codec.decode_images(shown, self.settings.depth)
         return to_uint8(colors).cpu(), depth.float().cpu()
 

@@ -6,7 +6,7 @@ The training loss and the sampling loop that put these together are ``CogVideoX.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -29,6 +29,8 @@ Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
 COGVIDEOX: dict[str, Any] = {"ddim": CogVideoXDDIMScheduler, "dpm": CogVideoXDPMScheduler}
 MULTISTEP: dict[str, Any] = {"unipc": UniPCMultistepScheduler, "dpm++": DPMSolverMultistepScheduler}
 SAMPLERS = COGVIDEOX | MULTISTEP
+
+DrawTimesteps = Callable[[list[torch.Generator]], Tensor]  # draws a timestep for each sample from its own generator
 
 
 @dataclass
@@ -76,14 +78,17 @@ class NoisedPrediction(NamedTuple):
     Args:
         predicted: the prediction.
         target: what it should be.
-        noisy: the latents for which it was made.
-        timesteps: their noise levels.
+        noised: the latents for which it was made.
     """
 
     predicted: Tensor
     target: Tensor
-    noisy: Tensor
-    timesteps: Tensor
+    noised: NoisedClips
+
+    def clean(self, scheduler: CogVideoXDDIMScheduler) -> Float[Tensor, "batch frame channel height width"]:
+        """Return the clean latents that are predicted, float32 and padded."""
+        level = noise_level(scheduler, self.noised.timesteps)
+        return level.clean(self.predicted.float(), self.noised.noisy.float())
 
 
 def sample_generators(seeds: Sequence[int]) -> list[torch.Generator]:

@@ -12,6 +12,7 @@ from persist_cli.api.stages import ParameterGroup
 
 LORA = ".lora_"  # in the names that PEFT gives to its parameters
 ADAPTER = "memory adapter "
+DISCRIMINATOR = "discriminator."  # before the names of parameters that are there in adversarial training alone
 
 
 def group_parameters(parameters: Iterable[tuple[str, nn.Parameter]]) -> list[ParameterGroup]:
@@ -34,6 +35,8 @@ def _part_of(name: str) -> tuple[str, bool]:
     """Return the part of a parameter, and whether that part is new."""
     if name.startswith("codec."):
         return "codec", False
+    if name.startswith(DISCRIMINATOR):
+        return "discriminator", True
     if LORA in name:
         return "LoRA", True
     if name.startswith("transformer.base."):

@@ -13,7 +13,9 @@ from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.config import CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import SamplingStep
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
+from persist_backbones.cogvideox.parameter_groups import DISCRIMINATOR
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
+from persist_backbones.extensions.adversarial import Discriminator, adversarial_loss, make_discriminator
 from persist_backbones.extensions.distillation import (
     Distillation,
     check_levels,
@@ -25,7 +27,7 @@ from persist_backbones.extensions.lora import add_lora, save_lora, train_lora
 from persist_backbones.extensions.savings import FrozenWeights, apply_memory_savings
 from persist_cli.api.backbone import Backbone, Clips, Sampling
 from persist_cli.api.inference import CONSISTENCY, InferenceOptions
-from persist_cli.api.stages import Distill, Lora, MemorySavings, Stage
+from persist_cli.api.stages import Adversarial, Distill, Lora, MemorySavings, Stage
 from persist_cli.errors import CheckpointError
 
 if TYPE_CHECKING:
@@ -46,6 +48,8 @@ class ExtendedCogVideoX(CogVideoX):
         self.offloaded: OffloadedParts | None = None
         self.caches: ClipCaches | None = None  # while a clip is sampled
         self.distillation: Distillation | None = None
+        self.adversarial: Adversarial | None = None
+        self.discriminator: Discriminator | None = None
 
     def set_parts(self, parts: DiffusersParts) -> None:
         """Build the model from diffusers' parts, which may be offloaded."""
@@ -53,10 +57,12 @@ class ExtendedCogVideoX(CogVideoX):
         bring_when_run(self.transformer)
 
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
-        """Return the training loss: of a distillation, where there is one, else that of ``CogVideoX``."""
-        if self.distillation is None:
-            return super().forward(clips, stage)
-        return consistency_loss(self, clips, self.distillation)
+        """Return the training loss: of distillation or adversarial training, else that of ``CogVideoX``."""
+        if self.distillation is not None:
+            return consistency_loss(self, clips, self.distillation)
+        if self.discriminator is not None and self.adversarial is not None:
+            return adversarial_loss(self, clips, self.discriminator, self.adversarial)
+        return super().forward(clips, stage)
 
     def distill(self, settings: Distill, teacher: Backbone, target: Backbone) -> None:
         """Let ``forward`` return the loss of consistency distillation; see ``distillation``."""
@@ -67,6 +73,12 @@ class ExtendedCogVideoX(CogVideoX):
             check_levels(settings, self.scheduler)
         self.distillation = Distillation(settings, teacher, target)
         self.own_sampling = Sampling(settings.steps, CONSISTENCY)
+
+    def train_adversarially(self, settings: Adversarial) -> dict[str, nn.Parameter]:
+        """Let ``forward`` return the loss of adversarial training; see ``adversarial``."""
+        self.adversarial, self.discriminator = settings, make_discriminator(self, settings)
+        self.own_sampling = Sampling(settings.steps, "ddim")
+        return {f"{DISCRIMINATOR}{name}": parameter for name, parameter in self.discriminator.named_parameters()}
 
     def sample(
         self,
@@ -118,6 +130,9 @@ class ExtendedCogVideoX(CogVideoX):
         parameters = super().trained_parameters(stage)
         if stage == "1":
             train_lora(self.transformer.base)
+        if self.discriminator is not None:
+            self.discriminator.requires_grad_(True)
+            parameters |= {name: p for name, p in self.named_parameters() if name.startswith(DISCRIMINATOR)}
         return {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
 
     def apply_memory_savings(self, stage: Stage, savings: MemorySavings) -> None:
