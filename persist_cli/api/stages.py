@@ -89,10 +89,10 @@ class Adversarial:
         width: number of channels of the discriminator's first layer.
     """
 
-    weight: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.05
+    weight: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.3
     steps: Annotated[int, Field(ge=1)] = 8
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-4
-    penalty: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5
+    penalty: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 10.0
     width: Annotated[int, Field(ge=1)] = 64
 
 

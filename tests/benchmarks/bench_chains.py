@@ -104,7 +104,8 @@ def figures(walks: list[Observations], predicted: list[Observations], frames: in
             values.append(metric.measure(prediction).double())
             weights.append(metric.frame_weights(prediction).double())
         value, weight = (torch.stack(parts).unflatten(1, (-1, frames)) for parts in (values, weights))
-        found[metric.name] = ((value * weight).sum((0, 2)) / weight.sum((0, 2))).tolist()
+        known = torch.where(weight > 0, value, 0.0)  # a frame that does not count may have no value
+        found[metric.name] = ((known * weight).sum((0, 2)) / weight.sum((0, 2))).tolist()
     return found
 
 
