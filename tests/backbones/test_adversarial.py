@@ -170,6 +170,7 @@ def test_a_sample_has_the_same_loss_in_any_batch():
 def test_the_discriminator_is_no_part_of_the_model_that_is_saved(tmp_path):
     model, _ = trained_against()
     assert "discriminator" in [group.name for group in model.parameter_groups()]
+    assert not any(name.startswith("discriminator.") for name in model.trained_parameters("codec"))
     model.save_base(tmp_path / "with")
     again = micro(**FRAMEWISE)
     again.load_base(tmp_path / "with")

@@ -20,6 +20,7 @@ from persist_cli.doctor.meta_model import build_meta_model
 from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
 from persist_cli.doctor.tracing import LiveBytes, fake_tensors
 from persist_cli.train.distributed import check_sharded
+from tests.support.micro_runs import MICRO as MICRO_SIZES
 from tests.support.micro_runs import MICRO_SETTINGS
 
 MICRO = [*MICRO_SETTINGS, "base=null"]
@@ -74,6 +75,14 @@ def test_tensors_without_values_are_counted_as_long_as_they_live():
 def test_each_change_lowers_the_bytes_that_it_is_meant_to(change, less):
     before, after = estimate().to_json(), estimate(change).to_json()
     assert after[less] < before[less]
+
+
+def test_samples_can_be_taken_one_by_one_where_the_given_frame_is_drawn_into_all_views():
+    framewise = json.dumps(MICRO_SIZES["vae"] | {"temporal_compression_ratio": 1})
+    changes = ["backbone.settings.given=rendered", f"backbone.settings.vae={framewise}", "training.accumulation=8"]
+    single = micro_meta_model(*changes)
+    assert single.recipe.training.samples_at_once(1) == 1
+    assert single.estimator().estimate(single.recipe, ONE_GPU).activations > 0
 
 
 def test_lora_has_fewer_gradients():

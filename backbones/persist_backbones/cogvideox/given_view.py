@@ -53,7 +53,7 @@ def views_of_given(
     """
     colors, depth = codec.decode_images(first.float())
     rgb, metres = to_uint8(colors)[:, 0], depth[:, 0].float()
-    if len(first) == 1 and codec.framewise:  # each distinct view is drawn and encoded once
+    if len(first) == 1 < len(cameras) and codec.framewise:  # each distinct view is drawn and encoded once
         distinct, numbers = distinct_views(cameras[:, 1:])
         given = cameras[0][:1]
         clips = Cameras.stack([Cameras.concatenate([given, distinct[number]]) for number in range(len(distinct))])

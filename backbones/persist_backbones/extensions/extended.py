@@ -130,7 +130,7 @@ class ExtendedCogVideoX(CogVideoX):
         parameters = super().trained_parameters(stage)
         if stage == "1":
             train_lora(self.transformer.base)
-        if self.discriminator is not None:
+        if self.discriminator is not None and stage != "codec":
             self.discriminator.requires_grad_(True)
             parameters |= {name: p for name, p in self.named_parameters() if name.startswith(DISCRIMINATOR)}
         return {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
