@@ -217,14 +217,14 @@ class Backbone(nn.Module, ABC):
         """
         raise PersistError(f"backbone {self.name!r} cannot be distilled; leave distill out")
 
-    def train_adversarially(self, settings: Adversarial) -> dict[str, nn.Parameter]:
+    def train_adversarially(self, settings: Adversarial) -> list[nn.Parameter]:
         """Let ``forward`` return the loss of adversarial training from now on.
 
         Args:
             settings: noise levels, weights and size of the discriminator, which is fresh.
 
         Returns:
-            The discriminator's parameters by name, which ``trained_parameters`` has too from now on.
+            The discriminator's parameters, which ``trained_parameters`` has too from now on.
 
         Raises:
             PersistError: when this backbone cannot be trained so.

@@ -60,7 +60,7 @@ class Trainer(TrainingLoop[Backbone]):
         if recipe.adversarial is not None:
             check_whole("adversarial", accelerator)
             discriminator = backbone.train_adversarially(recipe.adversarial)
-            opponent = Opponent([*discriminator.values()], recipe.adversarial.learning_rate)
+            opponent = Opponent(discriminator, recipe.adversarial.learning_rate)
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         for frames in recipe.data.clip_frames:
             backbone.check_clip_frames(frames)

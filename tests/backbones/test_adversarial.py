@@ -9,12 +9,11 @@ from functools import partial
 import pytest
 import torch
 
-from persist_backbones.cogvideox.diffusion import make_scheduler, sample_generators
+from persist_backbones.cogvideox.diffusion import draw_among, make_scheduler, sample_generators
 from persist_backbones.extensions.adversarial import (
     Discriminator,
     adversarial_loss,
     discriminator_loss,
-    draw_sampled,
     sampled_timesteps,
     steepness,
     to_compare,
@@ -56,9 +55,9 @@ def test_it_trains_at_the_noise_levels_of_the_sampler_that_the_checkpoint_asks_f
     timesteps = sampled_timesteps(model, SETTINGS)
     assert (model.own_sampling.steps, model.own_sampling.sampler) == (4, "ddim")
     assert timesteps.tolist() == make_scheduler(model.scheduler.config, "ddim", 4).timesteps.tolist()
-    drawn = draw_sampled(timesteps, sample_generators(range(40)))
+    drawn = draw_among(timesteps, sample_generators(range(40)))
     assert set(drawn.tolist()) == set(timesteps.tolist())
-    assert drawn[7] == draw_sampled(timesteps, sample_generators([7]))  # whatever the batch
+    assert drawn[7] == draw_among(timesteps, sample_generators([7]))  # whatever the batch
 
 
 @pytest.mark.parametrize("given", ["alone", "rendered"])
@@ -66,7 +65,7 @@ def test_it_trains_at_the_noise_levels_of_the_sampler_that_the_checkpoint_asks_f
 def test_frames_after_the_given_one_are_compared_beside_what_it_shows(given, weights):
     model, _ = trained_against(given=given, channel_weights=weights)
     clips = random_clips(2)
-    draw = partial(draw_sampled, sampled_timesteps(model, SETTINGS))
+    draw = partial(draw_among, sampled_timesteps(model, SETTINGS))
     prediction = model.predict_noised(clips, sample_generators(clips.seeds), draw)
     true, predicted, image = to_compare(model, clips, prediction)
     scale, noised = model.channel_weights().sqrt(), prediction.noised
@@ -82,7 +81,7 @@ def test_padding_is_not_compared():
     model = micro(transformer=MICRO["transformer"] | rotary, given="alone")
     model.train_adversarially(SETTINGS)
     clips = random_clips(1)
-    draw = partial(draw_sampled, sampled_timesteps(model, SETTINGS))
+    draw = partial(draw_among, sampled_timesteps(model, SETTINGS))
     prediction = model.predict_noised(clips, sample_generators(clips.seeds), draw)
     true, predicted, image = to_compare(model, clips, prediction)
     assert true.shape[1] == prediction.noised.clean.shape[1] - 2  # a latent frame of padding, and the given one

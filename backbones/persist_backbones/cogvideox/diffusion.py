@@ -108,6 +108,12 @@ def draw_timesteps(scheduler: CogVideoXDDIMScheduler, generators: list[torch.Gen
     return torch.cat([torch.randint(0, levels, (1,), generator=generator) for generator in generators])
 
 
+def draw_among(timesteps: Int[Tensor, " level"], generators: list[torch.Generator]) -> Int[Tensor, " batch"]:
+    """Draw one of some timesteps for each sample, from its own generator."""
+    numbers = torch.cat([torch.randint(0, len(timesteps), (1,), generator=generator) for generator in generators])
+    return timesteps.to(numbers.device)[numbers]
+
+
 def prediction_target(
     scheduler: CogVideoXDDIMScheduler, latents: Tensor, noise: Tensor, timesteps: Int[Tensor, " batch"]
 ) -> Tensor:

@@ -23,6 +23,7 @@ from torch.nn.functional import leaky_relu, softplus
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.diffusion import (
     NoisedPrediction,
+    draw_among,
     loss_parts,
     make_scheduler,
     sample_generators,
@@ -106,7 +107,7 @@ def adversarial_loss(
     ``discriminator`` among the parts is its loss without the penalty: log 2 where it cannot, 0 where it always can.
     """
     generators, clips = sample_generators(clips.seeds), clips.to(model.device)
-    prediction = model.predict_noised(clips, generators, partial(draw_sampled, sampled_timesteps(model, settings)))
+    prediction = model.predict_noised(clips, generators, partial(draw_among, sampled_timesteps(model, settings)))
     losses = loss_parts(model.weighted_error(prediction), model.settings.depth)
     with torch.autocast(model.device.type, enabled=False):
         true, predicted, image = to_compare(model, clips, prediction)
@@ -122,11 +123,6 @@ def sampled_timesteps(model: CogVideoX, settings: Adversarial) -> Int[Tensor, " 
     """The timesteps at which the sampler of the trained model predicts."""
     timesteps: Tensor = make_scheduler(model.scheduler.config, "ddim", settings.steps).timesteps
     return timesteps
-
-
-def draw_sampled(timesteps: Int[Tensor, " step"], generators: list[torch.Generator]) -> Int[Tensor, " batch"]:
-    """Draw one of some timesteps for each sample, from its own generator."""
-    return timesteps[torch.cat([torch.randint(0, len(timesteps), (1,), generator=draw) for draw in generators])]
 
 
 def to_compare(model: CogVideoX, clips: Clips, prediction: NoisedPrediction) -> tuple[Tensor, Tensor, Tensor]:

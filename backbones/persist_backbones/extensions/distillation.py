@@ -20,6 +20,7 @@ from persist_backbones.adapters.base import NoiseLevel
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.diffusion import (
     NoisedClips,
+    draw_among,
     loss_parts,
     make_scheduler,
     noise_level,
@@ -52,8 +53,7 @@ class Levels:
 
     def draw(self, generators: list[torch.Generator]) -> Int[Tensor, " batch"]:
         """Draw the timesteps of uniform levels, each sample from its own generator."""
-        numbers = [torch.randint(0, self.count, (1,), generator=generator) for generator in generators]
-        return self.timesteps.to(numbers[0].device)[torch.cat(numbers)]
+        return draw_among(self.timesteps, generators)
 
     def following(self, timesteps: Int[Tensor, " batch"]) -> tuple[Int[Tensor, " batch"], Bool[Tensor, " batch"]]:
         """Return the next timestep of each sample, and whether there is none: its step leads to the clean clip."""

@@ -74,11 +74,11 @@ class ExtendedCogVideoX(CogVideoX):
         self.distillation = Distillation(settings, teacher, target)
         self.own_sampling = Sampling(settings.steps, CONSISTENCY)
 
-    def train_adversarially(self, settings: Adversarial) -> dict[str, nn.Parameter]:
+    def train_adversarially(self, settings: Adversarial) -> list[nn.Parameter]:
         """Let ``forward`` return the loss of adversarial training; see ``adversarial``."""
         self.adversarial, self.discriminator = settings, make_discriminator(self, settings)
         self.own_sampling = Sampling(settings.steps, "ddim")
-        return {f"{DISCRIMINATOR}{name}": parameter for name, parameter in self.discriminator.named_parameters()}
+        return [*self.discriminator.parameters()]
 
     def sample(
         self,
