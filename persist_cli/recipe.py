@@ -111,7 +111,7 @@ class Recipe:
         distill: teach a trained model to sample in one or two denoising steps, stages 1 and 2 only; in stage 2 it is
             the adapter of ``adapter_from``.
         adversarial: train against a discriminator that tells predicted clips from true ones, for few denoising steps
-            without blur; stages 1 and 2 only.
+            with less blur; stages 1 and 2 only.
         policy: the policy, stage policy only.
         scene: the model of scenes, stages scene-codec and scene only.
         data: the clips.

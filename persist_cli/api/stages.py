@@ -74,7 +74,7 @@ class Distill:
 
 @dataclass(frozen=True)
 class Adversarial:
-    """Adversarial training of a model in stages 1 and 2: few denoising steps that leave no blur.
+    """Adversarial training of a model in stages 1 and 2: few denoising steps that leave less blur.
 
     A discriminator learns to tell the predicted latents of a clip from the true ones, and the model to be taken for
     true, beside its loss of denoising (ADD, Sauer et al., 2311.17042; APT, Lin et al., 2501.08316). It is kept with the

@@ -5,7 +5,7 @@
 
 The first trajectories of each data set are walked from their frame ``--start`` on, by a model without memory. Prints
 likeness to the truth, sharpness and grain for each clip of the chain, over all walks. Asserts nothing. ``--sheets``
-draws every fourth frame below the true one.
+draws frames of each walk below the true ones.
 """
 
 from __future__ import annotations
@@ -17,9 +17,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from PIL import Image
-from torch import Tensor
-from torch.nn.functional import pad
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
@@ -33,9 +30,10 @@ from persist_cli.io.files import write_json
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, Prediction
 from persist_cli.viewing.console import print_table, say
+from persist_cli.viewing.sheet import write_sheet
 
 FIGURES = ("lpips-alex", "psnr", "sharpness", "grain")
-APART = 4  # frames between those of a sheet
+FRAMES = 8  # of a walk on a sheet
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -60,8 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             predicted = chain(backbone, walks, Sampling(int(steps), sampler), options.clips)
             rows.append({"model": path.name, "sampling": text} | figures(walks, predicted, frames))
             if options.sheets:
-                picture = options.sheets / f"{path.name}-{steps}-{sampler}.png"
-                Image.fromarray(sheet(walks, predicted).numpy()).save(picture)
+                pairs = zip(walks, predicted, strict=True)
+                videos = [row for walk, made in pairs for row in (("truth", walk.rgb[1:]), (path.name, made.rgb))]
+                write_sheet(options.sheets / f"{path.name}-{steps}-{sampler}.png", videos, most=FRAMES)
     say(f"{len(walks)} walks; each figure by clip of the chain")
     table = [[row["model"], row["sampling"], *(joined(row[name]) for name in FIGURES)] for row in rows]
     print_table("", ["model", "sampling", *FIGURES], table)
@@ -112,12 +111,6 @@ def figures(walks: list[Observations], predicted: list[Observations], frames: in
 def joined(values: list[float]) -> str:
     """Figures of the clips as text."""
     return " ".join(f"{value:.1f}" if value > 5 else f"{value:.3f}" for value in values)
-
-
-def sheet(walks: list[Observations], predicted: list[Observations]) -> Tensor:
-    """True frames, and below them what was predicted, of each walk."""
-    rows = [part[::APART] for walk, made in zip(walks, predicted, strict=True) for part in (walk.rgb[1:], made.rgb)]
-    return torch.cat([torch.cat(list(pad(row, (0, 0, 1, 1, 1, 1))), dim=1) for row in rows])
 
 
 if __name__ == "__main__":
