@@ -18,8 +18,8 @@ from persist_cli.metrics.metric import FrameMetric, Metric
 ENDS: tuple[FrameSelection, ...] = ("all", "last", "return")
 
 SELECTIONS: dict[str, tuple[FrameSelection, ...]] = {  # of metrics shown over more than all frames
-    "psnr": (*ENDS, "new"), "sharpness": (*ENDS, "new"), "ssim": ENDS, "lpips-alex": ENDS, "lpips-vgg": ENDS,
-    "dreamsim": ENDS,
+    "psnr": (*ENDS, "new", "seen"), "sharpness": (*ENDS, "new"), "ssim": ENDS, "dreamsim": ENDS,
+    "lpips-alex": (*ENDS, "seen"), "lpips-vgg": (*ENDS, "seen"),
 }  # fmt: skip
 
 FAMILIAR = 0.9  # share of a view seen before from which on nothing of it counts as new
@@ -33,6 +33,7 @@ SUFFIXES: dict[FrameSelection, tuple[str, str, str]] = {
         "at the frames only that return to an earlier place over more than one predicted clip",
     ),
     "new": ("-new", " where new", f"at frames of whose view less than {FAMILIAR:.0%} was seen before only"),
+    "seen": ("-seen", " where seen", f"at frames of whose view at least {FAMILIAR:.0%} was seen before only"),
 }
 
 
@@ -99,6 +100,9 @@ def chosen_frames(cases: Sequence[Case], frames: FrameSelection, clip_frames: in
     if frames == "new":
         shares = [[1.0 if share is None else share for share in case.seen_before] for case in cases]
         chosen = torch.tensor(shares) < FAMILIAR
+    if frames == "seen":
+        shares = [[0.0 if share is None else share for share in case.seen_before] for case in cases]
+        chosen = torch.tensor(shares) >= FAMILIAR
     chosen[:, 0] = False
     return chosen
 

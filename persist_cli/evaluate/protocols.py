@@ -24,7 +24,7 @@ from persist_cli.viewing.console import watched
 
 T = TypeVar("T")
 
-FrameSelection = Literal["all", "last", "return", "new"]  # frames of a clip that a column is the mean over
+FrameSelection = Literal["all", "last", "return", "new", "seen"]  # frames of a clip that a column is the mean over
 
 LEAST_RECALLED = 0.3  # share of the last view seen earlier and not from the clip's first frame
 
@@ -161,7 +161,7 @@ class Revisit(Protocol):
         "all true frames up to the first; nothing is written"
     )
     writes = False
-    selections = ("all", "last", "new")
+    selections = ("all", "last", "new", "seen")
 
     def find(self, search: ClipSearch) -> list[Case]:
         """Find the clips with the most to recall, taking turns as ``in_turns`` does, disjoint in each trajectory."""
@@ -245,7 +245,7 @@ class Later(Revisit):
         "clips of the frames at the end of each capture that are held out from training (`persist import --hold-out`), "
         "each beginning in the middle of the one before; memory of all true frames up to the first; nothing is written"
     )
-    selections = ("all", "last", "new")
+    selections = ("all", "last", "new", "seen")
 
     def first_scored(self, file: TrajectoryFile) -> int:
         """The number of the first frame that is held out."""

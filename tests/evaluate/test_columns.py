@@ -16,7 +16,9 @@ def case(seen_before, first_visits=(-1, -1, -1, -1), counted=(False, True, True,
     return Case("data", "walk", "room", 0, 4, 0, seen_before, first_visits, counted)
 
 
-@pytest.mark.parametrize(("frames", "chosen"), [("all", [1, 2, 3]), ("last", [3]), ("return", [2]), ("new", [1, 2])])
+@pytest.mark.parametrize(
+    ("frames", "chosen"), [("all", [1, 2, 3]), ("last", [3]), ("return", [2]), ("new", [1, 2]), ("seen", [3])]
+)
 def test_a_column_is_the_mean_over_its_frames_and_never_over_the_given_first_frame(frames, chosen):
     cases = [case((0.0, 0.1, 0.89, 0.9), (-1, -1, 0, -1))]
     assert chosen_frames(cases, frames)[0].nonzero()[:, 0].tolist() == chosen
@@ -32,19 +34,20 @@ def test_a_copy_of_a_remembered_frame_enters_no_mean_but_that_of_a_metric_withou
     assert torch.equal(kept[0, :, 1], figures[0, :, 1])
 
 
-def test_views_without_depth_do_not_count_as_new():
-    assert not chosen_frames([case((None, None, None, None))], "new").any()
+@pytest.mark.parametrize("frames", ["new", "seen"])
+def test_views_without_depth_count_neither_as_new_nor_as_seen(frames):
+    assert not chosen_frames([case((None, None, None, None))], frames).any()
 
 
-def test_psnr_has_a_column_for_new_views_only_where_the_protocol_selects_them():
+def test_psnr_has_columns_for_new_and_for_seen_views_only_where_the_protocol_selects_them():
     chosen = choose_metrics(("psnr", "ssim"), METRICS)
-    names = [column.name for column in make_columns(chosen, PROTOCOLS["revisit"])]
-    assert names == ["psnr", "psnr-last", "psnr-new", "ssim", "ssim-last"]
-    new = make_columns(chosen, PROTOCOLS["revisit"])[2]
-    assert (new.title, new.definition) == (
-        "PSNR where new", "as PSNR, at frames of whose view less than 90% was seen before only",
-    )  # fmt: skip
-    assert "psnr-new" not in [column.name for column in make_columns(chosen, PROTOCOLS["return"])]
+    columns = make_columns(chosen, PROTOCOLS["revisit"])
+    assert [column.name for column in columns] == ["psnr", "psnr-last", "psnr-new", "psnr-seen", "ssim", "ssim-last"]
+    assert [(column.title, column.definition) for column in columns[2:4]] == [
+        ("PSNR where new", "as PSNR, at frames of whose view less than 90% was seen before only"),
+        ("PSNR where seen", "as PSNR, at frames of whose view at least 90% was seen before only"),
+    ]
+    assert not {"psnr-new", "psnr-seen"} & {column.name for column in make_columns(chosen, PROTOCOLS["return"])}
 
 
 def test_choosing_scene_consistency_chooses_its_guard_too():
