@@ -81,7 +81,7 @@ class Adversarial:
     run's state and is not part of the model.
 
     Args:
-        weight: weight of the loss of not passing for true beside that of denoising.
+        weight: how strongly the discriminator pulls each predicted clip, as a share of how strongly denoising does.
         steps: number of denoising steps of the sampler ``ddim`` that the checkpoint asks for when it is sampled; the
             model is trained at their noise levels alone.
         learning_rate: of the discriminator; it rises and falls as the model's does.

@@ -13,6 +13,8 @@ from persist_backbones.cogvideox.diffusion import draw_among, make_scheduler, sa
 from persist_backbones.extensions.adversarial import (
     Discriminator,
     adversarial_loss,
+    as_long_as,
+    directed,
     discriminator_loss,
     sampled_timesteps,
     steepness,
@@ -107,10 +109,10 @@ def test_either_loss_trains_its_own_network_alone(stage):
 
 def test_clips_that_are_alike_cannot_be_told_apart():
     judge, clips = Discriminator(3, (16, 16), 8), torch.randn(2, 3, 3, 16, 16)
-    apart, steep, scores = discriminator_loss(judge, clips, clips, torch.zeros_like(clips))
+    apart, steep, pull = discriminator_loss(judge, clips, clips, torch.zeros_like(clips))
     assert apart.item() == pytest.approx(math.log(2))
     assert steep > 0
-    assert scores.shape == (2, 1, 3, 4, 4)
+    assert pull.shape == clips.shape
 
 
 @pytest.mark.parametrize("frames", [1, 3])
@@ -140,9 +142,40 @@ def test_the_discriminator_learns_to_tell_and_the_model_learns_to_pass():
     assert apart < 0.2
     others = torch.randn(16, 2, 2, 8, 8)
     assert judge(others, image).mean() > judge(0.1 * others, image).mean()
-    passing = (0.1 * others).requires_grad_()
-    judge(passing, image).mean().backward()
-    assert judge(passing + passing.grad * 100, image).mean() > judge(passing, image).mean()
+    passing = 0.1 * others
+    _, _, pull = discriminator_loss(judge, others, passing, image)
+    assert judge(passing - 100 * pull, image).mean() > judge(passing, image).mean()
+
+
+def test_a_clip_is_pulled_to_pass_as_strongly_as_denoising_pulls_it():
+    denoising, passing = (
+        torch.tensor([[3.0, 4.0], [0.0, 1.0], [2.0, 0.0]]),
+        torch.tensor([[0.0, 0.1], [7.0, 0.0], [0.0, 0.0]]),
+    )
+    assert as_long_as(denoising, passing).tolist() == [[0.0, 5.0], [1.0, 0.0], [0.0, 0.0]]
+    predicted = torch.ones(3, 2, requires_grad=True)
+    loss = directed(predicted, passing)
+    loss.backward()
+    assert loss.item() == 0.0
+    assert torch.equal(predicted.grad, passing)
+
+
+def test_the_pull_grows_with_the_weight_and_not_with_the_scores():
+    model, parameters = trained_against()
+    clips = random_clips(2)
+    unopposed = gradients(model, parameters, clips, PLAIN)
+    names = [name for name in parameters if name.startswith("transformer.") and unopposed[name].any()]
+
+    def pull(weight):
+        both = gradients(model, parameters, clips, Adversarial(weight=weight, steps=4, width=8))
+        return torch.cat([(both[name] - unopposed[name]).flatten() for name in names])
+
+    once = pull(0.3)
+    assert once.any()
+    assert torch.allclose(pull(0.6), 2 * once, rtol=1e-3, atol=1e-6)
+    with torch.no_grad():
+        model.discriminator.layers[-1].weight.mul_(2)
+    assert pull(0.3).norm().item() == pytest.approx(once.norm().item(), rel=0.05)
 
 
 def test_a_step_of_the_shared_optimizer_trains_both():

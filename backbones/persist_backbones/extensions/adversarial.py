@@ -6,6 +6,10 @@ levels (ADD, Sauer et al., 2311.17042), and a discriminator of latents (LADD, 24
 shows too, compares each prediction with the truth of its clip (relativistic, 1807.00734). Its scores are kept from
 being steep at true and at predicted clips (the penalties R1 and R2, as in R3GAN, 2501.05441), for a discriminator that
 is always right teaches nothing. Both learn in the same step: either loss takes the other's weights as constants.
+
+The discriminator pulls the prediction of each clip as strongly, in proportion, as the loss of denoising does: the
+gradients of the two are compared where they meet, at the prediction (as VQGAN does for a batch at its last layer,
+2012.09841). So how strong its scores are does not matter, and a sample counts the same in any batch.
 """
 
 from __future__ import annotations
@@ -17,7 +21,6 @@ from typing import Final
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.func import functional_call
 from torch.nn.functional import leaky_relu, softplus
 
 from persist_backbones.cogvideox.cogvideox import CogVideoX
@@ -111,12 +114,24 @@ def adversarial_loss(
     losses = loss_parts(model.weighted_error(prediction), model.settings.depth)
     with torch.autocast(model.device.type, enabled=False):
         true, predicted, image = to_compare(model, clips, prediction)
-        apart, steep, true_scores = discriminator_loss(discriminator, true, predicted, image)
-        constant = {name: parameter.detach() for name, parameter in discriminator.named_parameters()}
-        scores: Tensor = functional_call(discriminator, constant, (predicted, image))
-        passing = softplus(true_scores - scores).mean()
-    total = losses["loss"] + settings.weight * passing + apart + settings.penalty * steep
+        apart, steep, pull = discriminator_loss(discriminator, true, predicted, image)
+        (denoising,) = torch.autograd.grad(losses["loss"], prediction.predicted, retain_graph=True)
+        (passing,) = torch.autograd.grad(predicted, prediction.predicted, pull, retain_graph=True)
+        towards = directed(prediction.predicted, settings.weight * as_long_as(denoising, passing))
+    total = losses["loss"] + towards + apart + settings.penalty * steep
     return losses | {"loss": total, "discriminator": apart}
+
+
+def as_long_as(one: Float[Tensor, "batch ..."], other: Float[Tensor, "batch ..."]) -> Float[Tensor, "batch ..."]:
+    """Return the other gradient with the length of the one, for each sample by itself; 0 where it is 0."""
+    lengths = [torch.linalg.vector_norm(part.float().flatten(1), dim=1) for part in (one, other)]
+    scale = torch.where(lengths[1] > 0, lengths[0] / lengths[1], 0.0)
+    return other.float() * scale.view(-1, *[1] * (other.ndim - 1))
+
+
+def directed(predicted: Tensor, gradient: Tensor) -> Tensor:
+    """Return a loss of value 0 with this gradient to a prediction."""
+    return (gradient.detach() * (predicted.float() - predicted.detach().float())).sum()
 
 
 def sampled_timesteps(model: CogVideoX, settings: Adversarial) -> Int[Tensor, " step"]:
@@ -145,7 +160,9 @@ def discriminator_loss(
     predicted: Float[Tensor, "batch frame channel height width"],
     image: Float[Tensor, "batch frame channel height width"],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return how badly true and predicted clips are told apart, how steep their scores are, and the true ones'.
+    """Return how badly true and predicted clips are told apart, how steep their scores are, and the pull.
+
+    The pull is the gradient to the predicted clips of the loss of not passing for true.
 
     Args:
         discriminator: gives the scores.
@@ -156,7 +173,10 @@ def discriminator_loss(
     true, predicted = (clips.detach().requires_grad_() for clips in (true, predicted))
     true_scores, predicted_scores = (discriminator(clips, image) for clips in (true, predicted))
     steep = steepness(true_scores, true) + steepness(predicted_scores, predicted)
-    return softplus(predicted_scores - true_scores).mean(), steep, true_scores.detach()
+    (pull,) = torch.autograd.grad(
+        softplus(true_scores.detach() - predicted_scores).mean(), predicted, retain_graph=True
+    )
+    return softplus(predicted_scores - true_scores).mean(), steep, pull
 
 
 def steepness(
