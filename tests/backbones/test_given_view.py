@@ -6,7 +6,6 @@ from functools import partial
 import pytest
 import torch
 
-from persist_backbones.cogvideox.codec import to_uint8
 from persist_backbones.cogvideox.diffusion import draw_timesteps, sample_generators
 from persist_backbones.cogvideox.given_view import render_given
 from persist_cli.api.backbone import Sampling
@@ -102,17 +101,6 @@ def test_one_given_frame_serves_several_ways():
         clips, rgb=clips.rgb[:1].expand_as(clips.rgb), depth=clips.depth[:1].expand_as(clips.depth)
     )
     assert torch.allclose(backbone.encode_first(shared), backbone.encode_first(repeated), atol=1e-5)
-
-
-def test_sampling_moves_the_pixels_of_the_given_frame_and_training_those_of_its_latents():
-    backbone, clips = micro(given="rendered"), random_clips()
-    latents = backbone.encode(clips).image
-    colors, depth = backbone.codec.decode_images(latents)
-    decoded = backbone.known_latents(latents, clips, (to_uint8(colors), depth))
-    assert torch.equal(backbone.known_latents(latents, clips), decoded)
-    own = backbone.known_latents(latents, clips, clips.first_frames())
-    assert torch.equal(backbone.encode_first(clips), backbone.image_condition(own, backbone.shape.of(clips)))
-    assert not torch.equal(own, decoded)
 
 
 def test_training_on_kept_latents_is_training_on_images():

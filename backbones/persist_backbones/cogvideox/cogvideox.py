@@ -284,11 +284,11 @@ class CogVideoX(AdaptedBackbone):
     def encode_first(self, clips: Clips) -> Float[Tensor, "batch frame channel height width"]:
         """Encode the clips' first frames as the image condition, float32 also for a model in lower precision."""
         first = self.codec.encode(*clips.first_frames()).float()
-        return self.image_condition(self.known_latents(first, clips, clips.first_frames()), self.shape.of(clips))
+        return self.image_condition(self.known_latents(first, clips), self.shape.of(clips))
 
-    def known_latents(self, first: Tensor, clips: Clips, pixels: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    def known_latents(self, first: Float[Tensor, "batch 1 channel height width"], clips: Clips) -> Tensor:
         """Return latents of the first frames alone, or of what they show in all views, as the settings say."""
-        return first if self.settings.given == "alone" else views_of_given(self.codec, first, clips.cameras, pixels)
+        return first if self.settings.given == "alone" else views_of_given(self.codec, first, clips.cameras)
 
     def image_condition(self, known: Float[Tensor, "batch known channel height width"], shape: ClipShape) -> Tensor:
         """Scale latents of what is known for the model, and add zeros for latent frames of which nothing is."""

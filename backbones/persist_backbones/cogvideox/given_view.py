@@ -42,10 +42,7 @@ class GivenViews(NamedTuple):
 
 @torch.no_grad()
 def views_of_given(
-    codec: Codec,
-    first: Float[Tensor, "batch 1 channel height width"],
-    cameras: Cameras,
-    pixels: tuple[Tensor, Tensor] | None = None,
+    codec: Codec, first: Float[Tensor, "batch 1 channel height width"], cameras: Cameras
 ) -> Float[Tensor, "batch latent_frame channel height width"]:
     """Return latents of what given frames show in all views of their clips, zeros where they show nothing.
 
@@ -53,20 +50,16 @@ def views_of_given(
         codec: the codec of the latents.
         first: latents of the given frames alone; one of them may serve all clips.
         cameras: axes ``batch frame``.
-        pixels: the given frames, RGB ``[batch, 1, height, width, 3]`` and depth ``[batch, 1, height, width]``, where
-            they are known; else they are decoded.
     """
-    if pixels is None:
-        colors, depth = codec.decode_images(first.float())
-        pixels = to_uint8(colors), depth
-    rgb, metres = (part[:, 0].to(first.device) for part in pixels)
+    colors, depth = codec.decode_images(first.float())
+    rgb, metres = to_uint8(colors)[:, 0], depth[:, 0].float()
     if len(first) == 1 < len(cameras) and codec.framewise:  # each distinct view is drawn and encoded once
         distinct, numbers = distinct_views(cameras[:, 1:])
         given = cameras[0][:1]
         clips = Cameras.stack([Cameras.concatenate([given, distinct[number]]) for number in range(len(distinct))])
-        drawn = _later_latents(codec, rgb, metres.float(), clips).flatten(0, 1)[numbers]
+        drawn = _later_latents(codec, rgb, metres, clips).flatten(0, 1)[numbers]
     else:
-        drawn = _later_latents(codec, rgb, metres.float(), cameras)
+        drawn = _later_latents(codec, rgb, metres, cameras)
     return torch.cat([first.expand(len(cameras), -1, -1, -1, -1), drawn.to(first)], dim=1)
 
 
