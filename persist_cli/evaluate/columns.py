@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -97,12 +98,10 @@ def chosen_frames(cases: Sequence[Case], frames: FrameSelection, clip_frames: in
     if frames == "return":
         visits = torch.tensor([case.first_visits for case in cases])
         chosen = (visits >= 0) & (torch.arange(visits.shape[1]) - visits > clip_frames)
-    if frames == "new":
-        shares = [[1.0 if share is None else share for share in case.seen_before] for case in cases]
-        chosen = torch.tensor(shares) < FAMILIAR
-    if frames == "seen":
-        shares = [[0.0 if share is None else share for share in case.seen_before] for case in cases]
-        chosen = torch.tensor(shares) >= FAMILIAR
+    if frames in ("new", "seen"):
+        known = [[math.nan if share is None else share for share in case.seen_before] for case in cases]
+        shares = torch.tensor(known)  # NaN is neither
+        chosen = shares < FAMILIAR if frames == "new" else shares >= FAMILIAR
     chosen[:, 0] = False
     return chosen
 
