@@ -205,7 +205,7 @@ def build_rows(arguments: argparse.Namespace) -> dict[str, Row]:
         name = "voxel"
         backbone.load_adapter(name, base.adapter_folder(name))
         packaged = dataclasses.replace(sampling, memory_guidance=1.5)
-        rows["packaged canvas, guidance 1.5"] = Model(backbone, adapter_memory(base, name), name, packaged)
+        rows["packaged voxel, guidance 1.5"] = Model(backbone, adapter_memory(base, name), name, packaged)
     return {name: row for name, row in rows.items() if not arguments.rows or name in arguments.rows.split(";")}
 
 
