@@ -8,7 +8,7 @@ back are compared with the row's own frames at these poses. Only the first image
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -29,7 +29,7 @@ from persist_cli.metrics.lpips import ALEX, LpipsAlex, perceptual_distance, tens
 from persist_cli.metrics.networks import missing_weights, network_weights, run_network
 from persist_cli.metrics.sharpness import LAPLACIAN, energy
 from persist_cli.rollout.world_model import WorldModel
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.viewing.console import add_task, progress, watched
 
 PART: Final = "return"
 
@@ -135,13 +135,13 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
             for name in values[0][0]
         }
         videos[row.name] = [piece for of_seed in walks for walk in of_seed for piece in pieces(walk["rgb"])]
-    count = min(len(true), *map(len, videos.values()))
+    distances = fvd_figures(videos, true)
     return {
         "columns": {name: column.definition for name, column in COLUMNS.items()},
         "views": [view.name for view in views],
         "steps": plan.steps,
         "missing": obstacles(true),
-        "rows": {row.name: figures[row.name] | {"fvd": distance(videos[row.name], true, count)} for row in rows},
+        "rows": {row.name: figures[row.name] | {"fvd": distances[row.name]} for row in rows},
     }
 
 
@@ -222,12 +222,23 @@ def obstacles(true: Sequence[Tensor]) -> list[str]:
     return weights + [short] * (not true)
 
 
-def distance(imagined: Sequence[Tensor], true: Sequence[Tensor], count: int) -> dict[str, float | None]:
-    """Return FVD of ``count`` imagined and true pieces; ``None`` without the weights or with too few."""
+def fvd_figures(
+    videos: Mapping[str, Sequence[UInt8[Tensor, "frame height width 3"]]],
+    true: Sequence[UInt8[Tensor, "frame height width 3"]],
+) -> dict[str, dict[str, float | None]]:
+    """Return FVD of the pieces of each row to the true ones; ``None`` without the weights or with too few.
+
+    All rows have as many pieces as the one with the fewest, spread over its walks, and so have the true ones.
+    """
+    count = min(len(true), *map(len, videos.values()))
     if missing_weights(WEIGHTS) or count < LEAST_VIDEOS:
-        return {"mean": None, "low": None, "high": None}
+        return {name: {"mean": None, "low": None, "high": None} for name in videos}
     metric = Fvd()
-    chosen = [torch.linspace(0, len(videos) - 1, count).round().long().tolist() for videos in (imagined, true)]
-    features = torch.stack([metric.features(imagined[place]) for place in chosen[0]])
-    truths = torch.stack([metric.features(true[place]) for place in chosen[1]])
-    return {"mean": number(metric.distance(features, truths)), "low": None, "high": None}
+
+    def features(pieces: Sequence[UInt8[Tensor, "frame height width 3"]]) -> Float[Tensor, "piece channel"]:
+        places = torch.linspace(0, len(pieces) - 1, count).round().long().tolist()
+        return torch.stack([metric.features(pieces[place]) for place in places])
+
+    found = [features(own) for own in watched([true, *videos.values()], "features for FVD", "rows")]
+    distances = {name: metric.distance(own, found[0]) for name, own in zip(videos, found[1:], strict=True)}
+    return {name: {"mean": number(value), "low": None, "high": None} for name, value in distances.items()}
