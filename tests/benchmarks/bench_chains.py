@@ -18,18 +18,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.backbone import Backbone, Clip, Clips, Sampling
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.observations import Observations
+from persist_cli.bench.scenes.return_part import fvd_figures, pieces
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.data.store import Store
 from persist_cli.evaluate.metric_suite import choose_metrics
 from persist_cli.io.files import write_json
 from persist_cli.metrics import METRICS
-from persist_cli.metrics.fvd import LEAST_FRAMES, Fvd
 from persist_cli.metrics.metric import FrameMetric, Prediction
 from persist_cli.viewing.console import print_table, say
 from persist_cli.viewing.sheet import write_sheet
@@ -55,15 +56,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         backbone = load_backbone(find_checkpoint(path))
         frames = backbone.frames_per_clip - 1
         walks = read_walks(options.data, options.each, options.start, options.clips * frames + 1)
+        videos: dict[str, list[Tensor]] = {}
         for text in options.samplings:
             steps, sampler = text.split(":")
             predicted = chain(backbone, walks, Sampling(int(steps), sampler), options.clips)
-            found = figures(walks, predicted, frames) | {"fvd": [distance(walks, predicted)]}
-            rows.append({"model": path.name, "sampling": text} | found)
+            rows.append({"model": path.name, "sampling": text} | figures(walks, predicted, frames))
+            pairs = zip(walks, predicted, strict=True)
+            videos[text] = [part for walk, made in pairs for part in pieces(torch.cat([walk.rgb[:1], made.rgb]))]
             if options.sheets:
                 pairs = zip(walks, predicted, strict=True)
                 videos = [row for walk, made in pairs for row in (("truth", walk.rgb[1:]), (path.name, made.rgb))]
                 write_sheet(options.sheets / f"{path.name}-{steps}-{sampler}.png", videos, most=FRAMES)
+        distances = fvd_figures(videos, [part for walk in walks for part in pieces(walk.rgb)])
+        for row in rows[-len(videos) :]:
+            row["fvd"] = [distances[row["sampling"]]["mean"]]
     say(f"{len(walks)} walks; each figure by clip of the chain")
     columns = [*FIGURES, "fvd"]
     table = [[row["model"], row["sampling"], *(joined(row[name]) for name in columns)] for row in rows]
@@ -110,19 +116,6 @@ def figures(walks: list[Observations], predicted: list[Observations], frames: in
         known = torch.where(weight > 0, value, 0.0)  # a frame that does not count may have no value
         found[metric.name] = ((known * weight).sum((0, 2)) / weight.sum((0, 2))).tolist()
     return found
-
-
-def distance(walks: list[Observations], predicted: list[Observations]) -> float:
-    """FVD of all pieces of the chains to the true frames."""
-    metric = Fvd()
-    sets = [[walk.rgb[1:] for walk in walks], [made.rgb for made in predicted]]
-    true, made = (
-        torch.stack(
-            [metric.features(part) for rgb in videos for part in rgb.split(LEAST_FRAMES) if len(part) == LEAST_FRAMES]
-        )
-        for videos in sets
-    )
-    return float(metric.distance(made, true))
 
 
 def joined(values: list[float]) -> str:
