@@ -128,7 +128,10 @@ def learn(
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
     context_noise: ContextNoiseOption = None,
+    dtype: DtypeOption = None,
+    save_memory: SaveMemoryOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Walks imagined at once.")] = 16,
+    verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
     """Let a policy practise in a new house inside the model, learn from what it reached, and repeat.
@@ -144,6 +147,7 @@ def learn(
         practice=PracticeSettings(walks, actions, execute, explore, batch), steps=training_steps,
         training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body,
+        placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_learn(plan, out, json)
 

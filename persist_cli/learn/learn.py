@@ -70,6 +70,7 @@ class LearnPlan:
         loop: how they are run.
         sampling: of the world model.
         seed: of all that is random.
+        placement: precision and memory savings of the world model.
         body: whether walls stop the agent inside the model; ``None``: where the height of its camera is told, see
             ``tells_body``.
     """
@@ -87,6 +88,7 @@ class LearnPlan:
     loop: LoopSettings
     sampling: SamplingOverrides
     seed: int
+    placement: InferenceOptions = InferenceOptions()
     body: bool | None = None
 
 
@@ -155,6 +157,7 @@ def run_rounds(learning: Learning) -> None:
 def prepare(plan: LearnPlan, out: Path) -> Learning:
     """Check everything that can be checked before the model is loaded, and write nothing."""
     check_folder(out)
+    plan.placement.device()  # a missing accelerator is an error before anything is loaded
     if plan.inside not in (MODEL, SIMULATOR):
         raise PersistError(f"--inside {plan.inside!r}: a policy practises inside the {MODEL} or the {SIMULATOR}")
     if plan.inside == SIMULATOR and plan.body is False:
@@ -181,7 +184,9 @@ def identity(learning: Learning) -> dict[str, Any]:
     values = asdict(plan) | {
         "policy": learning.begin.fingerprint, "checkpoint": None, "episodes": None, "rounds": None,
         "views": {"path": plan.views, "fingerprint": digest(learning.views)},
+        "sampling": asdict(plan.sampling) | plan.placement.changes(),
     }  # fmt: skip
+    del values["placement"]  # where weights wait for their turn changes nothing
     if plan.inside == MODEL:
         values["checkpoint"] = find_checkpoint(plan.checkpoint).fingerprint
     if plan.episodes is not None:
@@ -271,7 +276,7 @@ def open_place(learning: Learning) -> PracticePlace:
     adapter = checkpoint.chosen_adapter(plan.adapter)
     rollout = RolloutPlan(
         start=plan.views[0], actions=(), follow=False, frames=0, memory=None, adapter=plan.adapter, write=True,
-        seed=plan.seed, sampling=plan.sampling, placement=InferenceOptions(), body=plan.body,
+        seed=plan.seed, sampling=plan.sampling, placement=plan.placement, body=plan.body,
     )  # fmt: skip
     world = assemble_world(checkpoint, adapter, rollout, info)
     world.agents[0].memorize(learning.views, world.backbone.device)

@@ -14,7 +14,7 @@ import yaml
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Body
-from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.store import Store
@@ -163,9 +163,28 @@ def test_a_learning_goes_on_with_views_that_were_moved_and_with_no_others(learn,
     assert (result.code, "holds another learning (views fingerprint: " in result.err) == (1, True), result.err
 
 
+def test_a_learning_goes_on_with_less_memory_and_not_in_another_precision(learn):
+    assert learn("out", "--dtype", "bfloat16").code == 0
+    assert learn("out", "--dtype", "bfloat16", "--save-memory", "vae-slicing").code == 0
+    result = learn("out")
+    assert (result.code, "holds another learning (sampling dtype: bfloat16, " in result.err) == (1, True), result.err
+
+
+def test_walks_are_imagined_in_the_precision_that_is_asked_for(walks, voxel, policy_run, tmp_path):
+    plan = LearnPlan(
+        views=(f"{walks}#0:0-12",), policy=str(policy_run), inside="model", checkpoint=voxel, adapter=None, rounds=1,
+        practice=PracticeSettings(), steps=1, training=(), episodes=None, loop=LoopSettings(), sampling=ONE, seed=0,
+        placement=InferenceOptions("bfloat16"),
+    )  # fmt: skip
+    place = open_place(prepare(plan, tmp_path / "out"))
+    assert isinstance(place, ImaginedPlace)
+    assert {weight.dtype for weight in place.world.backbone.transformer.parameters()} == {torch.bfloat16}
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
+        ("--dtype", "bfloat61", "unknown --dtype 'bfloat61'; did you mean 'bfloat16'?"),
         ("--inside", "dream", "a policy practises inside the model or the simulator"),
         ("--inside", "simulator", "of no simulator; leave --episodes and --inside simulator out"),
         ("--policy", "nowhere/policy", "no trained policy there"),
