@@ -11,7 +11,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -88,7 +88,7 @@ class LearnPlan:
     loop: LoopSettings
     sampling: SamplingOverrides
     seed: int
-    placement: InferenceOptions = InferenceOptions()
+    placement: InferenceOptions = field(default_factory=InferenceOptions)
     body: bool | None = None
 
 

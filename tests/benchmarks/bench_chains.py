@@ -25,12 +25,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 from persist_cli.api.backbone import Backbone, Clip, Clips, Sampling
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.observations import Observations
-from persist_cli.bench.scenes.return_part import fvd_figures, pieces
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.data.store import Store
 from persist_cli.evaluate.metric_suite import choose_metrics
 from persist_cli.io.files import write_json
 from persist_cli.metrics import METRICS
+from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
 from persist_cli.metrics.metric import FrameMetric, Prediction
 from persist_cli.viewing.console import print_table, say
 from persist_cli.viewing.sheet import write_sheet
@@ -65,11 +65,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             videos[text] = [part for walk, made in pairs for part in pieces(torch.cat([walk.rgb[:1], made.rgb]))]
             if options.sheets:
                 pairs = zip(walks, predicted, strict=True)
-                videos = [row for walk, made in pairs for row in (("truth", walk.rgb[1:]), (path.name, made.rgb))]
-                write_sheet(options.sheets / f"{path.name}-{steps}-{sampler}.png", videos, most=FRAMES)
-        distances = fvd_figures(videos, [part for walk in walks for part in pieces(walk.rgb)])
+                shown = [row for walk, made in pairs for row in (("truth", walk.rgb[1:]), (path.name, made.rgb))]
+                write_sheet(options.sheets / f"{path.name}-{steps}-{sampler}.png", shown, most=FRAMES)
+        distances = fvd_of_rows(videos, [part for walk in walks for part in pieces(walk.rgb)])
         for row in rows[-len(videos) :]:
-            row["fvd"] = [distances[row["sampling"]]["mean"]]
+            row["fvd"] = [distances[row["sampling"]]]
     say(f"{len(walks)} walks; each figure by clip of the chain")
     columns = [*FIGURES, "fvd"]
     table = [[row["model"], row["sampling"], *(joined(row[name]) for name in columns)] for row in rows]

@@ -8,7 +8,7 @@ back are compared with the row's own frames at these poses. Only the first image
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -24,12 +24,13 @@ from persist_cli.bench.scenes.views import View
 from persist_cli.bench.scenes.walk_part import Wanderer, walk_name, walked
 from persist_cli.data.reference import parse_reference
 from persist_cli.evaluate.statistics import Draws, mean_figure, number
-from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, WEIGHTS, Fvd
+from persist_cli.metrics.fvd import LEAST_FRAMES, WEIGHTS
+from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
 from persist_cli.metrics.lpips import ALEX, LpipsAlex, perceptual_distance, tensor_shapes
 from persist_cli.metrics.networks import missing_weights, network_weights, run_network
 from persist_cli.metrics.sharpness import LAPLACIAN, energy
 from persist_cli.rollout.world_model import WorldModel
-from persist_cli.viewing.console import add_task, progress, watched
+from persist_cli.viewing.console import add_task, progress
 
 PART: Final = "return"
 
@@ -123,7 +124,8 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     true = true_pieces(bench)
     detail = true_detail(true)
     length = RendererLoader(bench, plan).load(rows[0]).backbone.frames_per_clip - 1
-    figures, videos = {}, {}
+    figures: dict[str, dict[str, Any]] = {}
+    videos = {}
     for row in rows:
         walks = [
             [bench.journal.samples(f"{PART} {row.name}", walk_name(view, seed)) for view in views]
@@ -135,13 +137,14 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
             for name in values[0][0]
         }
         videos[row.name] = [piece for of_seed in walks for walk in of_seed for piece in pieces(walk["rgb"])]
-    distances = fvd_figures(videos, true)
+    for name, distance in fvd_of_rows(videos, true).items():
+        figures[name]["fvd"] = {"mean": number(distance), "low": None, "high": None}
     return {
         "columns": {name: column.definition for name, column in COLUMNS.items()},
         "views": [view.name for view in views],
         "steps": plan.steps,
         "missing": obstacles(true),
-        "rows": {row.name: figures[row.name] | {"fvd": distances[row.name]} for row in rows},
+        "rows": figures,
     }
 
 
@@ -196,11 +199,6 @@ def lpips(
     return run_network(lambda a, b: perceptual_distance(weights, ALEX, a, b), one, two)
 
 
-def pieces(rgb: UInt8[Tensor, "frame height width 3"]) -> list[UInt8[Tensor, "piece height width 3"]]:
-    """Return the imagined frames of a walk in pieces of as many frames as FVD needs, without a rest."""
-    return [rgb[first : first + LEAST_FRAMES] for first in range(1, len(rgb) - LEAST_FRAMES + 1, LEAST_FRAMES)]
-
-
 def true_pieces(bench: SceneBench) -> list[UInt8[Tensor, "frame height width 3"]]:
     """Return pieces of the measured houses' own trajectories; none where all of these are too short."""
     wanted, scenes = {view.scene for view in bench.views}, []
@@ -220,25 +218,3 @@ def obstacles(true: Sequence[Tensor]) -> list[str]:
     short = f"no trajectory of the measured houses has more than {LEAST_FRAMES} frames, so no sharpness and no FVD"
     weights = [reason for name in (LpipsAlex.name, WEIGHTS) if (reason := missing_weights(name))]
     return weights + [short] * (not true)
-
-
-def fvd_figures(
-    videos: Mapping[str, Sequence[UInt8[Tensor, "frame height width 3"]]],
-    true: Sequence[UInt8[Tensor, "frame height width 3"]],
-) -> dict[str, dict[str, float | None]]:
-    """Return FVD of the pieces of each row to the true ones; ``None`` without the weights or with too few.
-
-    All rows have as many pieces as the one with the fewest, spread over its walks, and so have the true ones.
-    """
-    count = min(len(true), *map(len, videos.values()))
-    if missing_weights(WEIGHTS) or count < LEAST_VIDEOS:
-        return {name: {"mean": None, "low": None, "high": None} for name in videos}
-    metric = Fvd()
-
-    def features(pieces: Sequence[UInt8[Tensor, "frame height width 3"]]) -> Float[Tensor, "piece channel"]:
-        places = torch.linspace(0, len(pieces) - 1, count).round().long().tolist()
-        return torch.stack([metric.features(pieces[place]) for place in places])
-
-    found = [features(own) for own in watched([true, *videos.values()], "features for FVD", "rows")]
-    distances = {name: metric.distance(own, found[0]) for name, own in zip(videos, found[1:], strict=True)}
-    return {name: {"mean": number(value), "low": None, "high": None} for name, value in distances.items()}

@@ -9,21 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_cli.bench.scenes.return_part import (
-    first_visit,
-    fvd_figures,
-    obstacles,
-    pieces,
-    psnr,
-    true_detail,
-    true_pieces,
-    walk_values,
-)
+from persist_cli.bench.scenes.return_part import first_visit, obstacles, psnr, true_detail, true_pieces, walk_values
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, chosen_files, read_views
 from persist_cli.bench.scenes.scene_journal import SceneJournal
 from persist_cli.io.files import read_tensors
 from persist_cli.metrics import i3d
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, WEIGHTS
+from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
 from tests.support.cell_houses import write_cell_houses
 from tests.support.micro_runs import run_persist
 from tests.support.predictions import cache_random
@@ -78,7 +70,7 @@ def test_without_true_frames_there_is_no_sharpness_and_no_fvd() -> None:
     rgb = torch.randint(0, 255, (33, 32, 32, 3), dtype=torch.uint8)
     walk = {"rgb": rgb, "poses": torch.eye(4).expand(33, 4, 4), "out": torch.tensor(17), "seconds": torch.tensor(2.0)}
     assert math.isnan(walk_values(walk, 4, true_detail([]))["sharpness"])
-    assert fvd_figures({"voxel": pieces(rgb)}, [])["voxel"]["mean"] is None
+    assert math.isnan(fvd_of_rows({"voxel": pieces(rgb)}, [])["voxel"])
     assert any("has more than 16 frames, so no sharpness and no FVD" in reason for reason in obstacles([]))
 
 
@@ -89,7 +81,7 @@ def test_fvd_takes_as_many_pieces_of_each_row_as_there_are_true_ones(
     cache_random(tmp_path, WEIGHTS, i3d.tensor_shapes())
     true = list(torch.randint(0, 255, (LEAST_VIDEOS, LEAST_FRAMES, 32, 32, 3), dtype=torch.uint8))
     twice = [piece for piece in true for _ in range(2)]
-    assert fvd_figures({"twice": twice}, true)["twice"]["mean"] == pytest.approx(0.0, abs=1e-3)
+    assert fvd_of_rows({"twice": twice}, true)["twice"] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_houses_seen_in_few_frames_have_no_true_pieces(tmp_path: Path) -> None:
