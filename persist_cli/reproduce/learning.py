@@ -38,7 +38,7 @@ SIMULATOR: Final = "simulator"
 
 EPISODES: Final = "episodes.json"
 
-EACH: Final = 2  # episodes a house and kind: 8 actions away, 16 in sight, 16 hidden
+EACH: Final = 4  # most episodes a house and kind: 8 actions away, 16 in sight, 16 hidden
 
 VIEWS: Final = "views"
 
@@ -131,7 +131,10 @@ def preparations(plan: Plan) -> Iterator[str]:
     """Yield the commands that draw the episodes, unless they are drawn, and collect the given views."""
     home = shlex.quote(str(plan.out))
     if not (plan.out / EPISODES).is_file():
-        yield f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {EACH * plan.houses} --out {home}/{EPISODES}"
+        yield (
+            f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {EACH * plan.houses} --per-scene {EACH} "
+            f"--out {home}/{EPISODES}"
+        )
     yield f"collect miniworld --out {home}/{VIEWS} --scenes {plan.scenes} --frames {plan.views} --split test"
 
 
