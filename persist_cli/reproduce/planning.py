@@ -7,7 +7,8 @@ continues where it was stopped and repeats nothing that is done, so this may be 
   which the ways of planning were chosen (scenes 0:16).
 - The main table ranks ways over known ground by the paper's cost. Rows of the simulator in place of the model show what
   the model costs, and rows without imagination what imagining is worth. Its first half comes first, with a report.
-- The proposals of a trained policy are ranked likewise.
+- The proposals of a trained policy are ranked likewise, also to goals that no given image shows from so near that the
+  goal could be looked up.
 - The same is ranked without what an agent keeps of its last plan, and without its approach: what do these two give?
 - The cross-entropy method, another cost of images, and the way that is left follow. They take most of the time.
 """
@@ -30,11 +31,15 @@ WEIGHTS: Final = ("lpips-alex", "dinov2-s-derived")
 
 SAMPLING: Final = "--steps 1 --guidance 1"
 
-ALONE: Final = "policy,policy-walk,shortest-path,shortest-path-image,shortest-path-retrieval"
+LOOKED_UP: Final = "shortest-path,shortest-path-image,shortest-path-retrieval"
+
+ALONE: Final = f"policy,policy-walk,{LOOKED_UP}"
 
 MEMORIES: Final = "simulator,voxel,none"
 
 LOOP: Final = "--horizon 16 --execute 8"
+
+GAP: Final = 1.25  # metres around a goal from which no image is given
 
 
 @dataclass(frozen=True)
@@ -63,18 +68,19 @@ class PlanningFigures:
 def commands(figures: PlanningFigures) -> Iterator[str]:
     """Yield the command lines in order."""
     home, model = shlex.quote(str(figures.out)), shlex.quote(figures.checkpoint)
-    bench = f"bench plan {model} --episodes {home}/episodes.json {SAMPLING}"
+    bench = f"bench plan {model} {SAMPLING} --episodes {home}/episodes.json"
     plan = f"{bench} --policy {shlex.quote(figures.policy)}"
     yield f"weights fetch {' '.join(WEIGHTS)}"
-    if not (figures.out / "episodes.json").is_file():
-        yield (
-            f"bench episodes --scenes {figures.scenes} --bins {figures.bins} --each {figures.each} "
-            f"--out {home}/episodes.json"
-        )
+    drawn = f"bench episodes --scenes {figures.scenes} --bins {figures.bins} --each {figures.each}"
+    for name, gap in (("episodes", ""), ("gap", f" --goal-gap {GAP:g}")):
+        if not (figures.out / f"{name}.json").is_file():
+            yield f"{drawn}{gap} --out {home}/{name}.json"
     for rows in (f"{ALONE},rank-16,rank-16-walk", f"{ALONE},rank-8,rank-16,rank-16-walk"):
         yield f"{plan} {LOOP} --rows {rows} --memories {MEMORIES} {_to(home, 'lpips')}"
-    ranked = f"--policy {shlex.quote(figures.trained)} --rows policy,rank-8,rank-16,rank-16-walk --memories {MEMORIES}"
-    yield f"{bench} {ranked} {_to(home, 'trained')}"
+    trained = f"--policy {shlex.quote(figures.trained)} --rows"
+    yield f"{bench} {trained} policy,rank-8,rank-16,rank-16-walk --memories {MEMORIES} {_to(home, 'trained')}"
+    gap = f"bench plan {model} {SAMPLING} --episodes {home}/gap.json --loops closed"
+    yield f"{gap} {trained} policy,{LOOKED_UP},rank-16 --memories {MEMORIES} {_to(home, 'gap')}"
     for choice in ("no-keep", "no-approach"):
         yield f"{plan} {LOOP} --{choice} --loops closed --rows rank-16 --memories simulator,voxel {_to(home, choice)}"
     if not (figures.out / "collisions.json").is_file():
