@@ -111,7 +111,10 @@ def learn(
     walks: Annotated[int, typer.Option(min=1, help="Walks of a round.")] = 32,
     actions: Annotated[int, typer.Option(min=1, help="Actions of a walk.")] = 32,
     execute: Annotated[int, typer.Option(min=1, help="Actions done before the policy looks again.")] = 8,
-    explore: Annotated[float, typer.Option(min=0, max=1, help="Share of random proposals.")] = 0.2,
+    proposals: Annotated[
+        int, typer.Option(min=1, help="Of each decision; the one that leads nearest to the goal is done.")
+    ] = 16,
+    explore: Annotated[float, typer.Option(min=0, max=1, help="Share of random decisions.")] = 0.2,
     training_steps: Annotated[int, typer.Option(min=1, help="Training steps of a round.")] = 200,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Of the training, as in training.learning_rate=3e-5.")
@@ -122,6 +125,9 @@ def learn(
     ] = None,
     patience: Annotated[
         float, typer.Option(min=1, help="Most actions of one, as a multiple of the shortest way's.")
+    ] = 4,
+    stop: Annotated[
+        float, typer.Option(min=0, help="Predicted spacings of frames to the goal at which the evaluated policy stops.")
     ] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     steps: StepsOption = None,
@@ -144,10 +150,10 @@ def learn(
 
     plan = LearnPlan(
         views=tuple(views), policy=policy, inside=inside, checkpoint=checkpoint, adapter=adapter, rounds=rounds,
-        practice=PracticeSettings(walks, actions, execute, explore, batch), steps=training_steps,
+        practice=PracticeSettings(walks, actions, execute, explore, batch, proposals), steps=training_steps,
         training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body,
-        placement=InferenceOptions.of(dtype, save_memory),
+        placement=InferenceOptions.of(dtype, save_memory), stop=stop,
     )  # fmt: skip
     run_learn(plan, out, json)
 

@@ -28,7 +28,7 @@ from persist_cli.errors import DataError, PersistError
 from persist_cli.evaluate.journal import check_same
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
 from persist_cli.io.settings import parse_settings
-from persist_cli.learn.evaluation import evaluate_policy, mean_figures
+from persist_cli.learn.evaluation import STOP, evaluate_policy, mean_figures, stopping_policy
 from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
 from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
 from persist_cli.memorize.sources import common_reference, find_sources
@@ -71,6 +71,7 @@ class LearnPlan:
         sampling: of the world model.
         seed: of all that is random.
         placement: precision and memory savings of the world model.
+        stop: predicted spacings of frames to the goal up to which the evaluated policy stops, if it predicts them.
         body: whether walls stop the agent inside the model; ``None``: where the height of its camera is told, see
             ``tells_body``.
     """
@@ -89,6 +90,7 @@ class LearnPlan:
     sampling: SamplingOverrides
     seed: int
     placement: InferenceOptions = field(default_factory=InferenceOptions)
+    stop: float = STOP
     body: bool | None = None
 
 
@@ -333,7 +335,7 @@ def evaluate(learning: Learning, number: int) -> None:
     if not learning.episodes or (file.is_file() and "start_metres" in read_json(file)["figures"]):
         return
     assert learning.simulator is not None
-    policy = open_policy(str(learning.policy(number).folder))
+    policy = stopping_policy(str(learning.policy(number).folder), learning.plan.stop)
     records = evaluate_policy(policy, learning.simulator, learning.episodes, learning.plan.loop)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, {"figures": mean_figures(records), "episodes": records})

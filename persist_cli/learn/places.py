@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import torch
 
-from persist_cli.api.ground import GroundMap
+from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.true_scene import observations_of
@@ -22,6 +22,11 @@ class PracticePlace(Protocol):
 
     info: TrajectoryInfo
     origin: dict[str, Any]  # JSON values that say what it is
+
+    @property
+    def body(self) -> Body | None:
+        """The body of all agents; ``None`` where nothing stops them."""
+        ...
 
     def begin(self, starts: Sequence[Observations], seeds: Sequence[int]) -> None:
         """Begin walks at given frames; ``seeds`` are those of what is imagined."""
@@ -48,10 +53,15 @@ class ImaginedPlace:
     def __init__(self, world: WorldModel, info: TrajectoryInfo, origin: dict[str, Any]) -> None:
         self.world, self.first, self.info, self.origin = world, world.agents[0], info, origin
 
+    @property
+    def body(self) -> Body | None:
+        """The body of all agents."""
+        return self.first.body
+
     def begin(self, starts: Sequence[Observations], seeds: Sequence[int]) -> None:
         """Begin walks; see ``PracticePlace``."""
-        memory, body = self.first.memory, self.first.body
-        agents = [Agent(memory, seed, shared=memory is not None, body=body) for seed in seeds]
+        memory = self.first.memory
+        agents = [Agent(memory, seed, shared=memory is not None, body=self.body) for seed in seeds]
         self.world = WorldModel(self.world.backbone, agents, self.world.sampling, self.world.clip_frames)
         self.world.reset(starts, [self.info] * len(starts))
 
@@ -78,6 +88,7 @@ class TruePlace:
 
     def __init__(self, simulator: Simulator, info: TrajectoryInfo) -> None:
         self.simulator, self.info = simulator, info
+        self.body = body_of(info)
         self.origin: dict[str, Any] = {"simulator": simulator.name}
         self._stances: list[tuple[tuple[float, float], float]] = []
         self._mappers: list[GroundMapper] = []
@@ -90,7 +101,7 @@ class TruePlace:
             if stance is None:
                 raise DataError(f"simulator {self.simulator.name!r} cannot be put at a camera's pose")
             self._stances.append(stance)
-            self._mappers.append(GroundMapper(self.info.world_up, body_of(self.info)))
+            self._mappers.append(GroundMapper(self.info.world_up, self.body))
             self._mappers[-1].add(start)
 
     def act(self, ways: Mapping[int, Sequence[str]]) -> dict[int, StepResult]:

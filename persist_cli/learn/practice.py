@@ -1,7 +1,8 @@
 """Practice walks: a policy acts inside the model, or in the true scene, and what it saw becomes trajectories.
 
-Practice has no teacher. Whatever a walk reached serves as its goal afterwards (hindsight relabelling): training draws
-the goal of a sample from the later frames of the same walk, so that also a walk that missed its goal shows a way to
+Practice has no teacher. Of several proposals that one is done whose way leads nearest to the goal, by poses and by the
+ground that is known. Whatever a walk reached serves as its goal afterwards (hindsight relabelling): training draws the
+goal of a sample from the later frames of the same walk, so that also a walk that missed its goal shows a way to
 somewhere. What it only came to by wandering about is left out: such a way is not worth repeating.
 """
 
@@ -15,10 +16,13 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from persist_cli.api.ground import GroundMap
+from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
+from persist_cli.bench.stop_rules import AT_PLACE
 from persist_cli.learn.places import PracticePlace
+from persist_cli.planning.futures import padded, walk_all, without_images
+from persist_cli.plugins import make_cost
 from persist_cli.rollout.world_model import SEEDS
 
 
@@ -32,6 +36,8 @@ class PracticeSettings:
         execute: actions of a proposal that are done before the policy proposes again.
         explore: share of proposals that are random instead.
         batch: walks imagined together.
+        proposals: of each decision. Of several the one that comes nearest to the goal's place is done as far as there,
+            and a goal that is reached is followed by another one.
     """
 
     walks: Annotated[int, Field(ge=1)] = 32
@@ -39,6 +45,7 @@ class PracticeSettings:
     execute: Annotated[int, Field(ge=1)] = 8
     explore: Annotated[float, Field(ge=0, le=1)] = 0.2
     batch: Annotated[int, Field(ge=1)] = 16
+    proposals: Annotated[int, Field(ge=1)] = 16
 
 
 @dataclass(frozen=True)
@@ -49,7 +56,7 @@ class PracticeWalk:
         seen: the given frame at which it begins, and the frame after each action.
         actions: between these frames.
         blocked: number of actions that were blocked.
-        goals: number of goals that it was given; a new one each time the policy stops.
+        goals: number of goals that it was given; a new one each time the policy stops, or reaches it.
     """
 
     seen: Observations
@@ -83,7 +90,7 @@ def practise(
     """
     for first in range(0, settings.walks, settings.batch):
         numbers = range(first, min(first + settings.batch, settings.walks))
-        walkers = [Walker(place.info, policies, views, settings, seed * SEEDS + number) for number in numbers]
+        walkers = [Walker(place, policies, views, settings, seed * SEEDS + number) for number in numbers]
         place.begin([walker.seen for walker in walkers], [walker.sampling_seed for walker in walkers])
         while going := [number for number, walker in enumerate(walkers) if not walker.is_done]:
             ways = {number: walkers[number].decide(place.ground(number)) for number in going}
@@ -96,7 +103,7 @@ class Walker:
     """One walk while it goes on.
 
     Args:
-        info: scene, up axis and vocabulary.
+        place: where it walks.
         policies: as of ``practise``.
         views: the given frames.
         settings: of the practice.
@@ -105,14 +112,15 @@ class Walker:
 
     def __init__(
         self,
-        info: TrajectoryInfo,
+        place: PracticePlace,
         policies: tuple[Policy, Policy],
         views: Observations,
         settings: PracticeSettings,
         seed: int,
     ) -> None:
-        self.info, self.views, self.settings = info, views, settings
+        self.info, self.body, self.views, self.settings = place.info, place.body, views, settings
         self.policy, self.explorer = policies
+        self.cost = make_cost("geodesic", {}).of_body(self.body or Body())
         self.random = np.random.default_rng(seed)
         self.generator = torch.Generator().manual_seed(int(self.random.integers(2**62)))
         self.sampling_seed = int(self.random.integers(SEEDS))
@@ -131,12 +139,28 @@ class Walker:
         """Return its next actions, at least one while it is not done; where the policy stops, another goal is drawn."""
         situation = Situation(self.seen[-self.policy.frames :], self.info, self.goal, ground)
         horizon = min(self.settings.execute, self.policy.longest or self.settings.execute)
-        policy = self.explorer if self.random.random() < self.settings.explore else self.policy
-        way = policy.propose(situation, horizon, 1, self.generator)[0]
+        if self.random.random() < self.settings.explore:
+            way = self.explorer.propose(situation, horizon, 1, self.generator)[0]
+        else:
+            way = self._chosen(self.policy.propose(situation, horizon, self.settings.proposals, self.generator), ground)
         if not way:
             self._new_goal()
             way = self.explorer.propose(situation, horizon, 1, self.generator)[0]
         return tuple(way[: min(horizon, self.settings.actions - self.taken)])
+
+    def _chosen(self, ways: Sequence[tuple[str, ...]], ground: GroundMap) -> tuple[str, ...]:
+        """Return the only way, or the one that comes nearest to the goal, as far as there; none at the goal."""
+        if len(ways) == 1 or not all(ways):
+            return ways[0]
+        now, goal = self.seen.cameras[-1:], self.goal.position
+        assert goal is not None
+        if float(ground.places(goal - now.centers[0]).norm()) <= AT_PLACE:
+            return ()
+        walks = walk_all(now, self.info, ways, ground, self.body)
+        futures = without_images(*padded(walks, now.world_from_camera[0], "best"))
+        metres, after = self.cost.measure(futures, self.goal, ground).min(1)
+        best = int(metres.argmin())
+        return ways[best][: int(after[best]) + 1]
 
     def saw(self, way: Sequence[str], seen: Observations, free: Sequence[bool]) -> None:
         """Take in the frame after each action; of a blocked one nothing is kept but the count."""

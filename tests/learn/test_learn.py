@@ -13,15 +13,16 @@ import torch
 import yaml
 
 from persist_cli.api.checkpoint import find_checkpoint
-from persist_cli.api.ground import Body
+from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.policy import Goal
 from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.store import Store
 from persist_cli.learn.evaluation import mean_figures
 from persist_cli.learn.learn import LearnPlan, open_place, prepare
 from persist_cli.learn.places import ImaginedPlace
-from persist_cli.learn.practice import PracticeSettings, PracticeWalk, practise
+from persist_cli.learn.practice import PracticeSettings, PracticeWalk, Walker, practise
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import make_policy
 from persist_cli.policies.trained import find_policy
@@ -92,6 +93,45 @@ def test_a_walk_that_is_done_waits_for_the_others_without_acting(place, walks):
     found = list(practise(place, (policy, policy), views, settings, 1))
     assert sum(walk.blocked for walk in found) > 0
     assert [len(walk.actions) + walk.blocked for walk in found] == [16] * 3
+
+
+class Proposes:
+    """A policy of fixed proposals."""
+
+    frames, longest = 1, None
+
+    def __init__(self, *ways: str) -> None:
+        self.ways = [tuple(way.split()) for way in ways]
+
+    def propose(self, situation, horizon, count, generator) -> list[tuple[str, ...]]:
+        return [self.ways[number % len(self.ways)] for number in range(count)]
+
+
+def walker_towards(place, walks, metres: float, *ways: str, proposals: int = 3) -> Walker:
+    """A walker whose goal is straight ahead of its start."""
+    views = Store(walks)[0].read(range(12)).observations
+    settings = PracticeSettings(walks=1, actions=16, execute=8, explore=0.0, proposals=proposals)
+    walker = Walker(place, (Proposes(*ways), Proposes("right")), views, settings, 1)
+    camera = walker.seen.cameras
+    ahead = camera.world_from_camera[0, :3, 2].double()
+    walker.goal = Goal(walker.goal.rgb, camera.centers[0].double() + metres * ahead, place.info.scene)
+    return walker
+
+
+def test_of_several_proposals_that_one_is_done_that_leads_nearest_to_the_goal_as_far_as_there(place, walks):
+    step = place.info.vocabulary["forward"].forward
+    walker = walker_towards(place, walks, 4 * step, "left forward", "forward " * 7, "right right")
+    ground = GroundMap.empty(place.info.world_up)
+    assert walker.decide(ground) == ("forward",) * 4
+    alone = walker_towards(place, walks, 4 * step, "left forward", "forward " * 7, "right right", proposals=1)
+    assert alone.decide(ground) == ("left", "forward")
+
+
+def test_a_goal_that_is_reached_is_followed_by_another_one(place, walks):
+    walker = walker_towards(place, walks, 0.1, "left forward", "forward")
+    reached = walker.goal
+    assert walker.decide(GroundMap.empty(place.info.world_up)) == ("right",)
+    assert (walker.goals, walker.goal is reached) == (2, False)
 
 
 def test_practice_follows_from_its_seed_and_does_not_change_the_memory(place, walks):
