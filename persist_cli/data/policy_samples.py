@@ -23,6 +23,8 @@ from persist_cli.errors import DataError
 
 MOST_DRAWS: Final = 1000  # of a moment, before it is said that hardly any leads somewhere directly
 
+ANY_WAY: Final = 0.5  # share of the samples whose goal may be one that the trajectory wandered to
+
 ROUNDING: Final = 1e-3  # metres, radians and frames that rounded poses may be wrong by
 
 
@@ -51,15 +53,20 @@ class PolicySampleDataset(Dataset[PolicySample]):
     """Endless samples of some data sets; sample n depends on the seed and on n only.
 
     The frames before a trajectory's first one are that one again, as for an agent that has just begun. A goal is a
-    later frame of the trajectory, or any frame of another one.
+    later frame of the trajectory, or any frame of another one, which counts as far away.
+
+    With ``detour`` trajectories may wander about. Then a sample leads only to what the trajectory came to more or less
+    directly. In half of the samples any later frame is the goal: of one that was reached by wandering, the sample says
+    how far it is and not how to get there. Else all goals would be near, and a policy would take any goal for near.
+    Frames of other trajectories of the same scene count as far as they are.
 
     Args:
         folders: folders of the data sets; their order matters for which sample is number n.
         form: what belongs to a sample.
         seed: seed of the draws.
         mirror: share of the samples in which left and right are exchanged.
-        detour: later frames that the trajectory came to in more than so many times the frames of the direct way are no
-            goals; see ``GroundPath.direct_frames``. ``None`` for any later frame.
+        detour: what the trajectory came to in more than so many times the frames of the direct way counts as wandering,
+            and as so far; see ``GroundPath.direct_frames``. ``None``: whatever it came to is a goal to be led to.
 
     Raises:
         DataError: when no trajectory is long enough, or images are not all of one size.
@@ -99,22 +106,27 @@ class PolicySampleDataset(Dataset[PolicySample]):
         for _ in range(MOST_DRAWS):
             file = int(random.integers(len(self.files)))
             present = int(random.integers(len(self.files[file]) - self.form.waypoints * self.form.spacing))
-            goals = self._goals(file, present)
+            later = self._later(file, present)
+            goals = self._direct(file, present, later)
             if len(goals):
+                goals = later if self.detour is not None and random.random() < ANY_WAY else goals
                 return file, present, int(goals[int(random.integers(len(goals)))])
         raise DataError(
             f"{self.files[0].path.parent}: {MOST_DRAWS} moments drawn, and none leads to a later frame within "
             f"{self.detour:g} times the frames of the direct way; raise data.detour"
         )
 
-    def _goals(self, file: int, present: int) -> Int64[Tensor, " goal"]:
-        """The numbers of the later frames of a trajectory that may be the goal."""
+    def _later(self, file: int, present: int) -> Int64[Tensor, " goal"]:
+        """The numbers of the later frames of a trajectory that are not too far to be the goal."""
         spacing, last = self.form.spacing, len(self.files[file]) - 1
-        goals = torch.arange(present + spacing, min(last, present + self.form.farthest * spacing) + 1, spacing)
+        return torch.arange(present + spacing, min(last, present + self.form.farthest * spacing) + 1, spacing)
+
+    def _direct(self, file: int, present: int, later: Int64[Tensor, " goal"]) -> Int64[Tensor, " direct"]:
+        """Those of some later frames that the trajectory did not wander to."""
         if self.detour is None:
-            return goals
-        direct = self._path(file).direct_frames(present, goals)
-        return goals[goals - present <= self.detour * direct + ROUNDING]
+            return later
+        path = self._path(file)
+        return later[later - present <= self.detour * path.direct_frames(present, path, later) + ROUNDING]
 
     def read(self, choice: SampleFrames) -> PolicySample:
         """The sample with these frame numbers."""
@@ -129,9 +141,20 @@ class PolicySampleDataset(Dataset[PolicySample]):
         if choice.mirrored:
             seen, goal, waypoints = seen.flip(2), goal.flip(1), waypoints * torch.tensor([1.0, -1.0])
             place = place * torch.tensor([1.0, -1.0, 1.0, -1.0])
-        distance = (choice.goal - choice.present) // form.spacing if own else form.farthest
-        leads = own and form.nearest < distance < form.farthest
-        return PolicySample(seen, goal, waypoints, float(distance), place, leads, choice.seed)
+        distance, wandered = self._distance(choice)
+        leads = own and not wandered and form.nearest < distance < form.farthest
+        return PolicySample(seen, goal, waypoints, distance, place, leads, choice.seed)
+
+    def _distance(self, choice: SampleFrames) -> tuple[float, bool]:
+        """The spacings of frames to the goal, and whether the trajectory came there by wandering about, or not at all."""
+        form, own = self.form, choice.goal_file == choice.file
+        frames = choice.goal - choice.present if own else form.farthest * form.spacing
+        here, there = (self.files[number].info.scene for number in (choice.file, choice.goal_file))
+        if self.detour is None or here != there:
+            return float(frames // form.spacing), not own
+        path, goals = self._path(choice.goal_file), torch.tensor([choice.goal])
+        most = self.detour * float(self._path(choice.file).direct_frames(choice.present, path, goals)) + ROUNDING
+        return float(min(frames, most) // form.spacing), not own or frames > most
 
     def _waypoints(self, choice: SampleFrames) -> Float[Tensor, "waypoint 2"]:
         """Metres ahead and to the left of the present camera, float32."""
@@ -166,15 +189,20 @@ class GroundPath:
     places: Float[Tensor, "frame 2"]
     headings: Float[Tensor, "frame 2"]
 
-    def direct_frames(self, start: int, ends: Int64[Tensor, " end"]) -> Float[Tensor, " end"]:
+    def direct_frames(self, start: int, path: GroundPath, ends: Int64[Tensor, " end"]) -> Float[Tensor, " end"]:
         """Return how many frames the direct way takes from one frame to others, if nothing is in between.
 
         That is to turn to the place, to go straight there, and to turn to the heading, each at the greatest speed of
         this path. For an agent that steps and turns by fixed amounts it is the number of its actions.
+
+        Args:
+            start: number of the frame where the way begins.
+            path: on which it ends, this one or another one of the same scene.
+            ends: numbers of frames of that path.
         """
-        way = self.places[ends] - self.places[start]
+        way = path.places[ends] - self.places[start]
         metres, ahead = way.norm(dim=-1), functional.normalize(way, dim=-1)
-        before, after = self.headings[start].expand_as(ahead), self.headings[ends]
+        before, after = self.headings[start].expand_as(ahead), path.headings[ends]
         ahead = torch.where(metres[:, None] > ROUNDING, ahead, before)  # there is no way to turn to
         step, turn = self._speeds
         frames: Tensor = metres / step + (_angles(before, ahead) + _angles(ahead, after)) / turn

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from persist_cli.api.actions import rotation_about
-from persist_cli.api.policy_network import SampleForm
+from persist_cli.api.policy_network import PolicySample, SampleForm
 from persist_cli.data.policy_samples import GroundPath, PolicySampleDataset, ground_places, local_places
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
@@ -100,19 +100,36 @@ def test_frames_before_the_first_are_the_first_again(walks):
 def test_the_direct_way_of_an_agent_has_as_many_frames_as_it_takes_actions(tmp_path):
     file = Store(write_actions(tmp_path, "lllffffrr" + "lr" * 3))[0]
     path = GroundPath(*ground_places(file.poses(), UP))
-    direct = path.direct_frames(0, torch.tensor([3, 7, 9, 15]))
+    direct = path.direct_frames(0, path, torch.tensor([3, 7, 9, 15]))
     assert direct.tolist() == pytest.approx([3, 7, 9, 9], abs=1e-3)  # at the end it only turned to and fro
 
 
-def test_what_a_walk_only_came_to_by_wandering_is_no_goal(tmp_path):
+def test_what_a_walk_only_came_to_by_wandering_is_far_and_not_led_to(tmp_path):
     folder = write_actions(tmp_path, "ffffff" + "lr" * 6 + "ffffff")
-    any_way, direct = (PolicySampleDataset([folder], FORM, 0, detour=detour) for detour in (None, 1.5))
-    pairs, kept = (
-        {(choice.present, choice.goal) for choice in map(samples.choose, range(800))} for samples in (any_way, direct)
-    )
-    assert kept < pairs
-    assert {(6, 10), (0, 12)} <= pairs - kept  # to and fro where it is, and on a way that is as long as two
-    assert {(0, 6), (0, 8)} <= kept
+    form = dataclasses.replace(FORM, negatives=0.0, nearest=0, farthest=20)
+    any_way, direct = (PolicySampleDataset([folder], form, 0, detour=detour) for detour in (None, 1.5))
+    pairs: dict[tuple[int, int], PolicySample] = {}
+    for number in range(800):
+        choice = direct.choose(number)
+        pairs[choice.present, choice.goal] = direct[number]
+    straight, wandered = pairs[0, 6], pairs[0, 18]
+    assert (straight.distance, straight.leads_to_goal) == (3, True)
+    assert (wandered.distance, wandered.leads_to_goal) == (4, False)  # 6 frames ahead, in 18: counts as 1.5 times 6
+    share = sum(direct[number].leads_to_goal for number in range(200)) / 200
+    assert 0.5 < share < 0.9  # at least the half that is drawn from direct ways
+    assert all(any_way[number].leads_to_goal for number in range(50) if any_way[number].distance < 20)
+
+
+def test_another_walk_of_the_same_scene_is_as_far_as_it_is(tmp_path):
+    for number, word in enumerate(("f" * 12, "ff" + "l" * 6 + "f" * 6)):
+        write_actions(tmp_path / str(number), word)
+    folders = [tmp_path / "0", tmp_path / "1"]
+    samples = PolicySampleDataset(folders, dataclasses.replace(FORM, negatives=1.0, farthest=20), 0, detour=2.0)
+    choice = dataclasses.replace(samples.choose(0), file=0, present=0, goal_file=1, goal=2, mirrored=False)
+    sample = samples.read(choice)
+    assert (sample.distance, sample.leads_to_goal) == (2, False)  # two steps ahead, at most twice as many
+    unknown = PolicySampleDataset(folders, dataclasses.replace(FORM, negatives=1.0, farthest=20), 0)
+    assert unknown.read(choice).distance == 20
 
 
 def test_data_in_which_nothing_is_reached_directly_is_refused_in_one_line(tmp_path):
