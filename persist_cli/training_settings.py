@@ -125,9 +125,9 @@ class DataSettings:
             frame to the next; after 100 frames it is ten times as much. The newest frame has its true pose.
         pose_drift_degrees: the same for rotation about each axis, in degrees.
         depth_noise: standard deviation of the error of written depth as a share of it, smooth over the image.
-        detour: of a policy's samples (stage policy): a later frame is a goal only where the walk came to it in at most
-            so many times the frames of the direct way, which turns to it, goes straight and turns to its heading; with
-            ``null`` every later frame may be one.
+        detour: of a policy's samples (stage policy): they lead to a later frame only where the walk came to it in at
+            most so many times the frames of the direct way, which turns to it, goes straight and turns to its heading;
+            of others they tell the distance alone; with ``null`` they lead to every later frame.
         true_cells: share of the clips whose memory, a scene, holds the data's own cells, all of them known, in the
             place of what the context's frames show.
         clip_frames: lengths of the clips of stages 1 and 2 in frames with the given one, such as 2, 3, 5 and 9; one is

@@ -146,7 +146,7 @@ class PolicySampleDataset(Dataset[PolicySample]):
         return PolicySample(seen, goal, waypoints, distance, place, leads, choice.seed)
 
     def _distance(self, choice: SampleFrames) -> tuple[float, bool]:
-        """The spacings of frames to the goal, and whether the trajectory came there by wandering about, or not at all."""
+        """The spacings of frames to the goal, and whether the trajectory wandered there, or did not come there."""
         form, own = self.form, choice.goal_file == choice.file
         frames = choice.goal - choice.present if own else form.farthest * form.spacing
         here, there = (self.files[number].info.scene for number in (choice.file, choice.goal_file))
