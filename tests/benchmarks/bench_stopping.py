@@ -34,7 +34,7 @@ from persist_cli.learn.evaluation import ROW, StopsItself
 from persist_cli.plugins import make_simulator
 from persist_cli.policies.nomad.policy import NomadPolicy
 from persist_cli.policies.open_policy import open_policy
-from persist_cli.viewing.console import print_table, watched
+from persist_cli.viewing.console import print_table, say, watched
 
 STOPS = (1.5, 2, 3, 4, 5, 6, 8)  # spacings of frames
 
@@ -121,11 +121,8 @@ def report(walks: Sequence[Sequence[Walk]]) -> None:
     reached = 100 * np.mean([np.mean([one.reached for one in house]) for house in walks])
     near = 100 * np.mean([np.mean(np.concatenate([one.metres for one in house]) <= SUCCESS_METRES) for house in walks])
     episodes = f"{sum(map(len, walks))} episodes of {len(walks)} houses"
-    print_table(
-        f"{episodes}: {reached:.0f} % come to the goal, {near:.0f} % of frames are there",
-        ["stop at", "success", "wrong stop"],
-        rows,
-    )
+    say(f"{episodes}: {reached:.0f} % come to the goal, {near:.0f} % of their frames are there")
+    print_table("", ["stop at", "success", "wrong stop"], rows)
 
 
 if __name__ == "__main__":
