@@ -111,24 +111,16 @@ def learn(
     walks: Annotated[int, typer.Option(min=1, help="Walks of a round.")] = 32,
     actions: Annotated[int, typer.Option(min=1, help="Actions of a walk.")] = 32,
     execute: Annotated[int, typer.Option(min=1, help="Actions done before the policy looks again.")] = 8,
-    proposals: Annotated[
-        int, typer.Option(min=1, help="Of each decision; the one that leads nearest to the goal is done.")
-    ] = 16,
+    proposals: Annotated[int, typer.Option(min=1, help="Of a decision; that nearest to the goal is done.")] = 16,
     explore: Annotated[float, typer.Option(min=0, max=1, help="Share of random decisions.")] = 0.2,
     training_steps: Annotated[int, typer.Option(min=1, help="Training steps of a round.")] = 200,
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Of the training, as in training.learning_rate=3e-5.")
     ] = None,
     body: BodyOption = None,
-    episodes: Annotated[
-        Path | None, typer.Option(help="Episodes (`persist bench episodes`) to evaluate with in the true house.")
-    ] = None,
-    patience: Annotated[
-        float, typer.Option(min=1, help="Most actions of one, as a multiple of the shortest way's.")
-    ] = 4,
-    stop: Annotated[
-        float, typer.Option(min=0, help="Predicted spacings of frames to the goal at which the evaluated policy stops.")
-    ] = 4,
+    episodes: Annotated[Path | None, typer.Option(help="Of `persist bench episodes`: to evaluate in truth.")] = None,
+    patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
+    stop: Annotated[float, typer.Option(min=0, help="Predicted spacings to the goal at which it stops there.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
