@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
+from scipy import ndimage
 from torch import Tensor
 
 from persist_cli.api.cell_things import STRUCTURE
@@ -48,9 +49,24 @@ def seen_by_turning(view: View) -> Bool[Tensor, "first second level"]:
 
 def without_things(view: View) -> Classes:
     """Return the true cells with free ones in place of all furniture."""
+    return torch.where(furniture(view), FREE, view.truth.classes)
+
+
+def with_seen_things(view: View) -> Classes:
+    """Return the same with those pieces of furniture, each whole, of which the image shows a part."""
+    classes, there = without_things(view), furniture(view)
+    for kind in view.truth.classes[there].unique().tolist():
+        labels = torch.from_numpy(ndimage.label(view.truth.classes == kind, structure=np.ones((3, 3, 3)))[0])
+        shown = labels[view.known.known & view.known.solid & (labels > 0)].unique()
+        classes[torch.isin(labels, shown)] = kind
+    return classes
+
+
+def furniture(view: View) -> Bool[Tensor, "first second level"]:
+    """Return which true cells are neither structure nor free nor outside."""
     palette = view.truth.form.palette
-    kept = torch.tensor([FREE, OUTSIDE, *(palette.index(name) for name in STRUCTURE)])
-    return torch.where(torch.isin(view.truth.classes.long(), kept), view.truth.classes, FREE)
+    other = torch.tensor([FREE, OUTSIDE, *(palette.index(name) for name in STRUCTURE)])
+    return ~torch.isin(view.truth.classes.long(), other)
 
 
 def knowing(views: Sequence[View], houses: Sequence[House]) -> Iterator[tuple[str, list[Classes]]]:
@@ -60,9 +76,16 @@ def knowing(views: Sequence[View], houses: Sequence[House]) -> Iterator[tuple[st
     turned, structure = [seen_by_turning(view) for view in views], [without_things(view) for view in views]
     truth = [view.truth.classes for view in views]
     yield "class prior", prior
-    for name, known in (("what a full turn shows", truth), ("its structure", structure)):
-        triples = zip(turned, known, prior, strict=True)
-        yield f"{name}, else the prior", [torch.where(shown, true, guess) for shown, true, guess in triples]
+    seen = [with_seen_things(view) for view in views]
+    whole = [shown | (some != none) for shown, some, none in zip(turned, seen, structure, strict=True)]
+    rows = {
+        "what a full turn shows": (turned, truth),
+        "its structure": (turned, structure),
+        "its structure, and whole things of the image": (whole, seen),
+    }
+    for name, (told, known) in rows.items():
+        triples = zip(told, known, prior, strict=True)
+        yield f"{name}, else the prior", [torch.where(mask, true, guess) for mask, true, guess in triples]
     yield "all structure, no things", structure
     yield "the same, one cell aside", [torch.roll(known, 1, 0) for known in structure]
 
