@@ -31,9 +31,9 @@ WEIGHTS: Final = ("lpips-alex", "dinov2-s-derived")
 
 SAMPLING: Final = "--steps 1 --guidance 1"
 
-LOOKED_UP: Final = "shortest-path,shortest-path-image,shortest-path-retrieval"
+CLASSICAL: Final = "shortest-path,shortest-path-image,shortest-path-retrieval"
 
-ALONE: Final = f"policy,policy-walk,{LOOKED_UP}"
+ALONE: Final = f"policy,policy-walk,{CLASSICAL}"
 
 MEMORIES: Final = "simulator,voxel,none"
 
@@ -79,8 +79,8 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
         yield f"{plan} {LOOP} --rows {rows} --memories {MEMORIES} {_to(home, 'lpips')}"
     trained = f"--policy {shlex.quote(figures.trained)} --rows"
     yield f"{bench} {trained} policy,rank-8,rank-16,rank-16-walk --memories {MEMORIES} {_to(home, 'trained')}"
-    gap = f"bench plan {model} {SAMPLING} --episodes {home}/gap.json --loops closed"
-    yield f"{gap} {trained} policy,{LOOKED_UP},rank-16 --memories {MEMORIES} {_to(home, 'gap')}"
+    without_goal = f"bench plan {model} {SAMPLING} --episodes {home}/gap.json --loops closed"
+    yield f"{without_goal} {trained} policy,{CLASSICAL},rank-16 --memories {MEMORIES} {_to(home, 'gap')}"
     for choice in ("no-keep", "no-approach"):
         yield f"{plan} {LOOP} --{choice} --loops closed --rows rank-16 --memories simulator,voxel {_to(home, choice)}"
     if not (figures.out / "collisions.json").is_file():
