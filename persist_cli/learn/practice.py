@@ -3,7 +3,7 @@
 Practice has no teacher. Of several proposals that one is done whose way leads nearest to the goal, by poses and by the
 ground that is known. Whatever a walk reached serves as its goal afterwards (hindsight relabelling): training draws the
 goal of a sample from the later frames of the same walk, so that also a walk that missed its goal shows a way to
-somewhere. Of what it only came to by wandering about the policy learns how far it is: such a way is not worth repeating.
+somewhere. Of what it only came to by wandering about the policy learns the distance, not the way.
 """
 
 from __future__ import annotations
