@@ -120,7 +120,7 @@ def learn(
     body: BodyOption = None,
     episodes: Annotated[Path | None, typer.Option(help="Of `persist bench episodes`: to evaluate in truth.")] = None,
     patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
-    stop: Annotated[float, typer.Option(min=0, help="Predicted spacings to the goal at which it stops there.")] = 4,
+    stop_cost: Annotated[float, typer.Option(min=0, help="LPIPS of view and goal at which it stops there.")] = 0.15,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
@@ -145,7 +145,7 @@ def learn(
         practice=PracticeSettings(walks, actions, execute, explore, batch, proposals), steps=training_steps,
         training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body,
-        placement=InferenceOptions.of(dtype, save_memory), stop=stop,
+        placement=InferenceOptions.of(dtype, save_memory), stop_cost=stop_cost,
     )  # fmt: skip
     run_learn(plan, out, json)
 

@@ -14,17 +14,18 @@ from persist_cli.bench.episodes import Episode
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.run_episode import LoopSettings, run_closed_loop
+from persist_cli.bench.stop_rules import StopByCost, StopRule
 from persist_cli.bench.true_scene import TrueScene
-from persist_cli.policies.open_policy import open_policy
+from persist_cli.errors import PersistError
+from persist_cli.plugins import make_cost
 from persist_cli.viewing.console import watched
 
 ROW = PlanningRow("policy", "policy", None, None, "image", False)  # shown the goal image, given nothing else
 
+STOP_COST: Final = 0.15  # see docs/learning.md
 
-STOP: Final = 4.0  # of 1.5 to 12: most success of the packaged policy in 124 episodes of 10 validation houses
 
-
-class StopsItself:
+class NeverStops:
     """The rule of an agent that stops when its policy proposes nothing, and never else."""
 
     def stops(self, view: Observations, goal: Goal, world_up: Sequence[float]) -> bool:
@@ -32,27 +33,33 @@ class StopsItself:
         return False
 
 
-def stopping_policy(folder: str, stop: float) -> Policy:
-    """Return a trained policy; where it predicts how far its goal is, with the distance up to which it stops.
+def stop_rule(cost: float) -> StopRule:
+    """Return by what an agent knows its goal: a view that is like the goal image, as in ``persist bench plan``.
 
     Args:
-        folder: run or folder of the policy.
-        stop: spacings of frames. In plans an agent has another rule to stop by; alone, a policy that hardly ever stops
-            hardly ever succeeds.
+        cost: largest LPIPS-Alex of such a view; at 0 nothing is compared.
+
+    Raises:
+        PersistError: when the weights of LPIPS are missing.
     """
-    policy = open_policy(folder)
-    return open_policy(folder, {"stop": stop}) if hasattr(policy.settings, "stop") else policy
+    if not cost:
+        return NeverStops()
+    measure = make_cost("lpips", {})
+    if missing := measure.missing():
+        raise PersistError(f"--stop-cost: {missing}; or --stop-cost 0, to stop only where the policy does")
+    return StopByCost(measure, cost)
 
 
 def evaluate_policy(
-    policy: Policy, simulator: Simulator, episodes: Sequence[Episode], loop: LoopSettings
+    policy: Policy, simulator: Simulator, episodes: Sequence[Episode], stop: StopRule, loop: LoopSettings
 ) -> list[dict[str, Any]]:
     """Return what happened in each episode as JSON values, as ``persist bench plan`` keeps it.
 
     Args:
-        policy: acts alone; it stops where it proposes nothing.
+        policy: acts alone; it also stops where it proposes nothing.
         simulator: of the episodes.
         episodes: in any scenes of it.
+        stop: rule by which the agent stops.
         loop: actions between decisions, and patience.
     """
     parts, planning = RowParts(policy=policy), PlanSettings(horizon=policy.longest or PlanSettings().horizon)
@@ -61,7 +68,7 @@ def evaluate_policy(
         scene = TrueScene(simulator, episode)
         with torch.no_grad():
             navigator = Navigator(ROW, parts, planning, scene, planning.horizon)
-            record = run_closed_loop(scene, navigator, StopsItself(), loop)
+            record = run_closed_loop(scene, navigator, stop, loop)
         records.append({"episode": episode.name, **record})
     return records
 

@@ -28,7 +28,7 @@ from persist_cli.errors import DataError, PersistError
 from persist_cli.evaluate.journal import check_same
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
 from persist_cli.io.settings import parse_settings
-from persist_cli.learn.evaluation import STOP, evaluate_policy, mean_figures, stopping_policy
+from persist_cli.learn.evaluation import STOP_COST, evaluate_policy, mean_figures, stop_rule
 from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
 from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
 from persist_cli.memorize.sources import common_reference, find_sources
@@ -71,7 +71,7 @@ class LearnPlan:
         sampling: of the world model.
         seed: of all that is random.
         placement: precision and memory savings of the world model.
-        stop: predicted spacings of frames to the goal up to which the evaluated policy stops, if it predicts them.
+        stop_cost: LPIPS of view and goal image up to which the evaluated agent stops; at 0 only its policy stops it.
         body: whether walls stop the agent inside the model; ``None``: where the height of its camera is told, see
             ``tells_body``.
     """
@@ -90,7 +90,7 @@ class LearnPlan:
     sampling: SamplingOverrides
     seed: int
     placement: InferenceOptions = field(default_factory=InferenceOptions)
-    stop: float = STOP
+    stop_cost: float = STOP_COST
     body: bool | None = None
 
 
@@ -173,6 +173,8 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     views = Observations.concatenate([source.file.read(list(source.frames)).observations for source in sources])
     simulator = None if plan.episodes is None and plan.inside == MODEL else open_simulator(plan, info)
     episodes = [] if plan.episodes is None or simulator is None else episodes_of(plan.episodes, info, simulator)
+    if episodes:
+        stop_rule(plan.stop_cost)  # weights that are missing are an error before anything is done
     check_horizon(plan, begin)
     make_recipe(apply_overrides(recipe_of_round(plan, begin, 1), plan.training), "--set")
     learning = Learning(plan, out, info, views, begin, simulator, episodes)
@@ -335,8 +337,8 @@ def evaluate(learning: Learning, number: int) -> None:
     if not learning.episodes or (file.is_file() and "start_metres" in read_json(file)["figures"]):
         return
     assert learning.simulator is not None
-    policy = stopping_policy(str(learning.policy(number).folder), learning.plan.stop)
-    records = evaluate_policy(policy, learning.simulator, learning.episodes, learning.plan.loop)
+    policy, stop = open_policy(str(learning.policy(number).folder)), stop_rule(learning.plan.stop_cost)
+    records = evaluate_policy(policy, learning.simulator, learning.episodes, stop, learning.plan.loop)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, {"figures": mean_figures(records), "episodes": records})
 

@@ -12,9 +12,11 @@ from persist_cli.api.observations import Frame
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.data.store import Store, write_trajectory
+from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult
 from tests.support.miniworlds import make_world
+from tests.support.predictions import cache_random
 
 HOUSE = 1_000_001  # of the test split, with one room
 
@@ -55,12 +57,12 @@ def learn(persist, world, episodes, policy_run, tmp_path) -> Callable[..., Comma
     short = ["--walks", 2, "--actions", 10, "--execute", 5, "--training-steps", 1, "--rounds", 1, "--patience", 1]
     training = ["--set", "training.batch=2", "--set", "training.workers=0", "--inside", "simulator", "--json"]
 
-    def run(simulator: MiniWorld = world) -> CommandResult:
+    def run(*more: object, simulator: MiniWorld = world) -> CommandResult:
         simulator.open_scene(HOUSE)
         views, out = tmp_path / "views.parquet", tmp_path / "out"
         write_trajectory(views, simulator.info, turned_views(simulator, episodes))
         given = ["--views", f"{tmp_path}#views", "--policy", policy_run, "--episodes", episodes, "--out", out]
-        return persist("learn", *given, *short, *training)
+        return persist("learn", *given, *short, *training, *(more or ("--stop-cost", 0)))
 
     return run
 
@@ -88,7 +90,24 @@ def test_a_learning_that_was_stopped_before_its_last_evaluation_ends_as_one_that
 
 
 def test_episodes_of_another_agent_than_that_of_the_views_are_refused(learn, tmp_path):
-    result = learn(make_world(**SIZE, step=0.4, turn=30.0))
+    result = learn(simulator=make_world(**SIZE, step=0.4, turn=30.0))
     assert (result.code, result.err.count("\n")) == (1, 1)
     assert "with step 0.25 and turn 15.0, the views were collected with step 0.4 and turn 30.0" in result.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_evaluated_agent_stops_where_its_view_is_like_the_goal_image(learn, tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
+    cache_random(tmp_path / "cache", "lpips-alex", tensor_shapes(ALEX))
+    assert learn("--stop-cost", 1000).code == 0  # any view is
+    for number in (0, 1):
+        episode = json.loads((tmp_path / f"out/round-{number:02d}/episodes.json").read_text())["episodes"][0]
+        assert (episode["ended"], episode["actions"]) == ("stopped", "")
+
+
+def test_weights_that_are_missing_are_an_error_before_anything_is_done(learn, tmp_path, monkeypatch):
+    monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
+    result = learn("--stop-cost", 0.15)
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert "persist weights fetch lpips-alex; or --stop-cost 0, to stop only where the policy does" in result.err
     assert not (tmp_path / "out").exists()
