@@ -21,7 +21,8 @@ from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.bench.stop_rules import AT_PLACE
 from persist_cli.learn.places import PracticePlace
-from persist_cli.planning.futures import padded, walk_all, without_images
+from persist_cli.planning.futures import PoseFutures
+from persist_cli.planning.judge import Judge
 from persist_cli.plugins import make_cost
 from persist_cli.rollout.world_model import SEEDS
 
@@ -156,11 +157,8 @@ class Walker:
         assert goal is not None
         if float(ground.places(goal - now.centers[0]).norm()) <= AT_PLACE:
             return ()
-        walks = walk_all(now, self.info, ways, ground, self.body)
-        futures = without_images(*padded(walks, now.world_from_camera[0], "best"))
-        metres, after = self.cost.measure(futures, self.goal, ground).min(1)
-        best = int(metres.argmin())
-        return ways[best][: int(after[best]) + 1]
+        judge = Judge(PoseFutures(now, self.info, ground, self.body), self.cost, self.goal, ground, "best")
+        return min(judge.judge(ways, 1), key=lambda one: one.cost).chosen
 
     def saw(self, way: Sequence[str], seen: Observations, free: Sequence[bool]) -> None:
         """Take in the frame after each action; of a blocked one nothing is kept but the count."""

@@ -68,6 +68,34 @@ class FutureModel(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class PoseFutures:
+    """Where candidates lead, without any image.
+
+    Args:
+        camera: the present one, with a frame axis of one.
+        info: up axis and vocabulary.
+        ground: what is known to be free; a move over ground known to be occupied does not move.
+        body: of the agent; ``None`` for an agent that goes through walls.
+    """
+
+    camera: Cameras
+    info: TrajectoryInfo
+    ground: GroundMap
+    body: Body | None = None
+
+    def imagine(self, candidates: Sequence[Actions], over: Over, sees: bool = False) -> Imagined:
+        """Return where the candidates lead; see ``FutureModel``.
+
+        Raises:
+            ValueError: when images are needed.
+        """
+        if sees:
+            raise ValueError("poses alone show no images")
+        walks = walk_all(self.camera, self.info, candidates, self.ground, self.body)
+        return Imagined(without_images(*padded(walks, self.camera.world_from_camera[0], over)), walks)
+
+
 class WorldFutures:
     """The futures that a world model imagines.
 
@@ -88,10 +116,10 @@ class WorldFutures:
     def imagine(self, candidates: Sequence[Actions], over: Over, sees: bool = True) -> Imagined:
         """Return what the candidates would see; see ``FutureModel``."""
         agent = self.model.agents[0]
-        walks = walk_all(agent.now.cameras, agent.info, candidates, self.ground, self.body)
-        poses, free = padded(walks, agent.now.cameras.world_from_camera[0], over)
+        led = PoseFutures(agent.now.cameras, agent.info, self.ground, self.body).imagine(candidates, over)
         if not sees:
-            return Imagined(without_images(poses, free), walks)
+            return led
+        walks, poses, free = led.walks, led.futures.world_from_camera, led.futures.free
         moves = [free_actions(names, walk) for names, walk in zip(candidates, walks, strict=True)]
         seen = self._see_all({names: walk.poses[walk.free] for names, walk in zip(moves, walks, strict=True)}, over)
         chosen = [frame_numbers(walk, poses.shape[1], over) for walk in walks]

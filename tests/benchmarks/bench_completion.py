@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from persist_cli.api.cells import FREE, OUTSIDE
 from persist_cli.bench.scenes.class_counts import class_counts, things
 from persist_cli.bench.scenes.completions import Prior
 from persist_cli.bench.scenes.scene_bench import SceneBenchPlan, chosen_files, read_views, training_houses
-from persist_cli.bench.scenes.training_houses import House, nearest_houses, region_of_match
+from persist_cli.bench.scenes.training_houses import House, nearest_houses, vote
 from persist_cli.bench.scenes.views import View
 from persist_cli.viewing.console import print_table
 
@@ -92,17 +91,10 @@ def knowing(views: Sequence[View], houses: Sequence[House]) -> Iterator[tuple[st
 
 def looked_up(views: Sequence[View], houses: Sequence[House]) -> Iterator[tuple[str, list[Classes]]]:
     """Yield what most of the houses that agree best with the known cells have there, each in its best place."""
-    found = [nearest_houses(views, [house]) for house in houses]
-    order = [np.argsort([-matches[n].agreement for matches in found], kind="stable") for n in range(len(views))]
+    matches, classes = nearest_houses(views, houses, max(VOTES)), len(views[0].truth.form.palette)
     for count in VOTES:
-        said = []
-        for number, view in enumerate(views):
-            votes = torch.zeros(*view.region.shape, len(view.truth.form.palette))
-            for house in order[number][:count]:
-                match = replace(found[house][number], house=int(house))
-                classes = region_of_match(match, houses, view.region).long()[..., None]
-                votes.scatter_add_(3, classes, torch.ones(classes.shape))
-            said.append(votes.argmax(-1).to(torch.uint8))
+        pairs = zip(views, matches, strict=True)
+        said = [vote(found[:count], houses, view.region, classes) for view, found in pairs]
         yield f"most of the {count} nearest of {len(houses)} houses", said
 
 

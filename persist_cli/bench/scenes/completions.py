@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import torch
 from jaxtyping import UInt8
@@ -15,10 +15,19 @@ from persist_cli.api.cells import FREE, OUTSIDE, CellGrid
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_model import SceneModel
-from persist_cli.bench.scenes.training_houses import House, class_frequencies, nearest_houses, region_of_match
+from persist_cli.bench.scenes.training_houses import (
+    House,
+    Match,
+    class_frequencies,
+    nearest_houses,
+    region_of_match,
+    vote,
+)
 from persist_cli.bench.scenes.views import View, filled, same_form
 from persist_cli.errors import PersistError
 from persist_cli.memorize.factory import MemoryFactory
+
+MOST: Final = 5  # houses that vote
 
 
 class Completion(ABC):
@@ -101,11 +110,29 @@ class Prior(Completion):
         return filled(view.known, view.region.back(self.classes[key]))
 
 
+class HouseSearch:
+    """Looks for training houses that agree with what is known, once for all rows.
+
+    Args:
+        houses: of the training.
+    """
+
+    def __init__(self, houses: Sequence[House]) -> None:
+        self.houses = houses
+        self.matches: list[list[Match]] = []  # of each view, the best one first
+        self._views: Sequence[View] = ()
+
+    def look(self, views: Sequence[View]) -> None:
+        """Find the ``MOST`` best houses of each view."""
+        if views is not self._views:
+            self.matches, self._views = nearest_houses(views, self.houses, MOST), views
+
+
 class NearestHouse(Completion):
     """The training house that agrees best with what is known.
 
     Args:
-        houses: of the training.
+        search: of training houses.
     """
 
     name = "nearest house"
@@ -114,16 +141,28 @@ class NearestHouse(Completion):
         "whole cells; beyond it all is outside"
     )
 
-    def __init__(self, houses: Sequence[House]) -> None:
-        self.houses = houses
+    def __init__(self, search: HouseSearch) -> None:
+        self.search = search
 
     def prepare(self, views: Sequence[View]) -> None:
         """Find the house of each view."""
-        self.matches = nearest_houses(views, self.houses)
+        self.search.look(views)
 
     def complete(self, view: View, number: int, seed: int) -> CellGrid:
         """Return what is in the house at that place."""
-        return filled(view.known, region_of_match(self.matches[number], self.houses, view.region))
+        return filled(view.known, region_of_match(self.search.matches[number][0], self.search.houses, view.region))
+
+
+class NearestHouses(NearestHouse):
+    """What most of the training houses have that agree best with what is known."""
+
+    name = f"{MOST} nearest houses"
+    definition = f"what most of the {MOST} training houses have that agree best, each as the nearest house"
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return what most of the houses have at that place."""
+        search, classes = self.search, len(view.truth.form.palette)
+        return filled(view.known, vote(search.matches[number], search.houses, view.region, classes))
 
 
 class SceneCompletion(Completion):

@@ -19,7 +19,9 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.bench.scenes.completions import (
     Completion,
     Empty,
+    HouseSearch,
     NearestHouse,
+    NearestHouses,
     Outside,
     Prior,
     SceneCompletion,
@@ -137,7 +139,9 @@ class SceneBench:
     @property
     def rows(self) -> list[Completion]:
         """The rows of the completion; those that look training houses up only where there are any."""
-        looked_up: list[Completion] = [Prior(self.houses), NearestHouse(self.houses)] if self.houses else []
+        search, looked_up = HouseSearch(self.houses), list[Completion]()
+        if self.houses:
+            looked_up = [Prior(self.houses), NearestHouse(search), NearestHouses(search)]
         model: list[Completion] = [] if self.scenes.model is None else [SceneCompletion(self.scenes)]
         return [*model, Empty(), Outside(), *looked_up, Truth()]
 
@@ -288,7 +292,7 @@ def part_identities(
     if "completion" in plan.parts:
         looked_up = {"training houses": digest([house.scene for house in houses])}
         found |= {} if trained is None else {SceneCompletion.name: model}
-        found |= {row.name: looked_up for row in (Prior, NearestHouse) if houses}
+        found |= {row.name: looked_up for row in (Prior, NearestHouse, NearestHouses) if houses}
     return dict(json.loads(json.dumps(found, default=str)))
 
 

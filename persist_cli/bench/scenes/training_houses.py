@@ -82,31 +82,49 @@ def read_houses(store: Store, most: int, form: CellForm) -> list[House]:
     return houses
 
 
-def nearest_houses(views: Sequence[View], houses: Sequence[House]) -> list[Match]:
-    """Return for each view the training house whose cells agree most with the known ones, in its best place.
+def nearest_houses(views: Sequence[View], houses: Sequence[House], count: int = 1) -> list[list[Match]]:
+    """Return for each view the training houses whose cells agree most with the known ones, each in its best place.
 
     Every house is tried in four turns at every shift by whole columns; beyond it all counts as not free. Only whether a
-    cell is free is compared, since an image does not tell classes. Of equal ones the first is taken.
+    cell is free is compared, since an image does not tell classes. Of equal ones the first comes first.
 
     Args:
         views: all with regions of one shape.
         houses: at least one.
+        count: most houses of a view.
     """
     side = views[0].region.shape[0]
     size = side + max(max(house.cells.shape[:2]) for house in houses)
-    best: list[Match | None] = [None] * len(views)
+    best: list[list[Match]] = [[] for _ in views]
     with progress() as bar:
         task = add_task(bar, "looking for houses that are alike", len(houses), "houses")
         spectra = [*_view_spectra(views, size)]
         for number, house in enumerate(houses):
             spectrum = torch.fft.rfft2(_signs(house.cells, views[0].region).float() - 1, (size, size))
             for first, known, counts in spectra:
-                for place, match in enumerate(_best_places(known, counts, spectrum, size)):
-                    earlier = best[first + place]
-                    if earlier is None or match.agreement > earlier.agreement:
-                        best[first + place] = _named(match, number, house, size)
+                for view, place in enumerate(_best_places(known, counts, spectrum, size), first):
+                    found = [*best[view], _named(place, number, house, size)]
+                    best[view] = sorted(found, key=lambda match: -match.agreement)[:count]
             bar.advance(task)
-    return [match for match in best if match is not None]
+    return best
+
+
+def vote(
+    matches: Sequence[Match], houses: Sequence[House], region: Region, classes: int
+) -> UInt8[Tensor, "first second level"]:
+    """Return what most of the matched houses have in a view's region; of as many the class of the least number.
+
+    Args:
+        matches: of the view.
+        houses: of the training.
+        region: of the view.
+        classes: number of classes.
+    """
+    votes = torch.zeros(*region.shape, classes)
+    for match in matches:
+        said = region_of_match(match, houses, region).long()[..., None]
+        votes.scatter_add_(3, said, torch.ones(said.shape))
+    return votes.argmax(-1).to(torch.uint8)
 
 
 @dataclass(frozen=True)

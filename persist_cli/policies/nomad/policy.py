@@ -84,6 +84,11 @@ class NomadPolicy(Policy):
         sampled = self.network.sample(condition, count, self.steps, generator).tolist()
         return [follow_waypoints([(x, y) for x, y in way], ahead, turns, horizon) for way in sampled]
 
+    @torch.no_grad()
+    def distance(self, situation: Situation) -> float:
+        """Return how far the goal's image is, in predicted spacings of frames."""
+        return float(self.network.distance(self._condition(situation, False)))
+
     def _condition(self, situation: Situation, masked: bool) -> Tensor:
         """What waypoints and distance follow from; a short past begins with its first frame again and again."""
         own, device = self.network.settings, next(self.network.parameters()).device

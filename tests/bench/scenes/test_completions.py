@@ -8,7 +8,7 @@ import torch
 
 from persist_cli.api.cells import FREE
 from persist_cli.bench.scenes.class_counts import class_counts, class_iou, iou_figure, mean_iou, share_figure, things
-from persist_cli.bench.scenes.completions import Empty, NearestHouse, Prior, Truth
+from persist_cli.bench.scenes.completions import Empty, HouseSearch, NearestHouse, NearestHouses, Prior, Truth
 from persist_cli.bench.scenes.training_houses import House, nearest_houses
 from persist_cli.bench.scenes.views import Region, same_form
 from persist_cli.errors import DataError
@@ -65,10 +65,23 @@ def test_the_nearest_house_is_found_at_any_turn_and_shift(turns):
     classes = torch.rot90(grid.classes, turns, (0, 1))
     turned = type(grid)(classes, grid.colors.new_zeros(*classes.shape, 3), classes * 0 + 2, (-7, 3, 0), FORM, grid.axes)
     others = [two_rooms(slice(11, 15)), turned]
-    row = NearestHouse([House(str(number), cells, camera_in(grid)[None]) for number, cells in enumerate(others)])
+    houses = [House(str(number), cells, camera_in(grid)[None]) for number, cells in enumerate(others)]
+    row = NearestHouse(HouseSearch(houses))
     row.prepare([view])
-    assert (row.matches[0].house, row.matches[0].agreement) == (1, 1.0)
+    best = row.search.matches[0][0]
+    assert (best.house, best.agreement) == (1, 1.0)
     assert torch.equal(row.complete(view, 0, 0).classes, view.truth.classes)
+
+
+def test_most_of_the_nearest_houses_say_what_is_there():
+    grid = another_house()
+    view = view_of(grid, known_room(grid))
+    cells = [two_rooms(slice(11, 15)), grid, grid]  # the known room agrees with all
+    search = HouseSearch([House(str(number), house, camera_in(grid)[None]) for number, house in enumerate(cells)])
+    search.look([view])
+    assert [match.house for match in search.matches[0]] == [0, 1, 2]
+    assert not torch.equal(NearestHouse(search).complete(view, 0, 0).classes, view.truth.classes)
+    assert torch.equal(NearestHouses(search).complete(view, 0, 0).classes, view.truth.classes)
 
 
 def test_views_are_matched_together_as_they_are_alone():
@@ -103,9 +116,9 @@ def test_known_cells_stay_in_every_row():
     grid = another_house()
     view = view_of(grid, known_room(grid))
     house = House("other", two_rooms(), camera_in(grid)[None])
-    nearest = NearestHouse([house])
-    nearest.prepare([view])
-    for row in (Truth(), Empty(), Prior([house]), nearest):
+    search = HouseSearch([house])
+    search.look([view])
+    for row in (Truth(), Empty(), Prior([house]), NearestHouse(search), NearestHouses(search)):
         done = row.complete(view, 0, 0)
         assert bool(done.known.all())
         assert torch.equal(done.classes[view.known.known], view.known.classes[view.known.known])

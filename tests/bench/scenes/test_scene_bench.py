@@ -32,7 +32,7 @@ def measured(
 
 def test_every_row_is_compared_with_the_true_cells(measured: Path) -> None:
     part = json.loads((measured / "metrics.json").read_text())["completion"]
-    assert [*part["rows"]] == ["model", "empty", "outside", "class prior", "nearest house", "truth"]
+    assert [*part["rows"]] == ["model", "empty", "outside", "class prior", "nearest house", "5 nearest houses", "truth"]
     means = {name: row["figures"]["miou"]["mean"] for name, row in part["rows"].items()}
     assert means["truth"] == 1.0
     assert means["empty"] == means["outside"] == 0.0
