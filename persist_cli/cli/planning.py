@@ -120,7 +120,7 @@ def learn(
     body: BodyOption = None,
     episodes: Annotated[Path | None, typer.Option(help="Of `persist bench episodes`: to evaluate in truth.")] = None,
     patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
-    stop_cost: Annotated[float, typer.Option(min=0, help="LPIPS of view and goal at which it stops there.")] = 0.15,
+    stop_cost: Annotated[float, typer.Option(min=0, help="LPIPS of view and goal at which it stops there.")] = 0.17,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     steps: StepsOption = None,
     sampler: SamplerOption = None,

@@ -22,7 +22,9 @@ from persist_cli.viewing.console import watched
 
 ROW = PlanningRow("policy", "policy", None, None, "image", False)  # shown the goal image, given nothing else
 
-STOP_COST: Final = 0.15  # see docs/learning.md
+STOP_COST: Final = (
+    0.17  # LPIPS; of 0.05 to 0.3: most success of the packaged policy in 124 episodes of 10 validation houses
+)
 
 
 class NeverStops:
