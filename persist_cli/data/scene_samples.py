@@ -29,7 +29,7 @@ from persist_cli.errors import DataError
 MOST_FRAMES: Final = 24  # that a scene is written from
 STRIDES: Final = 4  # from frame to frame of these, at most
 FIXED: Final = 8  # single frames and as many walks that each trajectory offers, so that they come again and are kept
-JITTER: Final = 8  # cells that a window may lie beside the camera
+JITTER: Final = 8  # cells that a window may lie beside the camera; of kind grown it lies anywhere around it
 TRIES: Final = 16  # of finding a trajectory with interactions
 TRUTHS_KEPT: Final = 64  # grids of the latest trajectories
 PICK_UP, DROP = "pick_up", "drop"
@@ -55,7 +55,7 @@ class SampleShares:
     grown: float = 0.2
     interaction: float = 0.15
     named: float = 0.3
-    unseen: float = 0.15
+    unseen: float = 0.3
     idle: float = 0.15
 
 
@@ -153,7 +153,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
     def _grown(self, random: np.random.Generator) -> Window:
         """A sample of which much is known by class, and the rest is to go on from it."""
         file = self._file(random)
-        window = self._observed(file, self._frames(file, int(random.integers(2 * FIXED))), random, named=True)
+        window = self._observed(file, self._frames(file, int(random.integers(2 * FIXED))), random, grown=True)
         known = random_part(self.form.shape, random)
         seen, given = window.seen.copy(), window.given.clone()
         fresh = known & (given == Given.NOTHING)
@@ -213,25 +213,30 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         return replace(before, given=given, truth=truth, action=action)
 
     def _observed(
-        self, file: TrajectoryFile, frames: list[int], random: np.random.Generator, named: bool = False
+        self, file: TrajectoryFile, frames: list[int], random: np.random.Generator, grown: bool = False
     ) -> Window:
-        """A window around the newest of some frames, of which a scene knows what these show."""
+        """A window around the newest of some frames, of which a scene knows what these show.
+
+        A grown one is named, and holds the camera anywhere: an agent walks on, and the view stays where it was.
+        """
         scene = self.writer.scene(file, frames)
         whole = self._truth(file, frames[-1])
-        corner = self._corner(scene, whole, random)
+        corner = self._corner(scene, whole, random, max(self.form.shape[:2]) if grown else JITTER)
         seen = scene.known.box(corner, self.form.shape)
         truth = settled(around(whole, seen), seen)
-        if named or random.random() < self.shares.named:
+        if grown or random.random() < self.shares.named:
             unnamed = seen.known & (seen.classes == SOLID)
             seen.classes[unnamed] = truth.classes[unnamed]
         given = torch.where(seen.known, int(Given.CONTENT), int(Given.NOTHING)).to(torch.uint8)
         return Window(given, seen, truth, scene, carried=self.carried(file, frames[-1]))
 
-    def _corner(self, scene: WrittenScene, whole: CellGrid, random: np.random.Generator) -> tuple[int, int, int]:
-        """The lowest cell of a window around the camera or a little beside it, from the floor up."""
+    def _corner(
+        self, scene: WrittenScene, whole: CellGrid, random: np.random.Generator, most: int
+    ) -> tuple[int, int, int]:
+        """The lowest cell of a window around the camera or at most so many cells beside it, from the floor up."""
         first, second, _ = whole.numbers(scene.view.cameras.centers[0]).tolist()
-        jitter = random.integers(-JITTER, JITTER + 1, 2) if random.random() < 0.5 else np.zeros(2, int)
-        limits = [min(JITTER, side // 2 - 1) for side in self.form.shape[:2]]
+        jitter = random.integers(-most, most + 1, 2) if random.random() < 0.5 else np.zeros(2, int)
+        limits = [min(most, side // 2 - 1) for side in self.form.shape[:2]]
         by_first, by_second = (int(np.clip(by, -limit, limit)) for by, limit in zip(jitter, limits, strict=True))
         rows, columns, _ = self.form.shape
         return first - rows // 2 + by_first, second - columns // 2 + by_second, whole.corner[2]

@@ -17,12 +17,13 @@ from typing import Any, Final
 
 import yaml
 
-from persist_cli.api.checkpoint import PLAIN, find_checkpoint
+from persist_cli.api.checkpoint import PLAIN, find_checkpoint, step_folders
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.run_episode import LoopSettings
+from persist_cli.checkpoints.retention import ended_recipe
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError, PersistError
 from persist_cli.evaluate.journal import check_same
@@ -192,10 +193,18 @@ def identity(learning: Learning) -> dict[str, Any]:
     }  # fmt: skip
     del values["placement"]  # where weights wait for their turn changes nothing
     if plan.inside == MODEL:
-        values["checkpoint"] = find_checkpoint(plan.checkpoint).fingerprint
+        values |= model_identity(plan)
     if plan.episodes is not None:
         values["episodes"] = file_sha256(plan.episodes)
     return dict(json.loads(json.dumps(values, default=str)))
+
+
+def model_identity(plan: LearnPlan) -> dict[str, Any]:
+    """Return JSON values that tell models, and the adapters that are chosen of them, apart."""
+    checkpoint = find_checkpoint(plan.checkpoint)
+    adapter = checkpoint.chosen_adapter(plan.adapter)
+    weights = None if adapter is None else file_sha256(checkpoint.adapter_folder(adapter) / "adapter.safetensors")
+    return {"checkpoint": checkpoint.fingerprint, "adapter": {"name": adapter or PLAIN, "sha256": weights}}
 
 
 def digest(views: Observations) -> str:
@@ -318,14 +327,17 @@ def recipe_of_round(plan: LearnPlan, before: TrainedPolicy, number: int) -> dict
 
 
 def train(learning: Learning, number: int) -> None:
-    """Fine-tune the policy of the round before on the walks of all rounds so far."""
+    """Fine-tune the policy of the round before on the walks of all rounds so far, unless that is done."""
     run, plan = learning.folder(number) / "policy", learning.plan
+    steps = step_folders(run)
+    if steps and ended_recipe(steps[-1]):
+        return
     recipe = recipe_of_round(plan, learning.policy(number - 1), number)
     file = learning.folder(number) / "policy.yaml"
     if not file.is_file():
         write_text(file, yaml.safe_dump(recipe, sort_keys=False))
     data = [learning.folder(one) / "walks" for one in range(1, number + 1)]
-    run_finetune(FinetunePlan(str(file), plan.training, data, run, resume=bool(list(run.glob("step-*")))))
+    run_finetune(FinetunePlan(str(file), plan.training, data, run, resume=True))
 
 
 def evaluate(learning: Learning, number: int) -> None:

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 
 import torch
 
-from persist_cli.api.ground import Body, GroundMap
+from persist_cli.api.ground import Body
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.true_scene import observations_of
 from persist_cli.errors import DataError
-from persist_cli.navigation.ground_mapper import GroundMapper, body_of
+from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.rollout.world_model import Agent, StepResult, WorldModel
 
 
@@ -34,10 +34,6 @@ class PracticePlace(Protocol):
 
     def act(self, ways: Mapping[int, Sequence[str]]) -> dict[int, StepResult]:
         """Do the actions of some walks, by their numbers, and return what is seen and which were free."""
-        ...
-
-    def ground(self, number: int) -> GroundMap:
-        """Return what the agent of a walk knows to be free."""
         ...
 
 
@@ -72,11 +68,6 @@ class ImaginedPlace:
         world.agents = [self.world.agents[number] for number in ways]
         return dict(zip(ways, world.step(list(ways.values())), strict=True))
 
-    def ground(self, number: int) -> GroundMap:
-        """Return the map of the memory's points and of what the walk imagined; without a body nothing is known."""
-        surroundings = self.world.agents[number].surroundings
-        return GroundMap.empty(self.info.world_up) if surroundings is None else surroundings.map()
-
 
 class TruePlace:
     """The true scene in a simulator, where walks take turns.
@@ -91,26 +82,19 @@ class TruePlace:
         self.body = body_of(info)
         self.origin: dict[str, Any] = {"simulator": simulator.name}
         self._stances: list[tuple[tuple[float, float], float]] = []
-        self._mappers: list[GroundMapper] = []
 
     def begin(self, starts: Sequence[Observations], seeds: Sequence[int]) -> None:
         """Begin walks at given frames of this scene; nothing is imagined."""
-        self._stances, self._mappers = [], []
+        self._stances = []
         for start in starts:
             stance = self.simulator.stance(start.cameras.world_from_camera[0].numpy())
             if stance is None:
                 raise DataError(f"simulator {self.simulator.name!r} cannot be put at a camera's pose")
             self._stances.append(stance)
-            self._mappers.append(GroundMapper(self.info.world_up, self.body))
-            self._mappers[-1].add(start)
 
     def act(self, ways: Mapping[int, Sequence[str]]) -> dict[int, StepResult]:
         """Do the actions of each of these walks in turn."""
         return {number: self._walk(number, way) for number, way in ways.items()}
-
-    def ground(self, number: int) -> GroundMap:
-        """Return the map of what the walk has seen."""
-        return self._mappers[number].map()
 
     def _walk(self, number: int, way: Sequence[str]) -> StepResult:
         self.simulator.place(*self._stances[number])
@@ -120,6 +104,4 @@ class TruePlace:
             free.append(self.simulator.act(name))
             frames.append(self.simulator.observe())
         self._stances[number] = self.simulator.agent
-        seen = observations_of(frames, self.info)
-        self._mappers[number].add(seen)
-        return StepResult(seen, torch.tensor(free))
+        return StepResult(observations_of(frames, self.info), torch.tensor(free))

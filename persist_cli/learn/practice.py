@@ -1,9 +1,10 @@
 """Practice walks: a policy acts inside the model, or in the true scene, and what it saw becomes trajectories.
 
 Practice has no teacher. Of several proposals that one is done whose way leads nearest to the goal, by poses and by the
-ground that is known. Whatever a walk reached serves as its goal afterwards (hindsight relabelling): training draws the
-goal of a sample from the later frames of the same walk, so that also a walk that missed its goal shows a way to
-somewhere. Of what it only came to by wandering about the policy learns the distance, not the way.
+ground that the given views and the walk itself show, the same with every memory. Whatever a walk reached serves as its
+goal afterwards (hindsight relabelling): training draws the goal of a sample from the later frames of the same walk, so
+that also a walk that missed its goal shows a way to somewhere. Of what it only came to by wandering about the policy
+learns the distance, not the way.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.bench.stop_rules import AT_PLACE
 from persist_cli.learn.places import PracticePlace
+from persist_cli.navigation.ground_mapper import GroundMapper
 from persist_cli.planning.futures import PoseFutures
 from persist_cli.planning.judge import Judge
 from persist_cli.plugins import make_cost
@@ -89,15 +91,25 @@ def practise(
         settings: of the practice.
         seed: of all that is random.
     """
+    shown = ground_of(views, place)
     for first in range(0, settings.walks, settings.batch):
         numbers = range(first, min(first + settings.batch, settings.walks))
-        walkers = [Walker(place, policies, views, settings, seed * SEEDS + number) for number in numbers]
+        walkers = [Walker(place, policies, views, shown, settings, seed * SEEDS + number) for number in numbers]
         place.begin([walker.seen for walker in walkers], [walker.sampling_seed for walker in walkers])
         while going := [number for number, walker in enumerate(walkers) if not walker.is_done]:
-            ways = {number: walkers[number].decide(place.ground(number)) for number in going}
+            ways = {number: walkers[number].decide() for number in going}
             for number, result in place.act(ways).items():
                 walkers[number].saw(ways[number], result.seen, result.free.tolist())
         yield from (walker.walk() for walker in walkers)
+
+
+def ground_of(views: Observations, place: PracticePlace) -> GroundMapper | None:
+    """Return the ground that the given views show; ``None`` where nothing stops an agent."""
+    if place.body is None:
+        return None
+    mapper = GroundMapper(place.info.world_up, place.body)
+    mapper.add(views)
+    return mapper
 
 
 class Walker:
@@ -107,6 +119,7 @@ class Walker:
         place: where it walks.
         policies: as of ``practise``.
         views: the given frames.
+        ground: that they show; ``None`` where nothing stops an agent.
         settings: of the practice.
         seed: of its start, goals and proposals.
     """
@@ -116,9 +129,11 @@ class Walker:
         place: PracticePlace,
         policies: tuple[Policy, Policy],
         views: Observations,
+        ground: GroundMapper | None,
         settings: PracticeSettings,
         seed: int,
     ) -> None:
+        self.mapper = None if ground is None else ground.copy()
         self.info, self.body, self.views, self.settings = place.info, place.body, views, settings
         self.policy, self.explorer = policies
         self.cost = make_cost("geodesic", {}).of_body(self.body or Body())
@@ -136,8 +151,9 @@ class Walker:
         """Whether it has done its actions."""
         return self.taken >= self.settings.actions
 
-    def decide(self, ground: GroundMap) -> tuple[str, ...]:
+    def decide(self) -> tuple[str, ...]:
         """Return its next actions, at least one while it is not done; where the policy stops, another goal is drawn."""
+        ground = GroundMap.empty(self.info.world_up) if self.mapper is None else self.mapper.map()
         situation = Situation(self.seen[-self.policy.frames :], self.info, self.goal, ground)
         horizon = min(self.settings.execute, self.policy.longest or self.settings.execute)
         if self.random.random() < self.settings.explore:
@@ -166,6 +182,8 @@ class Walker:
         self.taken, self.blocked = self.taken + len(way), self.blocked + len(way) - len(moved)
         if moved:
             self.seen = Observations.concatenate([self.seen, seen[moved]])
+            if self.mapper is not None:
+                self.mapper.add(seen[moved])
             self.actions += [way[number] for number in moved]
 
     def walk(self) -> PracticeWalk:

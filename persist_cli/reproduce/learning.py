@@ -130,6 +130,7 @@ def keep_identity(plan: Plan, described: Mapping[str, Any]) -> None:
 def preparations(plan: Plan) -> Iterator[str]:
     """Yield the commands that draw the episodes, unless they are drawn, and collect the given views."""
     home = shlex.quote(str(plan.out))
+    yield "weights fetch lpips-alex"  # by which agents stop
     if not (plan.out / EPISODES).is_file():
         yield (
             f"bench episodes --scenes {plan.scenes} --bins 8,16 --each {EACH * plan.houses} --per-scene {EACH} "

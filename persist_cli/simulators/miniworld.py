@@ -202,12 +202,11 @@ class MiniWorld(Simulator):
         return FORM
 
     def cells(self) -> CellGrid:
-        """The cells of the open house as it is now, with what the agent carries in front of it."""
+        """The cells of the open house as it is now; what the agent carries is in none."""
         if self._structure is None:
             self._structure = structure_cells(self.house)
-        things = self._things_now()
-        if self._cells is None or self._cells[0] != things:
-            self._cells = things, with_things(self._structure, things, self.house.light)
+        if self._cells is None or self._cells[0] != self._things:
+            self._cells = list(self._things), with_things(self._structure, self._things, self.house.light)
         return self._cells[1]
 
     @property

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from safetensors.torch import load_file, save_file
 
 from persist_cli.api.checkpoint import find_checkpoint
-from persist_cli.api.ground import Body, GroundMap
+from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.policy import Goal
 from persist_cli.bench.run_episode import LoopSettings
@@ -22,7 +23,7 @@ from persist_cli.data.store import Store
 from persist_cli.learn.evaluation import mean_figures
 from persist_cli.learn.learn import LearnPlan, open_place, prepare
 from persist_cli.learn.places import ImaginedPlace
-from persist_cli.learn.practice import PracticeSettings, PracticeWalk, Walker, practise
+from persist_cli.learn.practice import PracticeSettings, PracticeWalk, Walker, ground_of, practise
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import make_policy
 from persist_cli.policies.trained import find_policy
@@ -42,8 +43,8 @@ def learn(persist, walks, policy_run, voxel, tmp_path) -> Callable[..., CommandR
     short = ["--walks", "3", "--actions", "10", "--execute", "4", "--training-steps", "2", "--rounds", "1"]
     training = ["--set", "training.batch=2", "--set", "training.workers=0"]
 
-    def run(out: str, *more: str, data: Path = walks, frames: str = "0-12") -> CommandResult:
-        given = ["learn", voxel, "--views", f"{data}#0:{frames}", "--policy", policy_run, "--out", tmp_path / out]
+    def run(out: str, *more: str, data: Path = walks, frames: str = "0-12", model: Path = voxel) -> CommandResult:
+        given = ["learn", model, "--views", f"{data}#0:{frames}", "--policy", policy_run, "--out", tmp_path / out]
         return persist(*given, *ONE_STEP, *short, *training, *more)
 
     return run
@@ -111,7 +112,7 @@ def walker_towards(place, walks, metres: float, *ways: str, proposals: int = 3) 
     """A walker whose goal is straight ahead of its start."""
     views = Store(walks)[0].read(range(12)).observations
     settings = PracticeSettings(walks=1, actions=16, execute=8, explore=0.0, proposals=proposals)
-    walker = Walker(place, (Proposes(*ways), Proposes("right")), views, settings, 1)
+    walker = Walker(place, (Proposes(*ways), Proposes("right")), views, ground_of(views, place), settings, 1)
     camera = walker.seen.cameras
     ahead = camera.world_from_camera[0, :3, 2].double()
     walker.goal = Goal(walker.goal.rgb, camera.centers[0].double() + metres * ahead, place.info.scene)
@@ -121,16 +122,29 @@ def walker_towards(place, walks, metres: float, *ways: str, proposals: int = 3) 
 def test_of_several_proposals_that_one_is_done_that_leads_nearest_to_the_goal_as_far_as_there(place, walks):
     step = place.info.vocabulary["forward"].forward
     walker = walker_towards(place, walks, 4 * step, "left forward", "forward " * 7, "right right")
-    ground = GroundMap.empty(place.info.world_up)
-    assert walker.decide(ground) == ("forward",) * 4
+    assert walker.decide() == ("forward",) * 4
     alone = walker_towards(place, walks, 4 * step, "left forward", "forward " * 7, "right right", proposals=1)
-    assert alone.decide(ground) == ("left", "forward")
+    assert alone.decide() == ("left", "forward")
+
+
+def test_whoever_practises_knows_the_ground_of_all_given_views_and_of_the_own_walk(place, walks):
+    place.first.body = Body()
+    walker = walker_towards(place, walks, 0.5, "forward")
+    views = Store(walks)[0].read(range(12)).observations
+    given = ground_of(views, place)
+    assert given.map().states.equal(walker.mapper.map().states)
+    alone = ground_of(walker.seen, place).map()
+    assert int((given.map().states > 0).sum()) > int((alone.states > 0).sum())
+    later = Store(walks)[1].read(range(12)).observations
+    walker.saw(("forward",) * len(later), later, [True] * len(later))
+    assert not given.map().states.equal(walker.mapper.map().states)
+    assert given.map().states.equal(ground_of(views, place).map().states)
 
 
 def test_a_goal_that_is_reached_is_followed_by_another_one(place, walks):
     walker = walker_towards(place, walks, 0.1, "left forward", "forward")
     reached = walker.goal
-    assert walker.decide(GroundMap.empty(place.info.world_up)) == ("right",)
+    assert walker.decide() == ("right",)
     assert (walker.goals, walker.goal is reached) == (2, False)
 
 
@@ -194,6 +208,27 @@ def test_a_folder_with_another_learning_is_refused(learn):
     result = learn("out", "--seed", "5")
     assert result.code == 1
     assert result.err.endswith("holds another learning (seed: 0, now 5); choose another --out or delete it\n")
+
+
+def test_a_learning_goes_on_in_a_folder_that_was_moved(learn, tmp_path):
+    assert learn("out").code == 0
+    policy = tmp_path / "out/round-01/policy"
+    trained = [(file, file.stat().st_mtime_ns) for file in sorted(policy.rglob("*")) if file.is_file()]
+    shutil.move(tmp_path / "out", tmp_path / "moved")
+    assert learn("moved", "--rounds", "2").code == 0
+    for file, written in trained:
+        assert (tmp_path / "moved" / file.relative_to(tmp_path / "out")).stat().st_mtime_ns == written
+    assert (tmp_path / "moved/round-02/policy").is_dir()
+
+
+def test_a_folder_of_another_adapter_is_refused(learn, voxel):
+    other = shutil.copytree(voxel, Path(voxel).with_name("other"))
+    assert learn("out").code == 0
+    file = next(other.rglob("adapter.safetensors"))
+    weights = load_file(file)
+    save_file({name: weight + 1 for name, weight in weights.items()}, file)
+    result = learn("out", model=other)
+    assert (result.code, "holds another learning (adapter sha256: " in result.err) == (1, True), result.err
 
 
 def test_a_learning_goes_on_with_views_that_were_moved_and_with_no_others(learn, walks, tmp_path):

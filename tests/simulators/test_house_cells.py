@@ -104,16 +104,18 @@ def test_the_box_of_a_house_stays_when_a_thing_is_carried(world: MiniWorld) -> N
     assert (world.cells().corner, world.cells().shape) == (before.corner, before.shape)
 
 
-def test_a_thing_leaves_its_cells_when_it_is_picked_up_and_is_before_the_agent(world: MiniWorld) -> None:
+def test_a_thing_leaves_its_cells_when_it_is_picked_up_and_is_in_others_when_it_is_dropped(world: MiniWorld) -> None:
     thing, box = stand_before(world, "box"), FORM.palette.index("box")
     x, z = thing.ground
     assert class_at(world.cells(), x, 0.25, z) == box
     assert world.act("pick_up")
-    (agent_x, agent_z), heading = world.agent
-    ahead_x, ahead_z = world.ahead(heading)
-    before = 0.5 + thing.radius
-    assert class_at(world.cells(), x, 0.25, z) == FREE
-    assert class_at(world.cells(), agent_x + before * ahead_x, 0.75, agent_z + before * ahead_z) == box
+    carried = world.cells()
+    assert class_at(carried, x, 0.25, z) == FREE
+    world.act("left")
+    assert world.cells() is carried
+    assert world.act("drop")
+    dropped = world.cells()
+    assert int((dropped.classes == box).sum()) > int((carried.classes == box).sum())
 
 
 def test_a_toggled_box_changes_colour_and_nothing_else(world: MiniWorld) -> None:

@@ -21,6 +21,8 @@ from persist_memory.scene_models.codec import (
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 
 WAVES = 6  # octaves of sines of a coordinate
+SHIFT = 2.0  # of the noise levels in training towards pure noise, from which sampling begins
+EVEN = 0.2  # share of training levels that are drawn evenly
 PIXEL = 14  # channels of a pixel: colour, nearness, whether it has depth, origin, direction and point of its ray
 
 
@@ -171,17 +173,27 @@ def known_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Boo
 
 
 def draw_levels(settings: SceneDiffusionSettings, generators: list[torch.Generator]) -> Float[Tensor, "batch token"]:
-    """Draw logit-normal noise levels: in half of the samples one for all tokens, else one for each region."""
+    """Draw noise levels: in half of the samples one for all tokens, else one for each region.
+
+    They are logit-normal, shifted towards noise, or even: training also sees the levels at which a sample begins.
+    """
     edge, tokens = settings.transformer.region, settings.tokens
     regions = [-(-length // edge) for length in tokens]
     levels = []
     for generator in generators:
-        drawn = torch.randn(*regions, generator=generator).sigmoid()
+        normal = shifted(torch.randn(*regions, generator=generator).sigmoid(), SHIFT)
+        even = torch.rand(2, *regions, generator=generator)
+        drawn = torch.where(even[0] < EVEN, even[1], normal)
         whole = torch.rand((), generator=generator) < 0.5
         drawn = drawn.flatten()[:1].expand(math.prod(regions)).reshape(regions) if whole else drawn
         blocks = drawn[None, None].expand(1, edge ** len(regions), *regions)
         levels.append(unfold(blocks, edge)[0, 0][tuple(slice(length) for length in tokens)].flatten())
     return torch.stack(levels)
+
+
+def shifted(levels: Float[Tensor, "*batch"], shift: float) -> Float[Tensor, "*batch"]:
+    """Return noise levels, 0…1, moved up by a shift above 1."""
+    return shift * levels / (1 + (shift - 1) * levels)
 
 
 def coordinates_of_tokens(settings: SceneDiffusionSettings) -> Int[Tensor, "token axis"]:

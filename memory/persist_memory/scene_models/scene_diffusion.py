@@ -33,6 +33,7 @@ from persist_memory.scene_models.conditions import (
     content,
     draw_levels,
     known_tokens,
+    shifted,
 )
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 from persist_memory.scene_models.transformer import SceneTransformer
@@ -107,10 +108,9 @@ class SceneDiffusion(SceneModel):
 
     def _diffuse(self, samples: SceneSamples, generators: list[torch.Generator]) -> dict[str, Tensor]:
         """The squared error of the velocities of all tokens that are not known."""
-        with torch.no_grad():
-            latents = self.codec.encode(*truth(samples)).float()
         known = known_tokens(samples, self.settings)
         levels = draw_levels(self.settings, generators).to(known.device).masked_fill(known, 0.0)
+        latents = self._latents(samples, known, levels)
         noise = noise_like(latents, generators)
         dropped = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         told = self.tell(samples, generators, dropped < self.settings.transformer.drop_view)
@@ -121,6 +121,19 @@ class SceneDiffusion(SceneModel):
         unknown = (~known).float()
         loss = (errors * unknown).sum() / unknown.sum().clamp_min(1)
         return {"loss": loss, "known_tokens": known.float().mean()}
+
+    @torch.no_grad()
+    def _latents(
+        self, samples: SceneSamples, known: Bool[Tensor, "batch token"], levels: Float[Tensor, "batch token"]
+    ) -> Float[Tensor, "batch channel *latent"]:
+        """Latents of the truth; known tokens hold what they hold in sampling.
+
+        A latent knows of its neighbours. Before the first snap sampling has free cells beside the given ones, and the
+        truth there must not leak into the latents of these.
+        """
+        true, held = (self.codec.encode(*cells).float() for cells in (truth(samples), start(samples)))
+        early = (levels.amax(1, keepdim=True) > self.settings.sampling.snap_below).expand_as(known)
+        return held.where(self._places((known & early).float()).bool(), true)
 
     def tell(self, samples: SceneSamples, generators: list[torch.Generator], dropped: Bool[Tensor, " batch"]) -> Told:
         """Return the embedded conditions.
@@ -151,7 +164,7 @@ class SceneDiffusion(SceneModel):
             latents = self._mix(held.where(fixed, clean), noise.where(fixed, rest), of_tokens, known)
             velocity = self._velocity(latents, of_tokens, told)
             clean, rest = latents - level * velocity, latents + (1 - level) * velocity
-            if own.snap_every and step % own.snap_every == 0 and following <= own.snap_below:
+            if own.snap_every and step % own.snap_every == 0 and 0 < following <= own.snap_below:
                 held = clean = self.codec.encode(*self._snapped(held.where(fixed, clean), samples))
         return self._snapped(held.where(fixed, clean), samples)
 
@@ -265,8 +278,8 @@ def noise_like(values: Tensor, generators: list[torch.Generator]) -> Tensor:
 
 def noise_levels(steps: int, shift: float) -> list[float]:
     """Return the noise levels of so many Euler steps, from 1 to 0; a shift above 1 moves them up."""
-    even = [1 - step / steps for step in range(steps + 1)]
-    return [shift * level / (1 + (shift - 1) * level) for level in even]
+    even = torch.tensor([1 - step / steps for step in range(steps + 1)], dtype=torch.float64)
+    return [float(level) for level in shifted(even, shift)]
 
 
 def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
