@@ -15,7 +15,7 @@ from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import make_scene_model
 from persist_memory.scene_models.codec import fold, unfold
 from persist_memory.scene_models.conditions import draw_levels, known_tokens
-from persist_memory.scene_models.scene_diffusion import SceneDiffusion, generators_of, noise_levels
+from persist_memory.scene_models.scene_diffusion import SceneDiffusion, generators_of, noise_levels, start, truth
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 from tests.support.micro_scenes import MICRO_SCENE, micro_model, micro_samples
 from tests.support.random_scenes import PALETTE
@@ -122,6 +122,28 @@ def test_regions_have_noise_levels_of_their_own_in_half_of_the_samples(model):
     assert ((levels >= 0) & (levels <= 1)).all()
     whole = (levels == levels[:, :1]).all(1).float().mean()
     assert 0.3 < whole < 0.7
+
+
+def test_training_sees_the_noise_levels_at_which_a_sample_begins(model):
+    levels = draw_levels(model.settings, [torch.Generator().manual_seed(seed) for seed in range(2000)])[:, 0]
+    shares = [float(((levels > low) & (levels <= low + 0.1)).float().mean()) for low in (0.0, 0.3, 0.6, 0.9)]
+    assert all(share > 0.01 for share in shares), shares
+    assert float((levels > 0.97).float().mean()) > 0.005
+
+
+@pytest.mark.parametrize(("level", "early"), [(0.9, True), (0.2, False)])
+def test_known_tokens_hold_in_training_what_they_hold_in_sampling(model, samples, level, early):
+    given = torch.zeros_like(samples.given)
+    given[:, :8] = int(Given.CONTENT)
+    told = replace(samples, given=given, classes=samples.true_classes * (given > 0))
+    known = known_tokens(told, model.settings)
+    assert bool(known.any())
+    latents = model._latents(told, known, torch.full(known.shape, level).masked_fill(known, 0.0))
+    with torch.no_grad():
+        before, after = (model.codec.encode(*cells) for cells in (start(told), truth(told)))
+    tokens, before, after = (model._tokens(part) for part in (latents, before, after))
+    assert tokens[~known].equal(after[~known])
+    assert tokens[known].equal((before if early else after)[known])  # beside given cells all is free before a snap
 
 
 def test_a_token_is_known_when_all_its_cells_are_settled(model, samples):
