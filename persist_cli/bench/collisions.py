@@ -8,6 +8,7 @@ again from the same pose, so that no wall counts twice.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -182,13 +183,18 @@ def random_walk(simulator: Simulator, random: np.random.Generator, actions: int)
     taken: list[str] = []
     attempts: list[Attempt] = []
     refused: set[str] = set()
+    tried: set[tuple[float, ...]] = set()  # poses and turns of the agent with the step that was tried there
     while len(taken) < actions:
         names = [name for name in SHARES if name not in refused]
         shares = np.array([SHARES[name] for name in names])
         action = str(random.choice(names, p=shares / shares.sum()))
+        (x, y), heading = simulator.agent
+        step = simulator.info.vocabulary[action].forward
+        here = tuple(round(value, 4) for value in (x, y, math.sin(heading), math.cos(heading), step))
         allowed = simulator.act(action)
-        if simulator.info.vocabulary[action].forward:
+        if step and here not in tried:
             attempts.append(Attempt(len(taken), action, allowed))
+            tried.add(here)
         if not allowed:
             refused.add(action)
             continue

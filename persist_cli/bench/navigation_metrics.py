@@ -20,8 +20,6 @@ from persist_cli.api.cameras import invert_rigid
 
 SUCCESS_METRES = 1.0  # geodesic distance to the goal within which a stop is a success
 
-SIM = "SIM = 100 · mean over episodes of cos(f(v), f(g))"  # f: features, v: view at the end, g: goal image
-
 
 def absolute_error(poses: Float[Tensor, "pose 4 4"], true: Float[Tensor, "pose 4 4"]) -> float:
     """Return ATE in metres: the root of the mean squared distance between positions, without alignment.

@@ -29,6 +29,7 @@ from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.metrics.src import chosen_encoder
 from persist_cli.plugins import check_simulator, make_cost, make_simulator
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
@@ -195,6 +196,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
             check_model(checkpoint, rows, episodes)
         if not journal.begun or (checkpoint is not None and not journal.identity().get("checkpoint")):
             check_scenes(episodes, trained_on(checkpoint, plan.policy), plan.allow_training_scenes)
+        check_budget(plan, rows, episodes)
         journal.begin(values, episodes)
     processes.wait()
     episodes = journal.episodes()
@@ -204,6 +206,19 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     processes.wait()  # the others find what the main process kept
     thresholds = find_thresholds(plan, cost, rows, simulator, journal)
     return PlanningBench(plan, checkpoint, episodes, rows, cost, simulator, journal, thresholds)
+
+
+def check_budget(plan: BenchPlan, rows: Sequence[PlanningRow], episodes: EpisodeSet) -> None:
+    """Raise ``PersistError`` when a decision may not imagine as many frames as its longest plan has actions."""
+    if not any(row.imagines for row in rows):
+        return
+    longest = [one.bin for one in episodes.episodes if one.bin <= plan.loop.open_longest and "open" in plan.loops]
+    needed, frames = max([plan.planning.horizon, *longest]), plan.planning.frames
+    if frames is not None and frames < needed:
+        rest = (
+            "a shorter --horizon" if needed == plan.planning.horizon else "--loops closed: open loops plan all at once"
+        )
+        raise PersistError(f"--frames {frames}: a plan has up to {needed} actions; give {needed} or more, or {rest}")
 
 
 def check_policies(rows: Sequence[PlanningRow], settings: PlanSettings) -> None:
@@ -311,6 +326,7 @@ def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict
     values = {
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
+        "encoder": chosen_encoder().name if cost.name == "dino" or "open" in plan.loops else None,
         "policy": None
         if plan.policy is None
         else {"name": plan.policy, "fingerprint": trained and trained.fingerprint},

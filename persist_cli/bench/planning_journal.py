@@ -85,7 +85,10 @@ class PlanningJournal:
         file = self._file(row, episode)
         if not file.is_file():
             return False
-        if cause := outdated(row, read_json(file)):
+        record = read_json(file)
+        if (name := record.get("row", row.name)) != row.name:
+            raise DataError(f"{file.parent}: holds the row {name!r}, {row.name!r} would be kept there too; rename one")
+        if cause := outdated(row, record):
             raise DataError(f"{file.parent}: {cause}; delete this folder to run the row again")
         return True
 

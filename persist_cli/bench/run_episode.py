@@ -22,6 +22,7 @@ from persist_cli.bench.navigation_metrics import (
 from persist_cli.bench.navigator import Decision, Navigator
 from persist_cli.bench.stop_rules import StopRule
 from persist_cli.bench.true_scene import TrueScene
+from persist_cli.errors import PersistError
 from persist_cli.metrics.networks import missing_weights
 from persist_cli.metrics.src import ENCODERS, VideoFeatures
 
@@ -43,6 +44,10 @@ class LoopSettings:
     patience: float = 4.0
     open_longest: int = 16
     max_actions: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.patience < math.inf:
+            raise PersistError(f"--patience {self.patience:g}: give a number from 1 on; it must be finite")
 
     def most(self, shortest: int) -> int:
         """Return the most actions of a closed loop whose shortest way has ``shortest`` actions."""

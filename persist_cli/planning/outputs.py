@@ -17,6 +17,7 @@ from persist_cli.api.cost import Cost
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.memory import MapPoints
 from persist_cli.api.policy import Goal
+from persist_cli.errors import PersistError
 from persist_cli.io.files import write_json
 from persist_cli.planning.futures import FutureModel, Imagined, Walk, WorldFutures
 from persist_cli.planning.judge import Candidate
@@ -100,7 +101,10 @@ def look_at(planned: Planned, best: int) -> Shown:
     true_model, unknown = true_futures(agent.now, agent.info)
     if true_model is None:
         return Shown(candidates, imagined, None, None, None, unknown)
-    truth, seen = videos_of(true_model, candidates)
+    try:
+        truth, seen = videos_of(true_model, candidates)
+    except PersistError as error:  # an interaction, which walking back does not undo
+        return Shown(candidates, imagined, None, None, None, str(error))
     costs = planned.cost.measure(seen.futures, planned.goal, planned.ground)
     true_costs = [float(costs[row, max(one.best - 1, 0)]) for row, one in enumerate(candidates)]
     return Shown(candidates, truth=truth, imagined=imagined, true_walks=seen.walks, true_costs=true_costs, unknown="")

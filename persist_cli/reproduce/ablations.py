@@ -127,7 +127,7 @@ def missing_weights(recipe: Recipe) -> str | None:
 
 def preparations(plan: Plan, houses: int) -> list[str]:
     """The command lines that bring weights, and houses where the plan names none of its own."""
-    explored, home = houses // 4, shlex.quote(str(plan.out))
+    explored, home = max(1, houses // 4), shlex.quote(str(plan.out))
     lines = [f"weights fetch {' '.join(FETCHED)}"]
     if plan.data == default_data(plan.out):
         lines += [
@@ -241,9 +241,10 @@ def points_of(plan: Plan) -> Iterator[Point]:
 def write_results(plan: Plan, left_out: dict[str, str]) -> None:
     """Write the figures so far as JSON, their table and their curves."""
     points = list(points_of(plan))
-    described: dict[str, Any] = {key: str(value) for key, value in asdict(plan).items() if key in ("base", "seed")}
-    described |= {"data": [*map(str, plan.data)], "held_out": [*map(str, plan.held_out)], "sampling": SAMPLING}
-    values = described | {"left_out": left_out, "points": [asdict(point) for point in points]}
+    values = {
+        "base": plan.base, "seed": plan.seed, "data": [*map(str, plan.data)], "held_out": [*map(str, plan.held_out)],
+        "sampling": SAMPLING, "left_out": left_out, "points": [asdict(point) for point in points],
+    }  # fmt: skip
     write_json(plan.out / "ablations.json", values)
     with written_aside(plan.out / "ablations.md") as aside:
         aside.write_text(table_text(points, left_out), encoding="utf-8")

@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from persist_cli.api.checkpoint import SHOWN, find_checkpoint
+from persist_cli.api.checkpoint import PLAIN, SHOWN, find_checkpoint
 from persist_cli.bench.episodes import read_episodes
 from persist_cli.bench.rows import NO_MEMORY
 from persist_cli.data.store import Store
@@ -83,9 +83,11 @@ def main(arguments: Sequence[str]) -> None:
     """Run what is not done yet and write the table anew after each house.
 
     Raises:
-        PersistError: when the folder holds what was learned with another model, policy, houses, views or options.
+        PersistError: when the folder holds what was learned with another model, policy, houses, views or options, or
+            the model lacks a memory.
     """
     plan = parse(arguments)
+    check_memories(plan)
     described = identity(plan)
     keep_identity(plan, described)
     for line in preparations(plan):
@@ -98,6 +100,13 @@ def main(arguments: Sequence[str]) -> None:
                 run_line(learning_line(plan, scene, names[scene], memory))
         write_results(plan, scenes, described)
     say(f"written to {plan.out / 'learning.md'}")
+
+
+def check_memories(plan: Plan) -> None:
+    """Raise ``CheckpointError`` when the model has no adapter of one of the names."""
+    checkpoint = find_checkpoint(Path(plan.model))
+    for memory in {*plan.memories} - {SIMULATOR, PLAIN}:
+        checkpoint.adapter_folder(memory)
 
 
 def identity(plan: Plan) -> dict[str, Any]:

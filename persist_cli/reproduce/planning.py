@@ -19,12 +19,13 @@ import argparse
 import shlex
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from persist_cli.errors import PersistError
 from persist_cli.reproduce.commands import run_line
+from persist_cli.reproduce.plan_file import base_json, keep_plan
 from persist_cli.viewing.console import say
 
 WEIGHTS: Final = ("lpips-alex", "dinov2-s-derived")
@@ -91,6 +92,13 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
     yield f"{closed} {LOOP} --rows rank-16 --memories {MEMORIES} --cost geodesic {_to(home, 'geodesic')}"
 
 
+def identity(figures: PlanningFigures) -> dict[str, Any]:
+    """Return JSON values of what the episodes follow from, and of what they are run with."""
+    values = asdict(figures) | {"checkpoint": base_json(figures.checkpoint)}
+    del values["out"]
+    return values
+
+
 def _to(home: str, name: str) -> str:
     return f"--out {home}/{name} --report {home}/report-{name}"
 
@@ -110,6 +118,7 @@ def main() -> None:
         figures = PlanningFigures(
             options.out, options.checkpoint, options.policy, options.trained, options.scenes, options.each, options.bins
         )
+        keep_plan(figures.out, identity(figures), "*.json")
         for line in commands(figures):
             run_line(line)
     except PersistError as error:

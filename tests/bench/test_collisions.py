@@ -30,6 +30,16 @@ def test_a_random_walk_is_deterministic_and_tries_no_refused_step_again(walk):
     assert len(refused) == len(set(refused)) > 0
 
 
+def test_no_step_counts_twice_from_one_pose():
+    world = make_world(height=16, width=16)
+    world.open_scene(1_000_000)
+    for seed in range(8):  # an agent that turns back after it was stopped
+        walk = random_walk(world, np.random.default_rng(seed), 24)
+        poses = walk.frames.cameras.world_from_camera.mul(1000).round().flatten(1).tolist()
+        tried = [(*poses[attempt.frame], attempt.action) for attempt in walk.attempts]
+        assert len(tried) == len(set(tried))
+
+
 def test_what_a_map_of_true_frames_takes_for_blocked_the_simulator_refuses():
     world = make_world()
     world.open_scene(1_100_001)

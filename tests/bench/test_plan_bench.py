@@ -115,6 +115,32 @@ def test_two_processes_keep_what_one_does(bench: Bench, tmp_path: Path) -> None:
     assert records(tmp_path / "two") == records(tmp_path / "one")
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--patience", "inf"), "--patience inf: give a number from 1 on; it must be finite"),
+        (
+            ("--frames", 6, "--horizon", 6, "--loops", "open"),
+            "a plan has up to 8 actions; give 8 or more, or --loops closed",
+        ),
+        (("--frames", 6, "--horizon", 9), "a plan has up to 9 actions; give 9 or more, or a shorter --horizon"),
+    ],
+)
+def test_settings_that_end_no_episode_are_one_line_before_any_is_run(bench, tmp_path, options, message) -> None:
+    ended = bench(*PLACE, "--bins", 8, *options)
+    assert (ended.code, ended.err.count("\n"), message in ended.err) == (1, 1, True), ended.err
+    assert not (tmp_path / "bench").exists()
+
+
+def test_two_rows_that_would_be_kept_in_one_place_are_refused(bench: Bench, tmp_path: Path) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--patience", 1, "--rows", "straight")
+    assert bench(*options).code == 0
+    file = next((tmp_path / "bench/parts/straight").iterdir())
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"row": "Straight"}))
+    ended = bench(*options)
+    assert (ended.code, "holds the row 'Straight', 'straight' would be kept there too" in ended.err) == (1, True)
+
+
 def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     options = ("--cost", "distance", "--loops", "closed", "--patience", 1)
     assert bench(*options, "--rows", "random").code == 0

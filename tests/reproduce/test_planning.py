@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import typer.main
 
 from persist_cli.bench.rows import RowChoice
 from persist_cli.cli.app import app
-from persist_cli.reproduce.planning import PlanningFigures, commands
+from persist_cli.errors import PersistError
+from persist_cli.reproduce.plan_file import keep_plan
+from persist_cli.reproduce.planning import PlanningFigures, commands, identity
 
 OUT = Path("my runs/planning")
 
@@ -30,6 +34,14 @@ def test_every_row_of_the_figures_can_be_made() -> None:
         if rows:
             names, memories = (text.split(",") for text in rows.groups())
             assert RowChoice(names, memories, "straight", "image", 60).rows()
+
+
+def test_a_folder_of_other_houses_is_refused(voxel: Path, tmp_path: Path) -> None:
+    figures = PlanningFigures(tmp_path, str(voxel))
+    for _ in range(2):
+        keep_plan(tmp_path, identity(figures), "*.json")
+    with pytest.raises(PersistError, match=r"another plan \(scenes: 40:96, now 0:4\)"):
+        keep_plan(tmp_path, identity(replace(figures, scenes="0:4")), "*.json")
 
 
 def test_episodes_that_are_drawn_are_not_drawn_again(tmp_path: Path) -> None:
