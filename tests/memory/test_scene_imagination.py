@@ -107,6 +107,14 @@ def test_what_a_path_will_see_is_imagined_once_and_always_the_same():
     assert torch.equal(grown.classes, again.cells.classes)
 
 
+def test_the_unknown_in_which_a_camera_stands_is_imagined_though_nothing_else_is_unknown():
+    room, scene = cell_room(), empty_scene(DrawnWalls())
+    room.origins[1:-1, 1:-1, 1:-1] = 0
+    scene.add(room)
+    scene.foresee([camera_at(room, (2, 3, 5), (9, 8, 2))])
+    assert int((scene.cells.origins == CellOrigin.IMAGINED).sum()) > 500
+
+
 def test_nothing_is_imagined_where_all_that_is_seen_is_known_or_there_is_no_model():
     whole = empty_scene(DrawnWalls())
     whole.add(cell_room())

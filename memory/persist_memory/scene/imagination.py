@@ -231,13 +231,21 @@ def windows_over(
 
 
 def sees_unknown(window: CellGrid, camera: Cameras, foresight: float, floor: int) -> bool:
-    """Whether a ray of a camera meets an unknown cell before any surface."""
+    """Whether a camera stands in an unknown cell of a window, or a ray of it meets one before any surface."""
+    if _stands_in_unknown(window, camera):
+        return True  # to its rays the unknown around it is no surface
     views = camera.resized(max(1, camera.height // FORESEEN_STRIDE), max(1, camera.width // FORESEEN_STRIDE))
     classes = torch.where(window.known, window.classes, len(window.form.palette)).to(torch.uint8)
     marked = replace(window, classes=classes)  # unknown cells are a thing of their own
     surfaces = first_surfaces(marked, views, 1, window.solid | ~window.known, sheet_cells(window, floor))
     unknown = ~window.known.flatten()[surfaces.cells[0].clamp_min(0)]
     return bool((unknown & surfaces.hit[0] & (surfaces.depth[0] < foresight)).any())
+
+
+def _stands_in_unknown(window: CellGrid, camera: Cameras) -> bool:
+    place = window.numbers(camera.centers[0]) - torch.tensor(window.corner)
+    inside = bool(((place >= 0) & (place < torch.tensor(window.shape))).all())
+    return inside and not bool(window.known[tuple(place)])
 
 
 def imagine_hidden(
