@@ -38,7 +38,7 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     _check_out(out)
     config, origin = resolve_memory_config(plan)
     sources = find_sources(_with_picture(data, picture, out))
-    config = of_known_cells(config, sources[0].file)
+    config = of_known_cells(config, sources[0].file, asked=origin is None or plan.checkpoint is not None)
     with busy("loading the encoder"):
         encoder = make_encoder(config.encoder, config.encoder_settings)
     memory = with_scene_model(make_memory(config.name, config.settings, encoder, common_reference(sources)))

@@ -39,7 +39,7 @@ def _loaded(folder: Path) -> SceneModel:
     return find_scene_model(folder).load()
 
 
-def of_known_cells(config: MemoryConfig, file: TrajectoryFile | None = None) -> MemoryConfig:
+def of_known_cells(config: MemoryConfig, file: TrajectoryFile | None = None, asked: bool = True) -> MemoryConfig:
     """Return the configuration of a scene with the cells that it shall have, where its settings leave them open.
 
     They are those of its model, else those that are stored with the data.
@@ -47,21 +47,22 @@ def of_known_cells(config: MemoryConfig, file: TrajectoryFile | None = None) -> 
     Args:
         config: of any memory; of one that is no scene it stays as it is.
         file: a trajectory that will be written into the scene.
+        asked: whether somebody asked for its settings. Else they give way to the cells of a model or of the data.
 
     Raises:
         CheckpointError: when there is no such model.
     """
-    if not issubclass(load_plugin("memory", config.name), Scene) or "palette" in config.settings:
+    if not issubclass(load_plugin("memory", config.name), Scene) or (asked and "palette" in config.settings):
         return config
     form: CellForm | None = None
     if config.settings.get("model") is not None:
         form = _form_of(str(config.settings["model"]))
-    elif file is not None and file.has_cells:
-        form = file.cells(0).form
+    elif file is not None:
+        form = file.cell_form
     if form is None:
         return config
     cells: dict[str, Any] = {"palette": list(form.palette), "size": form.size}
-    return replace(config, settings=cells | config.settings)
+    return replace(config, settings=cells | config.settings if asked else config.settings | cells)
 
 
 def _form_of(path: str) -> CellForm:

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from persist_cli.data.clips import ClipDataset, ClipPlan
+from persist_cli.data.store import Store
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
+from persist_cli.memorize.imagining import of_known_cells
 from persist_cli.recipe import MemoryConfig
 from tests.support.cell_walks import write_with_cells
 from tests.support.micro_runs import SIZE
@@ -45,3 +47,12 @@ def test_a_memory_that_is_no_scene_refuses_true_cells_in_one_line(walks, tmp_pat
     clips = ClipDataset([folder], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE), true_cells=1.0))
     with pytest.raises(RecipeError, match="memory 'voxel' takes no true cells; use the memory scene"):
         with_memory(clips[0], MemoryFactory.of(MemoryConfig("voxel")), 64)
+
+
+def test_the_cells_of_the_data_take_the_place_of_those_that_nobody_asked_for(walks, tmp_path):
+    file = Store(write_with_cells(walks, tmp_path / "cells"))[0]
+    config = MemoryConfig("scene", {"palette": ["free", "solid", "outside"], "layers": 3}, "classes")
+    given_way = of_known_cells(config, file, asked=False).settings
+    assert given_way == {"palette": list(file.cell_form.palette), "size": file.cell_form.size, "layers": 3}
+    assert of_known_cells(config, file) == config
+    assert of_known_cells(config, Store(walks)[0], asked=False) == config

@@ -74,6 +74,20 @@ def test_a_seed_makes_one_house_of_a_picture_and_another_seed_another(hall, mode
     assert torch.equal(house(3), house(3))
 
 
+def test_a_model_sets_the_classes_also_where_the_reference_model_draws_others(
+    hall, model, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.delenv("PERSIST_REFERENCE")
+    out, picture = tmp_path / "hall.safetensors", (hall / "hall.png", "--depth", hall / "hall.npy")
+    assert memorize(capsys, *picture, "--model", model, "--complete", "--out", out)["completed"] > 500
+    assert load_memory(out).settings.palette == PALETTE
+    asked = memorize(capsys, *picture, "--memory", "scene", "--checkpoint", "reference", "--out", out)
+    drawn = load_memory(out).settings.palette
+    assert drawn != PALETTE
+    assert asked["settings_of"] == memorize(capsys, *picture, "--memory", "scene", "--out", out)["settings_of"]
+    assert load_memory(out).settings.palette == drawn  # neither a model nor the data know cells
+
+
 def test_frames_of_data_are_completed_too_and_their_map_shows_what_is_imagined(model, tmp_path, capsys):
     Room(32, 32).write(tmp_path / "data" / "a.parquet", np.stack([look((0.0, 1.25, 0.0), 0.0, 0.0)] * 2))
     out = tmp_path / "house.safetensors"
