@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,8 +104,10 @@ def read_depth(path: Path) -> Array:
                 values = np.array(image)
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such depth file") from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except (UnidentifiedImageError, EOFError, OSError, SyntaxError, ValueError, zipfile.BadZipFile) as error:
         raise DataError(f"{path}: cannot be read as depth ({str(error).splitlines()[0]})") from error
+    if not isinstance(values, np.ndarray):
+        raise DataError(f"{path}: cannot be read as depth (an archive of arrays, as .npz is; give a single array)")
     whole = path.suffix != ".npy"
     if values.ndim != 2 or values.dtype.kind not in ("ui" if whole else "f") or (whole and values.dtype.itemsize < 2):
         raise DataError(

@@ -158,6 +158,9 @@ def test_a_picture_is_cropped_and_resized_as_a_model_needs(hall, tmp_path, capsy
         (["--depth", "torn.png"], "cannot be read as depth"),
         (["--depth", "small.npy"], "differ in size"),
         (["--depth", "pickled.npy"], "cannot be read as depth"),
+        (["--depth", "empty.npy"], "cannot be read as depth"),
+        (["--depth", "several.npy"], "give a single array"),
+        (["--depth", "torn.npy"], "cannot be read as depth"),
         (["--depth", "hall.npy", "--fov", "200"], "between 10 and 150"),
         (["--depth", "hall.npy", "--depth-model", "some"], "not both"),
         (["--depth-model", "empty"], "no usable folder"),
@@ -171,6 +174,10 @@ def test_a_picture_that_cannot_become_a_scene_is_refused_in_one_line(
     (tmp_path / "torn.png").write_bytes((hall / "depth.png").read_bytes()[:200])
     np.save(tmp_path / "small.npy", np.ones((4, 4), np.float32))
     np.save(tmp_path / "pickled.npy", np.array([{}]), allow_pickle=True)
+    np.savez(tmp_path / "several.npz", depth=np.ones((48, 64), np.float32))
+    (tmp_path / "several.npz").rename(tmp_path / "several.npy")
+    (tmp_path / "torn.npy").write_bytes((tmp_path / "several.npy").read_bytes()[:99])
+    (tmp_path / "empty.npy").touch()
     (tmp_path / "empty").mkdir()
     for name in ("hall.png", "hall.npy"):
         (tmp_path / name).write_bytes((hall / name).read_bytes())

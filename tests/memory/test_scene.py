@@ -275,6 +275,13 @@ def test_only_the_encoder_of_classes_fits_and_it_needs_a_channel_for_each_class(
         scene(palette=["wall"])
 
 
+@pytest.mark.parametrize("name", ["size", "floor", "farthest", "foresight", "carries"])
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_settings_are_finite(name, value):
+    with pytest.raises(PersistError, match=f"{name} must be a number"):
+        scene(**{name: value})
+
+
 def test_a_map_shows_solid_cells_with_their_origins():
     memory = named_scene()
     grid = cell_room()

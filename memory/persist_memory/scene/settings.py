@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveInt
 
 from persist_cli.api.cells import COMMON
+
+Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Distance = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Height = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -33,10 +37,10 @@ class GridSceneSettings:
         toggles: classes of the things that can be toggled.
     """
 
-    size: PositiveFloat = 0.25
+    size: Length = 0.25
     palette: tuple[str, ...] = COMMON
-    floor: float = 0.0
-    farthest: PositiveFloat = 10.0
+    floor: Height = 0.0
+    farthest: Length = 10.0
     layers: PositiveInt = 2
     stride: PositiveInt = 1
     unknown: Literal["clear", "ends"] = "clear"
@@ -44,9 +48,9 @@ class GridSceneSettings:
     model: str | None = None
     steps: PositiveInt = 10
     seed: NonNegativeInt = 0
-    foresight: NonNegativeFloat = 8.0
+    foresight: Distance = 8.0
     evolution: Literal["rules", "model"] = "rules"
-    carries: PositiveFloat = 0.75
+    carries: Length = 0.75
     toggles: tuple[str, ...] = ("solid", "box")
 
     def __post_init__(self) -> None:
