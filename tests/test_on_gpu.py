@@ -8,7 +8,11 @@ import os
 import pytest
 import torch
 
+from persist_cli.api.actions import walking_actions
 from persist_cli.api.backbone import Sampling
+from persist_cli.api.cells import Box
+from persist_cli.api.ground import Body
+from persist_cli.api.scene_edits import Insert, Remove
 from persist_cli.cli.app import main
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.store import Store
@@ -17,6 +21,7 @@ from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder
 from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
+from tests.support.cell_rooms import camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
 from tests.support.micro_runs import MICRO_SETTINGS, SIZE, losses, run_persist, stage
@@ -88,6 +93,24 @@ def test_a_scene_lies_where_its_frames_do_and_is_that_of_the_cpu():
     tokens = (one.read(frames.cameras, 1000).tensors() for one in (here, there))
     pairs = [*zip(here.tensors().values(), there.tensors().values(), strict=True)]
     pairs += zip(*(one.values() for one in tokens), strict=True)
+    assert all(close(one, other) for one, other in pairs)
+
+
+@pytest.mark.parametrize("evolution", ["rules", "model"])
+def test_a_scene_is_completed_acted_on_and_edited_as_on_the_cpu(evolution):
+    here, there = (empty_scene(DrawnWalls(), evolution=evolution, toggles=("box",)) for _ in range(2))
+    pose = camera_at(cell_room(), (5, 4, 5), (9, 4, 5)).world_from_camera[0]  # a metre before the box
+    names = ("toggle", "pick_up", "drop") if evolution == "rules" else ("pick_up",)
+    actions = {action.name: action for action in walking_actions().actions}
+    for scene, device in ((here, "cpu"), (there, DEVICE)):
+        scene.write(room_walk(2).to(device))
+        scene.complete(Box((3.0, 0.0, -1.0), (3.9, 1.4, 0.4)), seed=2)
+        scene.add(cell_room().to(device))
+        assert all(scene.to(device).act(actions[name], pose.to(device), Body()) for name in names)
+        low, high = (0.3, 0.2, 0.3), (0.9, 1.0, 1.2)  # a part of the table is in it
+        scene.edit([Remove(low=low, high=high), Insert(kind="box", at=(0.5, None, 0.5))], seed=1)
+    assert everywhere(tensor for name, tensor in there.tensors().items() if "carried" not in name)
+    pairs = [*zip(here.tensors().values(), there.tensors().values(), strict=True)]
     assert all(close(one, other) for one, other in pairs)
 
 

@@ -82,9 +82,9 @@ class CellGrid:
     def unknown(
         corner: tuple[int, int, int], shape: tuple[int, int, int], form: CellForm, axes: Float[Tensor, "3 3"]
     ) -> CellGrid:
-        """Return a box of cells of which nothing is known."""
+        """Return a box of cells of which nothing is known, on the CPU, its axes too."""
         empty = torch.zeros(shape, dtype=torch.uint8)
-        return CellGrid(empty, torch.zeros(*shape, 3, dtype=torch.uint8), empty.clone(), corner, form, axes)
+        return CellGrid(empty, torch.zeros(*shape, 3, dtype=torch.uint8), empty.clone(), corner, form, axes.cpu())
 
     @staticmethod
     def empty(form: CellForm, world_up: Sequence[float]) -> CellGrid:
@@ -127,7 +127,7 @@ class CellGrid:
         return torch.stack(torch.meshgrid(first, second, indexing="ij"), dim=-1)
 
     def box(self, corner: tuple[int, int, int], shape: tuple[int, int, int]) -> CellGrid:
-        """Return the cells of another box of the lattice, a copy; those outside of this one are unknown."""
+        """Return the cells of another box of the lattice, a copy on the CPU; those outside of this one are unknown."""
         part = CellGrid.unknown(corner, shape, self.form, self.axes)
         return part.put(self)
 

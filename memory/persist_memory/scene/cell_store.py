@@ -72,7 +72,7 @@ class CellStore:
         box = self.box
         numbers = box.known.nonzero()
         if not len(numbers):
-            return box.box((0, 0, 0), (0, 0, 0))
+            return box.box((0, 0, 0), (0, 0, 0)).to(self.device)
         low, high = numbers.amin(0).tolist(), (numbers.amax(0) + 1).tolist()
         part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         classes, colors, origins = (tensor[part].clone() for tensor in box.tensors())

@@ -313,10 +313,8 @@ class GridScene(Scene):
         return self.settings.size
 
     def _empty_store(self, device: torch.device | None = None) -> CellStore:
-        empty = CellGrid.unknown((0, 0, 0), (0, 0, 0), self._form, self._axes.to(device))
-        return CellStore(
-            replace(empty, **{name: getattr(empty, name).to(device) for name in ("classes", "colors", "origins")})
-        )
+        empty = CellGrid.unknown((0, 0, 0), (0, 0, 0), self._form, self._axes)
+        return CellStore(empty if device is None else empty.to(device))
 
     def _number_at(self, position: Float[Tensor, " 3"]) -> list[int]:
         """The number of the cell at a place in world metres."""

@@ -66,7 +66,7 @@ class Load:
 
 
 def read_load(tensors: Mapping[str, Tensor], classes: int, where: str) -> Load | None:
-    """Return the carried thing among the tensors of a memory of so many classes, ``None`` without one.
+    """Return the carried thing among the tensors of a memory of so many classes, on the CPU, ``None`` without one.
 
     Raises:
         CheckpointError: when a part of it is missing or damaged, or it is of another class.
@@ -76,7 +76,7 @@ def read_load(tensors: Mapping[str, Tensor], classes: int, where: str) -> Load |
         raise CheckpointError(f"{where}: the carried thing has {[len(part) for part in parts]} cells, classes, colours")
     if parts:
         check_classes(parts[1], classes, where, "the carried thing")
-    return Load(parts[0].long(), parts[1], parts[2]) if parts else None
+    return Load(parts[0].long().cpu(), parts[1].cpu(), parts[2].cpu()) if parts else None
 
 
 @dataclass(frozen=True)
