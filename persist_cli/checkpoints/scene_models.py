@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.api.checkpoint import SCENE_CARD, TrainingScenes
+from persist_cli.api.meta_device import without_weights
 from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
-from persist_cli.api.scene_model import SceneModel
+from persist_cli.api.scene_model import SceneForm, SceneModel
 from persist_cli.api.stages import SCENE_STAGES, Stage
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import bundled_folder
@@ -47,14 +48,24 @@ class TrainedSceneModel:
     fingerprint: str
     training_scenes: TrainingScenes | None
 
+    @property
+    def form(self) -> SceneForm:
+        """The windows that it knows; no weights are loaded for that.
+
+        Raises:
+            CheckpointError: when it has only a codec, and so cannot sample.
+        """
+        self._check_stage()
+        with without_weights():
+            return make_scene_model(self.plugin, self.settings).form
+
     def load(self) -> SceneModel:
         """Return the model with its weights, ready to sample.
 
         Raises:
             CheckpointError: when it has only a codec, or a file is missing or damaged, or does not fit.
         """
-        if self.stage != "scene":
-            raise CheckpointError(f"{self.folder}: the codec of a model of scenes alone; train the rest: {TRAIN}")
+        self._check_stage()
         model = make_scene_model(self.plugin, self.settings)
         self.load_into(model, "scene")
         return model.eval()
@@ -67,6 +78,10 @@ class TrainedSceneModel:
         """
         check_sums(self.folder)
         model.load(self.folder, stage)
+
+    def _check_stage(self) -> None:
+        if self.stage != "scene":
+            raise CheckpointError(f"{self.folder}: the codec of a model of scenes alone; train the rest: {TRAIN}")
 
 
 def save_scene_model(model: SceneModel, stage: Stage, folder: Path, scenes: TrainingScenes | None) -> None:

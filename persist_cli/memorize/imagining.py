@@ -9,12 +9,11 @@ from typing import Any
 
 from persist_cli.api.cells import CellForm
 from persist_cli.api.memory import Memory
-from persist_cli.api.meta_device import without_weights
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.data.store import TrajectoryFile
-from persist_cli.plugins import load_plugin, make_scene_model
+from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
 
 
@@ -50,23 +49,16 @@ def of_known_cells(config: MemoryConfig, file: TrajectoryFile | None = None, ask
         asked: whether somebody asked for its settings. Else they give way to the cells of a model or of the data.
 
     Raises:
-        CheckpointError: when there is no such model.
+        CheckpointError: when there is no such model, or it has only a codec.
     """
     if not issubclass(load_plugin("memory", config.name), Scene) or (asked and "palette" in config.settings):
         return config
     form: CellForm | None = None
     if config.settings.get("model") is not None:
-        form = _form_of(str(config.settings["model"]))
+        form = find_scene_model(str(config.settings["model"])).form.cells
     elif file is not None:
         form = file.cell_form
     if form is None:
         return config
     cells: dict[str, Any] = {"palette": list(form.palette), "size": form.size}
     return replace(config, settings=cells | config.settings if asked else config.settings | cells)
-
-
-def _form_of(path: str) -> CellForm:
-    """The cells that a trained model knows."""
-    found = find_scene_model(path)
-    with without_weights():
-        return make_scene_model(found.plugin, found.settings).form.cells

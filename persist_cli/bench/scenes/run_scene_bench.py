@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.bench.scenes.completion_part import completion_json, run_completion
+from persist_cli.bench.scenes.completions import SceneCompletion, Truth
 from persist_cli.bench.scenes.edit_part import edits_json, run_edits
 from persist_cli.bench.scenes.plan_pictures import picture_views
 from persist_cli.bench.scenes.return_part import return_json, run_returns
@@ -25,8 +26,6 @@ RESULTS: Final = "metrics.json"
 TABLES: Final = "tables.md"
 
 FORMAT, VERSION = "persist-scenes", 1
-
-BASELINES: Final = ("empty", "nearest house", "class prior")
 
 
 def run_scene_bench(plan: SceneBenchPlan, out: Path, report: Path | None, json: bool) -> None:
@@ -107,9 +106,12 @@ def results_json(bench: SceneBench) -> dict[str, Any]:
 
 
 def against_baselines(part: dict[str, Any]) -> dict[str, Any]:
-    """Return the best row without a model by mIoU, and how many times as good the model is; ``None`` without one."""
-    means = {name: part["rows"][name]["figures"]["miou"]["mean"] for name in BASELINES if name in part["rows"]}
-    best = max(means, key=lambda name: means[name] or 0.0)
-    model = part["rows"].get("model", {}).get("figures", {}).get("miou", {}).get("mean")
+    """Return the best row by mIoU that has no model and no truth, and how many times as good the model is.
+
+    The ratio is ``None`` without a model, or where the best row has nothing right.
+    """
+    means = {name: row["figures"]["miou"]["mean"] for name, row in part["rows"].items()}
+    model = means.pop(SceneCompletion.name, None)
+    best = max((name for name in means if name != Truth.name), key=lambda name: means[name] or 0.0)
     ratio = model / means[best] if model is not None and means[best] else None
     return {"best_baseline": best, "ratio": ratio}

@@ -175,7 +175,7 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
 
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
     """Raise ``PersistError`` when a model knows other cells than the data's, or was trained on one of their houses."""
-    same_form(CellGrid.empty(trained.load().form.cells, files[0].info.world_up), files[0].cells(0).form, "the model")
+    same_form(CellGrid.empty(trained.form.cells, files[0].info.world_up), files[0].cells(0).form, "the model")
     names = trained.training_scenes.names if trained.training_scenes is not None else frozenset()
     if trained.training_scenes is None or not trained.training_scenes.complete:
         warn(f"{trained.folder}: not all scenes that this model was trained on are known")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from persist_cli.api.actions import walking_actions
+from persist_cli.bench.scenes.run_scene_bench import against_baselines
 from persist_cli.bench.scenes.scene_journal import file_name
 from persist_cli.bench.scenes.walk_part import Wanderer
+from persist_cli.checkpoints.scene_models import find_scene_model
 from tests.conftest import Persist
 from tests.support.cell_houses import write_cell_houses
 from tests.support.micro_runs import run_persist
@@ -40,6 +43,21 @@ def test_every_row_is_compared_with_the_true_cells(measured: Path) -> None:
     assert part["classes"] == ["floor", "ceiling", "wall"]  # the doorway is farther away
     assert part["rows"]["model"]["seeds"] == 2
     assert part["rows"]["model"]["figures"]["miou"]["differences"].keys() == part["rows"].keys() - {"model", "truth"}
+
+
+def test_a_model_is_compared_with_the_best_row_that_has_no_model_and_no_truth() -> None:
+    means = {"model": 0.1, "empty": 0.0, "outside": 0.01, "nearest house": 0.04, "5 nearest houses": 0.08, "truth": 1.0}
+    rows = {name: {"figures": {"miou": {"mean": mean}}} for name, mean in means.items()}
+    compared = against_baselines({"rows": rows})
+    assert compared == {"best_baseline": "5 nearest houses", "ratio": pytest.approx(1.25)}
+    del rows["model"]
+    assert against_baselines({"rows": rows})["ratio"] is None
+
+
+def test_the_windows_of_a_model_are_known_without_its_weights(scene_model: Path, tmp_path: Path) -> None:
+    trained = find_scene_model(scene_model)
+    alone = shutil.copytree(trained.folder, tmp_path / "alone", ignore=shutil.ignore_patterns("*.safetensors"))
+    assert find_scene_model(alone).form == trained.load().form
 
 
 def test_walks_count_what_is_new_in_each_window(measured: Path) -> None:
