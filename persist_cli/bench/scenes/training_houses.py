@@ -42,8 +42,8 @@ class Match:
     Args:
         scene: name of the house.
         house: its number.
-        turns: quarter turns from the first ground axis towards the second that it was turned by.
-        shift: column of the region's corner in the turned house; it may be negative.
+        turns: quarter turns from the first ground axis towards the second by which the region is turned to fit.
+        shift: column of the house in which the corner of the turned region lies; it may be negative.
         agreement: share of the view's known cells that are free or not as the house's are.
     """
 
