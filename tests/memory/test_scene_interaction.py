@@ -6,10 +6,12 @@ import torch
 from persist_cli.api.actions import walking_actions
 from persist_cli.api.cells import FREE, SOLID, CellOrigin
 from persist_cli.api.ground import Body
+from persist_cli.api.scene_edits import Remove
 from persist_cli.errors import CheckpointError
 from persist_cli.memorize.memory_file import load_memory
-from tests.support.cell_rooms import BOX, BOX_CELLS, FLOOR, WALL, camera_at, cell_room
+from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
+from tests.support.scene_worlds import rendering
 
 ACTIONS = walking_actions()
 BEFORE_BOX = (5, 4, 5), (9, 4, 5)  # a metre before the box
@@ -156,6 +158,24 @@ def test_a_model_that_blurs_colours_and_names_classes_changes_nothing_else():
     assert do(scene, "pick_up")
     origins = scene.cells.box(grid.corner, grid.shape).origins
     assert int((origins == CellOrigin.IMAGINED).sum()) == 1
+
+
+@pytest.mark.parametrize("change", ["pick_up", "edit"])
+def test_the_view_that_a_model_is_told_of_no_longer_shows_what_is_gone(change):
+    scene, camera = furnished(), camera_at(cell_room(), (5, 4, 5), (9, 4, 1))
+    frame = rendering(cell_room(), camera)
+    scene.write(frame)
+    scene.add(cell_room())
+    if change == "pick_up":
+        assert do(scene, "pick_up")
+    else:
+        scene.edit([Remove(low=(1.6, 0.1, 1.3), high=(2.0, 0.4, 1.7))])
+    assert int(classes(scene)[BOX_CELLS]) == FREE
+    view, red = scene.tensors(), (frame.rgb[0] == torch.tensor(COLORS[BOX])).all(-1)
+    assert int(red.sum()) > 20
+    assert int(view["view.rgb"][red].max()) == 0 == float(view["view.depth"][red].max())
+    assert torch.equal(view["view.rgb"][~red], frame.rgb[0][~red])
+    assert torch.equal(view["view.depth"][~red], frame.depth[0][~red])
 
 
 def test_what_was_picked_up_is_not_seen_any_more():

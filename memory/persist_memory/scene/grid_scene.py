@@ -393,7 +393,10 @@ class GridScene(Scene):
         return True
 
     def _change(self, after: CellGrid, before: CellGrid) -> None:
-        """Overwrite the cells in which two grids of one box differ."""
+        """Overwrite the cells in which two grids of one box differ; the view no longer shows what is gone."""
+        gone = before.solid & ~after.solid
+        if self._view is not None and bool(gone.any()):
+            self._view = self._view.without(before, gone)
         self._store.replace(after, changed_cells(before, after))
         self._cells = None
 

@@ -17,9 +17,11 @@ from torch import Tensor
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cell_rays import first_surfaces, sheet_cells
 from persist_cli.api.cells import SOLID, CellGrid, CellOrigin
+from persist_cli.api.geometry import unproject
 from persist_cli.api.reach import cells_in_reach
 from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples
 from persist_cli.errors import CheckpointError
+from persist_memory.scene.fusion import UNDER, surface_normals
 from persist_memory.validation import Shape, part_of
 
 Corner = tuple[int, int, int]
@@ -50,6 +52,18 @@ class View:
     rgb: UInt8[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
     camera: Cameras
+
+    def without(self, grid: CellGrid, gone: Bool[Tensor, "first second level"]) -> View:
+        """Return this view with black pixels without depth where it shows what is gone from some cells of a grid."""
+        center, depth = self.camera.centers.double().cpu(), self.depth.cpu()
+        rays = (unproject(depth, self.camera.to("cpu")) - center)[None]  # to what the pixels see
+        inner = rays + UNDER * grid.form.size * surface_normals(rays, depth[None] > 0)  # as when frames are written
+        places = grid.numbers(inner[0] + center) - torch.tensor(grid.corner)
+        inside = ((places >= 0) & (places < torch.tensor(grid.shape))).all(-1) & (depth > 0)
+        stale = inside.clone()
+        stale[inside] = gone[tuple(places[inside].T)]
+        kept = ~stale.to(self.depth.device)
+        return replace(self, rgb=self.rgb * kept[..., None], depth=self.depth * kept)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that ``read_view`` takes back."""
