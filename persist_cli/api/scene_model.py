@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Tensor, nn
 
-from persist_cli.api.cells import CellForm
+from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.io.settings import NoSettings
 
@@ -93,6 +93,22 @@ class SceneSamples:
         """Return a batch of samples of one form."""
         parts = [sample.tensors() for sample in samples]
         return SceneSamples(**{name: torch.stack([part[name] for part in parts]) for name in parts[0]})
+
+
+def window_pose(window: CellGrid, world_from_camera: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """Return the pose of a camera in the ground axes, metres from the centre of a window's cell 0, float64."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = window.axes @ world_from_camera[:3, :3].double()
+    corner = torch.tensor(window.corner, dtype=torch.float64) * window.form.size
+    pose[:3, 3] = window.axes @ world_from_camera[:3, 3].double() - corner
+    return pose
+
+
+def no_view(form: SceneForm) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return RGB, depth, pose and intrinsics of a sample without a view: all pixels are 0, seen from cell 0."""
+    height, width = form.image
+    lens = torch.tensor([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1]])
+    return torch.zeros(height, width, 3, dtype=torch.uint8), torch.zeros(height, width), torch.eye(4), lens
 
 
 class SceneModel(nn.Module, ABC):

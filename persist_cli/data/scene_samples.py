@@ -20,8 +20,8 @@ from torch.utils.data import Dataset
 from persist_cli.api.cell_things import STRUCTURE
 from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellGrid, CellOrigin
 from persist_cli.api.reach import cells_in_reach
-from persist_cli.api.scene_model import Given, SceneForm, SceneSamples
-from persist_cli.data.scene_turns import Turn, window_pose
+from persist_cli.api.scene_model import Given, SceneForm, SceneSamples, no_view, window_pose
+from persist_cli.data.scene_turns import Turn
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.data.written_scenes import SceneWriter, TensorStore, WrittenScene
 from persist_cli.errors import DataError
@@ -258,9 +258,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         rgb, depth = (turned.image(image) for image in (view.rgb[0], view.depth[0]))
         pose, lens = turned.pose(pose, form), turned.lens(lens, form.image[1])
         if window.blind:
-            height, width = form.image
-            rgb, depth, pose = torch.zeros_like(rgb), torch.zeros_like(depth), torch.eye(4, dtype=torch.float64)
-            lens = torch.tensor([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1]], dtype=torch.float64)
+            rgb, depth, pose, lens = no_view(form)
         return SceneSamples(
             **cells,
             rgb=rgb,

@@ -1,4 +1,4 @@
-"""Poses in windows of cells, and the symmetries of a window with its view."""
+"""The symmetries of a window of cells with its view."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.api.cells import CellGrid
 from persist_cli.api.scene_model import SceneForm
 
 
@@ -62,12 +61,3 @@ class Turn:
             sides.reverse()
             pose[0, 3] += (sides[0] - 1) * form.cells.size
         return pose
-
-
-def window_pose(window: CellGrid, world_from_camera: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """The pose of a camera in the ground axes, metres from the centre of a window's cell 0, float64."""
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = window.axes @ world_from_camera[:3, :3].double()
-    corner = torch.tensor(window.corner, dtype=torch.float64) * window.form.size
-    pose[:3, 3] = window.axes @ world_from_camera[:3, 3].double() - corner
-    return pose

@@ -19,7 +19,7 @@ from persist_cli.api.cell_rays import first_surfaces, sheet_cells
 from persist_cli.api.cells import SOLID, CellGrid, CellOrigin
 from persist_cli.api.geometry import unproject
 from persist_cli.api.reach import cells_in_reach
-from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples
+from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples, no_view, window_pose
 from persist_cli.errors import CheckpointError
 from persist_memory.scene.fusion import UNDER, surface_normals
 from persist_memory.validation import Shape, part_of
@@ -181,23 +181,15 @@ class Imagination:
 
     def _seen(self, window: CellGrid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return RGB, depth, pose and intrinsics of the view, for a window; without a view in it all pixels are 0."""
-        height, width = self.model.form.image
-        rgb = torch.zeros(height, width, 3, dtype=torch.uint8)
-        depth, pose = torch.zeros(height, width), torch.eye(4)
-        matrix = torch.tensor([[width, 0, width / 2], [0, height, height / 2], [0, 0, 1]])
+        form = self.model.form
         if self.view is None:
-            return rgb, depth, pose, matrix
-        view = resized(self.view, height, width)
-        world_from_camera = view.camera.world_from_camera.double().cpu()
-        window_from_camera = torch.eye(4, dtype=torch.float64)
-        axes = window.axes.cpu()
-        window_from_camera[:3, :3] = axes @ world_from_camera[:3, :3]
-        corner = torch.tensor(window.corner, dtype=torch.float64)
-        window_from_camera[:3, 3] = axes @ world_from_camera[:3, 3] - corner * window.form.size
-        place = (window_from_camera[:3, 3] / window.form.size).round()
+            return no_view(form)
+        view = resized(self.view, *form.image)
+        pose = window_pose(window, view.camera.world_from_camera.cpu())
+        place = (pose[:3, 3] / window.form.size).round()
         if bool(((place < 0) | (place >= place.new_tensor(window.shape)))[:2].any()):
-            return rgb, depth, pose, matrix  # far from here: it shows another place
-        return view.rgb.cpu(), view.depth.cpu(), window_from_camera.float(), view.camera.intrinsics.float().cpu()
+            return no_view(form)  # far from here: it shows another place
+        return view.rgb.cpu(), view.depth.cpu(), pose.float(), view.camera.intrinsics.float().cpu()
 
 
 def resized(view: View, height: int, width: int) -> View:
