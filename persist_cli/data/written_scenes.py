@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -18,12 +18,13 @@ from torch import Tensor
 from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference
-from persist_cli.api.observations import Observations
+from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.scene import Scene
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.data.stored_cells import CellBox, encode_cells
 from persist_cli.errors import PluginError
-from persist_cli.plugins import find_plugin, make_encoder, make_memory
+from persist_cli.io.settings import parse_settings
+from persist_cli.plugins import find_plugin, load_plugin, make_encoder
 
 MEMORY: Final = "scene"  # the plugin that is written
 FORMAT: Final = 1  # of what is kept
@@ -75,9 +76,9 @@ class SceneWriter:
         """
         key = self._key(file, frames)
         tensors = self._kept(key)
-        view = file.read([frames[-1]]).observations
+        seen = file.read(frames if tensors is None else [frames[-1]]).observations
         if tensors is None:
-            known = self._write(file, frames)
+            known = self._write(file.info, seen)
             tensors = {
                 "box": torch.tensor([*known.corner, *known.shape]),
                 "cells": _to_tensor(encode_cells(known, None)),
@@ -85,7 +86,7 @@ class SceneWriter:
             self._keep(key, tensors)
         corner, shape = (tuple(int(n) for n in part) for part in (tensors["box"][:3], tensors["box"][3:]))
         box = CellBox(self.form, corner, shape)  # type: ignore[arg-type]
-        return WrittenScene(view, box.read([tensors["cells"].numpy().tobytes()], file.info.world_up))
+        return WrittenScene(seen[-1:], box.read([tensors["cells"].numpy().tobytes()], file.info.world_up))
 
     @cached_property
     def _encoder(self) -> Encoder:
@@ -95,12 +96,21 @@ class SceneWriter:
     def _version(self) -> str:
         return find_plugin("memory", MEMORY).version
 
-    def _write(self, file: TrajectoryFile, frames: Sequence[int]) -> CellGrid:
-        info, settings = file.info, {"size": self.form.size, "palette": list(self.form.palette)}
-        scene = make_memory(MEMORY, settings, self._encoder, FrameOfReference(info.scene, info.world_up))
-        if not isinstance(scene, Scene):
+    @cached_property
+    def _kind(self) -> type[Scene]:
+        kind = load_plugin("memory", MEMORY)
+        if not issubclass(kind, Scene):
             raise PluginError(f"memory {MEMORY!r} is no scene; samples of scenes are made with one")
-        scene.memorize(file.read(frames).observations)
+        return kind
+
+    @cached_property
+    def _settings(self) -> Any:
+        values = {"size": self.form.size, "palette": list(self.form.palette)}
+        return parse_settings(self._kind.settings_type, values, f"memory {MEMORY!r}")
+
+    def _write(self, info: TrajectoryInfo, seen: Observations) -> CellGrid:
+        scene = self._kind(self._settings, self._encoder, FrameOfReference(info.scene, info.world_up))
+        scene.memorize(seen)
         return scene.cells
 
     def _key(self, file: TrajectoryFile, frames: Sequence[int]) -> str:

@@ -6,13 +6,14 @@ import dataclasses
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from persist_cli.errors import RecipeError, nearest_name
 from persist_cli.io.value_kinds import describe_kind, is_fixed_tuple, kind_at, plain_value, union_members
 
 if TYPE_CHECKING:
-    from pydantic import ValidationError
+    from pydantic import TypeAdapter, ValidationError
     from pydantic_core import ErrorDetails
 
 T = TypeVar("T")
@@ -34,17 +35,25 @@ def parse_settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     Raises:
         RecipeError: one line with every unknown key and the known one nearest to it, missing key and wrong value.
     """
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import ValidationError
 
     problems = list(_unknown_keys(kind, values, ""))
     instance: T | None = None
     try:
-        instance = TypeAdapter(kind).validate_python(dict(values))
+        instance = _adapter_of(kind).validate_python(dict(values))  # type: ignore[arg-type]  # a class is hashable
     except ValidationError as error:
         problems += plain_problems(kind, values, error)
     if problems or instance is None:
         raise RecipeError(f"{where}: " + "; ".join(problems))
     return instance
+
+
+@lru_cache
+def _adapter_of(kind: type[T]) -> TypeAdapter[T]:
+    """Pydantic's view of a type; making it takes milliseconds, checking values with it hardly any."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
 
 
 def plain_problems(kind: Any, values: Mapping[str, Any], error: ValidationError) -> list[str]:
