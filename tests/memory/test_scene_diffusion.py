@@ -13,7 +13,7 @@ from persist_cli.api.scene_model import Given, SceneSamples
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import make_scene_model
-from persist_memory.scene_models.codec import fold, unfold
+from persist_memory.scene_models.codec import channels_first, fold, unfold, unfolded_cells
 from persist_memory.scene_models.conditions import draw_levels, known_tokens
 from persist_memory.scene_models.scene_diffusion import SceneDiffusion, generators_of, noise_levels, start, truth
 from persist_memory.scene_models.settings import SceneDiffusionSettings
@@ -44,6 +44,24 @@ def test_a_block_of_cells_becomes_the_channels_of_its_own_latent():
     values[..., 2:, :2] = 1.0
     assert fold(values, 2)[0, :, 1, 0].equal(torch.ones(4))
     assert fold(values, 2).sum() == 4
+
+
+@pytest.mark.parametrize("folded", [True, False])
+def test_given_cells_are_patched_as_by_the_convolution_whose_weights_they_have(folded, samples):
+    network = micro_model(codec=MICRO_SCENE["codec"] | {"fold_levels": folded}).double()
+    given = network.given
+    told = (samples.given != Given.NOTHING).int()
+    contents = told * (1 + samples.classes.int() + len(PALETTE) * (samples.given == Given.PAST))
+    cells = torch.cat([given.contents(contents), samples.colors.double() / 255 * told[..., None]], dim=-1)
+    convolved = given.patches(channels_first(cells, given.axes)).flatten(2).transpose(1, 2)
+    assert torch.allclose(given(samples), convolved, rtol=1e-12, atol=1e-12)
+
+
+def test_classes_and_colours_are_read_off_as_by_one_product(model):
+    latents = torch.randn(2, 8, 4, 4, generator=torch.Generator().manual_seed(0))
+    parts = torch.cat(model.codec.read_off(latents), dim=-1)
+    whole = model.codec.cell(unfolded_cells(model.codec.decoder(latents), 2, 8))
+    assert torch.allclose(parts, whole, atol=1e-5)
 
 
 @pytest.mark.parametrize("stage", ["scene-codec", "scene"])

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import gcd
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor, nn
+from torch.nn import functional
 
 from persist_memory.scene_models.settings import REDUCTION, SceneDiffusionSettings
 
@@ -76,8 +78,12 @@ class SceneCodec(nn.Module):
         self, latents: Float[Tensor, "batch channel *latent"]
     ) -> tuple[Float[Tensor, "batch first second level klass"], Float[Tensor, "batch first second level 3"]]:
         """Return the logits of classes and the colours (1 = 255) of latents that are not normalised."""
-        cells = self.cell(unfolded_cells(self.decoder(latents), self.axes, self.settings.shape[2])).float()
-        return cells[..., :-COLORS], cells[..., -COLORS:]
+        last: Any = self.cell[1]
+        cells = self.cell[0](unfolded_cells(self.decoder(latents), self.axes, self.settings.shape[2]))
+        # parts of the output of a single product would have gradients of its size, filled with zeros
+        parts = ((last.weight[part], last.bias[part]) for part in (slice(-COLORS), slice(-COLORS, None)))
+        logits, colors = (functional.linear(cells, weight, bias).float() for weight, bias in parts)
+        return logits, colors
 
     def measure(self, latents: Sequence[Float[Tensor, "batch channel *latent"]]) -> None:
         """Set the mean and deviation by which latents are normalised to those of some that are not."""

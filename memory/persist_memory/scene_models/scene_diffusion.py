@@ -92,9 +92,7 @@ class SceneDiffusion(SceneModel):
         share = self.settings.codec.noise
         noisy = (1 - share) * drawn + share * spread * noise_like(mean, generators)
         logits, predicted = self.codec.read_off(noisy)
-        errors = F.cross_entropy(logits.flatten(0, 3), classes.flatten().long(), reduction="none")
-        weights = self.weights[classes.flatten().int()]
-        cross_entropy = (weights * errors).sum() / weights.sum()
+        cross_entropy = F.cross_entropy(logits.flatten(0, 3), classes.flatten().long(), weight=self.weights)
         solid = is_solid(classes)
         color_error = ((predicted - colors / 255).abs().mean(-1) * solid).sum() / solid.sum().clamp_min(1)
         divergence = 0.5 * (mean**2 + logarithm.exp() - 1 - logarithm).sum() / classes.numel()
