@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
+from torch.nn import functional
 
 from persist_cli.api.cells import COMMON, SOLID
 from persist_cli.api.scene_model import Given, SceneSamples
 from persist_memory.scene_models.codec import (
     COLORS,
     cells_of_a_token,
-    channels_first,
     convolution,
     every_cell,
     unfold,
@@ -51,10 +52,29 @@ class GivenCells(nn.Module):
         kinds, given = len(self.settings.palette), samples.given.int()
         contents = (1 + samples.classes.int() + kinds * (given == Given.PAST)) * (given != Given.NOTHING)
         told = (given != Given.NOTHING)[..., None]
-        embedded = self.contents(contents)
-        cells = torch.cat([embedded, samples.colors.to(embedded.dtype) / 255 * told], dim=-1)
-        tokens: Tensor = self.patches(channels_first(cells, self.axes)).flatten(2).transpose(1, 2)
+        embedded = self.contents(self._blocks(contents))
+        colors = self._blocks(samples.colors * told).to(embedded.dtype) / 255
+        values = self._patched(torch.cat([embedded, colors], dim=-1).flatten(4)).movedim(-1, 1)
+        tokens: Tensor = self.patches[1:](values[..., 0] if self.axes == 2 else values).flatten(2).transpose(1, 2)
         return tokens
+
+    def _blocks(self, cells: Shaped[Tensor, "batch first second level *rest"]) -> Tensor:
+        """The cells of each token, ``[batch, row, column, layer, cell, …]``: cheaper before they are embedded."""
+        edge = cells_of_a_token(self.settings)
+        height = cells.shape[3] if self.axes == 2 else edge
+        parts = cells.unflatten(3, (-1, height)).unflatten(2, (-1, edge)).unflatten(1, (-1, edge))
+        blocks: Tensor = parts.permute(0, 1, 3, 5, 2, 4, 6, *range(7, parts.ndim)).flatten(4, 6)
+        return blocks
+
+    def _patched(self, values: Float[Tensor, "*batch value"]) -> Float[Tensor, "*batch channel"]:
+        """The first convolution, whose kernels do not overlap, as a product with the values of each token's cells."""
+        first: Any = self.patches[0]
+        if self.axes == 2:
+            kernels = first.weight.unflatten(1, (self.settings.shape[2], -1)).permute(0, 3, 4, 1, 2)
+        else:
+            kernels = first.weight.permute(0, 2, 3, 4, 1)
+        product: Tensor = functional.linear(values, kernels.flatten(1), first.bias)
+        return product
 
 
 class ViewTokens(nn.Module):
