@@ -124,7 +124,8 @@ class ClipDataset(Dataset[ClipSample]):
         plan: settings of the clips.
 
     Raises:
-        DataError: when no trajectory is long enough, or images are not of the plan's size.
+        DataError: when no trajectory is long enough, images are not of the plan's size, or one has no cells and some
+            of its samples would take the true ones.
     """
 
     def __init__(self, folders: Sequence[Path], plan: ClipPlan) -> None:
@@ -145,6 +146,8 @@ class ClipDataset(Dataset[ClipSample]):
             )
         for file in self.files:
             check_size(file.info, plan.image_size, f"{file.path.parent}#{file.name}", plan.augmentation.crop < 1)
+            if plan.true_cells and not file.has_cells:
+                raise file.without_cells()
 
     def __getitem__(self, number: int) -> ClipSample:
         return self.read(self.choose(number))

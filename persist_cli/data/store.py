@@ -116,6 +116,13 @@ class TrajectoryFile:
         """Size and classes of the stored cells, ``None`` without any."""
         return None if self._cell_box is None else self._cell_box.form
 
+    def without_cells(self) -> DataError:
+        """The error of a trajectory that was to have cells and has none."""
+        return DataError(
+            f"{self.path}: has no cells of its scene; `persist collect` writes them for simulators that know their "
+            "geometry"
+        )
+
     def cells(self, frame: int) -> CellGrid:
         """The scene's cells as they are at a frame, in the box that all frames of the trajectory have.
 
@@ -124,10 +131,7 @@ class TrajectoryFile:
         """
         box = self._cell_box
         if box is None:
-            raise DataError(
-                f"{self.path}: has no cells of its scene; `persist collect` writes them for simulators that know "
-                "their geometry"
-            )
+            raise self.without_cells()
         (number,) = self.frame_numbers([frame])
         groups = range(bisect.bisect_right(self._group_starts, number))
         with _parquet_errors(self.path), self._open() as file:

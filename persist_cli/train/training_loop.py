@@ -6,8 +6,8 @@ import math
 import signal
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, Generic, TypeVar, cast
@@ -55,6 +55,25 @@ def outlive_signals(_worker: int) -> None:
     """Let a process that reads data go on when all processes get a signal: the run ends it, after its checkpoint."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+
+
+class CaughtErrors(Dataset[Any]):
+    """The samples of a data set; an error that the user can mend stands in the place of the sample that it is about.
+
+    Raised in a process that reads data, its one line would come back with that process's traceback.
+
+    Args:
+        dataset: the data set.
+    """
+
+    def __init__(self, dataset: Dataset[Any]) -> None:
+        self.dataset = dataset
+
+    def __getitem__(self, number: int) -> Any:
+        try:
+            return self.dataset[number]
+        except PersistError as error:
+            return error
 
 
 class TrainingLoop(ABC, Generic[Model]):
@@ -117,15 +136,19 @@ class TrainingLoop(ABC, Generic[Model]):
         """The batch as the model takes it in this step; a subclass may measure a part of the work here."""
         return batch
 
-    def loader(self) -> Iterator[Any]:
-        """Batches of this process from the state's step to the last."""
+    def loader(self) -> Generator[Any, None, None]:
+        """Batches of this process from the state's step to the last.
+
+        Raises:
+            PersistError: when a sample cannot be read, whichever process reads it.
+        """
         settings = self.recipe.training
         batches = DistributedBatches(
             self.state.step, settings.steps, settings.batch, settings.accumulation,
             self.accelerator.process_index, self.accelerator.num_processes,
         )  # fmt: skip
         loader: DataLoader[Any] = DataLoader(
-            self.dataset,
+            CaughtErrors(self.dataset),
             batch_sampler=batches,
             num_workers=settings.workers,
             collate_fn=list,
@@ -133,12 +156,18 @@ class TrainingLoop(ABC, Generic[Model]):
             generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
         )
         remaining = iter(loader)
-        while True:
-            with self.times.part("data"):
-                samples = next(remaining, None)
-            if samples is None:
-                return
-            yield self.to_batch(samples)
+        try:
+            while True:
+                with self.times.part("data"):
+                    samples = next(remaining, None)
+                if samples is None:
+                    return
+                errors = [sample for sample in samples if isinstance(sample, PersistError)]
+                if errors:
+                    raise errors[0]
+                yield self.to_batch(samples)
+        finally:
+            del remaining  # its processes end now, and not when the traceback of an error is forgotten
 
     def first_batches(self, count: int) -> Iterator[Any]:
         """So many batches of the first samples, of which something is measured before or after training."""
@@ -148,12 +177,12 @@ class TrainingLoop(ABC, Generic[Model]):
 
     def steps(self) -> Iterator[dict[str, float]]:
         """Train to the last step; yields the logged values of each optimizer step."""
-        batches = self.loader()
-        while self.state.step < self.recipe.training.steps:
-            with self.times.step():
-                values = self.step(batches)
-            self.state.step += 1
-            yield values
+        with closing(self.loader()) as batches:
+            while self.state.step < self.recipe.training.steps:
+                with self.times.step():
+                    values = self.step(batches)
+                self.state.step += 1
+                yield values
 
     def step(self, batches: Iterator[Any]) -> dict[str, float]:
         """Take an optimizer step; returns its losses, which are means over micro-batches and processes.

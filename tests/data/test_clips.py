@@ -141,4 +141,4 @@ def test_true_cells_change_neither_the_choice_of_clips_nor_that_of_contexts(walk
 
 def test_true_cells_that_the_data_do_not_have_are_one_line(walks):
     with pytest.raises(DataError, match="has no cells of its scene"):
-        ClipDataset([walks], plan(true_cells=1.0))[0]
+        ClipDataset([walks], plan(true_cells=1.0))

@@ -234,6 +234,20 @@ def test_each_impossible_run_ends_in_one_line(persist, walks, codec, stage1, tmp
     assert not list((tmp_path / "a").glob("step-*"))
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_images_that_are_damaged_end_a_run_in_one_line_whichever_process_reads_them(
+    persist, walks, codec, tmp_path, workers
+):
+    shutil.copytree(walks, tmp_path / "walks")
+    for path in (tmp_path / "walks").iterdir():
+        content = path.read_bytes()
+        path.write_bytes(content[:1000] + bytes(len(content) // 2) + content[1000 + len(content) // 2 :])
+    changes = [f"base={codec}", f"training.workers={workers}"]
+    ended = persist(*stage("stage1", tmp_path / "walks", tmp_path / "run", *changes))
+    assert (ended.code, "not a whole Parquet file" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+
+
 def test_a_damaged_checkpoint_or_another_base_ends_a_rollout_in_one_line(persist, walks, codec, tmp_path):
     run = tmp_path / "base"
     short = [f"base={codec}", "training.steps=1"]
