@@ -111,7 +111,7 @@ class CacheKeys:
         if self.repeats and self.tokens is not None:
             context: dict[str, Any] = {"context": list(frames.context)}
             context |= {"errors": frames.noise_seed} if frames.noise_seed else {}
-            context = {"cells": "true"} if frames.true_cells else context
+            context = {"cells": frames.segments()[0].frames[0]} if frames.true_cells else context
             tokens = cache_key(clip | context | self.tokens)
             memory = cache_key(clip | {"frames": "memory"} | context | self.tokens)
         return ClipKeys(latents, tokens, memory)

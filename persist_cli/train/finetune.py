@@ -191,7 +191,7 @@ def prepare_trainer(
 ) -> AnyTrainer:
     """The trainer of a recipe, which begins at its base or with fresh weights."""
     if recipe.policy is not None:
-        return PolicyTrainer(recipe, prepare_policy(recipe, run, plan), accelerator)
+        return PolicyTrainer(recipe, *prepare_policy(recipe, run, plan), accelerator)
     if recipe.scene is not None:
         return SceneTrainer(recipe, *prepare_scene_model(recipe, run), accelerator, plan.cache)
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
@@ -212,8 +212,10 @@ def prepare_run(trainer: AnyTrainer, run: Path, base: Checkpoint | None, plan: F
     return RunFolder(run, trainer, base)
 
 
-def prepare_policy(recipe: Recipe, run: Path, plan: FinetunePlan) -> PolicyNetwork:
-    """The network to train: fresh, or that of the policy that ``base`` names, which a resumed run does not read again.
+def prepare_policy(recipe: Recipe, run: Path, plan: FinetunePlan) -> tuple[PolicyNetwork, TrainingScenes]:
+    """The network to train, fresh or that of the policy that ``base`` names, and the scenes that it was trained on.
+
+    A resumed run does not read its base again: its newest checkpoint names the base's scenes too.
 
     Raises:
         PersistError: when the base is not there or is another policy, or a cache is asked for.
@@ -222,12 +224,15 @@ def prepare_policy(recipe: Recipe, run: Path, plan: FinetunePlan) -> PolicyNetwo
     if plan.cache is not None:
         raise RecipeError("--cache keeps what is made of clips; a policy has none, leave it out")
     network = make_network(recipe.policy.name, recipe.policy.settings)
-    if recipe.base is not None and not step_folders(run):
-        base = find_policy(Path(recipe.base))
-        if base.policy != recipe.policy.name:
-            raise RecipeError(f"base {recipe.base} is of policy {base.policy!r}, not {recipe.policy.name!r}")
-        network.load(base.folder)
-    return network
+    steps = step_folders(run)
+    if not steps and recipe.base is None:
+        return network, TrainingScenes()
+    begun = find_policy(steps[-1] if steps else Path(str(recipe.base)))
+    if begun.policy != recipe.policy.name:
+        raise RecipeError(f"base {recipe.base} is of policy {begun.policy!r}, not {recipe.policy.name!r}")
+    if not steps:
+        network.load(begun.folder)
+    return network, begun.training_scenes or TrainingScenes(complete=False)
 
 
 def prepare_scene_model(recipe: Recipe, run: Path) -> tuple[SceneModel, TrainingScenes]:

@@ -21,20 +21,23 @@ class PolicyTrainer(TrainingLoop[PolicyNetwork]):
 
     Args:
         recipe: the run's recipe.
-        network: the network.
+        network: the network, with the weights that the training begins with.
+        scenes: those that these were trained on.
         accelerator: accelerate for this process, which may be one of many.
 
     Raises:
         PersistError: when there are no samples, or the network is to be sharded.
     """
 
-    def __init__(self, recipe: Recipe, network: PolicyNetwork, accelerator: Accelerator) -> None:
+    def __init__(
+        self, recipe: Recipe, network: PolicyNetwork, scenes: TrainingScenes, accelerator: Accelerator
+    ) -> None:
         super().__init__(recipe, accelerator)
         folders = [data_folder(path) for path in recipe.data.path]
         data, form = recipe.data, network.sample_form
         samples = PolicySampleDataset(folders, form, recipe.training.seed, data.mirror, data.detour)
         self.dataset = samples
-        self.scenes = TrainingScenes(frozenset(trained_scene(file.info) for file in samples.files))
+        self.scenes = scenes | TrainingScenes(frozenset(trained_scene(file.info) for file in samples.files))
         self.prepare(network, network.trained_parameters())
 
     def make_sharding(self) -> None:

@@ -7,9 +7,12 @@ import shutil
 
 import pytest
 
+from persist_cli.api.checkpoint import TrainingScenes, step_folders
 from persist_cli.io.files import read_tensors
+from persist_cli.policies.trained import find_policy
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.training_loop import learning_rate
+from tests.support.damage import without_sums
 from tests.support.micro_policies import policy_stage
 from tests.support.micro_runs import equal_runs, losses, run_result
 
@@ -50,6 +53,27 @@ def test_a_run_begins_at_the_weights_of_its_base(persist, walks, whole, tmp_path
     begun = run_result(tmp_path / "run")[0]
     assert all(begun[f"parameter/{name}"].allclose(value, atol=1e-9) for name, value in average.items())
     assert len(losses(tmp_path / "run")) == 1
+
+
+def test_a_run_knows_the_scenes_of_its_base_too_after_it_was_resumed_without_that(persist, held_out, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "base")
+    on = policy_stage(held_out, tmp_path / "run", f"base={tmp_path / 'base'}", "training.keep_checkpoints=9")
+    assert persist(*on, "training.steps=1").code == 0
+    shutil.rmtree(tmp_path / "base")
+    ended = persist(*on, "training.steps=2", "--resume")
+    assert ended.code == 0, ended.err
+    scenes = [find_policy(step).training_scenes for step in step_folders(tmp_path / "run")]
+    assert scenes == [TrainingScenes(frozenset(["room-0", "room-1", "held-out-0", "held-out-1"]))] * 2
+
+
+def test_a_run_on_a_base_of_unknown_scenes_does_not_know_all_of_its_own(persist, walks, whole, tmp_path):
+    base = tmp_path / "base"
+    shutil.copytree(whole / "step-00000004/model", base)
+    card = json.loads((base / "policy.json").read_text())
+    del card["training_scenes"]
+    (without_sums(base) / "policy.json").write_text(json.dumps(card))
+    assert persist(*policy_stage(walks, tmp_path / "run", f"base={base}", "training.steps=1")).code == 0
+    assert find_policy(tmp_path / "run").training_scenes == TrainingScenes(frozenset(["room-0", "room-1"]), False)
 
 
 def test_the_learning_rate_may_follow_a_cosine():
