@@ -267,6 +267,14 @@ def test_clips_of_other_frames_contexts_or_trajectories_have_other_keys(walks, t
     assert cache_key({"a": 1}) != cache_key({"a": 2})
 
 
+def test_the_true_cells_of_another_frame_are_another_memory_of_the_same_clip(walks, tmp_path):
+    clips = clips_in(walks, tmp_path)
+    clip = replace(clips.clips.choose(0), frames=range(9, 18), true_cells=True)
+    befores = ((), (range(1, 10),), (range(17, 8, -1),))
+    memories = [clips.cache.keys.of_clip(replace(clip, before=before)).memory for before in befores]
+    assert len({*memories}) == 3
+
+
 def test_an_entry_that_is_written_again_is_counted_once(tmp_path):
     cache = TensorCache(CacheSettings(tmp_path, 1))
     for _ in range(2):
