@@ -21,6 +21,7 @@ from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder
 from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
+from persist_cli.train.state import TrainingState, load_state, save_state
 from tests.support.cell_rooms import camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
@@ -130,6 +131,15 @@ def test_a_memory_file_is_read_where_the_model_computes(name, tmp_path):
     loaded = load_memory(tmp_path / "m.safetensors").to(DEVICE)
     assert everywhere(loaded.tensors().values())
     assert len(loaded.read(room_walk(3).cameras, 16)) == 16
+
+
+def test_a_checkpoint_restores_the_random_state_of_the_device_too(tmp_path):
+    state, draws = TrainingState({}, {}, None), []
+    save_state(tmp_path, state, lambda folder, home: folder.mkdir())
+    for _ in range(2):
+        load_state(tmp_path, state)
+        draws.append(torch.rand(8, device=DEVICE))
+    assert torch.equal(*draws)
 
 
 @pytest.mark.parametrize("form", ["cross", "projected", "canvas", "rendered"])

@@ -39,6 +39,8 @@ SHARDS_FOLDER: Final = "training"  # with a file of each process
 
 NOTES_FILE: Final = "training.json"  # what of the state is no tensor
 
+RANDOM_CUDA: Final = "random/cuda"  # tensor with the random state of a process's CUDA device
+
 
 @dataclass
 class TrainingState:
@@ -64,6 +66,8 @@ class TrainingState:
     def tensors(self) -> dict[str, Tensor]:
         """All tensors of the state, the random state of torch included, by the names that files give them."""
         tensors: dict[str, Tensor] = {"random/torch": torch.get_rng_state()}
+        if device := _random_device():  # which draws what is dropped out there
+            tensors[RANDOM_CUDA] = torch.cuda.get_rng_state(device)
         for name, parameter in self.parameters.items():
             tensors[f"parameter/{name}"] = parameter
             for key, value in self.moments[parameter].items():
@@ -145,6 +149,9 @@ class TrainingState:
                     for key, value in moments.get(name, {}).items()
                 }
         torch.set_rng_state(tensors["random/torch"])
+        device = _random_device()
+        if device and RANDOM_CUDA in tensors:  # checkpoints of a CPU lack it, and those of earlier versions
+            torch.cuda.set_rng_state(tensors[RANDOM_CUDA], device)
 
 
 def save_state(run: Path, state: TrainingState, save_model: Callable[[Path, Path], None]) -> None:
@@ -215,6 +222,12 @@ def read_shards(folder: Path, empty: Callable[[str, torch.Size, torch.dtype], Te
     except (SafetensorError, OSError, ValueError) as error:
         raise CheckpointError(f"{folder}: its parts cannot be read ({str(error).splitlines()[0]})") from error
     return tensors
+
+
+def _random_device() -> torch.device | None:
+    """The CUDA device of this process, which has a random state of its own; ``None`` on a CPU."""
+    device: torch.device = PartialState().device
+    return device if device.type == "cuda" else None
 
 
 def _causes(error: CheckpointException) -> str:
