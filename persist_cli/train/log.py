@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from persist_cli.io.files import write_json, written_aside
+from persist_cli.io.files import write_json, write_text, written_aside
 from persist_cli.viewing.console import print_table
 
 PARTS: Final = ("data", "encode", "memory", "forward", "backward", "optimizer")  # of a step, as they follow each other
@@ -33,7 +33,7 @@ class StepLog:
         self.path = path
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
         self.rows: list[dict[str, float]] = [row for row in map(_parse_row, lines) if row and row["step"] <= step]
-        path.write_text("".join(json.dumps(row) + "\n" for row in self.rows), encoding="utf-8")
+        write_text(path, "".join(json.dumps(row) + "\n" for row in self.rows))
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
         """Append the logged values of a step."""

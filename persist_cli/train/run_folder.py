@@ -56,6 +56,7 @@ class RunFolder:
         self.path, self.trainer, self.base = path, trainer, base
         self.saved = trainer.state.step
         self.scenes, self.recipes = trainer.scenes, dict[str, str]()
+        self.log: StepLog | None = None  # the main process's alone, as no two may rewrite it
         if trainer.accelerator.is_main_process:
             remove_leftovers(path)
             if base is not None:
@@ -64,8 +65,8 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
             write_text(path / RECIPE, to_yaml(trainer.recipe))
             write_hashes(trainer.recipe, path)
-        with trainer.accelerator.main_process_first():  # it makes the folder
             self.log = StepLog(path / "log.jsonl", self.saved)
+        trainer.accelerator.wait_for_everyone()  # the folder is there now
         self.speed = SpeedLog(path / "speed.jsonl", self.saved, trainer.recipe.training.batch)
 
     def save(self) -> None:
@@ -107,6 +108,7 @@ class RunFolder:
         save_state(self.path, state, self._save_model)
         if main:
             remove_superseded(self.path, self.trainer.recipe.training.keep_checkpoints)
+        if self.log is not None:
             self.log.draw(self.path / "loss.png")
 
     def _save_model(self, folder: Path, home: Path) -> None:

@@ -254,11 +254,11 @@ class TrainingLoop(ABC, Generic[Model]):
         any_due, any_signal = self.accelerator.gather(flags).amax(0).tolist()
         return bool(any_due), any_signal or None
 
-    def train(self, log: StepLog, save: Callable[[], None], stop: StopSignal) -> int | None:
+    def train(self, log: StepLog | None, save: Callable[[], None], stop: StopSignal) -> int | None:
         """Train to the last step or to a signal.
 
         Args:
-            log: gets the values of each step.
+            log: gets the values of each step; ``None`` on a process that logs nothing.
             save: writes a checkpoint; called as often as the recipe says.
             stop: the signal that asked this process to stop, once there is one.
 
@@ -271,7 +271,7 @@ class TrainingLoop(ABC, Generic[Model]):
             task = add_task(bar, "training", settings.steps, "steps", done=self.state.step)
             for values in self.steps():
                 bar.update(task, advance=1, note=f"loss {values['loss']:.4f}")
-                if self.accelerator.is_main_process:
+                if log is not None:
                     log.add(self.state.step, values | {"learning_rate": learning_rate(settings, self.state.step - 1)})
                 self.accelerator.log(values, step=self.state.step)
                 late = time.monotonic() - saved > 60 * settings.checkpoint_minutes

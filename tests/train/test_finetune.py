@@ -18,6 +18,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
 from persist_cli.recipe import make_recipe
 from persist_cli.train.finetune import next_command
+from persist_cli.train.log import StepLog
 from persist_cli.train.trainer import Trainer
 from tests.support.damage import without_sums
 from tests.support.disk import file_limit
@@ -171,6 +172,14 @@ def test_a_full_disk_ends_a_run_with_one_line_and_leaves_the_last_checkpoint(per
     assert [path.name for path in (tmp_path / "run").glob("*step*")] == ["step-00000001"]
 
 
+def test_a_log_that_cannot_be_rewritten_stays_as_it_was(tmp_path):
+    lines = "".join(json.dumps({"step": step, "loss": 0.5}) + "\n" for step in range(1, 1001))
+    (tmp_path / "log.jsonl").write_text(lines)
+    with file_limit(5_000), pytest.raises(OSError, match="too large"):
+        StepLog(tmp_path / "log.jsonl", 900)
+    assert (tmp_path / "log.jsonl").read_text() == lines
+
+
 def test_several_data_sets_train_like_a_single_one_with_all_trajectories(persist, walks, codec, tmp_path):
     for number in (0, 1):
         (tmp_path / str(number)).mkdir()
@@ -214,7 +223,16 @@ def test_each_impossible_run_ends_in_one_line(persist, walks, codec, stage1, tmp
     for arguments, cause in (
         (stage("stage1", walks, codec), "holds a run already"),
         (
-            stage("codec", walks, codec, "--resume", *MICRO_SETTINGS, "training.learning_rate=1", "chosen_on=8 houses"),
+            stage(
+                "codec",
+                walks,
+                codec,
+                "--resume",
+                *MICRO_SETTINGS,
+                "training.learning_rate=1",
+                "chosen_on=8 houses",
+                "description=another",
+            ),
             "another recipe; training.learning_rate changed",
         ),
         (stage("stage1", walks, tmp_path / "a", f"base={tmp_path}"), "no checkpoint there"),
