@@ -145,7 +145,7 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     # settings that the run's version did not have get their defaults
     before = to_plain(make_recipe(with_scene_paths(values), str(path)))
     found_by_weights = known_hashes(run).keys() & distilled(recipe).keys()
-    changeable = changeable_on_resume() | found_by_weights | {"chosen_on"}  # which changes no weight
+    changeable = changeable_on_resume() | found_by_weights | {"chosen_on", "description"}  # which change no weight
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]
     pointer = base_pointer(read_card(steps[-1] / "model")) if network_of(recipe) is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
