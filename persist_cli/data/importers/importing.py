@@ -196,7 +196,8 @@ def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: I
     return {
         "name": f"{out.name}/{trajectory.name}" if plan.part else trajectory.name,
         "frames": length,
-        "left_out": plan.written(trajectory) - length,
+        # later frames take the places of those that are left out of the training part
+        "left_out": len(left_out) if state == "written" else max(0, plan.written(trajectory) - length),
         "causes": [str(cause) for cause in left_out[:MOST_CAUSES]],
         "height": info.height,
         "width": info.width,

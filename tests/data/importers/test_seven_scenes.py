@@ -219,6 +219,16 @@ def test_frames_at_the_end_can_be_held_out_of_the_training_part(tmp_path: Path) 
     run_import("7scenes", tmp_path / "kitchen", tmp_path / "out", ImportPlan(hold_out=0.3), False)  # already there
 
 
+def test_bad_frames_before_the_held_out_ones_are_counted_in_both_parts(tmp_path: Path, capsys) -> None:
+    sequence = write_sequence(tmp_path / "kitchen", 10)
+    for path in sorted(sequence.glob("*.pose.txt"))[1:3]:
+        path.write_text(LOST)
+    for state, counts in (("written", [2, 2]), ("already there", [0, 2])):
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True, hold_out=0.3), True)
+        rows = json.loads(capsys.readouterr().out)["trajectories"]
+        assert [(row["state"], row["left_out"]) for row in rows] == [(state, count) for count in counts]
+
+
 @pytest.mark.parametrize(("share", "cause"), [(1.0, "--hold-out 1: give a share"), (0.01, "leaves a part empty")])
 def test_a_share_that_leaves_nothing_to_train_or_test_is_refused(sequence: Path, share: float, cause: str) -> None:
     with pytest.raises(DataError, match=cause):
