@@ -86,8 +86,9 @@ def fall(curves: Array) -> Array:
 
 
 def growth(curves: Array) -> Array:
-    """The last window over the first."""
-    ratio: Array = curves[:, -1] / curves[:, 0]
+    """The last window over the first; NaN where the first is 0, as of a rollout that is right to the bit."""
+    first, last = curves[:, 0], curves[:, -1]
+    ratio: Array = np.divide(last, first, out=np.full_like(last, np.nan), where=first > 0)
     return ratio
 
 

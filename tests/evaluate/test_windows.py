@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,13 @@ def test_a_short_rollout_has_no_growth_since_its_end_is_its_frame_16():
     assert np.isnan(growth.figure(values)).all()
     late = np.where(np.arange(129) > 100, 0.6, 0.4)[None]
     assert growth.figure(window_values(late, np.ones_like(late), growth.windows(129))[0]) == pytest.approx([1.5])
+
+
+def test_an_early_window_of_zero_has_no_growth_and_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ratios = CURVE_COLUMNS["lpips-alex"].figure(np.array([[0.0, 0.0], [0.0, 0.3], [0.2, 0.3], [np.nan, 0.3]]))
+    assert ratios == pytest.approx([np.nan, np.nan, 1.5, np.nan], nan_ok=True)
 
 
 def test_only_protocols_that_write_have_figures_of_windows():
