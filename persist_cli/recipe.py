@@ -189,10 +189,22 @@ def _recipe_text(name: str) -> str:
     if _is_file(name):
         if not Path(name).is_file():
             raise RecipeError(f"{name}: no such recipe file")
-        return Path(name).read_text(encoding="utf-8")
+        return read_recipe_file(Path(name))
     if name not in recipe_names():
         raise RecipeError(f"unknown recipe {name!r}; {hint(name, recipe_names())} (a file of your own ends in .yaml)")
     return (resources.files("persist_recipes") / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def read_recipe_file(path: Path) -> str:
+    """The text of a recipe's file.
+
+    Raises:
+        RecipeError: when it is not UTF-8.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path}: not UTF-8 (byte {error.start} is no part of a character)") from error
 
 
 def recipe_comment(name: str) -> list[str]:

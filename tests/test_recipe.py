@@ -155,11 +155,13 @@ def test_the_learning_rate_falls_to_zero_over_the_cooldown():
 def test_an_unknown_missing_or_broken_recipe_is_one_line(tmp_path):
     (tmp_path / "a.yaml").write_text("stage: [")
     (tmp_path / "b.yaml").write_text("- 1")
+    (tmp_path / "d.yaml").write_bytes("description: Räume".encode("latin-1"))
     for name, cause in (
         ("tiny-stage3", "did you mean"),
         ("c.yaml", "no such recipe file"),
         (str(tmp_path / "a.yaml"), "not YAML"),
         (str(tmp_path / "b.yaml"), "a recipe is a mapping"),
+        (str(tmp_path / "d.yaml"), r"d\.yaml: not UTF-8 \(byte 14"),
     ):
         with pytest.raises(RecipeError, match=cause) as error:
             read_recipe(name)

@@ -205,7 +205,7 @@ def show_version(show: bool) -> None:
 
 
 class Commands(TyperGroup):
-    """Commands that end in one line: Ctrl-C with exit code 130, SIGTERM with 143, full disks or bad plugins with 1."""
+    """Commands that end in one line: Ctrl-C with exit code 130, SIGTERM with 143, files or bad plugins with 1."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         """Read the words of the command line, and keep them for results that say how they were made."""
@@ -219,14 +219,23 @@ class Commands(TyperGroup):
         try:
             with _terminated_like_interrupted(), plugin_errors(), command_line(ctx.meta.get(WORDS, ())):
                 return super().invoke(ctx)
+        except BrokenPipeError:  # nobody reads what is printed: typer ends quietly
+            raise
         except OSError as error:
-            if error.errno not in DISK_ERRORS:
-                raise
-            place, cause = error.filename or "a file cannot be written", error.strerror
-            raise PersistError(f"{place}: {cause}; make room there, or choose another place") from error
+            raise PersistError(system_error(error)) from error
         except KeyboardInterrupt as stop:
             typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
             raise typer.Exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED) from None
+
+
+def system_error(error: OSError) -> str:
+    """One line about what a file, a disk or the network refused."""
+    if error.errno in DISK_ERRORS:
+        place = error.filename or "a file cannot be written"
+        return f"{place}: {error.strerror}; make room there, or choose another place"
+    if error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 class Terminated(KeyboardInterrupt):

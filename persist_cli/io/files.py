@@ -25,10 +25,12 @@ ENVIRONMENT: Final = "PERSIST_REFERENCE"  # a folder that holds the bundled mode
 
 
 def check_folder(path: Path) -> None:
-    """Raise ``PersistError`` when a file is in the place of this folder or of one above it, before any work is done."""
+    """Raise ``PersistError`` when this folder cannot be made or written into, before any work is done."""
     nearest = next((folder for folder in (path, *path.parents) if folder.exists()), path)
     if nearest.exists() and not nearest.is_dir():
         raise PersistError(f"{path}: no folder can be made there, {nearest} is a file; choose another --out")
+    if nearest.exists() and not os.access(nearest, os.W_OK | os.X_OK):
+        raise PersistError(f"{path}: cannot be written, {nearest} is read-only for this user; choose another --out")
 
 
 SAFETENSORS_TYPES: Final = {  # the format's names for those of torch

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
 import subprocess
 import sys
@@ -95,6 +97,41 @@ def test_sigterm_ends_a_command_in_one_line_with_the_exit_code_of_that_signal(pe
     ended = persist("recipes")
     assert (ended.code, ended.err) == (143, "stopped; what is written is whole, run the same command to go on\n")
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_a_folder_that_may_not_be_written_is_reported_before_any_work(persist, walks, tmp_path, monkeypatch):
+    access = os.access  # the superuser, as who tests may run, may write everywhere
+    monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path and access(path, mode))
+    ended = persist("finetune", "tiny-codec", "--data", walks, "--out", tmp_path / "there" / "x")
+    assert (ended.code, f"{tmp_path} is read-only for this user" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "a.txt"), "a.txt: No such file or directory"),
+        (OSError(errno.EIO, "Input/output error", "a.txt"), "a.txt: Input/output error"),
+        (OSError("process 1: no room\nprocess 2: no room"), "process 1: no room process 2: no room"),
+        (TimeoutError(), "TimeoutError"),
+    ],
+)
+def test_what_the_system_refuses_ends_a_command_in_one_line(persist, monkeypatch, error, line):
+    def fail(_: bool) -> None:
+        raise error
+
+    monkeypatch.setattr("persist_cli.viewing.listings.show_recipes", fail)
+    ended = persist("recipes")
+    assert (ended.code, ended.err) == (1, f"error: {line}\n")
+
+
+def test_a_reader_that_has_gone_ends_a_command_without_a_word(persist, monkeypatch):
+    def fail(_: bool) -> None:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr("persist_cli.viewing.listings.show_recipes", fail)
+    ended = persist("recipes")
+    assert (ended.code, ended.err) == (1, "")
 
 
 def test_a_full_disk_ends_a_command_in_one_line(persist, walks, tmp_path):
