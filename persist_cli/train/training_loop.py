@@ -21,7 +21,7 @@ from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe
-from persist_cli.train.distributed import Sharding, ZeroState, unflattened, uses_zero
+from persist_cli.train.distributed import Sharding, ZeroState, is_sharded, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import Opponent, make_average, make_optimizer, set_learning_rate, update_average
 from persist_cli.train.state import TrainingState
@@ -188,7 +188,8 @@ class TrainingLoop(ABC, Generic[Model]):
         """Take an optimizer step; returns its losses, which are means over micro-batches and processes.
 
         Raises:
-            PersistError: when the loss is not finite; the parameters are then unchanged.
+            PersistError: when the loss or a gradient is not finite; the parameters are then unchanged, unless they are
+                DeepSpeed's, which takes its step within the backward pass.
         """
         settings, accelerator, times = self.recipe.training, self.accelerator, self.times
         set_learning_rate(self.optimizer, learning_rate(settings, self.state.step))
@@ -204,18 +205,24 @@ class TrainingLoop(ABC, Generic[Model]):
                 totals[name] = totals.get(name, 0) + loss.detach() / settings.accumulation
             del batch, losses  # nothing of a batch stays on the device while the optimizer works
         means = {name: float(accelerator.reduce(total, "mean")) for name, total in totals.items()}
-        if not math.isfinite(means["loss"]):
-            raise PersistError(
-                f"the loss is {means['loss']} at step {self.state.step}; lower training.learning_rate or train with "
-                "training.precision=no"
-            )
+        self.check_finite("loss", means["loss"])
         with times.part("optimizer"):
-            accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
+            norm: Any = accelerator.clip_grad_norm_(self.state.parameters.values(), settings.clip)
+            if norm is not None:  # DeepSpeed may have none
+                self.check_finite("norm of the gradients", float(norm.full_tensor() if is_sharded(norm) else norm))
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
             if self.state.average is not None:
                 update_average(self.state.average, self.state.parameters.values())
         return means
+
+    def check_finite(self, name: str, value: float) -> None:
+        """Raise ``PersistError`` when a value of the step is NaN or infinite."""
+        if not math.isfinite(value):
+            raise PersistError(
+                f"the {name} is {value} at step {self.state.step}; lower training.learning_rate or train with "
+                "training.precision=no"
+            )
 
     def synchronized(self, last: bool) -> AbstractContextManager[None]:
         """Within the block of the last micro-batch, processes add up their gradients.

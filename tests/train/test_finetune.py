@@ -90,6 +90,24 @@ def test_gradients_are_clipped_by_the_norm_of_all_of_them(persist, walks, codec,
     assert first_gradients(run_result(tmp_path / "run")[0]).norm() == pytest.approx(0.001, rel=1e-3)
 
 
+def test_a_gradient_that_is_not_finite_ends_a_run_before_it_changes_a_weight(
+    persist, walks, codec, tmp_path, monkeypatch
+):
+    prepare, trained = Trainer.prepare, list[torch.nn.Parameter]()
+
+    def prepare_with_a_fault(trainer, model, parameters, opponent=None):
+        trained.extend(parameters.values())
+        for parameter in trained:
+            parameter.register_hook(lambda gradient: gradient * float("inf"))
+        prepare(trainer, model, parameters, opponent)
+
+    monkeypatch.setattr(Trainer, "prepare", prepare_with_a_fault)
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))
+    assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
+    assert "the norm of the gradients is nan at step 0; lower training.learning_rate" in ended.err
+    assert all(parameter.isfinite().all() for parameter in trained)
+
+
 def test_training_lowers_the_loss(persist, walks, codec, tmp_path):
     changes = ["training.steps=40", "training.learning_rate=3e-3", "training.batch=4", f"base={codec}"]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
