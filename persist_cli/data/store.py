@@ -6,6 +6,7 @@ import bisect
 import contextlib
 import itertools
 import json
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -169,16 +170,15 @@ class TrajectoryFile:
 
     def poses(self) -> Float[Tensor, "frame 4 4"]:
         """World from camera of every frame, float64, without reading an image."""
-        column = self._column("world_from_camera")
-        return torch.tensor(column, dtype=torch.float64).reshape(-1, 4, 4)
+        return self._poses.clone()
 
     def cameras(self, frames: Sequence[int]) -> Cameras:
         """The cameras of some frames, without reading an image."""
-        return self._cameras(self.poses()[self.frame_numbers(frames)])
+        return self._cameras(self._poses[self.frame_numbers(frames)])
 
     def actions(self) -> tuple[str | None, ...]:
         """The action of every frame, without reading an image."""
-        return tuple(self._column("action"))
+        return self._actions
 
     def timestamps(self) -> Float[Tensor, " frame"]:
         """Seconds of every frame, float64, without reading an image."""
@@ -211,6 +211,17 @@ class TrajectoryFile:
         if METADATA_KEY in (metadata.metadata or {}) and missing:
             raise DataError(f"{self.path}: its columns {', '.join(sorted(missing))} are missing")
         return metadata
+
+    @cached_property
+    def _poses(self) -> Float[Tensor, "frame 4 4"]:
+        """World from camera of every frame; kept, as each clip of a training asks for some."""
+        column = self._column("world_from_camera")
+        return torch.tensor(column, dtype=torch.float64).reshape(-1, 4, 4)
+
+    @cached_property
+    def _actions(self) -> tuple[str | None, ...]:
+        """The action of every frame; kept like the poses, each name once."""
+        return tuple(name if name is None else sys.intern(name) for name in self._column("action"))
 
     @cached_property
     def _cell_box(self) -> CellBox | None:

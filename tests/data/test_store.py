@@ -60,6 +60,19 @@ def test_poses_actions_and_times_need_no_image(path: Path) -> None:
     assert file.timestamps().tolist() == [number / 10 for number in range(20)]
 
 
+def test_poses_and_actions_are_read_once_and_not_changed_with_what_was_returned(path: Path) -> None:
+    file = TrajectoryFile(path)
+    poses, actions, cameras = file.poses(), file.actions(), file.cameras([1]).world_from_camera
+    file.poses().zero_()
+    file.cameras([1]).world_from_camera.zero_()
+    path.unlink()
+    assert torch.equal(file.poses(), poses)
+    assert torch.equal(file.cameras([1]).world_from_camera, cameras)
+    assert file.actions() == actions
+    with pytest.raises(DataError, match="no such file"):  # another process reads them itself
+        pickle.loads(pickle.dumps(file)).poses()
+
+
 def test_depth_that_is_no_distance_is_stored_as_missing(tmp_path: Path) -> None:
     frame = make_frames(1)[0]
     frame.depth[0, :7] = [np.nan, -1, np.inf, -np.inf, 65.54, 65.53, 0]
