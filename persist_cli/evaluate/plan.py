@@ -21,7 +21,14 @@ from persist_cli.evaluate.journal import Journal, Processes, Unit
 from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_setup
 from persist_cli.evaluate.new_poses import NEW_POSES, NewPoses
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, Protocol
-from persist_cli.evaluate.provenance import checkpoint_json, metric_json, scenes_of, trained_on, training_scenes
+from persist_cli.evaluate.provenance import (
+    checkpoint_json,
+    metric_json,
+    scene_models,
+    scenes_of,
+    trained_on,
+    training_scenes,
+)
 from persist_cli.evaluate.report.remarks import contamination
 from persist_cli.evaluate.rows.build_rows import (
     RowConfig,
@@ -257,4 +264,7 @@ def identity(
         "checkpoints": [checkpoint_json(checkpoint) for checkpoint in checkpoints],
         "metric definitions": metric_json(metrics),
     }
+    imagined = scene_models(checkpoints, plan.memories or ())
+    if any(imagined):  # others are equal to those that an earlier version began
+        values["scene models"] = imagined
     return dict(json.loads(json.dumps(values)))  # lists for tuples, as a file gives them back

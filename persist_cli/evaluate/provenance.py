@@ -14,10 +14,12 @@ import torch
 from persist_cli import __version__
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.checkpoints import lineage
+from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.held_out import was_trained_on
 from persist_cli.evaluate.cases import Case
 from persist_cli.io.files import file_sha256, read_json
 from persist_cli.io.hub import cached_weight
+from persist_cli.memorize.imagining import scene_model_fingerprint
 from persist_cli.metrics.metric import Metric
 from persist_cli.viewing.console import warn
 
@@ -48,6 +50,19 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
         "recipe_sha256": recipe_sha256(checkpoint.folder),
         "adapters": adapters,
     }
+
+
+def scene_models(checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> list[dict[str, str]]:
+    """For each checkpoint the hash of the model that imagines in the scenes of each of these memories that has one."""
+    return [
+        {name: found for name in memories if name in one.adapters and (found := imagined_by(one, name))}
+        for one in checkpoints
+    ]
+
+
+def imagined_by(checkpoint: Checkpoint, adapter: str) -> str:
+    """The hash of the model that imagines in the scenes of an adapter, empty where there is none."""
+    return scene_model_fingerprint(adapter_memory(checkpoint, adapter))
 
 
 def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str, Any]:

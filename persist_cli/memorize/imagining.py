@@ -13,6 +13,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.data.store import TrajectoryFile
+from persist_cli.errors import CheckpointError
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
 
@@ -36,6 +37,21 @@ def open_scene_model(path: str) -> SceneModel:
 @functools.lru_cache(maxsize=2)
 def _loaded(folder: Path) -> SceneModel:
     return find_scene_model(folder).load()
+
+
+def scene_model_fingerprint(config: MemoryConfig) -> str:
+    """The hash of the weights of the model that imagines in scenes of a configuration; empty where there is none.
+
+    Args:
+        config: of any memory.
+    """
+    model = config.settings.get("model")
+    if model is None or not issubclass(load_plugin("memory", config.name), Scene):
+        return ""
+    try:
+        return find_scene_model(str(model)).fingerprint
+    except CheckpointError:  # whoever imagines with it says so; scenes of true cells never ask for it
+        return ""
 
 
 def of_known_cells(config: MemoryConfig, file: TrajectoryFile | None = None, asked: bool = True) -> MemoryConfig:

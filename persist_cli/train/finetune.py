@@ -69,7 +69,7 @@ from persist_cli.train.distributed import (
 from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.run_folder import AnyTrainer, RunFolder
 from persist_cli.train.scene_trainer import SceneTrainer
-from persist_cli.train.sources import distilled, held_sources, known_hashes
+from persist_cli.train.sources import check_scene_model, distilled, held_sources, known_hashes, knows_scene_model
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
@@ -132,8 +132,8 @@ def limited_threads(threads: int) -> Iterator[None]:
 def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     """Raise ``PersistError`` when no run can be written there, or when this is not the run in the folder to go on with.
 
-    Settings that ``changeable_on_resume`` names may be others than those of the run in the folder, and the base and
-    what is distilled may be at another place.
+    Settings that ``changeable_on_resume`` names may be others than those of the run in the folder, and the base, what
+    is distilled and the model that imagines may be at another place.
     """
     check_folder(run)
     steps = step_folders(run)
@@ -147,12 +147,14 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     before = to_plain(make_recipe(with_scene_paths(values), str(path)))
     found_by_weights = known_hashes(run).keys() & distilled(recipe).keys()
     changeable = changeable_on_resume() | found_by_weights | {"chosen_on", "description"}  # which change no weight
+    changeable |= {"memory.settings.model"} if knows_scene_model(run) else set()
     changed = [key for key in _different_keys(before, to_plain(recipe), "") if key not in changeable]
     pointer = base_pointer(read_card(steps[-1] / "model")) if network_of(recipe) is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
         changed.remove("base")
     if changed:
         raise RecipeError(f"{run}: cannot resume with another recipe; {', '.join(changed)} changed")
+    check_scene_model(recipe, run)
 
 
 def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) -> int | None:

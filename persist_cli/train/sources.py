@@ -2,6 +2,7 @@
 
 A run's base is known by the cards of its checkpoints. What a distillation reads besides, its teacher and the adapter
 that is distilled, is known by the hashes of their weights in a file of the run's folder: a teacher's run may train on.
+So may that of a model that imagines in the run's scenes; another one than the run began with is refused.
 """
 
 from __future__ import annotations
@@ -33,9 +34,13 @@ from persist_cli.checkpoints.save import fingerprint
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, write_json
 from persist_cli.io.sha256sums import hash_files
+from persist_cli.memorize.imagining import scene_model_fingerprint
 from persist_cli.recipe import Recipe, network_of
 
 DISTILLED: Final = "distilled.json"  # in a run's folder: hashes of what it distils, by the recipe's keys
+
+
+IMAGINED: Final = "imagined.json"  # in a run's folder: the hash of the model that imagines in its scenes
 
 
 def distilled(recipe: Recipe) -> dict[str, str]:
@@ -53,7 +58,7 @@ def known_hashes(run: Path) -> dict[str, str]:
 
 
 def write_hashes(recipe: Recipe, run: Path) -> None:
-    """Write the hashes of what a run distils into its folder.
+    """Write the hashes of what a run distils, and of the model that imagines in its scenes, into its folder.
 
     Args:
         recipe: the recipe that ``held_sources`` returned.
@@ -62,6 +67,27 @@ def write_hashes(recipe: Recipe, run: Path) -> None:
     hashes = {key: weights_hash(*named_model(text, recipe.stage)) for key, text in distilled(recipe).items()}
     if hashes:
         write_json(run / DISTILLED, hashes)
+    imagined = "" if recipe.memory is None else scene_model_fingerprint(recipe.memory)
+    if imagined:
+        write_json(run / IMAGINED, {"fingerprint": imagined})
+
+
+def check_scene_model(recipe: Recipe, run: Path) -> None:
+    """Raise ``CheckpointError`` when other weights would imagine in a run's scenes than those that it began with."""
+    if recipe.memory is None or not knows_scene_model(run):
+        return
+    began, now = str(read_json(run / IMAGINED)["fingerprint"]), scene_model_fingerprint(recipe.memory)
+    if now != began:
+        raise CheckpointError(
+            f"{recipe.memory.settings.get('model')}: the weights that imagine in the scenes of {run} ({began[:SHOWN]}) "
+            f"are not there any more, but {now[:SHOWN] or 'none'}; give memory.settings.model=FOLDER that has them, or "
+            "begin a new run"
+        )
+
+
+def knows_scene_model(run: Path) -> bool:
+    """Whether a run that has begun says which weights imagine in its scenes; those of earlier versions do not."""
+    return bool(step_folders(run)) and (run / IMAGINED).is_file()
 
 
 def named_model(text: str, stage: Stage) -> tuple[Checkpoint, str | None]:

@@ -8,10 +8,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import adapter_memory
-from persist_cli.checkpoints.scene_models import save_scene_model
+from persist_cli.checkpoints.scene_models import find_scene_model, save_scene_model
 from persist_cli.plugins import make_scene_model
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.simulators.house_cells import FORM as HOUSES
@@ -53,18 +54,78 @@ def scene_model(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def imagining(renderer: Path, scene_model: Path, cells: Path, stage1: Path, tmp_path_factory) -> Path:
-    """The renderer, trained on with what the model of scenes imagines, whose place is given relative."""
-    folder = tmp_path_factory.mktemp("imagining")
+def imagined_stage(folder: Path, renderer: Path, model: str, cells: Path, stage1: Path) -> list[str]:
+    """Arguments of a short run that trains the renderer on with what a model of scenes imagines."""
     recipe = folder / "recipe.yaml"
     recipe.write_text(f"extends: houses-64-stage2-scene-imagined\nbase: {stage1}\nadapter_from: {renderer}\n")
     small = ["training.steps=2", "training.batch=2", "training.workers=0", "training.warmup=0", "training.cooldown=0"]
     small += ["data.clip_frames=[]"]  # this codec folds time
-    imagines = [f"memory.settings.model={os.path.relpath(scene_model)}", "memory.settings.steps=1", "data.true_cells=0"]
+    imagines = [f"memory.settings.model={model}", "memory.settings.steps=1", "data.true_cells=0"]
     cache = ["--cache", folder / "cache", "data.clips_per_trajectory=1"]
-    run_persist(*map(str, ["finetune", recipe, "--data", cells, "--out", folder / "run", *small, *imagines, *cache]))
+    return [*map(str, ["finetune", recipe, "--data", cells, "--out", folder / "run", *small, *imagines, *cache])]
+
+
+@pytest.fixture(scope="module")
+def imagining(renderer: Path, scene_model: Path, cells: Path, stage1: Path, tmp_path_factory) -> Path:
+    """The renderer, trained on with what the model of scenes imagines, whose place is given relative."""
+    folder = tmp_path_factory.mktemp("imagining")
+    run_persist(*imagined_stage(folder, renderer, os.path.relpath(scene_model), cells, stage1))
     return folder / "run"
+
+
+def with_model_at(imagining: Path, run: Path, place: Path) -> Path:
+    """A copy of the run whose scenes are imagined by the model at another place."""
+    shutil.copytree(imagining, run)
+    step = next(run.glob("step-*"))
+    without_sums(step)
+    path = without_sums(step / "model") / "adapters/scene/memory.json"
+    values = json.loads(path.read_text())
+    values["settings"]["model"] = str(place)
+    path.write_text(json.dumps(values))
+    return run
+
+
+def trained_on(scene_model: Path, folder: Path) -> Path:
+    """A folder of the model with other weights."""
+    torch.manual_seed(1)
+    model = find_scene_model(scene_model).load()
+    with torch.no_grad():
+        next(model.parameters()).add_(1.0)
+    folder.mkdir()
+    save_scene_model(model, "scene", folder, None)
+    return folder
+
+
+def test_a_run_goes_on_with_the_scene_model_that_it_began_with_and_with_no_other(
+    renderer, scene_model, cells, stage1, tmp_path, persist
+):
+    model = tmp_path / "model"
+    shutil.copytree(scene_model, model)
+    begin = imagined_stage(tmp_path, renderer, str(model), cells, stage1)
+    assert persist(*begin, "training.steps=1").code == 0
+    shutil.rmtree(model)
+    trained_on(scene_model, model)
+    ended = persist(*begin, "--resume")
+    assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
+    assert "give memory.settings.model=FOLDER that has them" in ended.err
+    ended = persist(*begin, f"memory.settings.model={scene_model}", "--resume")
+    assert ended.code == 0, ended.err
+
+
+def test_an_evaluation_goes_on_with_the_scene_model_that_it_began_with_and_with_no_other(
+    imagining, scene_model, held_out_cells, tmp_path, persist
+):
+    run = with_model_at(imagining, tmp_path / "run", tmp_path / "model")
+    shutil.copytree(scene_model, tmp_path / "model")
+    command = ["eval", run, "--data", held_out_cells, "--out", tmp_path / "eval", "--memories", "scene",
+               "--controls", "copy", "--clips", 1, "--seeds", 1, "--steps", 1, "--metrics", "psnr"]  # fmt: skip
+    for _ in range(2):
+        ended = persist(*command)
+        assert ended.code == 0, ended.err
+    shutil.rmtree(tmp_path / "model")
+    trained_on(scene_model, tmp_path / "model")
+    ended = persist(*command)
+    assert (ended.code, "holds another evaluation (scene models 0 scene: " in ended.err) == (1, True)
 
 
 def test_a_renderer_trained_on_true_cells_is_evaluated_on_its_own_scene_and_on_the_true_one(
@@ -109,13 +170,7 @@ def test_an_export_takes_along_the_model_that_imagines(imagining, scene_model, s
 
 
 def test_an_export_whose_model_of_scenes_is_gone_ends_in_one_line(imagining, stage1, persist, tmp_path):
-    run = shutil.copytree(imagining, tmp_path / "run")
-    step = next(run.glob("step-*"))
-    without_sums(step)
-    path = without_sums(step / "model") / "adapters/scene/memory.json"
-    values = json.loads(path.read_text())
-    values["settings"]["model"] = str(tmp_path / "gone")
-    path.write_text(json.dumps(values))
+    run = with_model_at(imagining, tmp_path / "run", tmp_path / "gone")
     result = persist("export", stage1, run, "--out", tmp_path / "export")
     assert (result.code, result.err.strip().splitlines()[-1].count(str(tmp_path / "gone"))) == (1, 1), result.err
     assert not (tmp_path / "export").exists()
