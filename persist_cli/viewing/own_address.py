@@ -19,7 +19,7 @@ DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")  # one of these is s
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Return a socket that is bound to a host and port and does not listen yet.
+    """Return a socket that listens on a host and port; nobody is answered before a server takes it up.
 
     Args:
         host: name or address.
@@ -37,6 +37,7 @@ def bind(host: str, port: int) -> socket.socket:
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound.bind(address)
+        bound.listen()  # else another one that does not listen yet could bind the same port
     except OSError as error:
         bound.close()
         advice = "another --port, or --port 0 for any free one, or an address of this machine as --host"

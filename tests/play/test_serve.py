@@ -44,7 +44,6 @@ def test_what_cannot_be_opened_is_said_before_a_page_is_served(persist, voxel, w
 
 def test_a_port_that_is_taken_is_said_before_the_model_is_loaded(persist, tmp_path):
     with bind("127.0.0.1", 0) as taken:
-        taken.listen()
         port = taken.getsockname()[1]
         ended = persist("play", tmp_path / "no-model", "--port", port, "--no-open")
     assert ended.code == 1

@@ -140,7 +140,6 @@ def test_bytes_that_are_no_request_do_not_harm_the_server(server):
 
 def test_a_port_that_is_taken_is_said_in_one_line():
     with bind("127.0.0.1", 0) as first:
-        first.listen()
         port = first.getsockname()[1]
         with pytest.raises(PersistError, match=f":{port}: Address already in use; give another --port"):
             bind("127.0.0.1", port)
