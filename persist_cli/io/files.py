@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
@@ -231,11 +232,17 @@ def folder_aside(path: Path) -> Iterator[Path]:
             aside.rename(path)
 
 
-def remove_leftovers(folder: Path, name: str = "") -> None:
-    """Delete what killed writers left aside in ``folder``, for all files or for those of one ``name``."""
+def remove_leftovers(folder: Path, *names: str, age: float = 0.0) -> None:
+    """Delete what killed writers left aside in ``folder``.
+
+    Args:
+        folder: where they wrote.
+        names: of the files and folders that they wrote; all where none is named.
+        age: seconds for which it must have lain there, so that what others write meanwhile stays.
+    """
     for leftover in folder.glob(f"{ASIDE}*"):
         owner = leftover.name.removeprefix(ASIDE).partition("-")[2]
-        if name and owner != name:
+        if (names and owner not in names) or _seconds_since_change(leftover) < age:
             continue
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
@@ -250,6 +257,14 @@ def follow_umask(folder: Path) -> None:
     for path in folder.rglob("*"):
         if path.is_file():
             path.chmod(0o666 & ~mask)
+
+
+def _seconds_since_change(path: Path) -> float:
+    """How long ago a file was written to, or something was added to a folder; 0 when it has gone meanwhile."""
+    try:
+        return max(0.0, time.time() - path.stat().st_mtime)
+    except FileNotFoundError:
+        return 0.0
 
 
 def _path_aside(path: Path) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from persist_cli.io.hub import cached_weight, weights_home
 from persist_cli.viewing.console import busy, print_json, print_table, say
 from persist_cli.weights.cache import fill_folder
 from persist_cli.weights.catalog import WEIGHTS, Weight, find_weight
-from persist_cli.weights.weight_sources import DOWNLOADS, find_source, from_directory
+from persist_cli.weights.weight_sources import find_source, from_directory, remove_downloads
 
 SHA256: Final = re.compile("[0-9a-fA-F]{64}")
 COLUMNS = ("name", "for", "licence", "MB", "from", "here")
@@ -51,7 +50,7 @@ def run_fetch(names: Sequence[str], directory: Path | None, offline: bool, sha25
             failures.append(str(error))
     if failures:
         raise PersistError("; ".join(failures))
-    shutil.rmtree(weights_home() / DOWNLOADS, ignore_errors=True)
+    remove_downloads(weights)
 
 
 def with_hash(weights: Sequence[Weight], sha256: str) -> Weight:
@@ -88,7 +87,7 @@ def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
         with folder_aside(home / weight.name) as aside, verifying:
             provenance = fill_folder(weight, file, aside)
     except CheckpointError:
-        shutil.rmtree(home / DOWNLOADS, ignore_errors=True)  # or the same archive would be refused for ever
+        remove_downloads([weight])  # or the same archive would be refused for ever
         raise
     except OSError as error:
         raise PersistError(f"{home}: {weight.name} cannot be written there ({error})") from error

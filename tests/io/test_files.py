@@ -131,6 +131,8 @@ def test_only_leftovers_of_the_given_name_are_removed(tmp_path):
         (tmp_path / name).touch()
     remove_leftovers(tmp_path, "m")
     assert {path.name for path in tmp_path.iterdir()} == {f"{ASIDE}0123abcd-big-m", f"{ASIDE}0123abcd-m-big", "m"}
+    remove_leftovers(tmp_path, age=60)
+    assert len(list(tmp_path.iterdir())) == 3
     remove_leftovers(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["m"]
 

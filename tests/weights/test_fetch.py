@@ -11,7 +11,7 @@ from persist_cli.io.files import read_tensors
 from persist_cli.io.hub import cached_weight, weights_home
 from persist_cli.weights.catalog import WEIGHTS, HubRepository
 from persist_cli.weights.conversion import CONVERSIONS
-from persist_cli.weights.fetch import fetch_weight
+from persist_cli.weights.fetch import fetch_weight, run_fetch
 from persist_cli.weights.weight_sources import DOWNLOADS
 from tests.support.small_weights import NAME, SOURCE_NAME, original, weight_of, write_archive
 
@@ -183,6 +183,21 @@ def test_a_downloaded_archive_that_is_refused_is_removed(home, tmp_path):
     (home / DOWNLOADS).mkdir(parents=True)
     write_archive(weight, b"another", home / DOWNLOADS)
     refused(weight, None)
+
+
+def test_a_fetch_leaves_what_another_process_downloads(home, tmp_path, directory, monkeypatch):
+    weight = weight_of(NAME, original(NAME), tmp_path)
+    monkeypatch.setitem(WEIGHTS, NAME, weight)
+    other = home / DOWNLOADS / f".partial-0123abcd-{weight.archive.file}" / "temporary"
+    other.mkdir(parents=True)
+    archive = write_archive(weight, b"another", home / DOWNLOADS)
+    with pytest.raises(PersistError, match="refused"):
+        run_fetch([NAME], None, offline=True)
+    assert not archive.exists()
+    write_archive(weight, original(NAME), home / DOWNLOADS)
+    run_fetch([NAME], None, offline=True)
+    assert not archive.exists()
+    assert other.is_dir()
 
 
 def test_a_weight_that_no_source_has_is_reported_in_one_line_with_each_source_and_advice(directory):

