@@ -181,13 +181,14 @@ def run_collect(plan: CollectPlan, out: Path, workers: int, json: bool) -> None:
     missing = {seed: path for seed, path in paths.items() if not path.exists()}
     started = time.perf_counter()
     if missing:
+        remove_leftovers(out, *(path.name for path in missing.values()))  # others may collect other scenes meanwhile
         _collect_all(plan, missing, workers or os.cpu_count() or 1)
     seconds = time.perf_counter() - started
     _report(plan, out, len(paths), len(missing), seconds, json)
 
 
 def claim_folder(plan: CollectPlan, out: Path) -> None:
-    """Make ``out`` this plan's folder and remove files that a killed run left half-written in it.
+    """Make ``out`` this plan's folder.
 
     Raises:
         DataError: when it holds trajectories of another split, of other settings, or not collected ones.
@@ -205,7 +206,6 @@ def claim_folder(plan: CollectPlan, out: Path) -> None:
             write_json(file, settings)
         except OSError as error:
             raise DataError(f"{out}: cannot write there ({error.strerror})") from error
-    remove_leftovers(out)
 
 
 @plugin_errors()  # a traceback does not come back from a worker process

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -193,6 +194,20 @@ def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Pa
     assert 1 < len(list(killed.glob("house-*"))) < 5
     run_collect(FIVE, killed, 1, json=True)
     assert contents(killed) == contents(whole)
+
+
+def test_what_another_command_collects_into_the_folder_is_left_alone(collected: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(collected, out)
+    (out / "house-000001.parquet").unlink()
+    for number in range(4):
+        (out / f".partial-0123abcd-house-{number:06d}.parquet").touch()
+    run_collect(SMALL, out, 1, json=True)
+    left = {path.name[-14:-8] for path in out.glob(".partial-*")}
+    assert left == {"000000", "000002", "000003"}
+    assert (out / "house-000001.parquet").read_bytes() == (collected / "house-000001.parquet").read_bytes()
+    run_collect(SMALL, out, 1, json=True)  # nothing is missing
+    assert len(list(out.glob(".partial-*"))) == 3
 
 
 def children(pid: int) -> list[int]:
