@@ -232,7 +232,7 @@ def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
     """
     try:
         values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # the latter for a date such as 2024-13-45
         raise RecipeError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(values, dict):
         raise RecipeError(f"{where}: a recipe is a mapping of settings, not {type(values).__name__}")
@@ -276,7 +276,7 @@ def _read_override(override: str) -> tuple[str, Any]:
         raise RecipeError(f"cannot read {override!r}; write KEY=VALUE, as in training.steps=200")
     try:
         return key, yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise RecipeError(f"cannot read the value in {override!r}") from error
 
 

@@ -65,7 +65,8 @@ def test_the_data_path_is_one_folder_or_a_list():
      (["training.precision=fp8"], "training.precision"), (["data.path=3"], "data.path"),
      (["training.batch=5", "training.accumulation=2"], "multiple of accumulation"),
      (["training.steps=200", "training.cooldown=201"], "set both, as in training.steps=200 training.cooldown=66"),
-     (["data.true_cells=1"], "data.true_cells is for stage 2 only"), (["a=[1"], "cannot read the value")],
+     (["data.true_cells=1"], "data.true_cells is for stage 2 only"), (["a=[1"], "cannot read the value"),
+     (["a=2024-13-45"], "cannot read the value"), (["a=0x_"], "cannot read the value")],
 )  # fmt: skip
 def test_an_error_in_a_recipe_is_one_line(overrides, cause):
     with pytest.raises(RecipeError, match=cause) as error:
@@ -156,12 +157,14 @@ def test_an_unknown_missing_or_broken_recipe_is_one_line(tmp_path):
     (tmp_path / "a.yaml").write_text("stage: [")
     (tmp_path / "b.yaml").write_text("- 1")
     (tmp_path / "d.yaml").write_bytes("description: Räume".encode("latin-1"))
+    (tmp_path / "e.yaml").write_text("description: 2024-13-45")
     for name, cause in (
         ("tiny-stage3", "did you mean"),
         ("c.yaml", "no such recipe file"),
         (str(tmp_path / "a.yaml"), "not YAML"),
         (str(tmp_path / "b.yaml"), "a recipe is a mapping"),
         (str(tmp_path / "d.yaml"), r"d\.yaml: not UTF-8 \(byte 14"),
+        (str(tmp_path / "e.yaml"), r"not YAML \(month must be in 1\.\.12\)"),
     ):
         with pytest.raises(RecipeError, match=cause) as error:
             read_recipe(name)

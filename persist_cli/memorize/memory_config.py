@@ -122,7 +122,7 @@ def plugin_settings(texts: Sequence[str], kinds: Sequence[str] = ("memory", "enc
             raise RecipeError(f"cannot read setting {text!r}; write {forms}")
         try:
             settings[kind][name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError) as error:  # the latter for a date such as 2024-13-45
             raise RecipeError(f"cannot read the value of {text!r}: {str(error).splitlines()[0]}") from error
     return settings
 

@@ -136,7 +136,7 @@ def test_memories_that_cannot_be_merged_are_refused_in_one_line(data, tmp_path, 
 def test_plugin_settings_go_to_memory_or_encoder_by_their_first_word():
     parsed = plugin_settings(["memory.cell=[1, 2, 3]", "encoder.seed=4", "memory.max_depth=null"])
     assert parsed == {"memory": {"cell": [1, 2, 3], "max_depth": None}, "encoder": {"seed": 4}}
-    for wrong in ("cell=1", "memory.cell", "memory.=1", "camera.cell=1", "memory.cell=[1,"):
+    for wrong in ("cell=1", "memory.cell", "memory.=1", "camera.cell=1", "memory.cell=[1,", "memory.cell=2024-13-45"):
         with pytest.raises(RecipeError):
             plugin_settings([wrong])
 
