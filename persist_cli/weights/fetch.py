@@ -71,8 +71,14 @@ def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
     """Bring one weight into the cache, whole or not at all, and print on one line where it came from.
 
     Nothing happens when the cache has it whole.
+
+    Raises:
+        PersistError: one line when no source has it, its file is refused, or the cached one was made from a file with
+            another hash than the user gives.
     """
     if is_whole(weight.name):
+        if weight.original and weight.sha256 is not None:
+            _check_cached(weight, weight.sha256)
         return
     if weight.original and weight.sha256 is None:
         raise PersistError(
@@ -104,6 +110,17 @@ def is_whole(name: str) -> bool:
     except CheckpointError:
         return False
     return isinstance(card, dict) and card.get("sha256") == file_sha256(folder / "model.safetensors")
+
+
+def _check_cached(weight: Weight, sha256: str) -> None:
+    """Raise ``CheckpointError`` unless the cached weight was made from the file with the hash that the user gives."""
+    folder = weights_home() / weight.name
+    source = read_json(folder / "weight.json").get("source_sha256")
+    if source != sha256:
+        raise CheckpointError(
+            f"{folder}: refused, it was made from a file whose SHA-256 is {source}, not {sha256}; delete the folder to "
+            "fetch another"
+        )
 
 
 def show_weights(json: bool) -> None:

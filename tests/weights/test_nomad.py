@@ -66,6 +66,15 @@ def test_they_are_refused_without_a_hash_and_with_another(persist, original, tmp
     assert "for one weight whose hash is not known here (nomad)" in ended.err
 
 
+def test_weights_in_the_cache_are_compared_with_the_hash_that_is_given(persist, original):
+    sha256 = hashlib.sha256((original / "nomad.pth").read_bytes()).hexdigest()
+    for hashes in (("--sha256", sha256), ("--sha256", sha256.upper()), ()):
+        assert persist("weights", "fetch", "nomad", "--from", original, *hashes).code == 0
+    ended = persist("weights", "fetch", "nomad", "--from", original, "--sha256", "0" * 64)
+    assert f"made from a file whose SHA-256 is {sha256}, not {'0' * 64}; delete the folder" in ended.err
+    assert (ended.code, ended.err.count("\n")) == (1, 1)
+
+
 @pytest.mark.parametrize("change", ["missing", "unknown", "shape"])
 def test_another_networks_file_is_refused_in_one_line(persist, original, change):
     tensors = published_tensors()
