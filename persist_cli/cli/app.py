@@ -39,6 +39,7 @@ from persist_cli.cli.options import (
     TurnOption,
     VerifyOption,
     limit_spinning,
+    refuse_options,
     show_version,
     split_names,
 )
@@ -248,6 +249,7 @@ def relink(
 
 @app.command()
 def memorize(
+    context: typer.Context,
     data: Annotated[list[str] | None, typer.Argument(metavar="DATA[#trajectory[:frames]]")] = None,
     out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
     memory: Annotated[str | None, typer.Option(help="Of `persist plugins`; the checkpoint's, else voxel.")] = None,
@@ -286,11 +288,8 @@ def memorize(
     from persist_cli.memorize.picture import PictureOptions
 
     if merge:
-        if checkpoint or memory or encoder or settings or model or complete:
-            raise PersistError(
-                "--merge joins memories as they are; leave out --checkpoint, --memory, --encoder, --set, --model and "
-                "--complete"
-            )
+        unused = "memory encoder settings checkpoint model complete seed depth depth_model fov size"
+        refuse_options(context, unused, "not with --merge, which joins memories as they are")
         run_merge([*merge, *(Path(name) for name in data or [])], out, json)
     else:
         plan = MemorizePlan(memory, encoder, settings or [], checkpoint, model, complete, seed)

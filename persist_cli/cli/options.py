@@ -197,6 +197,21 @@ def split_names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
+def refuse_options(context: typer.Context, names: str, why: str) -> None:
+    """Raise ``PersistError`` when the command line has options that a command would not use.
+
+    Args:
+        context: the command's.
+        names: names of their parameters, separated by spaces.
+        why: when they may be given, which the message ends with.
+    """
+    options = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    sources = {options[name]: context.get_parameter_source(name) for name in names.split()}
+    given = [option for option, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+    if given:
+        raise PersistError(f"{', '.join(given)}: {why}")
+
+
 def show_version(show: bool) -> None:
     """Print the version and end the command, when ``show`` is set."""
     if show:

@@ -23,6 +23,7 @@ from persist_cli.cli.options import (
     TrainingScenesOption,
     TurnOption,
     VerifyOption,
+    refuse_options,
     split_names,
 )
 from persist_cli.errors import PersistError
@@ -268,6 +269,7 @@ def bench_plan(
 
 @bench_app.command("scene")
 def bench_scene(
+    context: typer.Context,
     data: Annotated[str, typer.Option(help="Test houses with cells, as `persist collect miniworld` writes them.")],
     model: Annotated[str | None, typer.Argument(help="A scene model; without one only the other rows.")] = None,
     train: Annotated[Path | None, typer.Option(help="Training houses, for the rows that look them up.")] = None,
@@ -302,7 +304,10 @@ def bench_scene(
     from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBenchPlan
 
     rendering = None
-    if checkpoint is not None:
+    if checkpoint is None:
+        unused = "memories return_steps denoising_steps sampler guidance dtype save_memory"
+        refuse_options(context, unused, "only with --checkpoint, whose model draws scenes")
+    else:
         sampling = SamplingOverrides(denoising_steps, sampler, guidance)
         placement = InferenceOptions.of(dtype, save_memory)
         rendering = RenderingPlan(checkpoint, split_names(memories), return_steps, sampling, placement)

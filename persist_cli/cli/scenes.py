@@ -9,7 +9,14 @@ import typer
 from typer.core import TyperCommand
 
 from persist_cli.api.inference import SamplingOverrides
-from persist_cli.cli.options import GuidanceOption, JsonOption, SamplerOption, StepsOption, VerifyOption
+from persist_cli.cli.options import (
+    GuidanceOption,
+    JsonOption,
+    SamplerOption,
+    StepsOption,
+    VerifyOption,
+    refuse_options,
+)
 from persist_cli.errors import PersistError
 
 scenes_app = typer.Typer()
@@ -86,6 +93,8 @@ def edit(
         return run_list(memory, json)
     if out is None:
         raise PersistError("give --out FILE for the edited memory, or --list to see what can be edited")
+    if checkpoint is None:
+        refuse_options(context, "adapter steps sampler guidance", "only with --checkpoint, whose model imagines a view")
     sampling = SamplingOverrides(steps, sampler, guidance)
     imagination = None if checkpoint is None else Imagination(checkpoint, adapter, sampling, seed)
     written = tuple(WrittenEdit(*edit) for edit in context.obj)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from persist_cli.cli.options import JsonOption, VerifyOption
+from persist_cli.cli.options import JsonOption, VerifyOption, refuse_options
 
 VIEW_PORT = 8421
 
@@ -16,6 +16,7 @@ viewing_app = typer.Typer()
 
 @viewing_app.command()
 def view(
+    context: typer.Context,
     source: Annotated[
         str, typer.Argument(metavar="SOURCE", help="DATA#trajectory, a memory file, or the folder of a rollout.")
     ],
@@ -46,5 +47,8 @@ def view(
     from persist_cli.viewer.imagine import ImagineSettings
     from persist_cli.viewer.view import Address, ViewPlan, run_view
 
+    if export is not None:
+        unused = "out checkpoint adapter seed host port"
+        refuse_options(context, unused, "not with --export, which writes a page that edits and imagines nothing")
     plan = ViewPlan(source, truth, start, ImagineSettings(checkpoint, adapter, seed), out, most, seed)
     run_view(plan, Address(host, port, opens), export, json)

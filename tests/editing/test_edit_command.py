@@ -114,6 +114,10 @@ def test_the_edits_are_not_saved_in_the_place_of_the_memory(persist, room, tmp_p
         (["--remove", "box#1"], "give --out FILE"),
         (["--remove", "box#1", "--out", "x.png"], "name a memory file to write"),
         (["--remove", "box#1", "--out", "x.safetensors", "--checkpoint", "reference"], "add --camera DATA#trajectory"),
+        (
+            ["--remove", "box#1", "--out", "x.safetensors", "--sampler", "dpm", "--adapter", "scene"],
+            "--adapter, --sampler: only with --checkpoint",
+        ),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(persist, room, options, words):

@@ -128,8 +128,10 @@ def test_memories_that_cannot_be_merged_are_refused_in_one_line(data, tmp_path, 
     assert "room and cellar" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "c", *out)
     assert "not a whole memory file" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "broken", *out)
     assert "two memory files" in failure(capsys, "--merge", tmp_path / "a", *out)
-    for option in (("--checkpoint", tmp_path), ("--memory", "voxel"), ("--set", "memory.cell=1")):
-        assert "leave out" in failure(capsys, "--merge", tmp_path / "a", tmp_path / "a", *option, *out)
+    for option in (("--checkpoint", tmp_path), ("--set", "memory.cell=1"), ("--seed", 0), ("--fov", 60), ("--size", 9)):
+        assert f"{option[0]}: not with --merge" in failure(
+            capsys, "--merge", tmp_path / "a", tmp_path / "a", *option, *out
+        )
     assert not (tmp_path / "merged").exists()
 
 

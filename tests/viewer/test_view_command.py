@@ -28,6 +28,20 @@ def test_a_trajectory_is_exported_as_one_page(persist, walks, tmp_path):
     assert "Content-Security-Policy" in text.partition("</head>")[0]
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--export", "page.txt"], "name a page to write, as in view.html"),
+        (["--export", "page.html", "--port", "0", "--out", "edited.safetensors"], "--out, --port: not with --export"),
+    ],
+)
+def test_a_page_that_cannot_be_exported_is_one_line(persist, voxel_map, tmp_path, monkeypatch, options, words):
+    monkeypatch.chdir(tmp_path)
+    result = persist("view", voxel_map, *options)
+    assert (result.code, words in result.err, result.err.count("\n")) == (1, True, 1)
+    assert not list(tmp_path.iterdir())
+
+
 def test_ctrl_c_ends_it_without_an_error(walks):
     command = [sys.executable, "-m", "persist_cli", "view", f"{walks}#0:0-2", "--port", "0", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -92,7 +106,6 @@ def places(walks, voxel, voxel_map, room):
         (["{walks}#0", "--out", "e.safetensors"], "has no memory that could be edited; leave --out out"),
         (["{map}", "--out", "{map}"], "is the memory that is shown; it stays as it is, name another file"),
         (["{map}", "--out", "edited.json"], "name a memory file to write, as in edited.safetensors"),
-        (["{map}", "--export", "page.txt"], "name a page to write, as in view.html"),
         (["{map}", "--host", "no.such.host.invalid"], "give an address of this machine"),
         (["{walks}#0", "--truth", "{walks}#9"], "has 2 trajectories (0-1), there is no number 9"),
         (["{map}", "--start", "{walks}#9"], "has 2 trajectories (0-1), there is no number 9"),

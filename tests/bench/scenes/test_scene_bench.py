@@ -131,6 +131,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
         (("--parts", "compeltion"), "completion"),
         (("--parts", "walk"), "needs a scene model"),
         (("--parts", "edits"), "--checkpoint"),
+        (("--dtype", "float32", "--denoising-steps", 2), "--denoising-steps, --dtype: only with --checkpoint"),
         (("--train", same), "is measured, too"),
         (("--data", walks), "no cells"),
         ((tmp_path,), str(tmp_path)),
