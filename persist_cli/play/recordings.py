@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import secrets
 import shutil
 import tempfile
@@ -14,6 +13,7 @@ from typing import Final
 from persist_cli.errors import PersistError
 from persist_cli.play.messages import Recorded
 from persist_cli.play.play import Play
+from persist_cli.viewing.console import warn
 
 ADDRESS: Final = "/recordings/"
 NAME_BYTES: Final = 16  # of randomness in a name: who was not told it cannot guess it
@@ -109,8 +109,11 @@ class Shelf:
             play: the walk that ends; what it still records is saved, where recordings stay.
         """
         if self._recordings.stays and play is not None and play.recording:
-            with contextlib.suppress(PersistError):  # nobody is there any more to whom it could be said
+            try:
                 self.save(play)
+            except PersistError as error:  # the page is not there any more, to which it could be said
+                cause = error.__cause__ or error
+                warn(f"{self._recordings.folder}: the recording of a walk that has ended is lost, not saved ({cause})")
         for name in self._names:
             self._recordings.withdraw(name)
         for folder in [] if self._recordings.stays else self._folders:

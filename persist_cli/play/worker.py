@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
+import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from queue import SimpleQueue
@@ -54,6 +56,13 @@ class Worker:
             del job, future, call  # what they hold is freed before the next call comes
 
 
+def print_error(done: Future[Any]) -> None:
+    """Print the traceback of a call that nobody waits for, if it failed."""
+    error = done.exception()
+    if error is not None:
+        traceback.print_exception(error, file=sys.stderr)
+
+
 class Workers:
     """What works for all sessions: ``model`` imagines and encodes, ``saver`` saves recordings meanwhile."""
 
@@ -61,8 +70,8 @@ class Workers:
         self.model, self.saver = Worker(), Worker()
 
     def give_last(self, call: Callable[[], object]) -> None:
-        """Let the saver do a call after all that both were given up to now."""
-        self.model.give(lambda: self.saver.give(call))
+        """Let the saver do a call after all that both were given up to now; nobody waits for it."""
+        self.model.give(lambda: self.saver.give(call).add_done_callback(print_error))
 
     def close(self, seconds: float) -> bool:
         """Take no more calls, and return whether those they were given are done within some seconds for each."""

@@ -10,6 +10,7 @@ from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
 from persist_cli.play import recording
 from persist_cli.play.recordings import ADDRESS, Recordings
+from persist_cli.play.worker import Workers
 from tests.support.micro_plays import micro_walks
 
 
@@ -65,6 +66,27 @@ def test_a_recording_that_is_saved_has_ended_and_is_not_saved_again(play, tmp_pa
         shelf.save(play)
     shelf.clear(play)
     assert len([*tmp_path.iterdir()]) == 1
+
+
+def test_a_recording_that_cannot_be_saved_when_its_walk_ends_is_said_on_the_terminal(
+    play, tmp_path, monkeypatch, capsys
+):
+    def no_room(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shutil, "make_archive", no_room)
+    Recordings(tmp_path).shelf().clear(play)
+    error = capsys.readouterr().err
+    assert f"{tmp_path}: the recording of a walk that has ended is lost, not saved" in error
+    assert "No space left on device" in error
+    assert error.count("\n") == 1
+
+
+def test_a_last_call_that_fails_is_said_on_the_terminal(capsys):
+    workers = Workers()
+    workers.give_last(lambda: 1 / 0)
+    assert workers.close(60)
+    assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 def test_of_a_recording_that_cannot_be_saved_nothing_is_left(play, tmp_path, monkeypatch):
