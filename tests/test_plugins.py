@@ -77,6 +77,23 @@ def test_a_broken_plugin_shows_its_cause_and_stops_no_others(persist, site):
         load_plugin("memory", "broken")
 
 
+RAISING = """
+    from persist_cli.api.cost import Cost
+
+    class Raising(Cost):
+        def measure(self, futures, goal, ground): pass
+        @classmethod
+        def missing(cls): raise OSError("no such lib")
+"""
+
+
+def test_a_plugin_that_cannot_say_what_is_missing_stops_no_others(persist, site):
+    install(site, "persist-raising", "persist.costs", "raising = raising_cost:Raising", RAISING)
+    rows = {row["name"]: row for row in json.loads(persist("plugins", "--json").out)}
+    assert rows["raising"]["state"] == "its missing() raised OSError: no such lib"
+    assert rows["voxel"]["state"] == "ok"
+
+
 UNFINISHED = """
     from dataclasses import dataclass
     from persist_cli.api.memory import Memory

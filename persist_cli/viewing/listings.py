@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from persist_cli.errors import PluginError
-from persist_cli.plugins import KINDS, Plugin, import_plugin, list_plugins
+from persist_cli.plugins import KINDS, Plugin, first_line, import_plugin, list_plugins
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import print_json, print_table, say
 
@@ -48,9 +48,11 @@ def plugin_state(plugin: Plugin, claims: int) -> str:
         return f"name claimed by {claims} packages"
     try:
         loaded = import_plugin(plugin)
+        missing = loaded.missing() if plugin.kind in ("simulator", "cost") else ""
     except PluginError as error:
         return error.cause
-    missing = loaded.missing() if plugin.kind in ("simulator", "cost") else ""
+    except Exception as error:  # a plugin may raise anything, and the others are listed all the same
+        return f"its missing() raised {first_line(error)}"
     return missing or "ok"
 
 
