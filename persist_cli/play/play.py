@@ -232,7 +232,8 @@ class Play:
         return self._goal
 
     def take_goal(self) -> None:
-        """Make the present frame of the first memory the goal."""
+        """Make the present frame of the first memory the goal; a planner that walks to another one stops."""
+        self.stop()
         now = self._walkers.lead.now
         self._goal = Goal(now.rgb[0].cpu(), now.cameras.centers[0].cpu().double(), self.info.scene)
 

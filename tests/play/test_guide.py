@@ -63,6 +63,18 @@ def test_a_held_key_stops_the_planner(monkeypatch):
     assert play.advance(frozenset()) is None
 
 
+def test_a_goal_that_is_taken_while_the_planner_walks_stops_it(monkeypatch):
+    monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    monkeypatch.setattr(Guide, "decide", lambda *_: ("left",) * 3)
+    play = play_in_room(look((1.7, 1.25, 0.5), 0.0, 0.0))
+    play.take_goal()
+    play.plan()
+    assert play.advance(frozenset()).action == "left"
+    play.take_goal()
+    assert not play.planning
+    assert play.advance(frozenset()) is None  # not the rest of the way to the old one
+
+
 def test_a_walk_to_the_goal_is_shown_step_by_step_and_ends_nearer_to_it(monkeypatch):
     play = play_in_room(look((1.6, 1.25, -0.6), 60.0, 0.0))
     play.take_goal()
