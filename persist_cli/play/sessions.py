@@ -26,7 +26,7 @@ NOT_ALLOWED: Final = 1008
 FAULT: Final = 1011
 TRY_LATER: Final = 1013
 
-MESSAGES: Final = (200.0, 100.0)  # of a page: at once, and a second
+MESSAGES: Final = (200.0, 100.0)  # of a page: at once, and a second, beside one for each frame that it draws
 WRONG: Final = (20.0, 0.1)  # of these, that cannot be read
 SEND_SECONDS: Final = 30.0  # in which a page takes a message, or is given up
 RELOAD_SECONDS: Final = 1.0  # in which a session may end for one that wants to begin
@@ -110,7 +110,9 @@ class Session:
         self.wishes = Wishes(Pace(sessions.limits.frames_per_second))
         self.shelf = sessions.recordings.shelf()
         self._play: Play | None = None
-        self._allowance, self._wrong = Allowance(*MESSAGES), Allowance(*WRONG)
+        most, rate = MESSAGES
+        self._allowance = Allowance(most, rate + sessions.limits.frames_per_second)
+        self._wrong = Allowance(*WRONG)
         loop = asyncio.get_running_loop()
         self._stopped: asyncio.Future[None] = loop.create_future()
         self.over: asyncio.Future[None] = loop.create_future()

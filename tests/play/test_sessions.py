@@ -180,10 +180,19 @@ def test_text_that_is_no_text_closes_the_session_without_a_traceback(server, pag
 
 def test_too_many_messages_close_the_session(page):
     with contextlib.suppress(ConnectionClosed):  # of which the server may be rid before the last one is sent
-        for _ in range(400):
+        for _ in range(1000):
             page.say("ack", number=1)
     assert closed(page) == 1008
     assert page.texts[-1]["ended"]
+
+
+def test_a_page_may_say_of_every_frame_that_it_is_drawn(walk):
+    with serving(walk, Limits(frames_per_second=1e5)) as served, served.page() as page:
+        page.until("frame")
+        for number in range(1, 1001):
+            page.say("ack", number=number)
+        page.say("undo")
+        assert page.until("notice")[0]["text"] == "nothing is left to undo"
 
 
 def test_messages_that_cannot_be_read_close_the_session_in_the_end(page):
