@@ -61,7 +61,7 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
         recordings = Recordings(serving.recordings)
         try:
             sessions = Sessions(first_ready(open_walks(options)), serving.limits, recordings)
-            app = make_app(walking_page(), sessions, names_of(serving.host), serving.host in EVERYWHERE)
+            app = make_app(walking_page(), sessions, names_of(serving.host, bound), serving.host in EVERYWHERE)
             server = Server(app, sessions, lambda: announce(bound, serving))
             signals.end(server)
             server.serve_on(bound)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 import rich
@@ -29,7 +29,8 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
     Raises:
         PersistError: when the address cannot be used or the port is taken.
     """
-    bind(host, port).close()  # viser would take the next free port, or wait for ever
+    with bind(host, port) as bound:  # and freed: viser itself would take the next free port, or wait for ever
+        names = names_of(host, bound)
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True  # viser prints on it
     log, one_line = logging.getLogger("websockets.server"), _OneLine()
@@ -39,7 +40,7 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
         try:
             if port and server.get_port() != port:  # taken in between, and viser went on to the next one
                 raise PersistError(f"cannot serve at {host}:{port}: taken; give another --port, or --port 0")
-            _refuse_other_origins(server, host)
+            _refuse_other_origins(server, names, host in EVERYWHERE)
             server.__dict__["request_share_url"] = _never_shared  # it would open a tunnel
             server.gui.configure_theme(show_share_button=False, show_logo=False, control_layout="collapsible")
             server.scene.configure_environment_map(None)  # blocks have no shading of light, and it would fade in
@@ -51,12 +52,12 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
         log.removeFilter(one_line)
 
 
-def _refuse_other_origins(server: viser.ViserServer, host: str) -> None:
+def _refuse_other_origins(server: viser.ViserServer, names: Collection[str], anywhere: bool) -> None:
     """Close every connection but those that a page of this server opens, before anything is sent on it.
 
     viser has no setting for this, so that the connections of its WebSocket server are looked at here.
     """
-    pages, names = server._websock_server, names_of(host)
+    pages = server._websock_server
 
     async def check(client: Any) -> None:
         connection = pages._live_connections.get(client.client_id)
@@ -65,7 +66,7 @@ def _refuse_other_origins(server: viser.ViserServer, host: str) -> None:
         connection.protocol.max_message_size = MOST_BYTES
         asked = connection.request.headers.get("Host", "")
         is_own_page = same_host(connection.request.headers.get("Origin", ""), asked)
-        if not (is_own_page and leads_here(asked, names, host in EVERYWHERE)):
+        if not (is_own_page and leads_here(asked, names, anywhere)):
             await connection.close(REFUSED, "another origin")
             with contextlib.suppress(ConnectionClosed):
                 while True:  # what it has sent by now is dropped

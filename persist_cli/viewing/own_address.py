@@ -56,10 +56,15 @@ def is_loopback(bound: socket.socket) -> bool:
     return ipaddress.ip_address(bound.getsockname()[0]).is_loopback
 
 
-def names_of(host: str) -> set[str]:
-    """Return the names in lower case by which a page may be asked for that is served on a host."""
+def names_of(host: str, bound: socket.socket) -> set[str]:
+    """Return the names in lower case by which a page may be asked for that is served on a host.
+
+    Args:
+        host: name or address.
+        bound: the socket that is bound to it, whose address is one of the names.
+    """
     names = {socket.gethostname(), socket.getfqdn()} if host in EVERYWHERE else {host}
-    return {"localhost", *(name.lower() for name in names)}
+    return {"localhost", bound.getsockname()[0], *(name.lower() for name in names)}
 
 
 def leads_here(host: str, names: Collection[str], anywhere: bool = False) -> bool:

@@ -56,5 +56,10 @@ def test_the_address_is_one_that_a_browser_of_this_machine_finds():
 
 
 def test_a_page_for_everybody_is_found_by_the_name_of_this_machine():
-    assert socket.gethostname().lower() in names_of("0.0.0.0")
-    assert names_of("Lab.local") == {"localhost", "lab.local"}
+    with bind("0.0.0.0", 0) as everywhere:
+        assert socket.gethostname().lower() in names_of("0.0.0.0", everywhere)
+
+
+def test_a_page_is_found_by_the_name_that_is_given_and_by_the_address_of_that_name():
+    with bind("127.0.0.1", 0) as bound:
+        assert names_of("Lab.local", bound) == {"localhost", "lab.local", "127.0.0.1"}
