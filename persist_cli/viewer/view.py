@@ -123,10 +123,10 @@ def serve_page(plan: ViewPlan, subject: Subject, address: Address, as_json: bool
 
 
 def say_unsaved(session: EditSession) -> None:
-    """Say what is edited and not saved, if anything is."""
+    """Say what is edited and not saved, if anything is, apart from what ``--json`` prints."""
     count = len(session.edits)
     if session.unsaved:
-        say(f"{count} edits are not saved in {session.out}" if count else f"{session.out} has edits that were undone")
+        warn(f"{count} edits are not saved in {session.out}" if count else f"{session.out} has edits that were undone")
 
 
 def check_address(address: Address) -> None:

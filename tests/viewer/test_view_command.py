@@ -78,7 +78,9 @@ def test_edits_that_are_not_saved_are_named_at_the_end(room, tmp_path, capsys):
     say_unsaved(session)
     session.undo()
     say_unsaved(session)
-    printed = capsys.readouterr().out.replace("\n", "")
+    out, err = capsys.readouterr()
+    assert out == ""  # which is JSON with --json
+    printed = err.replace("\n", "")
     assert printed.count("1 edits are not saved in") == 1
     assert printed.endswith("edited.safetensors has edits that were undone")
 
