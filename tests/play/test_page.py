@@ -172,9 +172,9 @@ def test_the_planner_walks_to_a_goal_picture_until_it_is_stopped(
         hold(page, "a", 2)
         first = frame_number(page)
         page.click("#plan")
-        page.wait_for_selector("#stop:enabled")
+        page.wait_for_selector("#stop[aria-disabled=false]")
         wait_for_frame(page, first + 1)
         page.click("#stop")
-        page.wait_for_selector("#stop:disabled", state="attached")
+        page.wait_for_selector("#stop[aria-disabled=true]")
         assert KeptPlay.newest.goal is not None
         assert not KeptPlay.newest.planning

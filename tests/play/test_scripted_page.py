@@ -119,7 +119,7 @@ def test_keys_walk_and_stop_the_planner_after_a_click_on_the_map_or_a_box(
             page.keyboard.press(key)
         assert held(walks, 4) == [["forward"], [], ["left"], []]
         walks.tell_state(goal=True, planning=True)
-        page.wait_for_selector("#stop:enabled")
+        page.wait_for_selector("#stop[aria-disabled=false]")
         page.locator("#map").focus()
         page.keyboard.press("Escape")
         walks.messages("stop", 1)
@@ -172,6 +172,39 @@ def test_a_button_is_held_with_the_space_bar(browser: Browser, walks: ScriptedWa
         assert held(walks, 2) == [["pick_up"], []]
 
 
+def test_a_button_is_tapped_once_by_the_mouse_by_a_key_and_by_what_only_clicks(
+    browser: Browser, walks: ScriptedWalks
+) -> None:
+    walks.answering = False
+    with opened(browser, walks) as page:
+        button = page.locator("[data-action=forward]")
+        for number, tap in enumerate(
+            (
+                button.click,
+                lambda: button.press("Enter"),
+                lambda: button.press("Space"),
+                lambda: button.evaluate("b => b.click()"),
+            )
+        ):
+            tap()
+            assert held(walks, 2 * number + 2) == [["forward"], []] * (number + 1)
+
+
+def test_a_button_that_cannot_be_pressed_any_more_keeps_the_focus(browser: Browser, walks: ScriptedWalks) -> None:
+    with opened(browser, walks) as page:
+        walks.tell_state(goal=True, planning=False)
+        page.wait_for_selector("#plan[aria-disabled=false]")
+        page.locator("#plan").press("Enter")
+        walks.messages("plan", 1)
+        walks.tell_state(goal=True, planning=True)
+        page.wait_for_selector("#plan[aria-disabled=true]")
+        assert page.evaluate("document.activeElement.id") == "plan"
+        page.keyboard.press("Enter")
+        page.keyboard.press("Escape")
+        walks.messages("stop", 1)
+        assert len(walks.messages("plan")) == 1
+
+
 def test_a_click_on_the_map_asks_for_its_place_in_metres(browser: Browser, walks: ScriptedWalks) -> None:
     with opened(browser, walks) as page:
         page.wait_for_selector("#agent", state="attached")
@@ -205,7 +238,7 @@ def test_commands_are_buttons_and_keys(browser: Browser, walks: ScriptedWalks) -
         walks.tell_state(goal=True, recording=True)
         page.wait_for_selector("#goal-picture", state="visible")
         page.click("#plan")
-        page.wait_for_selector("#record:enabled")
+        page.wait_for_selector("#record[aria-disabled=false]")
         page.keyboard.press("r")
         page.keyboard.press("r")  # is not told before the server has answered
         page.click("#goal")

@@ -47,9 +47,9 @@ class Controls {
   }
 
   command(name) {
-    if (byId(name).disabled) return;
+    if (byId(name).getAttribute("aria-disabled") === "true") return;
     this.tookGoal ||= name === "goal"; // its picture is shown when the server has it
-    if (name === "record") byId(name).disabled = true; // until the server has begun, or saved
+    if (name === "record") setAble(byId(name), false); // until the server has begun, or saved
     this.send(name, name === "record" ? { on: !this.state.recording } : {});
   }
 
@@ -61,11 +61,11 @@ class Controls {
 
   show(state) {
     this.state = state;
-    byId("record").disabled = false;
+    setAble(byId("record"), true);
     byId("record").setAttribute("aria-pressed", String(state.recording));
     byId("record").firstChild.textContent = state.recording ? "End recording" : "Record";
-    byId("plan").disabled = !state.goal || state.planning;
-    byId("stop").disabled = !state.planning;
+    setAble(byId("plan"), state.goal && !state.planning);
+    setAble(byId("stop"), state.planning);
     byId("goal-box").hidden = !state.goal;
     this.fill();
   }
@@ -102,6 +102,11 @@ class Controls {
     while (lines.children.length > MOST_LINES) lines.firstChild.remove();
     if (kind === "notice") setTimeout(() => line.remove(), NOTICE);
   }
+}
+
+// Says whether a button can be pressed; unlike one that is disabled, it keeps the focus.
+function setAble(button, able) {
+  button.setAttribute("aria-disabled", String(!able));
 }
 
 function link(words, address) {

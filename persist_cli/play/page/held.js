@@ -43,15 +43,23 @@ class Held {
     } else button.append(words);
     const key = keys.find(code => !code.startsWith("Arrow"));
     if (key) button.append(make("kbd", { textContent: keyName(key) }));
+    let used = false; // by a pointer or a key, after which a click comes too
     button.onpointerdown = event => {
       if (event.button !== 0) return;
+      used = true;
       button.setPointerCapture(event.pointerId); // a finger that slides off still releases this button
       this.hold(event.pointerId, name, event);
     };
     button.onpointerup = button.onpointercancel = button.onlostpointercapture = event => this.release(event.pointerId);
     button.oncontextmenu = event => event.preventDefault(); // a long touch
     button.onkeydown = event => {
-      if ((event.code === "Space" || event.code === "Enter") && !event.repeat) this.hold(event.code, name, event);
+      if (event.code !== "Space" && event.code !== "Enter") return;
+      used = true;
+      if (!event.repeat) this.hold(event.code, name, event);
+    };
+    button.onclick = event => {
+      if (!used) this.tap(name, event); // assistive technology clicks without either
+      used = false;
     };
     button.onblur = () => ["Space", "Enter"].forEach(code => this.release(code));
     return button;
@@ -74,6 +82,11 @@ class Held {
   release(source) {
     const action = this.sources.get(source);
     if (this.sources.delete(source) && !this.actions.includes(action)) this.tell({});
+  }
+
+  tap(action, event) {
+    this.hold("click", action, event);
+    this.release("click");
   }
 
   releaseAll() {
