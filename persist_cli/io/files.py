@@ -215,13 +215,17 @@ def empty_folder_aside(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def folder_aside(path: Path) -> Iterator[Path]:
+def folder_aside(path: Path, age: float = 0.0) -> Iterator[Path]:
     """A temporary folder that becomes ``path`` when the block ends well and replaces what is there.
 
     Whatever a killed writer of ``path`` left aside is removed first.
+
+    Args:
+        path: the folder.
+        age: seconds for which what is removed must have lain there, where others may write ``path`` meanwhile.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    remove_leftovers(path.parent, path.name)
+    remove_leftovers(path.parent, path.name, age=age)
     with empty_folder_aside(path) as aside:
         yield aside
         if path.exists():  # a folder cannot be renamed over one that is not empty, so the old one is moved aside first

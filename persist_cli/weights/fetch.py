@@ -15,7 +15,7 @@ from persist_cli.io.hub import cached_weight, weights_home
 from persist_cli.viewing.console import busy, print_json, print_table, say
 from persist_cli.weights.cache import fill_folder
 from persist_cli.weights.catalog import WEIGHTS, Weight, find_weight
-from persist_cli.weights.weight_sources import find_source, from_directory, remove_downloads
+from persist_cli.weights.weight_sources import DAY, find_source, from_directory, remove_downloads
 
 SHA256: Final = re.compile("[0-9a-fA-F]{64}")
 COLUMNS = ("name", "for", "licence", "MB", "from", "here")
@@ -90,7 +90,7 @@ def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
         home.mkdir(parents=True, exist_ok=True)
         file = find_source(weight, directory, offline)
         verifying = busy(f"{weight.name}: verifying and converting")
-        with folder_aside(home / weight.name) as aside, verifying:
+        with folder_aside(home / weight.name, DAY) as aside, verifying:
             provenance = fill_folder(weight, file, aside)
     except CheckpointError:
         remove_downloads([weight])  # or the same archive would be refused for ever

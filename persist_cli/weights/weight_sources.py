@@ -23,7 +23,7 @@ DOWNLOADS: Final = ".downloads"  # folder of downloaded archives beside the weig
 UNBUILT: Final = Path(__file__).parent / "unbuilt"
 MEGABYTE: Final = 1_000_000
 POLL: Final = 0.2  # seconds
-DAY: Final = 86_400.0  # seconds; no download takes longer
+DAY: Final = 86_400.0  # seconds; no process downloads or converts for longer
 
 Form = Literal["archive", "original", "converted"]
 

@@ -185,11 +185,13 @@ def test_a_downloaded_archive_that_is_refused_is_removed(home, tmp_path):
     refused(weight, None)
 
 
-def test_a_fetch_leaves_what_another_process_downloads(home, tmp_path, directory, monkeypatch):
+def test_a_fetch_leaves_what_another_process_downloads_and_converts(home, tmp_path, directory, monkeypatch):
     weight = weight_of(NAME, original(NAME), tmp_path)
     monkeypatch.setitem(WEIGHTS, NAME, weight)
     other = home / DOWNLOADS / f".partial-0123abcd-{weight.archive.file}" / "temporary"
-    other.mkdir(parents=True)
+    converted = home / f".partial-0123abcd-{NAME}"
+    for folder in (other, converted):
+        folder.mkdir(parents=True)
     archive = write_archive(weight, b"another", home / DOWNLOADS)
     with pytest.raises(PersistError, match="refused"):
         run_fetch([NAME], None, offline=True)
@@ -198,6 +200,7 @@ def test_a_fetch_leaves_what_another_process_downloads(home, tmp_path, directory
     run_fetch([NAME], None, offline=True)
     assert not archive.exists()
     assert other.is_dir()
+    assert converted.is_dir()
 
 
 def test_a_weight_that_no_source_has_is_reported_in_one_line_with_each_source_and_advice(directory):
