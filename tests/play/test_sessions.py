@@ -187,7 +187,7 @@ def test_too_many_messages_close_the_session(page):
 
 
 def test_a_page_may_say_of_every_frame_that_it_is_drawn(walk):
-    with serving(walk, Limits(frames_per_second=1e5)) as served, served.page() as page:
+    with serving(walk, Limits(frames_per_second=1e9)) as served, served.page() as page:
         page.until("frame")
         for number in range(1, 1001):
             page.say("ack", number=number)
