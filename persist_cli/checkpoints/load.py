@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.scene import Scene
@@ -18,7 +16,13 @@ from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import load_plugin
-from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe
+from persist_cli.recipe import (
+    BackboneConfig,
+    MemoryConfig,
+    Recipe,
+    parse_yaml_mapping,
+    read_recipe_file,
+)
 from persist_cli.viewing.console import warn
 
 if TYPE_CHECKING:
@@ -194,12 +198,17 @@ def changed_settings(settings: Mapping[str, Any], changes: Mapping[str, Any]) ->
 
 
 def is_own_codec(base: Checkpoint) -> bool:
-    """Whether a base is a codec that was trained from nothing, so that its video model has random weights."""
+    """Whether a base is a codec that was trained from nothing, so that its video model has random weights.
+
+    Raises:
+        RecipeError: when its recipe is damaged.
+    """
     recipe = base.base_folder / RECIPE
     if not recipe.is_file():
         return False
-    values = yaml.safe_load(recipe.read_text())
-    return values["stage"] == "codec" and not values["base"] and not values["backbone"]["settings"].get("pretrained")
+    values = parse_yaml_mapping(read_recipe_file(recipe), str(recipe))
+    settings = (values.get("backbone") or {}).get("settings") or {}
+    return values.get("stage") == "codec" and not values.get("base") and not settings.get("pretrained")
 
 
 def is_distilled(checkpoint: Checkpoint) -> bool:
