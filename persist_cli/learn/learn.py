@@ -190,6 +190,7 @@ def identity(learning: Learning) -> dict[str, Any]:
         "policy": learning.begin.fingerprint, "checkpoint": None, "episodes": None, "rounds": None,
         "views": {"path": plan.views, "fingerprint": digest(learning.views)},
         "sampling": asdict(plan.sampling) | plan.placement.changes(),
+        "ground": "of the given views and the walk",  # by which proposals are judged; once that of the memory
     }  # fmt: skip
     del values["placement"]  # where weights wait for their turn changes nothing
     if plan.inside == MODEL:
