@@ -149,8 +149,9 @@ def test_training_sees_the_noise_levels_at_which_a_sample_begins(model):
     assert float((levels > 0.97).float().mean()) > 0.005
 
 
-@pytest.mark.parametrize(("level", "early"), [(0.9, True), (0.2, False)])
-def test_known_tokens_hold_in_training_what_they_hold_in_sampling(model, samples, level, early):
+@pytest.mark.parametrize(("snaps", "level", "early"), [(1, 0.9, True), (1, 0.2, False), (0, 0.2, True)])
+def test_known_tokens_hold_in_training_what_they_hold_in_sampling(samples, snaps, level, early):
+    model = micro_model(sampling={"snap_every": snaps})
     given = torch.zeros_like(samples.given)
     given[:, :8] = int(Given.CONTENT)
     told = replace(samples, given=given, classes=samples.true_classes * (given > 0))

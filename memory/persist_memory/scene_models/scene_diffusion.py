@@ -1,8 +1,8 @@
 """The model of scenes: a codec from cells to latents, and a diffusion transformer that fills windows of them.
 
 Training follows PERSIST (arXiv 2603.03482): rectified flow on velocities, with noise levels of their own for regions,
-so that known places are clean where others are noise. Sampling takes Euler steps. The prediction is decoded after a
-step, given cells are written into it, it is snapped to classes and encoded again.
+so that known places are clean where others are noise. Sampling takes Euler steps. At the end, or after each step as in
+PERSIST, the prediction is decoded, given cells are written into it, and it is snapped to classes.
 
 diffusers has such blocks and Euler steps too, but importing them takes several seconds, and a scene imagines at once.
 """
@@ -130,7 +130,9 @@ class SceneDiffusion(SceneModel):
         truth there must not leak into the latents of these.
         """
         true, held = (self.codec.encode(*cells).float() for cells in (truth(samples), start(samples)))
-        early = (levels.amax(1, keepdim=True) > self.settings.sampling.snap_below).expand_as(known)
+        own = self.settings.sampling
+        snapped_from = own.snap_below if own.snap_every else -1.0
+        early = (levels.amax(1, keepdim=True) > snapped_from).expand_as(known)
         return held.where(self._places((known & early).float()).bool(), true)
 
     def tell(self, samples: SceneSamples, generators: list[torch.Generator], dropped: Bool[Tensor, " batch"]) -> Told:

@@ -85,13 +85,14 @@ class SamplingSettings:
     Args:
         shift: above 1 more steps are at high noise.
         guidance: how much more the view counts; 1 is off, and else each step takes twice as long.
-        snap_every: steps after which the prediction is decoded, snapped to classes and encoded again; 0 for never.
+        snap_every: steps after which the prediction is decoded, snapped to classes and encoded again, as PERSIST's is;
+            0 for the end alone, since a small codec loses some of what is one cell thick each time, doors above all.
         snap_below: noise level from which on that is done.
     """
 
-    shift: Metres = 1.0
+    shift: Metres = 3.0
     guidance: Amount = 1.0
-    snap_every: Count = 1
+    snap_every: Count = 0
     snap_below: Annotated[float, Field(ge=0, le=1)] = 0.5
 
 
