@@ -207,6 +207,15 @@ def read_recipe_file(path: Path) -> str:
         raise RecipeError(f"{path}: not UTF-8 (byte {error.start} is no part of a character)") from error
 
 
+def recipe_values(path: Path) -> dict[str, Any]:
+    """The plain values of a recipe's file, without those of a recipe that it extends.
+
+    Raises:
+        RecipeError: when it is not UTF-8, or not a YAML mapping.
+    """
+    return parse_yaml_mapping(read_recipe_file(path), str(path))
+
+
 def recipe_comment(name: str) -> list[str]:
     """The lines of comment with which a recipe begins: the command that runs it, and what there is to know.
 

@@ -12,7 +12,7 @@ from persist_cli.data.reference import data_folder
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import write_text
-from persist_cli.recipe import parse_yaml_mapping, read_recipe_file
+from persist_cli.recipe import parse_yaml_mapping, read_recipe_file, recipe_values
 from persist_cli.viewing.console import warn
 
 RECIPE: Final = "recipe.yaml"  # of the last stage, in the checkpoint folder of a run
@@ -83,7 +83,7 @@ def training_scenes(checkpoint: Checkpoint) -> TrainingScenes:
     if checkpoint.training_scenes is not None:
         return checkpoint.training_scenes
     path = checkpoint.folder / RECIPE
-    values = parse_yaml_mapping(read_recipe_file(path), str(path)) if path.is_file() else {}
+    values = recipe_values(path) if path.is_file() else {}
     own = _scenes_of_data((values.get("data") or {}).get("path") or ())
     if checkpoint.base_folder != checkpoint.folder:
         return own | training_scenes(find_checkpoint(checkpoint.base_folder))

@@ -16,13 +16,7 @@ from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import load_plugin
-from persist_cli.recipe import (
-    BackboneConfig,
-    MemoryConfig,
-    Recipe,
-    parse_yaml_mapping,
-    read_recipe_file,
-)
+from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe, recipe_values
 from persist_cli.viewing.console import warn
 
 if TYPE_CHECKING:
@@ -206,7 +200,7 @@ def is_own_codec(base: Checkpoint) -> bool:
     recipe = base.base_folder / RECIPE
     if not recipe.is_file():
         return False
-    values = parse_yaml_mapping(read_recipe_file(recipe), str(recipe))
+    values = recipe_values(recipe)
     settings = (values.get("backbone") or {}).get("settings") or {}
     return values.get("stage") == "codec" and not values.get("base") and not settings.get("pretrained")
 

@@ -18,7 +18,7 @@ from persist_cli.api.checkpoint import STEP, Checkpoint, step_folders
 from persist_cli.checkpoints.lineage import RECIPE
 from persist_cli.errors import PersistError
 from persist_cli.io.files import empty_folder_aside, read_json, write_json
-from persist_cli.recipe import parse_yaml_mapping, read_recipe_file
+from persist_cli.recipe import recipe_values
 from persist_cli.viewing.console import warn
 
 USERS: Final = "used-by"  # the folder of the marks, beside the checkpoints of a run
@@ -102,7 +102,7 @@ def ended_recipe(step: Path) -> bool:
     """Whether a checkpoint is at the last step of its recipe."""
     path = step / "model" / RECIPE
     try:
-        training = parse_yaml_mapping(read_recipe_file(path), str(path)).get("training")
+        training = recipe_values(path).get("training")
     except (OSError, PersistError):
         return False
     return isinstance(training, dict) and f"{STEP}{training.get('steps', 0):08d}" == step.name

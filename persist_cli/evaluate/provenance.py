@@ -54,15 +54,11 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
 
 def scene_models(checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> list[dict[str, str]]:
     """For each checkpoint the hash of the model that imagines in the scenes of each of these memories that has one."""
-    return [
-        {name: found for name in memories if name in one.adapters and (found := imagined_by(one, name))}
+    hashes = [
+        {name: scene_model_fingerprint(adapter_memory(one, name)) for name in memories if name in one.adapters}
         for one in checkpoints
     ]
-
-
-def imagined_by(checkpoint: Checkpoint, adapter: str) -> str:
-    """The hash of the model that imagines in the scenes of an adapter, empty where there is none."""
-    return scene_model_fingerprint(adapter_memory(checkpoint, adapter))
+    return [{name: found for name, found in of_one.items() if found} for of_one in hashes]
 
 
 def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str, Any]:

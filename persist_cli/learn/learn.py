@@ -41,6 +41,7 @@ from persist_cli.recipe import apply_overrides, make_recipe
 from persist_cli.rollout.camera_path import RolloutPlan
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.train.finetune import FinetunePlan, run_finetune
+from persist_cli.train.sources import weights_hash
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 from persist_cli.viewing.curve import Curve, draw_curves
 
@@ -204,7 +205,7 @@ def model_identity(plan: LearnPlan) -> dict[str, Any]:
     """Return JSON values that tell models, and the adapters that are chosen of them, apart."""
     checkpoint = find_checkpoint(plan.checkpoint)
     adapter = checkpoint.chosen_adapter(plan.adapter)
-    weights = None if adapter is None else file_sha256(checkpoint.adapter_folder(adapter) / "adapter.safetensors")
+    weights = weights_hash(checkpoint, adapter)
     return {"checkpoint": checkpoint.fingerprint, "adapter": {"name": adapter or PLAIN, "sha256": weights}}
 
 

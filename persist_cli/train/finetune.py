@@ -53,10 +53,9 @@ from persist_cli.recipe import (
     changeable_on_resume,
     make_recipe,
     network_of,
-    parse_yaml_mapping,
     read_recipe,
-    read_recipe_file,
     recipe_names,
+    recipe_values,
     to_plain,
 )
 from persist_cli.train.distributed import (
@@ -142,7 +141,7 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     if not resume:
         raise PersistError(f"{run}: holds a run already; go on with --resume or choose another --out")
     path = run / "recipe.yaml"
-    values = parse_yaml_mapping(read_recipe_file(path), str(path))
+    values = recipe_values(path)
     # settings that the run's version did not have get their defaults
     before = to_plain(make_recipe(with_scene_paths(values), str(path)))
     found_by_weights = known_hashes(run).keys() & distilled(recipe).keys()

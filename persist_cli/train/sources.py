@@ -39,7 +39,6 @@ from persist_cli.recipe import Recipe, network_of
 
 DISTILLED: Final = "distilled.json"  # in a run's folder: hashes of what it distils, by the recipe's keys
 
-
 IMAGINED: Final = "imagined.json"  # in a run's folder: the hash of the model that imagines in its scenes
 
 

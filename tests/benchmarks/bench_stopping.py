@@ -25,6 +25,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
+from persist_cli.api.cost import Cost
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Situation
@@ -61,12 +62,13 @@ class Recorder:
     unlike: list[float] = field(default_factory=list)
     predicted: list[float] = field(default_factory=list)
     seen: Observations | None = None
+    cost: Cost = field(default_factory=lambda: make_cost("lpips", {}))  # keeps the features of the goal image
 
     def stops(self, view: Observations, goal: Goal, world_up: Sequence[float]) -> bool:
         """Take in a view, and return false."""
         past = view if self.seen is None else Observations.concatenate([self.seen, view])
         self.seen = past[-self.policy.frames :]
-        self.unlike += view_costs(make_cost("lpips", {}), view, goal)
+        self.unlike += view_costs(self.cost, view, goal)
         self.predicted.append(self.policy.distance(Situation(self.seen, self.info, goal, GroundMap.empty(world_up))))
         return False
 
