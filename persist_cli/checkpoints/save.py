@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.api.checkpoint import CARD, REFERENCE, STARTED_FROM, VERSION, Checkpoint, TrainingScenes
+from persist_cli.api.inference import CONSISTENCY
 from persist_cli.checkpoints.lineage import MEMORY_FILE
 from persist_cli.io.files import bundled_folder, write_json
 from persist_cli.io.sha256sums import hash_files, write_sums
@@ -38,7 +39,7 @@ def save_base(
     backbone.save_base(folder)
     hashes = hash_weights(folder)
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(hashes)}
-    card |= own_sampling(backbone)
+    card |= own_sampling(backbone) or kept_sampling(base)
     started = {} if base is None else {STARTED_FROM: pointer_to(base.base_folder, base.fingerprint, home or folder)}
     write_card(folder, card | started, scenes)
     write_sums(folder, hashes)
@@ -102,6 +103,14 @@ def own_sampling(backbone: Backbone) -> dict[str, Any]:
     """The sampling that a backbone's card asks for, where it has one of its own."""
     sampling = backbone.own_sampling
     return {} if sampling is None else {"sampling": dataclasses.asdict(sampling)}
+
+
+def kept_sampling(base: Checkpoint | None) -> dict[str, Any]:
+    """The sampling that a card asks for since its base did; not that of a distilled base, which training undoes."""
+    if base is None or base.sampling is None or base.sampling.sampler == CONSISTENCY:
+        return {}
+    protocols = {name: dataclasses.asdict(sampling) for name, sampling in base.protocol_sampling.items()}
+    return {"sampling": dataclasses.asdict(base.sampling)} | ({"protocol_sampling": protocols} if protocols else {})
 
 
 def base_files(folder: Path, pattern: str) -> list[Path]:

@@ -13,6 +13,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import PROTOCOLS as PROTOCOL_NAMES
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.load import load_adapter, load_backbone
+from persist_cli.checkpoints.save import save_base
 from persist_cli.errors import CheckpointError
 from persist_cli.evaluate.protocols import PROTOCOLS
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
@@ -123,6 +124,18 @@ def test_a_protocol_may_have_a_sampling_of_its_own_which_options_still_override(
     assert card.sampling_with(SamplingOverrides(steps=2), "return") == Sampling(2, "ddim", 1.5)
     assert persist("export", tmp_path / "m", "--steps", 5, "--out", tmp_path / "again").code == 0
     assert find_checkpoint(tmp_path / "again").sampling_with(SamplingOverrides(), "return") == Sampling(20, "ddim", 1.5)
+
+
+@pytest.mark.parametrize(("sampler", "kept"), [("unipc", Sampling(4, "unipc")), ("consistency", None)])
+def test_a_model_trained_on_is_sampled_as_its_base_unless_that_is_distilled(export, tmp_path, sampler, kept):
+    export(tmp_path / "m", "--steps", "4", "--sampler", sampler, "--sampling-for", "return:steps=20")
+    base = find_checkpoint(tmp_path / "m")
+    (tmp_path / "on").mkdir()
+    save_base(load_backbone(base), tmp_path / "on", base=base)
+    trained = find_checkpoint(tmp_path / "on")
+    assert trained.sampling == kept
+    expected = Sampling(20, "unipc") if kept else Sampling(50, "ddim")
+    assert trained.sampling_with(SamplingOverrides(), "return") == expected
 
 
 @pytest.fixture
