@@ -29,6 +29,8 @@ from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.plugins import make_backbone
+from persist_cli.policies.nomad.efficientnet import EfficientNet
+from persist_cli.policies.trained import packaged_policy
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 from persist_cli.viewing.console import print_table
@@ -149,6 +151,20 @@ def feature_pairs(sample: ClipSample) -> list[Pair]:
     return [Pair("features kept: memory of DINOv2 alone", *runs)]
 
 
+def policy_pairs() -> list[Pair]:
+    """The encoder of a policy's images with the channels of a pixel side by side in memory, and apart."""
+    encoder = EfficientNet(packaged_policy().load().settings.encoder, 3, 0.0)
+    images = torch.rand(LARGE, 3, 64, 64)
+
+    def apart() -> None:
+        state = F.silu(encoder.stem_norm(encoder.stem(images)))
+        for block in encoder.blocks:
+            state = block(state)
+        encoder.head_norm(encoder.head(state)).sum().backward()
+
+    return [Pair("channels last: a policy's images", apart, lambda: encoder.map(images).sum().backward())]
+
+
 def main() -> None:
     """Time all pairs and print one table."""
     say_conditions(f"the reference model with untrained weights, 64×64, batches of {BATCH}")
@@ -161,6 +177,7 @@ def main() -> None:
         pairs = [
             *codec_pairs(Clips.stack(clips)),
             *model_pairs(clips),
+            *policy_pairs(),
             *memory_pairs(longest, Path(folder) / "cache"),
             *(feature_pairs(longest) if cached_weight("dinov2-s-derived") else ()),
         ]

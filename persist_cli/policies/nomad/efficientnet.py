@@ -117,6 +117,7 @@ class EfficientNet(nn.Module):
 
     def map(self, image: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch head row column"]:
         """Return what the last convolution makes of each place of the image, normalised."""
+        image = image.contiguous(memory_format=torch.channels_last)  # faster on a CPU
         state = functional.silu(self.stem_norm(self.stem(image)))
         for block in self.blocks:
             state = block(state)
