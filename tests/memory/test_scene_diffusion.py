@@ -94,8 +94,35 @@ def test_the_codec_learns_rooms_and_the_transformer_their_latents(samples):
             optimizer.zero_grad()
         model.finish_stage(stage, [samples])
         assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
-    latents = model.codec.encode(samples.true_classes, samples.true_colors).detach()
-    assert latents.transpose(0, 1).flatten(1).std(1).allclose(torch.ones(latents.shape[1]), atol=1e-3)
+    assert components_of(model, samples).var(1).mean().allclose(torch.tensor(1.0), atol=1e-3)
+
+
+def components_of(model, samples):
+    """What is generated of some windows, ``[component, place]``."""
+    with torch.no_grad():
+        return model.codec.encode(samples.true_classes, samples.true_colors).transpose(0, 1).flatten(1)
+
+
+@pytest.mark.parametrize("evenness", [0.0, 0.5, 1.0])
+def test_the_first_principal_components_of_latents_are_generated(samples, evenness):
+    model = micro_model(codec=MICRO_SCENE["codec"] | {"components": 3, "evenness": evenness})
+    with torch.no_grad():
+        latents = model.codec.posterior(samples.true_classes, samples.true_colors)[0]
+    model.finish_stage("scene-codec", [samples])
+    spread = torch.linalg.eigvalsh(latents.transpose(0, 1).flatten(1).cov()).flip(0)[:3].sqrt() ** (1 - evenness)
+    expected = torch.diag(spread**2 / (spread**2).mean())
+    assert components_of(model, samples).cov().allclose(expected, atol=1e-4)
+    assert model.sample(samples, 1)[0].shape == samples.classes.shape
+
+
+def test_all_components_of_latents_are_decoded_as_the_latents_themselves(samples):
+    model = micro_model()
+    model.finish_stage("scene-codec", [samples])
+    with torch.no_grad():
+        latents = model.codec.posterior(samples.true_classes, samples.true_colors)[0]
+        decoded = model.codec.decode(model.codec.encode(samples.true_classes, samples.true_colors))
+        for ours, theirs in zip(decoded, model.codec.read_off(latents), strict=True):
+            assert ours.allclose(theirs, atol=1e-4)
 
 
 def test_given_cells_come_out_to_the_bit_and_solid_ones_as_something(model, samples):
@@ -230,6 +257,7 @@ def test_a_codec_alone_leaves_the_rest_as_it_was(model, tmp_path):
         ({"shape": [16, 16, 6], "codec": {"fold_levels": False}}, "must be multiples of 4"),
         ({"image": [20, 16]}, "multiples of view_patch 8"),
         ({"transformer": {"width": 32}}, "must be a multiple of twice the heads"),
+        ({"codec": {"latent": 8, "components": 9}}, "components 9 must be at most codec.latent, 8"),
     ],
 )
 def test_sizes_that_do_not_go_together_are_refused(change, message):

@@ -19,18 +19,21 @@ from persist_memory.scene_models.settings import REDUCTION, SceneDiffusionSettin
 COLORS = 3
 HALF = 2  # cells or latents along an edge that a halving makes one of
 GROUPS = 8  # of a group normalisation
+SMALLEST = 1e-12  # variance of a component
 
 
 class SceneCodec(nn.Module):
     """Encodes windows of cells as latents and decodes these.
 
-    Latents are normalised by a mean and a deviation that ``measure`` sets and checkpoints hold.
+    What is generated are the first principal components of the latents, by a mean, axes and deviations that ``measure``
+    sets and checkpoints hold: of the channels many say nearly the same, and noise is the same in every direction.
 
     Args:
         settings: sizes of windows and codec.
     """
 
     latent_mean: Tensor
+    latent_axes: Tensor
     latent_deviation: Tensor
 
     def __init__(self, settings: SceneDiffusionSettings) -> None:
@@ -51,7 +54,8 @@ class SceneCodec(nn.Module):
         )  # fmt: skip
         self.cell = nn.Sequential(nn.SiLU(), nn.Linear(codec.cell, len(settings.palette) + COLORS))
         self.register_buffer("latent_mean", torch.zeros(codec.latent))
-        self.register_buffer("latent_deviation", torch.ones(codec.latent))
+        self.register_buffer("latent_axes", torch.eye(codec.latent)[:, : settings.components])
+        self.register_buffer("latent_deviation", torch.ones(settings.components))
 
     def posterior(
         self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]
@@ -63,16 +67,18 @@ class SceneCodec(nn.Module):
 
     def encode(
         self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]
-    ) -> Float[Tensor, "batch channel *latent"]:
-        """Return normalised latents, the means of their distributions."""
+    ) -> Float[Tensor, "batch component *latent"]:
+        """Return components of latents, which are the means of their distributions."""
         mean, _ = self.posterior(classes, colors)
-        return (mean - self._shaped(self.latent_mean)) / self._shaped(self.latent_deviation)
+        centred = mean.movedim(1, -1) - self.latent_mean
+        return (centred @ self.latent_axes / self.latent_deviation).movedim(-1, 1)
 
     def decode(
-        self, latents: Float[Tensor, "batch channel *latent"]
+        self, components: Float[Tensor, "batch component *latent"]
     ) -> tuple[Float[Tensor, "batch first second level klass"], Float[Tensor, "batch first second level 3"]]:
-        """Return the logits of classes and the colours (1 = 255) of normalised latents."""
-        return self.read_off(latents * self._shaped(self.latent_deviation) + self._shaped(self.latent_mean))
+        """Return the logits of classes and the colours (1 = 255) of components of latents."""
+        scaled = components.movedim(1, -1) * self.latent_deviation
+        return self.read_off((scaled @ self.latent_axes.T + self.latent_mean).movedim(-1, 1))
 
     def read_off(
         self, latents: Float[Tensor, "batch channel *latent"]
@@ -86,13 +92,15 @@ class SceneCodec(nn.Module):
         return logits, colors
 
     def measure(self, latents: Sequence[Float[Tensor, "batch channel *latent"]]) -> None:
-        """Set the mean and deviation by which latents are normalised to those of some that are not."""
-        values = torch.cat([part.transpose(0, 1).flatten(1) for part in latents], dim=1).float()
+        """Set mean, axes and deviations to those of some latents; the components' mean variance is then 1."""
+        values = torch.cat([part.transpose(0, 1).flatten(1) for part in latents], dim=1).double()
+        variances, axes = torch.linalg.eigh(values.cov())
+        kept = variances.argsort(descending=True)[: self.settings.components]
+        deviations = variances[kept].clamp_min(SMALLEST).sqrt()
+        even = deviations**self.settings.codec.evenness
         self.latent_mean.copy_(values.mean(1))
-        self.latent_deviation.copy_(values.std(1).clamp_min(1e-6))
-
-    def _shaped(self, values: Float[Tensor, " channel"]) -> Float[Tensor, channel * latent]:
-        return values.reshape(-1, *[1] * self.axes)
+        self.latent_axes.copy_(axes[:, kept])
+        self.latent_deviation.copy_(even * (deviations / even).square().mean().sqrt())
 
     def _conv(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Module:
         padding = kernel // 2 if stride == 1 else 0

@@ -30,6 +30,8 @@ class CodecSettings:
         channels: channels after the first halving and after the second.
         blocks: residual blocks at each size.
         latent: channels of a latent.
+        components: principal components of the latents that the transformer generates; ``None`` for as many as channels.
+        evenness: of their deviations: 1 makes all alike, 0 leaves them as they are, so that noise hides small ones first.
         cell: channels of a cell in the decoder, before its class and colour are read off.
         furniture_weight: weight of a cell in the loss that holds a thing; all others have 1.
         color_weight: weight of the colours' error.
@@ -42,6 +44,8 @@ class CodecSettings:
     channels: tuple[Positive, Positive] = (64, 128)
     blocks: Positive = 1
     latent: Positive = 48
+    components: Positive | None = None
+    evenness: Annotated[float, Field(ge=0, le=1)] = 0.5
     cell: Positive = 16
     furniture_weight: Metres = 4.0
     color_weight: Amount = 1.0
@@ -123,11 +127,18 @@ class SceneDiffusionSettings:
     def __post_init__(self) -> None:
         if self.palette[: len(COMMON)] != COMMON or len(set(self.palette)) < len(self.palette):
             raise ValueError(f"palette must begin with {', '.join(COMMON)} and name each class once")
+        if self.components > self.codec.latent:
+            raise ValueError(f"codec.components {self.components} must be at most codec.latent, {self.codec.latent}")
         unit, view = REDUCTION * self.transformer.patch, self.transformer.view_patch
         if any(length % unit for length in self.divided):
             raise ValueError(f"shape {list(self.shape)} must be multiples of {unit}, but the height of folded levels")
         if any(length % view for length in self.image):
             raise ValueError(f"image {list(self.image)} must be multiples of view_patch {view}")
+
+    @property
+    def components(self) -> int:
+        """The principal components of the latents that are generated."""
+        return self.codec.components or self.codec.latent
 
     @property
     def divided(self) -> tuple[int, ...]:

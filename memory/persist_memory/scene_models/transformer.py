@@ -85,7 +85,7 @@ class SceneTransformer(nn.Module):
         super().__init__()
         own = settings.transformer
         self.settings, width = settings, own.width
-        folded = settings.codec.latent * own.patch ** len(settings.tokens)
+        folded = settings.components * own.patch ** len(settings.tokens)
         self.inputs = nn.Linear(folded, width)
         self.places = nn.Parameter(0.02 * torch.randn(math.prod(settings.tokens), width))
         self.level = nn.Sequential(nn.Linear(2 * LEVEL_WAVES, width), nn.SiLU(), nn.Linear(width, width))
