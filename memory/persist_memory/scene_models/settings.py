@@ -30,8 +30,8 @@ class CodecSettings:
         channels: channels after the first halving and after the second.
         blocks: residual blocks at each size.
         latent: channels of a latent.
-        components: principal components of the latents that the transformer generates; ``None`` for as many as channels.
-        evenness: of their deviations: 1 makes all alike, 0 leaves them as they are, so that noise hides small ones first.
+        components: principal components of the latents that the transformer generates; ``None`` for all.
+        evenness: of their deviations: 1 makes all alike, 0 leaves them as they are: noise hides small ones first.
         cell: channels of a cell in the decoder, before its class and colour are read off.
         furniture_weight: weight of a cell in the loss that holds a thing; all others have 1.
         color_weight: weight of the colours' error.
