@@ -77,6 +77,7 @@ class Answers:
 
 def measure(page: Page, server: psutil.Process, presses: int, hold: int) -> Answers:
     """Press keys, hold each for some frames, and return what that gave."""
+    wait_until_still(page)  # an answer to a press before is not counted
     chance, after = random.Random(0), frame_number(page)
     page.evaluate("() => { latencies.length = 0; }")
     began, rates = processor_seconds(server), []
