@@ -39,7 +39,7 @@ def save_base(
     backbone.save_base(folder)
     hashes = hash_weights(folder)
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(hashes)}
-    card |= own_sampling(backbone) or kept_sampling(base)
+    card |= asked_sampling(backbone, base)
     started = {} if base is None else {STARTED_FROM: pointer_to(base.base_folder, base.fingerprint, home or folder)}
     write_card(folder, card | started, scenes)
     write_sums(folder, hashes)
@@ -63,6 +63,7 @@ def save_lora(
         changes = pointer_to(base.base_folder, base.fingerprint, home)
     hashes = hash_weights(folder)
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "changes": changes}
+    card |= asked_sampling(backbone, base)
     write_card(folder, card | {"fingerprint": card_fingerprint(hashes, card)}, scenes)
     write_sums(folder, hashes)
 
@@ -105,10 +106,14 @@ def own_sampling(backbone: Backbone) -> dict[str, Any]:
     return {} if sampling is None else {"sampling": dataclasses.asdict(sampling)}
 
 
-def kept_sampling(base: Checkpoint | None) -> dict[str, Any]:
-    """The sampling that a card asks for since its base did; not that of a distilled base, which training undoes."""
-    if base is None or base.sampling is None or base.sampling.sampler == CONSISTENCY:
-        return {}
+def asked_sampling(backbone: Backbone, base: Checkpoint | None) -> dict[str, Any]:
+    """The sampling that the card of a video model asks for: its own, else that of the base that it was trained on.
+
+    That of a distilled base is not kept, for the training undoes it.
+    """
+    own = own_sampling(backbone)
+    if own or base is None or base.sampling is None or base.sampling.sampler == CONSISTENCY:
+        return own
     protocols = {name: dataclasses.asdict(sampling) for name, sampling in base.protocol_sampling.items()}
     return {"sampling": dataclasses.asdict(base.sampling)} | ({"protocol_sampling": protocols} if protocols else {})
 

@@ -12,8 +12,9 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import PROTOCOLS as PROTOCOL_NAMES
 from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.stages import Lora
 from persist_cli.checkpoints.load import load_adapter, load_backbone
-from persist_cli.checkpoints.save import save_base
+from persist_cli.checkpoints.save import save_base, save_lora
 from persist_cli.errors import CheckpointError
 from persist_cli.evaluate.protocols import PROTOCOLS
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
@@ -136,6 +137,18 @@ def test_a_model_trained_on_is_sampled_as_its_base_unless_that_is_distilled(expo
     assert trained.sampling == kept
     expected = Sampling(20, "unipc") if kept else Sampling(50, "ddim")
     assert trained.sampling_with(SamplingOverrides(), "return") == expected
+
+
+def test_a_low_rank_change_is_sampled_as_the_base_that_it_changes(export, tmp_path):
+    export(tmp_path / "m", "--steps", "4", "--sampler", "unipc", "--sampling-for", "return:steps=20")
+    base = find_checkpoint(tmp_path / "m")
+    backbone = load_backbone(base)
+    backbone.add_lora(Lora(rank=2))
+    (tmp_path / "low").mkdir()
+    save_lora(backbone, base, tmp_path / "low", tmp_path / "low")
+    changed = find_checkpoint(tmp_path / "low")
+    assert (changed.sampling, changed.protocol_sampling) == (base.sampling, base.protocol_sampling)
+    assert changed.sampling == Sampling(4, "unipc")
 
 
 @pytest.fixture
