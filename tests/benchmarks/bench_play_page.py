@@ -82,10 +82,9 @@ def measure(page: Page, server: psutil.Process, presses: int, hold: int) -> Answ
     page.evaluate("() => { latencies.length = 0; }")
     began, rates = processor_seconds(server), []
     for number in range(presses):
-        wait_until_still(page)
         page.wait_for_timeout(chance.uniform(*PAUSES))
         rates.append(press(page, KEYS[number % len(KEYS)], hold))
-    wait_until_still(page)
+        wait_until_still(page)
     rates = [rate for rate in rates if rate is not None]
     latencies, walked = page.evaluate("latencies"), frame_number(page) - after
     seconds = processor_seconds(server) - began
