@@ -7,6 +7,7 @@ follow from its own seed, so that a batch can be divided.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 WEIGHTS: Final = "model.safetensors"
 MEAN: Final = (0.485, 0.456, 0.406)  # of ImageNet
 DEVIATION: Final = (0.229, 0.224, 0.225)
+FARTHEST_PLACE: Final = 50.0  # metres
 SMALLEST_SHARE: Final = 1e-2  # added to a share that a mean is divided by, as published
 
 Positive = Annotated[int, Field(ge=1)]
@@ -59,7 +61,7 @@ class NomadNetworkSettings:
         still: metres; waypoints that end nearer than this are not learned. A place cannot tell a turn on the spot.
         masked: share of the samples whose goal is masked.
         distance_weight: weight of the distance's squared error; that of the noise has the rest.
-        place_weight: weight of the error of where the goal lies, which nothing but training reads; 0 as published.
+        place_weight: weight of the error of where the goal lies; 0 as published, where nothing predicts it.
         encoder: both encoders of images.
         matcher: encoder whose maps of the present frame and the goal are compared place by place; ``None`` as
             published, where ``encoder`` sees both on top of each other.
@@ -108,6 +110,29 @@ class NomadNetworkSettings:
             raise ValueError(f"least {list(self.least)} must be below most {list(self.most)}")
         if self.nearest >= self.farthest:
             raise ValueError(f"nearest {self.nearest} must be below farthest {self.farthest}")
+
+
+@dataclass(frozen=True)
+class GoalPlace:
+    """Where the goal's image was taken, as predicted.
+
+    Args:
+        ahead: metres ahead of the present camera.
+        left: metres to the left of it.
+        heading: degrees to the left of its heading.
+        certainty: length of the predicted unit vector of the heading: 1 where one heading is certain, and the nearer to
+            0 the farther apart those are that the network holds possible.
+    """
+
+    ahead: float
+    left: float
+    heading: float
+    certainty: float
+
+    @property
+    def metres(self) -> float:
+        """From the present camera, straight over the ground."""
+        return math.hypot(self.ahead, self.left)
 
 
 class NomadNetwork(PolicyNetwork):
@@ -228,6 +253,20 @@ class NomadNetwork(PolicyNetwork):
             motions = self.scheduler.step(noise, step, motions, generator=generator).prev_sample
         return self.waypoints(motions)
 
+    @torch.no_grad()
+    def goal_place(self, condition: Float[Tensor, " token"]) -> GoalPlace | None:
+        """Return where the goal lies; ``None`` of a network that has not learned it.
+
+        Args:
+            condition: a result of ``condition`` whose goal was not masked.
+        """
+        if self.place is None:
+            return None
+        predicted = self.place(condition).double().cpu()
+        ahead, left = unsquashed(predicted[:2]).tolist()
+        forward, aside = predicted[2:].tolist()
+        return GoalPlace(ahead, left, math.degrees(math.atan2(aside, forward)), math.hypot(forward, aside))
+
     def normalised(self, waypoints: Float[Tensor, "batch waypoint 2"]) -> Float[Tensor, "batch waypoint 2"]:
         """Return the motions from waypoint to waypoint as numbers in -1…1."""
         motions = torch.diff(waypoints / self.settings.metres, dim=1, prepend=torch.zeros_like(waypoints[:, :1]))
@@ -280,6 +319,13 @@ def squashed(place: Float[Tensor, "batch 4"]) -> Float[Tensor, "batch 4"]:
     """The places of goals with their metres r as r / (1 + r), so that far goals count no more than near ones."""
     metres = place[:, :2].norm(dim=1, keepdim=True)
     return torch.cat([place[:, :2] / (1 + metres), place[:, 2:]], dim=1)
+
+
+def unsquashed(place: Float[Tensor, " 2"]) -> Float[Tensor, " 2"]:
+    """The place in metres of one that ``squashed`` gave; a prediction is at most ``FARTHEST_PLACE`` metres away."""
+    share = float(place.norm())
+    metres = min(share / (1 - min(share, 1 - 1e-6)), FARTHEST_PLACE)
+    return place / max(share, 1e-6) * metres
 
 
 def sinusoids_interleaved(places: int, width: int) -> Float[Tensor, "place width"]:

@@ -1,4 +1,4 @@
-"""Waypoints followed by the actions of a vocabulary: turn towards the next one, and walk."""
+"""Waypoints, or the place of a goal, followed by the actions of a vocabulary: turn towards it, and walk."""
 
 from __future__ import annotations
 
@@ -42,6 +42,32 @@ def follow_waypoints(
             heading += turn.turn
         names.append((turn or ahead).name)
     return tuple(names)
+
+
+def go_straight_and_face(
+    place: tuple[float, float], heading: float, ahead: Action, turns: Sequence[Action]
+) -> tuple[str, ...]:
+    """Return the actions that turn to a place, go straight there, and turn to a heading; none where both are so.
+
+    Args:
+        place: metres ahead and to the left of where the agent is now.
+        heading: degrees to the left of its heading.
+        ahead: a step straight ahead.
+        turns: a turn to each side, or to one side alone.
+    """
+    steps = round(math.hypot(*place) / ahead.forward)
+    way = math.degrees(math.atan2(place[1], place[0]))
+    names, turned = _turns(way, turns) if steps else ((), 0.0)
+    return (*names, *[ahead.name] * steps, *_turns(heading - turned, turns)[0])
+
+
+def _turns(angle: float, turns: Sequence[Action]) -> tuple[tuple[str, ...], float]:
+    """The names of the turns that come nearest to an angle in degrees, and the degrees that they turn."""
+    names, turned = list[str](), 0.0
+    while turn := _turn_towards(angle - turned, turns):
+        names.append(turn.name)
+        turned += turn.turn
+    return tuple(names), turned
 
 
 def _turn_towards(angle: float, turns: Sequence[Action]) -> Action | None:

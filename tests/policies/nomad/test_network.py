@@ -14,7 +14,7 @@ from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.settings import parse_settings
 from persist_cli.policies.nomad.efficientnet import EncoderSettings
 from persist_cli.policies.nomad.matcher import Matcher
-from persist_cli.policies.nomad.network import NomadNetwork, NomadNetworkSettings
+from persist_cli.policies.nomad.network import NomadNetwork, NomadNetworkSettings, squashed
 from tests.support.micro_policies import micro_network, random_samples
 
 NO = torch.zeros(4, dtype=torch.bool)
@@ -87,6 +87,21 @@ def test_the_error_of_the_goals_place_is_learned_where_the_goal_is_seen_and_its_
     assert errors[0] == errors[1]
     assert errors[0] != losses["place_error"]
     assert "place_error" not in micro_network()(samples, "policy")
+
+
+def test_the_predicted_place_of_a_goal_is_in_metres_and_says_how_certain_its_heading_is():
+    network = micro_network(place_weight=0.5, matcher=MATCHER)
+    condition = network.condition(random_samples().seen, random_samples().goal, torch.zeros(4, dtype=torch.bool))[0]
+    assert network.place is not None
+    torch.nn.init.zeros_(network.place[-1].weight)
+    network.place[-1].bias.data = squashed(torch.tensor([[3.0, -4.0, 0.0, 0.5]]))[0]
+    place = network.goal_place(condition)
+    assert place is not None
+    found = [place.ahead, place.left, place.metres, place.heading, place.certainty]
+    assert found == pytest.approx([3.0, -4.0, 5.0, 90.0, 0.5], rel=1e-5)
+    network.place[-1].bias.data = torch.tensor([0.9, 0.9, 1.0, 0.0])  # farther than anything
+    assert network.goal_place(condition).metres == pytest.approx(50)
+    assert micro_network().goal_place(condition) is None
 
 
 def test_a_matcher_finds_each_place_of_an_image_where_it_has_gone_in_another():

@@ -13,6 +13,7 @@ from persist_cli.api.policy import Goal, Situation
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError, PluginError, RecipeError
 from persist_cli.io.files import read_tensors
+from persist_cli.policies.nomad.network import GoalPlace, NomadNetwork
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.policies.trained import find_policy, save_policy
 from tests.support.rooms import UP
@@ -57,6 +58,23 @@ def test_it_stops_where_the_predicted_distance_says_so_but_not_where_it_explores
     policy = open_policy(str(policy_run), {"stop": 1e6})
     assert policy.propose(situation, 8, 3, draw()) == [()] * 3
     assert all(policy.propose(with_goal(situation, None), 8, 3, draw()))
+
+
+def test_near_a_goal_whose_place_is_certain_the_first_way_leads_there_and_turns_to_its_heading(
+    policy_run, situation, monkeypatch
+):
+    place = GoalPlace(ahead=0.5, left=0.0, heading=30.0, certainty=0.8)
+    monkeypatch.setattr(NomadNetwork, "goal_place", lambda network, condition: place)
+    straight = ("forward", "forward", "left", "left")
+    policy = open_policy(str(policy_run), {"stop": 0})
+    first, *others = policy.propose(situation, 8, 5, draw())
+    assert first == straight
+    assert others == open_policy(str(policy_run), {"stop": 0, "arrive": 0}).propose(situation, 8, 4, draw())
+    assert policy.propose(situation, 3, 1, draw()) == [straight[:3]]
+    for settings in ({"arrive": 0.4}, {"sure": 0.9}, {"masked": True}):
+        ways = open_policy(str(policy_run), {"stop": 0, **settings}).propose(situation, 8, 5, draw())
+        assert len(ways) == 5
+        assert ways[0] != straight
 
 
 def test_a_short_past_and_images_of_another_size_will_do(policy_run, situation):

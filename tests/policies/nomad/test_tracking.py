@@ -9,7 +9,7 @@ import torch
 
 from persist_cli.api.actions import walking_actions
 from persist_cli.data.policy_samples import ground_places, local_places
-from persist_cli.policies.nomad.tracking import follow_waypoints
+from persist_cli.policies.nomad.tracking import follow_waypoints, go_straight_and_face
 from persist_cli.policies.simple import gait
 from tests.support.rooms import UP, look
 
@@ -53,3 +53,24 @@ def test_an_agent_that_turns_to_one_side_alone_turns_the_long_way_round():
     right_only = [turn for turn in turns if turn.name == "right"]
     names = follow_waypoints([(0.0, 1.0)], ahead, right_only, 60)
     assert names == ("right",) * 18 + ("forward",) * 4
+
+
+@pytest.mark.parametrize(("place", "heading"), [((0.0, 1.0), -90.0), ((1.5, -0.5), 30.0), ((-1.0, 0.0), 180.0)])
+def test_it_goes_straight_to_a_place_and_turns_to_a_heading(place, heading):
+    names = go_straight_and_face(place, heading, *gait(walking_actions()))
+    start = torch.from_numpy(look((0.3, 1.25, -0.7), 40.0, 0.0))
+    poses = walking_actions().follow(start, names, torch.tensor(UP))
+    places, headings = ground_places(torch.cat([start[None], poses]), UP)
+    end = local_places(places[-1:], places[0], headings[0])[0]
+    assert math.dist(end.tolist(), place) <= 0.25
+    facing = local_places(headings[-1:], torch.zeros(2).double(), headings[0])[0]
+    turned = math.degrees(math.atan2(facing[1], facing[0]))
+    assert abs((turned - heading + 180) % 360 - 180) <= 7.5 + 1e-6
+
+
+def test_who_is_there_only_turns_and_who_faces_it_too_does_nothing():
+    ahead, turns = gait(walking_actions())
+    assert go_straight_and_face((0.1, 0.0), 44.0, ahead, turns) == ("left",) * 3
+    assert go_straight_and_face((0.0, -0.1), 5.0, ahead, turns) == ()
+    right_only = [turn for turn in turns if turn.name == "right"]
+    assert go_straight_and_face((0.0, 0.0), 30.0, ahead, right_only) == ("right",) * 22
