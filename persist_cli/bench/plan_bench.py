@@ -13,6 +13,7 @@ from typing import Any, Final
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
 from persist_cli.api.cost import Cost
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.policy import Policy
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.find_episodes import EpisodeSearch
@@ -31,7 +32,7 @@ from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics.src import chosen_encoder
 from persist_cli.plugins import check_simulator, make_cost, make_simulator
-from persist_cli.policies.open_policy import open_policy
+from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, busy, progress, warn
@@ -273,7 +274,7 @@ def check_scenes(episodes: EpisodeSet, trained: Mapping[str, Collection[str]], a
 def trained_on(checkpoint: Checkpoint | None, policy: str | None) -> dict[str, Collection[str]]:
     """Return the names of the scenes that model and policy were trained on, by words for each."""
     names: dict[str, Collection[str]] = {} if checkpoint is None else {"the model": training_scenes([checkpoint])}
-    trained = None if policy is None else trained_policy(policy)
+    trained = None if policy is None else trained_policy(open_policy(policy))
     if trained is not None:
         scenes = trained.training_scenes
         if scenes is None or not scenes.complete:
@@ -282,12 +283,19 @@ def trained_on(checkpoint: Checkpoint | None, policy: str | None) -> dict[str, C
     return names
 
 
-def trained_policy(name: str) -> TrainedPolicy | None:
-    """Return the trained policy behind a name or folder; ``None`` for a policy that is not trained."""
-    settings = open_policy(name).settings
-    if not hasattr(settings, "checkpoint"):
+def trained_policy(policy: Policy) -> TrainedPolicy | None:
+    """Return what a policy has learned as it lies on disk; ``None`` for a policy that is not trained."""
+    if not hasattr(policy.settings, "checkpoint"):
         return None
-    return packaged_policy() if settings.checkpoint is None else find_policy(Path(settings.checkpoint))
+    checkpoint = policy.settings.checkpoint
+    return packaged_policy() if checkpoint is None else find_policy(Path(checkpoint))
+
+
+def policy_json(name: str) -> dict[str, Any]:
+    """Return JSON values that tell policies apart, and how they act."""
+    policy = open_policy(name)
+    trained = trained_policy(policy)
+    return {"name": name, "fingerprint": trained and trained.fingerprint, "settings": acting_settings(policy)}
 
 
 def open_simulator(episodes: EpisodeSet) -> Simulator:
@@ -319,7 +327,6 @@ def find_thresholds(
 def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict[str, Any]:
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
-    trained = None if plan.policy is None else trained_policy(plan.policy)
     planning = asdict(plan.planning)
     if plan.planning.frames is not None and plan.planning.approach:
         planning["approach frames"] = "no bound"  # once they were those of a decision
@@ -327,9 +334,7 @@ def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
         "encoder": chosen_encoder().name if cost.name == "dino" or "open" in plan.loops else None,
-        "policy": None
-        if plan.policy is None
-        else {"name": plan.policy, "fingerprint": trained and trained.fingerprint},
+        "policy": None if plan.policy is None else policy_json(plan.policy),
         "cem candidates": plan.cem_candidates,
         "planning": planning,
         "loop": asdict(plan.loop) | {"loops": list(plan.loops)},

@@ -35,7 +35,7 @@ from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
 from persist_cli.memorize.sources import common_reference, find_sources
 from persist_cli.planning.true_futures import open_again
 from persist_cli.plugins import make_policy
-from persist_cli.policies.open_policy import open_policy
+from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.recipe import apply_overrides, make_recipe
 from persist_cli.rollout.camera_path import RolloutPlan
@@ -186,9 +186,10 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
 
 def identity(learning: Learning) -> dict[str, Any]:
     """Return JSON values of all that changes what is learned: a learning with equal values goes on."""
-    plan = learning.plan
+    plan, begin = learning.plan, open_policy(str(learning.begin.folder))
     values = asdict(plan) | {
-        "policy": learning.begin.fingerprint, "checkpoint": None, "episodes": None, "rounds": None,
+        "policy": {"fingerprint": learning.begin.fingerprint, "settings": acting_settings(begin)},
+        "checkpoint": None, "episodes": None, "rounds": None,
         "views": {"path": plan.views, "fingerprint": digest(learning.views)},
         "sampling": asdict(plan.sampling) | plan.placement.changes(),
         "ground": "of the given views and the walk",  # by which proposals are judged; once that of the memory

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,3 +33,8 @@ def open_policy(text: str, settings: Mapping[str, Any] | None = None) -> Policy:
         return make_policy(trained.policy, {**settings, "checkpoint": str(trained.folder)})
     names = sorted({plugin.name for plugin in list_plugins("policy")})
     raise PluginError(f"unknown policy {text!r}; {hint(text, names, 'installed')}; or give the folder of a trained one")
+
+
+def acting_settings(policy: Policy) -> dict[str, Any]:
+    """Return the settings that say how a policy acts; where its weights lie is none of them."""
+    return {name: value for name, value in asdict(policy.settings).items() if name != "checkpoint"}
