@@ -12,8 +12,11 @@ from pydantic import Field
 from torch import Tensor
 
 from persist_cli.api.actions import Action
+from persist_cli.api.ground import Cover
 from persist_cli.api.policy import Policy, Situation
 from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.navigation.ground_mapper import body_of
+from persist_cli.navigation.ways import way_is_free
 from persist_cli.policies.nomad.network import NomadNetwork
 from persist_cli.policies.nomad.tracking import follow_waypoints, go_straight_and_face
 from persist_cli.policies.simple import gait
@@ -24,6 +27,8 @@ STOP: Final = 2.0  # spacings
 # of 1 to 3 metres, and certainties of 0.3 to 0.9: most success alone in 124 episodes of 10 validation houses
 ARRIVE: Final = 2.0  # metres
 SURE: Final = 0.5
+SAMPLES: Final = 8
+SOON: Final = 4  # actions of a sampled way that shall be free; an agent looks again after about as many
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,8 @@ class NomadSettings:
             0 follows waypoints to the end, as published. They say nothing of headings, and near the goal none were
             learned.
         sure: certainty of the predicted place from which that is done, see ``GoalPlace``.
+        samples: ways that are sampled at least. Those whose beginning the known ground leaves free come first, and a
+            goal behind something known is not gone straight to.
     """
 
     checkpoint: str | None = None
@@ -47,12 +54,14 @@ class NomadSettings:
     stop: Annotated[float, Field(ge=0, allow_inf_nan=False)] = STOP
     arrive: Annotated[float, Field(ge=0, allow_inf_nan=False)] = ARRIVE
     sure: Annotated[float, Field(ge=0, le=1)] = SURE
+    samples: Annotated[int, Field(ge=1)] = SAMPLES
 
 
 class NomadPolicy(Policy):
     """Samples ways towards an image, or anywhere where there is none.
 
-    The first is the straight way to the goal where the network is sure to be near it, else a sample like the others.
+    The first is the straight way to the goal where the network is sure to be near it. Then come samples that the known
+    ground leaves free, and then the others.
 
     Raises:
         PersistError: when the trained policy is not there, is of another architecture, or has fewer noise levels.
@@ -98,11 +107,14 @@ class NomadPolicy(Policy):
         if stop and not masked and float(self.network.distance(condition)) <= stop:
             return [()] * count
         arrival = () if masked else self._arrival(condition, ahead, turns)
-        ways = [arrival[:horizon]] if arrival else []
+        ways = [arrival[:horizon]] if arrival and leaves_free(situation, [arrival])[0] else []
         if count > len(ways):
-            sampled = self.network.sample(condition, count - len(ways), self.steps, generator).tolist()
-            ways += [follow_waypoints([(x, y) for x, y in way], ahead, turns, horizon) for way in sampled]
-        return ways
+            places = self.network.sample(condition, max(count, self.settings.samples), self.steps, generator).tolist()
+            sampled = [follow_waypoints([(x, y) for x, y in way], ahead, turns, horizon) for way in places]
+            free = leaves_free(situation, [way[:SOON] for way in sampled])
+            order = sorted(range(len(sampled)), key=lambda number: not free[number])
+            ways += [sampled[number] for number in order]
+        return ways[:count]
 
     def _arrival(self, condition: Tensor, ahead: Action, turns: Sequence[Action]) -> tuple[str, ...]:
         """Return the straight way to where the goal's image was taken, if that is near and certain enough."""
@@ -126,3 +138,14 @@ class NomadPolicy(Policy):
         hidden = torch.tensor([masked], device=device)
         condition: Tensor = self.network.condition(seen[None].to(device), goal[None].to(device), hidden)[0]
         return condition
+
+
+def leaves_free(situation: Situation, ways: Sequence[tuple[str, ...]]) -> list[bool]:
+    """Return for each way whether nothing on the known ground is in the way of the agent's body."""
+    up = torch.tensor(situation.info.world_up, dtype=torch.float64)
+    pose = situation.seen.cameras.world_from_camera[-1].cpu().double()
+    poses = [torch.cat([pose[None], situation.info.vocabulary.follow(pose, way, up)]) for way in ways]
+    places = [situation.ground.places(one[:, :3, 3]) for one in poses]
+    starts, ends = torch.cat([one[:-1] for one in places]), torch.cat([one[1:] for one in places])
+    covers = way_is_free(situation.ground, starts, ends, body_of(situation.info).radius)
+    return [bool((one != Cover.OCCUPIED).all()) for one in covers.split([len(way) for way in ways])]

@@ -8,12 +8,13 @@ import shutil
 import pytest
 import torch
 
-from persist_cli.api.ground import GroundMap
+from persist_cli.api.ground import Cover, GroundMap
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError, PluginError, RecipeError
 from persist_cli.io.files import read_tensors
 from persist_cli.policies.nomad.network import GoalPlace, NomadNetwork
+from persist_cli.policies.nomad.policy import leaves_free
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.policies.trained import find_policy, save_policy
 from tests.support.rooms import UP
@@ -75,6 +76,36 @@ def test_near_a_goal_whose_place_is_certain_the_first_way_leads_there_and_turns_
         ways = open_policy(str(policy_run), {"stop": 0, **settings}).propose(situation, 8, 5, draw())
         assert len(ways) == 5
         assert ways[0] != straight
+
+
+def test_ways_that_the_known_ground_leaves_free_come_first_and_nothing_known_is_gone_through(
+    policy_run, situation, monkeypatch
+):
+    policy = open_policy(str(policy_run), {"stop": 0, "samples": 16})
+    known = dataclasses.replace(situation, ground=wall_ahead(situation))
+    ways = policy.propose(known, 8, 16, draw())
+    free = leaves_free(known, [way[:4] for way in ways])
+    assert free == sorted(free, reverse=True)
+    assert {*free} == {True, False}
+    assert sorted(ways) == sorted(policy.propose(situation, 8, 16, draw()))
+    assert policy.propose(known, 8, 1, draw()) == ways[:1]
+
+    place = GoalPlace(ahead=0.8, left=0.0, heading=0.0, certainty=1.0)
+    monkeypatch.setattr(NomadNetwork, "goal_place", lambda network, condition: place)
+    assert policy.propose(situation, 8, 1, draw()) == [("forward",) * 4]
+    assert policy.propose(known, 8, 16, draw()) == ways
+
+
+def wall_ahead(situation: Situation) -> GroundMap:
+    """A ground map of which all is known: a wall lies 0.3 m ahead of the agent, all else is free."""
+    ground = GroundMap.empty(UP)
+    pose = situation.seen.cameras.world_from_camera[-1].double()
+    place, heading = ground.places(pose[:3, 3]), ground.axes[:2] @ pose[:3, 2]
+    squares = torch.cartesian_prod(torch.arange(80), torch.arange(80)).flip(1)
+    ahead = (place - 2 + (squares + 0.5) * ground.spacing - place) @ heading
+    states = torch.where((ahead > 0.3) & (ahead < 0.5), int(Cover.OCCUPIED), int(Cover.FREE)).to(torch.uint8)
+    x, y = (place - 2).tolist()
+    return dataclasses.replace(ground, states=states.view(80, 80), origin=(x, y))
 
 
 def test_a_short_past_and_images_of_another_size_will_do(policy_run, situation):
