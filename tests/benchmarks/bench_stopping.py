@@ -7,10 +7,10 @@
 
 The policy acts alone and never stops. After each action its view is compared with the goal image (LPIPS), and its
 distance to the goal is predicted, so each threshold tells where it would have stopped: by its view or where the policy
-does by itself, as ``persist learn`` evaluates, and by the predicted distance alone. ``--arrive 0`` is a policy that
-follows waypoints to the end. ``--learned`` takes for each house the policy that learned there (``make learning``), and
-only houses that have one. Means are over houses; a run without ``--learned`` can be limited to the same houses by
-``--houses``. Prints tables, asserts nothing.
+does by itself, as ``persist learn`` evaluates, and by the predicted distance alone. ``--set arrive=0 samples=1`` is a
+policy that follows the first sampled waypoints to their end. ``--learned`` takes for each house the policy that learned
+there (``make learning``), and only houses that have one. Means are over houses; a run without ``--learned`` can be
+limited to the same houses by ``--houses``. Prints tables, asserts nothing.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
@@ -39,7 +40,7 @@ from persist_cli.bench.stop_rules import view_costs
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.learn.evaluation import ROW
 from persist_cli.plugins import make_cost, make_simulator
-from persist_cli.policies.nomad.policy import ARRIVE, STOP, SURE, NomadPolicy
+from persist_cli.policies.nomad.policy import STOP, NomadPolicy
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.viewing.console import print_table, say, watched
 
@@ -134,15 +135,15 @@ def main() -> None:
     parser.add_argument("--learned", type=Path, help="folder with a learning for each house")
     parser.add_argument("--round", type=int, default=1, help="of these learnings")
     parser.add_argument("--houses", type=int, help="most houses, the first ones")
-    parser.add_argument("--arrive", type=float, default=ARRIVE, help="setting of the policy; 0 follows waypoints alone")
-    parser.add_argument("--sure", type=float, default=SURE, help="setting of the policy")
+    parser.add_argument("--set", nargs="+", default=(), help="settings of the policy, as in --set arrive=0 samples=1")
     options = parser.parse_args()
     torch.set_num_threads(1)
     episodes = read_episodes(options.episodes)
     simulator = make_simulator(episodes.simulator, episodes.settings)
+    settings = {name: yaml.safe_load(value) for name, value in (text.split("=") for text in options.set)}
     walks: list[list[Walk]] = []
     for scene, text in watched([*policies(options, episodes)], "walking", "houses"):
-        policy = open_policy(text, {"stop": 0, "arrive": options.arrive, "sure": options.sure})
+        policy = open_policy(text, {"stop": 0, **settings})
         assert isinstance(policy, NomadPolicy)
         walks.append([walk(policy, simulator, one) for one in episodes.episodes if one.scene_name == scene])
     report(walks)
