@@ -42,6 +42,12 @@ EACH: Final = 4  # most episodes a house and kind: 8 actions away, 16 in sight, 
 
 VIEWS: Final = "views"
 
+FIRST: Final = 300  # house of the test split; the options were chosen in the houses 200 to 203
+
+OPTIONS: Final = (
+    "--walks 96 --training-steps 300 --steps 1 --guidance 1 --set training.batch=32 --set training.learning_rate=3e-4"
+)
+
 CHANGE: Final = "after − before"
 
 ADVANTAGE: Final = "after − after with the memory compared with"
@@ -275,11 +281,11 @@ def parse(arguments: Sequence[str]) -> Plan:
     parser.add_argument("--model", default="reference", help="checkpoint of the world model")
     parser.add_argument("--policy", help="run or folder of the trained policy; else the packaged one")
     parser.add_argument("--memories", default="voxel,none,simulator", help="adapters, and simulator")
-    parser.add_argument("--houses", type=int, default=24)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first house of the test split")
+    parser.add_argument("--houses", type=int, default=12)
+    parser.add_argument("--first", type=int, default=FIRST, help="seed of the first house of the test split")
     parser.add_argument("--views", type=int, default=32, help="given posed frames of each house")
-    parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--options", default="", help="further options of persist learn")
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--options", default=OPTIONS, help="further options of persist learn (default: %(default)s)")
     given = parser.parse_args(arguments)
     memories = [name.strip() for name in given.memories.split(",") if name.strip()]
     if not memories or min(given.houses, given.views, given.rounds) < 1:
