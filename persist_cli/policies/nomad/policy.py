@@ -118,10 +118,10 @@ class NomadPolicy(Policy):
 
     def _arrival(self, condition: Tensor, ahead: Action, turns: Sequence[Action]) -> tuple[str, ...]:
         """Return the straight way to where the goal's image was taken, if that is near and certain enough."""
-        place = self.network.goal_place(condition)
-        if place is None or place.metres > self.settings.arrive or place.certainty < self.settings.sure:
-            return ()
-        return go_straight_and_face((place.ahead, place.left), place.heading, ahead, turns)
+        place, settings = self.network.goal_place(condition), self.settings
+        if place is not None and place.metres <= settings.arrive and place.certainty >= settings.sure:
+            return go_straight_and_face((place.ahead, place.left), place.heading, ahead, turns)
+        return ()  # also where the prediction is NaN
 
     @torch.no_grad()
     def distance(self, situation: Situation) -> float:
