@@ -295,7 +295,7 @@ def policy_json(name: str) -> dict[str, Any]:
     """Return JSON values that tell policies apart, and how they act."""
     policy = open_policy(name)
     trained = trained_policy(policy)
-    return {"name": name, "fingerprint": trained and trained.fingerprint, "settings": acting_settings(policy)}
+    return {"name": name, "fingerprint": trained and trained.fingerprint, "settings": acting_settings(policy.settings)}
 
 
 def open_simulator(episodes: EpisodeSet) -> Simulator:

@@ -34,7 +34,7 @@ from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
 from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
 from persist_cli.memorize.sources import common_reference, find_sources
 from persist_cli.planning.true_futures import open_again
-from persist_cli.plugins import make_policy
+from persist_cli.plugins import make_policy, make_settings
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.recipe import apply_overrides, make_recipe
@@ -186,9 +186,10 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
 
 def identity(learning: Learning) -> dict[str, Any]:
     """Return JSON values of all that changes what is learned: a learning with equal values goes on."""
-    plan, begin = learning.plan, open_policy(str(learning.begin.folder))
+    plan, begin = learning.plan, learning.begin
+    acts = acting_settings(make_settings("policy", begin.policy, {}))
     values = asdict(plan) | {
-        "policy": {"fingerprint": learning.begin.fingerprint, "settings": acting_settings(begin)},
+        "policy": {"fingerprint": begin.fingerprint, "settings": acts},
         "checkpoint": None, "episodes": None, "rounds": None,
         "views": {"path": plan.views, "fingerprint": digest(learning.views)},
         "sampling": asdict(plan.sampling) | plan.placement.changes(),

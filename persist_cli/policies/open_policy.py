@@ -35,6 +35,6 @@ def open_policy(text: str, settings: Mapping[str, Any] | None = None) -> Policy:
     raise PluginError(f"unknown policy {text!r}; {hint(text, names, 'installed')}; or give the folder of a trained one")
 
 
-def acting_settings(policy: Policy) -> dict[str, Any]:
-    """Return the settings that say how a policy acts; where its weights lie is none of them."""
-    return {name: value for name, value in asdict(policy.settings).items() if name != "checkpoint"}
+def acting_settings(settings: Any) -> dict[str, Any]:
+    """Return what of a policy's settings says how it acts; where its weights lie does not."""
+    return {name: value for name, value in asdict(settings).items() if name != "checkpoint"}
