@@ -1,8 +1,8 @@
 """``make table1``: the reference model from nothing to its tables, by the commands that a user would type.
 
 ``python -m persist_cli.reproduce.table1 [OUT]`` runs them in order, each in a process of its own; with ``--reference``
-it trains nothing and measures the model that comes with the package. Every command continues where it was stopped and
-repeats nothing that is done, so this may be stopped and started at any time.
+it trains nothing and measures the model that comes with the package, as its card says. Every command continues where it
+was stopped and repeats nothing that is done, so this may be stopped and started at any time.
 
 Houses for training, validation and test share no scene. Cells, head and sampling are chosen for each memory by itself
 on validation houses, by ``persist_cli.reproduce.choose``, before any of the tables is measured.
@@ -31,10 +31,10 @@ EQUAL = ("voxel", "map2d", "snapshots", "views", "context")  # memories of equal
 WITHOUT_DEPTH = ("none", "context", "views", "voxel")  # on a model that never saw depth; voxel reads it all the same
 SEEDS = 3  # trainings of none, voxel and the best other
 
-SAMPLING = "--steps 4 --sampler unipc --guidance 1"  # of the packaged model; chosen on 39 clips of validation houses
 COMMON = "--steps 4 --sampler unipc --guidance 1"  # where nothing was chosen, or for another recipe than those compared
 INVENTING = "--steps 20 --sampler ddim --guidance 1"  # few steps blur what is invented, which raises PSNR and SRC
-METRICS = "psnr,ssim,lpips-alex,absrel,delta1"
+METRICS = "psnr,sharpness,grain,ssim,lpips-alex,fvd,absrel,delta1"
+RGB_METRICS = "psnr,sharpness,grain,ssim,lpips-alex,fvd"  # of models without depth
 WEIGHTS = ("lpips-alex", "lpips-vgg", "i3d-kinetics-400", "dinov2-s-derived")  # of every metric that can be fetched
 
 
@@ -87,7 +87,7 @@ def choice_plan(out: Path) -> choose.Plan:
 
 
 def reference_commands(out: Path) -> list[str]:
-    """The command lines that measure the packaged model: all tables of its four memories."""
+    """The command lines that measure the packaged model: the tables of its card."""
     return [fetch_command(), *collect_held_out(out, "test"), *packaged_commands(out)]
 
 
@@ -158,8 +158,8 @@ def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
     rows are sampled alike: what was chosen was chosen for the winner's recipe, which would have the advantage, and on a
     model with depth.
     """
-    home, runs = shlex.quote(str(out)), tables(out, tuple(CHOSEN), chosen)
-    revisit = revisit_options(out)
+    home, runs = shlex.quote(str(out)), tables(out, chosen)
+    revisit = f"{revisit_options(out)} --clips 200"
     equal = [f"{home}/equal-{memory}" for memory in EQUAL]
     forms = [f"{home}/forms-{form}" for form in FORMS]
     without_depth = [f"{home}/{name}-rgb" for name in WITHOUT_DEPTH]
@@ -171,7 +171,7 @@ def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
         table(out, "forms", forms, f"{alike(('voxel',))} {revisit} --controls codec --metrics {METRICS}"),
         table(
             out, "without-depth", without_depth,
-            f"{alike(WITHOUT_DEPTH)} {revisit} --controls codec --metrics psnr,ssim,lpips-alex",
+            f"{alike(WITHOUT_DEPTH)} {revisit} --controls codec --metrics {RGB_METRICS}",
         ),
         table(
             out, "seeds", seeds,
@@ -181,37 +181,44 @@ def evaluate_commands(out: Path, chosen: Chosen = Chosen()) -> list[str]:
 
 
 def packaged_commands(out: Path) -> list[str]:
-    """The command lines of the tables of the packaged model."""
-    return tables(out, PACKAGED, None)
+    """The command lines of the tables of the packaged model's card, sampled as it asks for itself.
+
+    They have fewer clips and one sampling seed, so that two cores measure them in about an hour.
+    """
+    memories, loops = ",".join(PACKAGED), f"--data {shlex.quote(str(out))}/loop"
+    revisit = f"{revisit_options(out)} --seeds 1"
+    return [
+        table(out, "revisit", [], f"--memories {memories} {revisit} --clips 48 --controls copy,nearest,warp,codec"),
+        table(out, "disturbed", [], f"--memories voxel {revisit} --clips 24 --controls warp,noisy,drifting"),
+        table(
+            out, "return", [],
+            f"--memories none,voxel {loops} --protocol return --frames 129 --clips 8 --seeds 1 --controls copy,codec",
+        ),
+    ]  # fmt: skip
 
 
-def tables(out: Path, memories: Sequence[str], chosen: Chosen | None) -> list[str]:
+def tables(out: Path, chosen: Chosen) -> list[str]:
     """The command lines of the tables of all memories: revisits, disturbed memories, returns and long rollouts.
 
-    Args:
-        out: folder of everything.
-        memories: names of the memories; the first is the baseline, the second the one that is disturbed.
-        chosen: what was chosen for the runs in ``out``; ``None`` measures the packaged model.
+    The first memory is the baseline, the second the one that is disturbed.
     """
-    home, pair, returns = shlex.quote(str(out)), memories[:2], f"--data {shlex.quote(str(out))}/loop"
+    home, pair, returns = shlex.quote(str(out)), CHOSEN[:2], f"--data {shlex.quote(str(out))}/loop"
+    revisit = f"{revisit_options(out)} --clips 200"
 
-    def rows(names: Sequence[str], *fixed: str) -> list[str]:
-        return [] if chosen is None else [f"{home}/{name}" for name in (*names, *fixed)]
-
-    def sampled(names: Sequence[str]) -> str:
-        return f"--memories {','.join(names)} {SAMPLING}" if chosen is None else named(names, chosen)
+    def rows(names: Sequence[str]) -> list[str]:
+        return [f"{home}/{name}" for name in names]
 
     def inventing(names: Sequence[str]) -> str:
         return f"--memories {','.join(names)} {INVENTING}"
 
     disturbed = f"--controls shuffled,emptied,oracle,noisy,drifting --metrics {METRICS}"
-    revisit = revisit_options(out)
     return [
         table(
-            out, "revisit", rows(memories, *FIXED), f"{sampled(memories)} {revisit} --controls copy,nearest,warp,codec"
+            out, "revisit", rows([*CHOSEN, *FIXED]),
+            f"{named(CHOSEN, chosen)} {revisit} --controls copy,nearest,warp,codec",
         ),
-        table(out, "disturbed", rows(pair), f"{sampled(pair)} {revisit} {disturbed}"),
-        table(out, "return", rows(memories), f"{inventing(memories)} {returns} --protocol return --clips 32"),
+        table(out, "disturbed", rows(pair), f"{named(pair, chosen)} {revisit} {disturbed}"),
+        table(out, "return", rows(CHOSEN), f"{inventing(CHOSEN)} {returns} --protocol return --clips 32"),
         table(
             out, "long", rows(pair), f"{inventing(pair)} {returns} --protocol long --clips 16 --metrics {METRICS}"
         ),
@@ -222,7 +229,7 @@ def revisit_options(out: Path) -> str:
     """The options of a table of revisits to places of the test houses."""
     home = shlex.quote(str(out))
     data = " ".join(f"--data {home}/test/{policy}" for policy in HELD_OUT)
-    return f"{data} --protocol revisit --frames 17 --clips 200"
+    return f"{data} --protocol revisit --frames 17"
 
 
 def named(memories: Sequence[str], chosen: Chosen) -> str:

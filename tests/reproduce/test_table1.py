@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import typer.main
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.checkpoint import reference_checkpoint
 from persist_cli.cli.app import app
 from persist_cli.errors import INTERRUPTED
 from persist_cli.io.files import write_json
@@ -159,9 +161,28 @@ def test_a_model_without_depth_is_trained_on_the_codec_and_its_adapters_on_it() 
 
 def test_the_packaged_model_is_measured_without_any_training() -> None:
     lines = [line for line in reference_commands(OUT) if line.startswith("eval")]
-    assert len(lines) == 4
+    assert len(lines) == 3
     assert not [line for line in lines if shlex.split(line)[1].startswith(str(OUT))]
     assert not [line for line in reference_commands(OUT) if line.startswith("finetune") or "/houses/" in line]
+
+
+def options(line: str) -> dict[str, str]:
+    """The options of a command line but those that name a folder."""
+    found = dict(option.split(maxsplit=1) for option in re.findall(r"--\S+ [^-\s]\S*", line))
+    return {name: value for name, value in found.items() if name not in ("--data", "--out", "--report")}
+
+
+def test_the_packaged_model_is_measured_by_the_commands_of_its_card(monkeypatch) -> None:
+    monkeypatch.delenv("PERSIST_REFERENCE")  # that of the package
+    card = " ".join((reference_checkpoint() / "README.md").read_text(encoding="utf-8").split())
+    cited = [options(span) for span in re.findall(r"`(persist eval [^`]*)`", card)]
+    assert cited == [options(line) for line in reference_commands(OUT) if line.startswith("eval")]
+
+
+@pytest.mark.parametrize("line", [line for line in [*LINES, *reference_commands(OUT)] if line.startswith("eval")])
+def test_every_table_shows_sharpness_with_its_guard_and_fvd(line: str) -> None:
+    metrics = options(line).get("--metrics")  # else every metric
+    assert metrics is None or {"sharpness", "grain", "fvd"} <= set(metrics.split(","))
 
 
 @pytest.mark.parametrize("family", ["houses-64-forms-", "houses-64-equal-", "houses-64-stage2-"])
