@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.recipe import make_recipe, read_recipe, recipe_names
 from tests.support.micro_runs import SIZE, run_result
 from tests.support.twins import write_twin
 
@@ -16,6 +19,8 @@ SMALL = [
 ]  # fmt: skip
 
 BLOCKS = ["memory.encoder=patches", "adapter={width: 16, heads: 2, token_budget: 32}", "data.context_frames=4"]
+
+SIZES = {"width": 16, "heads": 2, "every": 1, "head_width": 8, "attention_tokens": 16}  # of an adapter that has them
 
 
 @pytest.mark.usefixtures("fresh_accelerator")
@@ -35,3 +40,11 @@ def test_the_recipes_of_a_published_model_train_one_after_the_other(persist, wal
         for memory in ("voxel", "map2d", "snapshots"):
             changes = [f"base={tmp_path / base}", f"memory.name={memory}", *BLOCKS]
             assert [*train("stage2-voxel", f"{base}-{memory}", *changes).adapters] == [memory]
+    for name in recipe_names():
+        if name.startswith(f"{family}-stage2-") and name != f"{family}-stage2-voxel":
+            own = make_recipe(read_recipe(name), name)
+            sizes = [f"adapter.{key}={size}" for key, size in SIZES.items() if key in own.adapter]
+            changes = [f"base={tmp_path / 'whole'}", *sizes, "data.context_frames=4"]
+            ((memory, folder),) = train(name.removeprefix(f"{family}-"), name, *changes).adapters.items()
+            assert memory == own.memory.name
+            assert json.loads((folder / "adapter.json").read_text())["form"] == own.adapter["form"] != "cross"
