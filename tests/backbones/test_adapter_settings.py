@@ -11,13 +11,13 @@ from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from tests.support.micro_model import CHANNELS, micro, with_adapter
 
 FORM_KEYS = {
-    "cross": {"heads", "frequencies", "positions", "normalize", "key_positions", "key_camera"},
-    "projected": {"heads", "frequencies"},
-    "canvas": {"canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
+    "cross": {"heads", "frequencies", "origins", "positions", "normalize", "key_positions", "key_camera"},
+    "projected": {"heads", "frequencies", "origins"},
+    "canvas": {"origins", "canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
     "rendered": {
         "heads", "frequencies", "token_size", "splat_pixels", "hole_share", "thickness", "supersampling", "head_width",
         "head_layers", "attention_tokens", "layers", "classes", "class_channels", "layer_width", "layer_gap",
-        "layer_scale", "color_error", "depth_error",
+        "layer_scale", "color_error", "depth_error", "origins",
     },
     "frames": {"heads", "frequencies", "frame_patch"},
 }  # fmt: skip

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from accelerate import Accelerator
+from safetensors.torch import load_file
 
 from persist_cli.api.backbone import Clips
 from persist_cli.api.checkpoint import find_checkpoint
@@ -112,6 +113,16 @@ def test_a_run_on_own_writes_resumed_with_a_cache_equals_an_uninterrupted_one_wi
     assert persist(*stage(number, walks, tmp_path / "true", *changes, "data.own_writes=0.001")).code == 0
     assert losses(tmp_path / "whole")[0] == losses(tmp_path / "true")[0]  # the warm-up
     assert losses(tmp_path / "whole")[1:] != losses(tmp_path / "true")[1:]
+
+
+def test_an_adapter_learns_from_own_writes_what_was_imagined(persist, walks, stage1, tmp_path):
+    learned = {}
+    for name, changes in {"own": OWN, "true": []}.items():
+        changes = [f"base={stage1}", "adapter.origins=true", *changes]
+        assert persist(*stage("stage2-voxel", walks, tmp_path / name, *changes)).code == 0
+        weights = find_checkpoint(tmp_path / name).adapters["voxel"] / "adapter.safetensors"
+        learned[name] = bool(load_file(weights)["origin.imagined"].any())
+    assert learned == {"own": True, "true": False}
 
 
 def test_own_writes_are_refused_where_nothing_is_predicted():

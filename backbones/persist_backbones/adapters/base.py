@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from persist_backbones.noise_levels import LevelEmbedding, add_level
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.observations import Origin
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 
@@ -56,6 +57,18 @@ class AdapterSettings:
 
 
 @dataclass(frozen=True)
+class OriginSettings(AdapterSettings):
+    """Settings of the forms whose tokens tell their origin only when asked to.
+
+    Args:
+        origins: whether tokens that were imagined are marked by an embedding, which starts at zero and learns where
+            training shows such tokens, as with ``data.own_writes``.
+    """
+
+    origins: bool = False
+
+
+@dataclass(frozen=True)
 class VideoShape:
     """The sizes of the video model that an adapter is built for.
 
@@ -87,6 +100,27 @@ class VideoShape:
     def folded(self) -> int:
         """Number of frames of the clip that a video token stands for."""
         return self.temporal * self.token_frames
+
+
+class OriginEmbedding(nn.Module):
+    """An embedding that marks tokens that were imagined; a fresh one is zero and changes nothing.
+
+    Observed tokens stay as they are, before and after training.
+
+    Args:
+        width: channels of an embedded token.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.imagined = nn.Parameter(torch.zeros(width))
+
+    def forward(
+        self, embedded: Float[Tensor, "batch *group token width"], origins: UInt8[Tensor, "batch *group token"]
+    ) -> Float[Tensor, "batch *group token width"]:
+        """Return embedded tokens with the embedding added to those whose origin is imagined."""
+        imagined = (origins == Origin.IMAGINED)[..., None]
+        return embedded + self.imagined.to(embedded.dtype) * imagined
 
 
 Encode = Callable[[Tensor, Tensor], Tensor]  # uint8 RGB and metres of clips to latents of both, as ``Codec.encode``

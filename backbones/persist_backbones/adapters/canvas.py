@@ -12,7 +12,14 @@ from jaxtyping import Bool, Float
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, AdapterSettings, NoiseLevel, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import (
+    Adapter,
+    NoiseLevel,
+    OriginEmbedding,
+    OriginSettings,
+    PreparedMemory,
+    VideoShape,
+)
 from persist_backbones.adapters.splat import rasterize, splat
 from persist_backbones.tensors import fold_frames, tokens_of, zero_init
 from persist_cli.api.cameras import Cameras
@@ -112,7 +119,7 @@ class CanvasBlock(nn.Module):
 
 
 @dataclass(frozen=True)
-class CanvasSettings(AdapterSettings):
+class CanvasSettings(OriginSettings):
     """Settings of the adapter that adds its canvas before every n-th transformer block, the first included.
 
     An ``ff_factor`` of 0 leaves the feed-forward out.
@@ -173,6 +180,7 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
             raise CheckpointError(f"splat_pixels must be odd, not {settings.splat_pixels}")
         canvas_channels = settings.canvas_channels
         self.embed = nn.Linear(channels, canvas_channels)
+        self.origin = OriginEmbedding(canvas_channels) if settings.origins else None
         self.patch = video.patch * settings.canvas_scale
         self.patches = nn.Linear((canvas_channels + 2) * video.folded * self.patch**2, settings.width, bias=False)
         layers = range(0, video.layers, settings.every)
@@ -213,6 +221,7 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         splats = rasterize(tokens.positions, tokens.mask, views, self.settings.token_size, self.settings.splat_pixels)
         batch, frames = tokens.mask.shape[0], views.world_from_camera.shape[1]
         features = self.embed(tokens.features.to(self.patches.weight.dtype))
+        features = features if self.origin is None else self.origin(features, tokens.origins)
         return splat(features, splats, (batch, frames, views.height, views.width))
 
     def draw_learned(self, cameras: Cameras) -> Float[Tensor, "batch frame channel height width"]:

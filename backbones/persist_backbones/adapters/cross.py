@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import Adapter, OriginEmbedding, OriginSettings, PreparedMemory, VideoShape
 from persist_backbones.adapters.memory_block import AttentionSettings, memory_blocks, position_code
 from persist_backbones.tensors import fold_frames
 from persist_cli.api.cameras import Cameras, invert_rigid
@@ -20,7 +20,7 @@ from persist_cli.errors import CheckpointError
 
 
 @dataclass(frozen=True)
-class CrossSettings(AttentionSettings):
+class CrossSettings(AttentionSettings, OriginSettings):
     """Settings of the paper's cross-attention to tokens with positions in metres.
 
     The paper concatenates the position code to a token's features, so that keys and values have it, and the camera to
@@ -66,6 +66,7 @@ class CrossAdapter(Adapter[CrossMemory]):
             raise CheckpointError("adapter: key_positions needs positions, not none; give positions=relative")
         code = 0 if settings.positions == "none" else 6 * settings.frequencies
         self.embed = nn.Linear(channels + code, settings.width)
+        self.origin = OriginEmbedding(settings.width) if settings.origins else None
         self.blocks = memory_blocks(settings, video, video.camera_channels)
         keys = code * settings.key_positions + 6 * video.folded * settings.key_camera
         for block in self.blocks.values() if keys else ():
@@ -78,6 +79,7 @@ class CrossAdapter(Adapter[CrossMemory]):
         if self.settings.normalize:
             features = F.layer_norm(features, features.shape[-1:])
         hidden = self.embed(torch.cat([features, code], dim=-1).to(dtype))
+        hidden = hidden if self.origin is None else self.origin(hidden, tokens.origins)
         codes = [code[:, None]] if self.settings.key_positions else []
         if self.settings.key_camera:
             rays = fold_frames(token_rays(tokens, cameras).transpose(2, 3), self.video.folded).transpose(2, 3)

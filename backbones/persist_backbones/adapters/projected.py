@@ -9,7 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import NEAR, Adapter, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import (
+    NEAR,
+    Adapter,
+    OriginEmbedding,
+    OriginSettings,
+    PreparedMemory,
+    VideoShape,
+)
 from persist_backbones.adapters.memory_block import AttentionSettings, memory_blocks, position_code
 from persist_backbones.tensors import fold_frames
 from persist_cli.api.cameras import Cameras
@@ -22,7 +29,7 @@ OCTAVES = 8.0  # 6 cm to 16 m, the depths of rooms, span one unit of log z as th
 
 
 @dataclass(frozen=True)
-class ProjectedSettings(AttentionSettings):
+class ProjectedSettings(AttentionSettings, OriginSettings):
     """Settings of the paper's memory block with positions in each latent frame's own cameras."""
 
     form: Literal["projected"] = "projected"
@@ -57,6 +64,7 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         super().__init__(channels, settings, video)
         code = video.folded * (6 * settings.frequencies + 1)
         self.embed = nn.Linear(channels, settings.width)
+        self.origin = OriginEmbedding(settings.width) if settings.origins else None
         self.place = nn.Linear(code, settings.width, bias=False)
         self.blocks = memory_blocks(settings, video, video.camera_channels + 4 * settings.frequencies)
 
@@ -67,7 +75,9 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         code = torch.cat([self.code(places) * seen[..., None], seen[..., None].float()], dim=-1)
         folded = fold_frames(code.transpose(2, 3), frames).transpose(2, 3)
         mask = fold_frames(seen[:, :, None], frames).any(dim=2)
-        hidden = self.embed(tokens.features.to(dtype))[:, None] + self.place(folded.to(dtype))
+        features = self.embed(tokens.features.to(dtype))
+        features = features if self.origin is None else self.origin(features, tokens.origins)
+        hidden = features[:, None] + self.place(folded.to(dtype))
         places = self.query_places(cameras).to(dtype)
         return self.with_learned(ProjectedMemory(hidden * mask[..., None], mask, places))
 

@@ -20,7 +20,15 @@ from jaxtyping import Bool, Float, Int64, Shaped, UInt8
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import NEAR, Adapter, Encode, NoiseLevel, PreparedMemory, VideoShape
+from persist_backbones.adapters.base import (
+    NEAR,
+    Adapter,
+    Encode,
+    NoiseLevel,
+    OriginSettings,
+    PreparedMemory,
+    VideoShape,
+)
 from persist_backbones.adapters.canvas import CanvasHead
 from persist_backbones.adapters.memory_block import AttentionSettings
 from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
@@ -44,8 +52,10 @@ SPARSE = 0.125  # share of a latent pixel at which a fresh gate is half open: ho
 
 
 @dataclass(frozen=True)
-class RenderedSettings(AttentionSettings):
+class RenderedSettings(AttentionSettings, OriginSettings):
     """Settings of the adapter that renders its tokens; those of attention are for the tokens that are not rendered.
+
+    So is ``origins``, since the views always tell what was imagined.
 
     Args:
         token_size: edge in metres of the square that a token is drawn as, somewhat more than the edge of a cell.
@@ -288,7 +298,7 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         zero_init(self.patches)
         self.head = RenderedHead(drawn, video, settings)
         self.register_parameter("learned", None)  # learned tokens are those of attention
-        shared = {field.name: getattr(settings, field.name) for field in dataclasses.fields(AttentionSettings)}
+        shared = {field.name: getattr(settings, field.name) for field in dataclasses.fields(ProjectedSettings)}
         attention = ProjectedSettings(**shared | {"form": "projected", "noise": 0.0})
         reads = settings.attention_tokens or settings.learned_tokens
         self.attention = ProjectedAdapter(channels, attention, video) if reads else None
