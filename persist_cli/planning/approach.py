@@ -1,20 +1,36 @@
-"""The last steps to a goal that was recognised: straight ways ahead and to both sides, which a planner compares.
+"""The last steps to a goal that was recognised: short ways, which a planner compares.
 
 For example a goal image is recognised from two metres behind the place where it was taken. Its view looks much the same
 from there, so no threshold of a cost tells near from far. But it costs less with every step towards that place, and
 more beyond it: the agent imagines some steps in several directions, and goes to the best view of all.
+
+From half a metre beside the line through that place a straight way does not lead to it, or leads to it with the view
+turned away. Where no straight way is better, the agent compares ways aside, which turn back at their end.
 """
 
 from __future__ import annotations
 
-from persist_cli.api.actions import ActionVocabulary
-from persist_cli.planning.judge import Judge
+import itertools
+from collections.abc import Generator, Sequence
+
+from persist_cli.api.actions import Action, ActionVocabulary
+from persist_cli.planning.judge import Candidate, Judge
 from persist_cli.policies.simple import gait
 
 SIDES = 3  # turns to each side at most
 
+ASIDE = (30.0, 60.0)  # degrees to a side of the ways aside
 
-def straight_ways(vocabulary: ActionVocabulary, horizon: int) -> list[tuple[str, ...]]:
+METRES = (0.5, 1.0)  # of the ways aside
+
+BACK = 30.0  # degrees beyond the first heading to which they turn back
+
+ALL = 1_000  # more ways than are compared
+
+Way = tuple[str, ...]
+
+
+def straight_ways(vocabulary: ActionVocabulary, horizon: int) -> list[Way]:
     """Return ways of ``horizon`` actions: some turns to a side, none to ``SIDES``, and steps straight ahead.
 
     Raises:
@@ -26,28 +42,69 @@ def straight_ways(vocabulary: ActionVocabulary, horizon: int) -> list[tuple[str,
     return list(dict.fromkeys(ways))
 
 
-def glances(vocabulary: ActionVocabulary) -> list[tuple[str, ...]]:
+def glances(vocabulary: ActionVocabulary) -> list[Way]:
     """Return a turn to each side and back; where there are turns to one side only, no action at all."""
     _, turns = gait(vocabulary)
     names = [turn.name for turn in turns]
     return list(zip(names, reversed(names), strict=True)) if len(names) > 1 else [()]
 
 
-def approach_ways(vocabulary: ActionVocabulary, horizon: int) -> list[tuple[str, ...]]:
-    """Return all ways that ``best_approach`` compares: those that stay, then those that go; errors as of these."""
-    return [*glances(vocabulary), *straight_ways(vocabulary, horizon)]
+def ways_aside(vocabulary: ActionVocabulary) -> list[Way]:
+    """Return ways that turn to a side, go ahead, and turn back beyond the first heading; none without two turns.
+
+    Raises:
+        PersistError: when the vocabulary has no step ahead or no turn.
+    """
+    ahead, turns = gait(vocabulary)
+    if len(turns) == 1:
+        return []
+    return [
+        (*_turned(away, angle), *(ahead.name,) * max(1, round(metres / ahead.forward)), *_turned(back, angle + BACK))
+        for away, back in (turns, turns[::-1])
+        for angle, metres in itertools.product(ASIDE, METRES)
+    ]
 
 
-def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> tuple[str, ...]:
-    """Return the actions to the best view on straight ways; none where the view is as good without a step.
+def _turned(turn: Action, degrees: float) -> Way:
+    """Turn by about so many degrees, once at least."""
+    return (turn.name,) * max(1, round(degrees / abs(turn.turn)))
 
-    What is imagined costs more than what is truly seen, so the view without a step is imagined too, by ``glances``.
+
+def approaching(judge: Judge, vocabulary: ActionVocabulary, horizon: int, at_once: int) -> Generator[None, None, Way]:
+    """Do what ``best_approach`` does, and give way after every ``at_once`` ways that were compared."""
+    stay = glances(vocabulary)
+    for ways in filter(None, (straight_ways(vocabulary, horizon), ways_aside(vocabulary))):
+        compared = [*stay, *ways]
+        for first in range(0, len(compared), at_once):
+            judge.judge(compared[first : first + at_once], 1)  # which remembers them
+            yield
+        here, there = _best(judge, stay), _best(judge, ways)
+        if there.cost < here.cost:
+            return there.chosen
+    return ()
+
+
+def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> Way:
+    """Return the actions to the best view on straight ways; where none is better, on ways aside; else none.
+
+    Better is what costs less than the view without a step. What is imagined costs more than what is truly seen, so that
+    view is imagined too, by ``glances``.
 
     Args:
         judge: judges every frame of a candidate (``over`` is ``best``).
         vocabulary: of the agent.
-        horizon: actions of each way.
+        horizon: actions of each straight way.
+
+    Raises:
+        PersistError: when the vocabulary has no step ahead or no turn.
     """
-    judged, here = judge.judge(approach_ways(vocabulary, horizon), 1), len(glances(vocabulary))
-    stay, best = (min(part, key=lambda one: one.cost) for part in (judged[:here], judged[here:]))
-    return best.chosen if best.cost < stay.cost else ()
+    parts = approaching(judge, vocabulary, horizon, ALL)
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            return tuple(end.value)
+
+
+def _best(judge: Judge, ways: Sequence[Way]) -> Candidate:
+    return min(judge.judge(ways, 1), key=lambda one: one.cost)

@@ -19,7 +19,7 @@ from persist_cli.api.cost import Cost, Futures
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.navigation.routes import distances_to
-from persist_cli.planning.approach import approach_ways, best_approach
+from persist_cli.planning.approach import approaching
 from persist_cli.planning.futures import WorldFutures
 from persist_cli.planning.judge import Judge, check_goal
 from persist_cli.play.ground import pose_at, turned
@@ -170,9 +170,4 @@ class Guide:
         known = agent.surroundings
         ground = GroundMap.empty(agent.info.world_up) if known is None else known.map()
         judge = Judge(WorldFutures(world, ground, agent.body), self._cost, self.goal, ground, "best")
-        vocabulary = agent.info.vocabulary
-        ways = approach_ways(vocabulary, STEPS)
-        for first in range(0, len(ways), WAYS_AT_ONCE):
-            judge.judge(ways[first : first + WAYS_AT_ONCE], 1)  # which remembers them
-            yield
-        return best_approach(judge, vocabulary, STEPS)
+        return (yield from approaching(judge, agent.info.vocabulary, STEPS, WAYS_AT_ONCE))
