@@ -246,10 +246,13 @@ def row_json(
 
 
 def compared_with(row: PlanningRow, rows: Sequence[PlanningRow]) -> list[str]:
-    """Return the names of the rows that a row is compared with: its planner without memory, and those without one."""
+    """Return the names of the rows that a row is compared with.
+
+    They are its planner without memory and with the simulator as the model, and rows without a planner.
+    """
     names = [other.name for other in rows]
     alone = next((name for name in ("policy", "random") if name in names), None)
-    head = row.name.partition(",")[0]
-    without = [f"{head.removesuffix(WALK)}{walk}, {NO_MEMORY}" for walk in (WALK, "")]
-    wanted = [*without, alone, POLICY_WALK, "shortest-path", RETRIEVAL] if row.imagines else [alone]
+    planner = row.name.partition(",")[0].removesuffix(WALK)
+    models = [f"{planner}{WALK}, {NO_MEMORY}", f"{planner}, {NO_MEMORY}", f"{planner}, {SIMULATOR}"]
+    wanted = [*models, alone, POLICY_WALK, "shortest-path", RETRIEVAL] if row.imagines else [alone]
     return [name for name in wanted if name is not None and name in names and name != row.name]

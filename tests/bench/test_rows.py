@@ -44,6 +44,15 @@ def test_a_memory_is_compared_with_the_models_that_forget_with_and_without_the_w
     assert compared["rank-16-walk, none"] == ["rank-16, none", "policy"]
 
 
+def test_each_model_is_compared_with_the_simulator_in_its_place_under_the_same_planner() -> None:
+    rows = choice("rank-8", "rank-16", "rank-16-walk", memories=("none", "voxel", "simulator")).rows()
+    compared = {row.name: compared_with(row, rows) for row in rows}
+    assert compared["rank-16, voxel"] == ["rank-16-walk, none", "rank-16, none", "rank-16, simulator"]
+    assert compared["rank-16-walk, none"] == ["rank-16, none", "rank-16, simulator"]
+    assert compared["rank-8, none"] == ["rank-8, simulator"]
+    assert compared["rank-8, simulator"] == ["rank-8, none"]
+
+
 def test_the_classical_planner_is_told_the_place_whatever_the_others_see() -> None:
     place, image = choice("shortest-path", "shortest-path-image").rows()
     assert (place.goal, image.goal) == ("place", "image")
