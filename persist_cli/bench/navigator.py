@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, Literal
 
 import torch
 
@@ -18,7 +18,10 @@ from persist_cli.api.simulator import Simulator
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.stop_rules import view_costs
 from persist_cli.bench.true_scene import TrueScene
+from persist_cli.errors import PersistError
+from persist_cli.io.settings import parse_settings
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.memorize.memory_config import plugin_settings
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.planning.approach import best_approach
 from persist_cli.planning.futures import FutureModel, Over, SimulatorFutures, WorldFutures
@@ -28,7 +31,14 @@ from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
 APPROACH = 8  # actions of the ways that are compared before an agent stops
 
-KEPT = 0.5  # share of the last plan's distributions that ``cem`` begins with
+CEM: Final = CemSettings(shift=0.5)  # of the rows of ``cem``, where nothing else is said
+
+ELSEWHERE: Final = {  # settings of ``cem`` that are no row's own, and what says them
+    "horizon": "give --horizon",
+    "candidates": "give --candidates",
+    "rounds": "give --rounds",
+    "actions": "all rows have the actions of the episodes; leave it out",
+}
 
 MANY = 1_000_000  # actions after which nothing is left of a plan
 
@@ -48,6 +58,7 @@ class PlanSettings:
         body: whether imagined moves over ground known to be occupied do not move.
         keep: whether what is left of the last plan is judged again; ``cem`` begins near its distributions, too.
         approach: whether an agent that recognises the goal goes on to the best view before it stops.
+        cem: the other settings of ``cem``.
     """
 
     horizon: int = 8
@@ -58,6 +69,27 @@ class PlanSettings:
     body: bool = True
     keep: bool = True
     approach: bool = True
+    cem: CemSettings = CEM
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values; of ``cem`` only what is not as usual, so that benchmarks begun without it go on."""
+        values = asdict(self)
+        changed = {name: value for name, value in values.pop("cem").items() if value != getattr(CEM, name)}
+        return values | ({"cem": changed} if changed else {})
+
+    def with_cem(self, texts: Sequence[str]) -> PlanSettings:
+        """Return these settings with those of ``cem`` in texts such as ``method.elites=0.1``.
+
+        Raises:
+            PersistError: one line for what is no setting of these rows, or cannot be.
+        """
+        values = plugin_settings(texts, ("method",))["method"]
+        for name, instead in ELSEWHERE.items():
+            if name in values:
+                raise PersistError(f"--set method.{name}: {instead}")
+        if "shift" in values and not self.keep:
+            raise PersistError("--set method.shift: --no-keep begins each plan anew; leave one of them out")
+        return replace(self, cem=parse_settings(CemSettings, asdict(CEM) | values, "method 'cem'"))
 
 
 @dataclass(frozen=True)
@@ -251,8 +283,9 @@ def make_world(
 def make_planner(row: PlanningRow, policy: Policy | None, settings: PlanSettings, horizon: int) -> Planner:
     """Return the planner of a row that imagines."""
     if row.planner == "cem":
-        shift = KEPT if settings.keep else 0.0
-        return Cem(CemSettings(horizon=horizon, candidates=row.candidates, rounds=settings.rounds, shift=shift), policy)
+        shift = settings.cem.shift if settings.keep else 0.0
+        sizes = {"horizon": horizon, "candidates": row.candidates, "rounds": settings.rounds}
+        return Cem(replace(settings.cem, shift=shift, **sizes), policy)
     if policy is None:
         raise ValueError(f"row {row.name!r} ranks and has no policy")
     return Rank(policy, RankSettings(horizon=horizon, candidates=row.candidates, keep=settings.keep))

@@ -18,7 +18,7 @@ from persist_cli.api.simulator import Simulator
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.find_episodes import EpisodeSearch
 from persist_cli.bench.make_episodes import draw_episodes
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
+from persist_cli.bench.navigator import CEM, Navigator, PlanSettings, RowParts
 from persist_cli.bench.planning_journal import PlanningJournal
 from persist_cli.bench.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
 from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_open_loop
@@ -185,6 +185,8 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     if missing := cost.missing():
         raise PersistError(f"cost {cost.name!r}: {missing}")
     check_policies(rows, plan.planning)
+    if plan.planning.cem != CEM and all(row.planner != "cem" for row in rows):
+        raise PersistError("--set method.…: no row has the cross-entropy method; add cem to --rows, or leave it out")
     checkpoint = find_checkpoint(plan.checkpoint) if any(row.uses_world_model for row in rows) else None
     journal = PlanningJournal(out)
     if processes.main:
@@ -327,7 +329,7 @@ def find_thresholds(
 def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict[str, Any]:
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
-    planning = asdict(plan.planning)
+    planning = plan.planning.to_json()
     if plan.planning.frames is not None and plan.planning.approach:
         planning["approach frames"] = "no bound"  # once they were those of a decision
     values = {

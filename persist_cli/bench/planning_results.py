@@ -164,7 +164,7 @@ def settings_json(bench: PlanningBench) -> dict[str, Any]:
     return {
         "cost": {"name": bench.cost.name, "settings": asdict(bench.cost.settings), "reads": bench.cost.reads},
         "policy": plan.policy,
-        "planning": asdict(plan.planning),
+        "planning": plan.planning.to_json(),
         "loops": list(plan.loops),
         "loop": asdict(plan.loop),
         "stop": stop_words(bench),

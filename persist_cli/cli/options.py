@@ -44,6 +44,10 @@ PlanSettingsOption = Annotated[
     typer.Option("--set", help="As in method.elites=0.1, policy.KEY=VALUE or cost.KEY=VALUE."),
 ]
 
+CemSettingsOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Of cem, as in method.elites=0.1 or method.kept=0.3.")
+]
+
 StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
 
 SamplerOption = Annotated[

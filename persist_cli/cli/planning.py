@@ -10,6 +10,7 @@ import typer
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
     BodyOption,
+    CemSettingsOption,
     ContextNoiseOption,
     DtypeOption,
     GuidanceOption,
@@ -238,7 +239,8 @@ def bench_plan(
     loops: Annotated[str, typer.Option(help="closed, open or both; open: up to 16 actions.")] = "closed,open",
     stop_cost: Annotated[float | None, typer.Option(help="Cost of a view to stop at; else chosen.")] = None,
     body: Annotated[bool, typer.Option(help="Imagined moves into known obstacles do not move.")] = True,
-    keep: Annotated[bool, typer.Option(help="rank-N: the rest of the last plan is a candidate again.")] = True,
+    keep: Annotated[bool, typer.Option(help="What is left of the last plan is a candidate of the next.")] = True,
+    settings: CemSettingsOption = None,
     approach: Annotated[bool, typer.Option(help="Go to the best imagined view of a goal in sight, then stop.")] = True,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
@@ -257,14 +259,13 @@ def bench_plan(
     """
     from persist_cli.bench import navigator, plan_bench, run_episode, run_plan_bench
 
-    plan = plan_bench.BenchPlan(
+    run_plan_bench.run_plan_bench(plan_bench.BenchPlan(
         plan_bench.EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each),
         checkpoint, split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
-        navigator.PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach), split_names(loops),
-        run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
+        navigator.PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach).with_cem(settings or ()),
+        split_names(loops), run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
         SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
-    )  # fmt: skip
-    run_plan_bench.run_plan_bench(plan, out, report, json)
+    ), out, report, json)  # fmt: skip
 
 
 @bench_app.command("scene")

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,14 @@ import pytest
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Cover
 from persist_cli.bench.episodes import EpisodeSet
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
+from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, make_planner
 from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, trained_on
 from persist_cli.bench.planning_pictures import end_words
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.errors import DataError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
+from persist_cli.planning.planners import CemSettings
 from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult, Persist
@@ -30,6 +32,8 @@ from tests.support.processes import run_command, run_in_pair
 Bench = Callable[..., CommandResult]
 
 PLACE = ("--cost", "distance", "--rows", "random,rank-12", "--memories", "simulator", "--loops", "closed")
+
+SEARCH = ("--cost", "distance", "--rows", "cem", "--memories", "simulator")
 
 SIMULATED = ("--memories", "simulator", "--candidates", 2, "--rounds", 1)
 
@@ -211,6 +215,26 @@ def test_what_cem_did_before_it_forgot_plans_that_were_done_is_refused(bench: Be
     assert "was run when cem still judged the end of a plan that was done; delete this folder" in bench(*options).err
 
 
+def test_how_cem_searches_can_be_set_and_a_benchmark_begun_before_goes_on(bench: Bench, tmp_path: Path) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--rows", "cem", *SIMULATED)
+    usual = json.loads(bench(*options, "--json").out)["settings"]["planning"]
+    held = json.loads((tmp_path / "bench/parts/plan.json").read_text())["planning"]
+    assert (usual, "cem" in held) == (held, False)  # as before anything of it could be set
+    assert bench(*options, "--set", "method.shift=0.5").code == 0  # which it is anyway
+    changed = ("--set", "method.kept=0.3", "--set", "method.elites=0.5")
+    assert "holds another benchmark (planning cem: None, now {'elites': 0.5, 'kept'" in bench(*options, *changed).err
+    other = json.loads(bench(*options, *changed, "--json", out="other").out)
+    assert other["settings"]["planning"] == usual | {"cem": {"elites": 0.5, "kept": 0.3}}
+
+
+def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_said() -> None:
+    row = PlanningRow("cem, simulator", "cem", None, "simulator", "place", walk=True, candidates=7)
+    plans = PlanSettings(rounds=2).with_cem(["method.kept=0.3", "method.smoothing=0"])
+    wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
+    assert make_planner(row, None, plans, 5).settings == wanted
+    assert make_planner(row, None, replace(plans, keep=False), 5).settings == replace(wanted, shift=0.0)
+
+
 def test_soft_spl_of_older_records_is_made_again_from_what_they_hold(bench: Bench, tmp_path: Path) -> None:
     options = ("--cost", "distance", "--loops", "closed", "--patience", 1, "--rows", "random", "--json")
     now = json.loads(bench(*options).out)["tables"][0]["rows"]["random"]
@@ -265,6 +289,12 @@ def test_a_world_model_is_ranked_by_what_it_imagines(bench: Bench, voxel: Path, 
         ((*PLACE, "--loops", "shut"), "unknown loop 'shut'"),
         ((*PLACE[:2], "--rows", "random", "--bins", "64"), "no episode of 64 actions"),
         (("--cost", "distanc"), "did you mean 'distance'"),
+        ((*SEARCH, "--set", "method.elits=0.1"), "unknown key 'elits', did you mean 'elites'?"),
+        ((*SEARCH, "--set", "method.elites=2"), "elites 2 is a share"),
+        ((*SEARCH, "--set", "method.horizon=4"), "--set method.horizon: give --horizon"),
+        ((*SEARCH, "--set", "cost.unknown=4"), "write method.KEY=VALUE"),
+        ((*SEARCH, "--no-keep", "--set", "method.shift=1"), "--no-keep begins each plan anew"),
+        ((*PLACE, "--set", "method.elites=0.1"), "no row has the cross-entropy method; add cem to --rows"),
         (("--cost", "distance", "--rows", "policy", "--policy", "rndom"), "unknown policy 'rndom'"),
     ],
 )

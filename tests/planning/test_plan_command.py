@@ -139,6 +139,8 @@ PLACE = ("--cost", "distance")
         ((*PLACE, "--actions", "forward,jump"), "unknown action 'jump'"),
         ((*PLACE, "--set", "policy.weights={left: 1}"), "policy.weights: no policy proposes here; name one"),
         ((*PLACE, "--set", "method.elites=2"), "elites 2 is a share"),
+        ((*PLACE, "--set", "method.shift=0.5"), "method.shift acts between one plan and the next, and this command"),
+        ((*PLACE, "--method", "rank", "--set", "method.keep=true"), "method.keep acts between one plan and the next"),
         ((*PLACE, "--set", "elites=2"), "write method.KEY=VALUE or policy.KEY=VALUE or cost.KEY=VALUE"),
         ((*PLACE, "--method", "rank", "--actions", "left"), "--actions are those that --method cem chooses from"),
     ],
