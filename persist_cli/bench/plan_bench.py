@@ -198,7 +198,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         if checkpoint is not None:
             check_model(checkpoint, rows, episodes)
         if not journal.begun or (checkpoint is not None and not journal.identity().get("checkpoint")):
-            check_scenes(episodes, trained_on(checkpoint, plan.policy), plan.allow_training_scenes)
+            check_scenes(episodes.scenes, trained_on(checkpoint, plan.policy), plan.allow_training_scenes)
         check_budget(plan, rows, episodes)
         journal.begin(values, episodes)
     processes.wait()
@@ -256,16 +256,16 @@ def check_model(checkpoint: Checkpoint, rows: Sequence[PlanningRow], episodes: E
         )
 
 
-def check_scenes(episodes: EpisodeSet, trained: Mapping[str, Collection[str]], allowed: bool) -> None:
+def check_scenes(scenes: Sequence[str], trained: Mapping[str, Collection[str]], allowed: bool) -> None:
     """Raise ``DataError`` when something was trained on a scene of the episodes, unless that is allowed.
 
     Args:
-        episodes: the episodes.
+        scenes: names of the scenes of the episodes.
         trained: names of the scenes that model and policy were trained on, by words for each.
         allowed: whether such scenes may be measured.
     """
     for words, names in trained.items():
-        known = next((scene for scene in episodes.scenes if scene in names), None)
+        known = next((scene for scene in scenes if scene in names), None)
         if known is not None and not allowed:
             raise DataError(
                 f"scene {known!r}: {words} was trained on it; take episodes of another split, or measure it all the "

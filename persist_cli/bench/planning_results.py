@@ -165,6 +165,7 @@ def settings_json(bench: PlanningBench) -> dict[str, Any]:
         "cost": {"name": bench.cost.name, "settings": asdict(bench.cost.settings), "reads": bench.cost.reads},
         "policy": plan.policy,
         "planning": plan.planning.to_json(),
+        "allow_training_scenes": plan.allow_training_scenes,
         "loops": list(plan.loops),
         "loop": asdict(plan.loop),
         "stop": stop_words(bench),

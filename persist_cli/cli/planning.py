@@ -131,6 +131,7 @@ def learn(
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Walks imagined at once.")] = 16,
+    allow_training_scenes: TrainingScenesOption = False,
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -146,8 +147,8 @@ def learn(
         views=tuple(views), policy=policy, inside=inside, checkpoint=checkpoint, adapter=adapter, rounds=rounds,
         practice=PracticeSettings(walks, actions, execute, explore, batch, proposals), steps=training_steps,
         training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body,
-        placement=InferenceOptions.of(dtype, save_memory), stop_cost=stop_cost,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body, stop_cost=stop_cost,
+        placement=InferenceOptions.of(dtype, save_memory), allow_training_scenes=allow_training_scenes,
     )  # fmt: skip
     run_learn(plan, out, json)
 

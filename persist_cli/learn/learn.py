@@ -22,6 +22,7 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.bench.plan_bench import check_scenes, trained_on
 from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.retention import ended_recipe
 from persist_cli.data.store import write_trajectory
@@ -76,6 +77,7 @@ class LearnPlan:
         stop_cost: LPIPS of view and goal image up to which the evaluated agent stops; at 0 only its policy stops it.
         body: whether walls stop the agent inside the model; ``None``: where the height of its camera is told, see
             ``tells_body``.
+        allow_training_scenes: whether a scene that model or policy was trained on may be evaluated.
     """
 
     views: tuple[str, ...]
@@ -94,6 +96,7 @@ class LearnPlan:
     placement: InferenceOptions = field(default_factory=InferenceOptions)
     stop_cost: float = STOP_COST
     body: bool | None = None
+    allow_training_scenes: bool = False
 
 
 @dataclass(frozen=True)
@@ -177,6 +180,7 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     episodes = [] if plan.episodes is None or simulator is None else episodes_of(plan.episodes, info, simulator)
     if episodes:
         stop_rule(plan.stop_cost)  # weights that are missing are an error before anything is done
+        check_held_out(plan, begin, info.scene)
     check_horizon(plan, begin)
     make_recipe(apply_overrides(recipe_of_round(plan, begin, 1), plan.training), "--set")
     learning = Learning(plan, out, info, views, begin, simulator, episodes)
@@ -195,7 +199,7 @@ def identity(learning: Learning) -> dict[str, Any]:
         "sampling": asdict(plan.sampling) | plan.placement.changes(),
         "ground": "of the given views and the walk",  # by which proposals are judged; once that of the memory
     }  # fmt: skip
-    del values["placement"]  # where weights wait for their turn changes nothing
+    del values["placement"], values["allow_training_scenes"]  # neither changes what is learned
     if plan.inside == MODEL:
         values |= model_identity(plan)
     if plan.episodes is not None:
@@ -240,6 +244,12 @@ def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
             f"walks of {plan.practice.actions} actions: the policy learns from {needed} actions at once, and blocked "
             f"ones do not count; give --actions {2 * needed} or more"
         )
+
+
+def check_held_out(plan: LearnPlan, begin: TrainedPolicy, scene: str) -> None:
+    """Raise ``DataError`` when model or policy were trained on the evaluated scene, unless that is allowed."""
+    checkpoint = find_checkpoint(plan.checkpoint) if plan.inside == MODEL else None
+    check_scenes([scene], trained_on(checkpoint, str(begin.folder)), plan.allow_training_scenes)
 
 
 def episodes_of(file: Path, info: TrajectoryInfo, simulator: Simulator) -> list[Episode]:
@@ -375,6 +385,7 @@ def summary(learning: Learning) -> dict[str, Any]:
     return {
         "format": "persist-learning", "version": 1, "inside": learning.plan.inside, "scene": learning.info.scene,
         "views": len(learning.views), "episodes": len(learning.episodes), "rounds": rows,
+        "allow_training_scenes": learning.plan.allow_training_scenes,
     }  # fmt: skip
 
 

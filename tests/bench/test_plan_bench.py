@@ -330,9 +330,9 @@ def test_scenes_that_the_model_was_trained_on_are_refused(episodes: EpisodeSet, 
     room = episodes.episodes[0].model_copy(update={"scene_name": "room-0"})
     known = episodes.model_copy(update={"episodes": [room]})
     with pytest.raises(DataError, match="'room-0': the model was trained on it"):
-        check_scenes(known, trained, allowed=False)
-    check_scenes(known, trained, allowed=True)
-    check_scenes(episodes, trained, allowed=False)
+        check_scenes(known.scenes, trained, allowed=False)
+    check_scenes(known.scenes, trained, allowed=True)
+    check_scenes(episodes.scenes, trained, allowed=False)
 
 
 def test_a_trained_policy_acts_alone_and_proposes_what_is_ranked(
@@ -348,8 +348,9 @@ def test_a_trained_policy_acts_alone_and_proposes_what_is_ranked(
 
 def test_scenes_that_the_policy_was_trained_on_are_refused(episodes: EpisodeSet, policy_run: Path) -> None:
     room = episodes.episodes[0].model_copy(update={"scene_name": "room-1"})
+    known = episodes.model_copy(update={"episodes": [room]})
     with pytest.raises(DataError, match=r"'room-1': policy .* was trained on it"):
-        check_scenes(episodes.model_copy(update={"episodes": [room]}), trained_on(None, str(policy_run)), allowed=False)
+        check_scenes(known.scenes, trained_on(None, str(policy_run)), allowed=False)
     assert trained_on(None, "random") == {}
 
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from persist_cli.api.checkpoint import CARD, TrainingScenes, find_checkpoint
 from persist_cli.api.observations import Frame
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.data.store import Store, write_trajectory
+from persist_cli.io.files import read_json, write_json
+from persist_cli.io.sha256sums import write_sums
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
+from persist_cli.policies.trained import find_policy, write_policy_card
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult
 from tests.support.miniworlds import make_world
@@ -93,6 +98,33 @@ def test_episodes_of_another_agent_than_that_of_the_views_are_refused(learn, tmp
     result = learn(simulator=make_world(**SIZE, step=0.4, turn=30.0))
     assert (result.code, result.err.count("\n")) == (1, 1)
     assert "with step 0.25 and turn 15.0, the views were collected with step 0.4 and turn 30.0" in result.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_house_that_the_policy_was_trained_on_is_evaluated_only_where_that_is_allowed(
+    learn, world, episodes, policy_run, tmp_path
+):
+    (scene,) = EpisodeSet.model_validate_json(episodes.read_text()).scenes
+    known = Path(shutil.copytree(find_policy(policy_run).folder, tmp_path / "known"))
+    trained = find_policy(known)
+    write_policy_card(known, trained.policy, trained.settings, TrainingScenes(frozenset({scene})))
+    write_sums(known)
+    result = learn("--policy", known, "--stop-cost", 0)
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert f"scene {scene!r}: policy {str(known)!r} was trained on it; take episodes of another split" in result.err
+    assert not (tmp_path / "out").exists()
+    allowed = learn("--policy", known, "--stop-cost", 0, "--allow-training-scenes")
+    assert json.loads(allowed.out)["allow_training_scenes"], allowed.err
+
+
+def test_a_house_that_the_model_was_trained_on_is_not_evaluated(learn, episodes, stage1, tmp_path):
+    (scene,) = EpisodeSet.model_validate_json(episodes.read_text()).scenes
+    known = Path(shutil.copytree(find_checkpoint(stage1).folder, tmp_path / "known"))
+    scenes = {"training_scenes": TrainingScenes(frozenset({scene})).to_json()}
+    write_json(known / CARD, read_json(known / CARD) | scenes)
+    write_sums(known)
+    result = learn(known, "--inside", "model", "--stop-cost", 0)
+    assert (result.code, f"scene {scene!r}: the model was trained on it" in result.err) == (1, True), result.err
     assert not (tmp_path / "out").exists()
 
 
