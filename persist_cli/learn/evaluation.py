@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import torch
@@ -53,8 +54,8 @@ def stop_rule(cost: float) -> StopRule:
 
 def evaluate_policy(
     policy: Policy, simulator: Simulator, episodes: Sequence[Episode], stop: StopRule, loop: LoopSettings
-) -> list[dict[str, Any]]:
-    """Return what happened in each episode as JSON values, as ``persist bench plan`` keeps it.
+) -> Iterator[dict[str, Any]]:
+    """Yield what happened in each episode as JSON values, as ``persist bench plan`` keeps it.
 
     Args:
         policy: acts alone; it also stops where it proposes nothing.
@@ -64,18 +65,19 @@ def evaluate_policy(
         loop: actions between decisions, and patience.
     """
     parts, planning = RowParts(policy=policy), PlanSettings(horizon=policy.longest or PlanSettings().horizon)
-    records = []
     for episode in watched(episodes, "evaluating", "episodes"):
         scene = TrueScene(simulator, episode)
         with torch.no_grad():
             navigator = Navigator(ROW, parts, planning, scene, planning.horizon)
             record = run_closed_loop(scene, navigator, stop, loop)
-        records.append({"episode": episode.name, **record})
-    return records
+        yield {"episode": episode.name, **record}
 
 
 def mean_figures(records: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Return the mean of each figure over the episodes that have it finite."""
-    names = list(records[0]["figures"])
-    values = {name: torch.tensor([one["figures"][name] for one in records], dtype=torch.float64) for name in names}
-    return {name: float(value[value.isfinite()].mean()) for name, value in values.items()}
+    """Return the mean of each figure over the episodes that have it finite; JSON has ``None`` for those that do not."""
+    means = {}
+    for name in records[0]["figures"]:
+        figures = [one["figures"][name] for one in records]
+        values = torch.tensor([math.nan if one is None else one for one in figures], dtype=torch.float64)
+        means[name] = float(values[values.isfinite()].mean())
+    return means

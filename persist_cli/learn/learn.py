@@ -1,7 +1,8 @@
 """``persist learn``: a policy practises in a new house inside the model, learns from what it reached, and repeats.
 
 A round practises, adds its walks to those of the rounds before, fine-tunes the policy on all of them, and evaluates it
-in the true scene. What is done is not done again, so a stopped run goes on.
+in the true scene. What is done is not done again, so a stopped run goes on: it repeats at most a batch of walks, what
+was trained since the last checkpoint, and an episode.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from persist_cli.viewing.console import add_task, print_json, print_table, progr
 from persist_cli.viewing.curve import Curve, draw_curves
 
 PLAN: Final = "plan.json"
-WALKS: Final = "walks.json"  # of a round whose walks are done
+WALKS: Final = "walks.json"  # of a round: how many walks are done, and their counts
 RESULTS: Final = "learn.json"
 CURVE: Final = "success.png"
 FIGURES: Final = ("success", "reached", "spl", "soft_spl", "collisions_per_action", "end_metres")
@@ -150,7 +151,7 @@ def run_learn(plan: LearnPlan, out: Path, as_json: bool) -> None:
 def run_rounds(learning: Learning) -> None:
     """Run all rounds that are not done yet."""
     rounds = range(1, learning.plan.rounds + 1)
-    walked = {number for number in rounds if (learning.folder(number) / WALKS).is_file()}
+    walked = {number for number in rounds if counts_of(learning, number)["walks"] == learning.plan.practice.walks}
     place = None if len(walked) == len(rounds) else open_place(learning)  # whatever does not fit there ends it here
     keep_plan(learning)
     evaluate(learning, 0)
@@ -311,23 +312,29 @@ def open_place(learning: Learning) -> PracticePlace:
     return ImaginedPlace(world, info, origin)
 
 
+def counts_of(learning: Learning, number: int) -> dict[str, int]:
+    """Return how many walks of a round are done, with their actions, blocked actions and goals."""
+    file = learning.folder(number) / WALKS
+    return dict(read_json(file)) if file.is_file() else dict.fromkeys(("walks", "actions", "blocked", "goals"), 0)
+
+
 def walk(learning: Learning, place: PracticePlace, number: int) -> None:
-    """Practise with the policy of the round before, and write its walks as a data set."""
+    """Practise with the policy of the round before, and write its walks as a data set; batches that are done count."""
     trained = learning.policy(number - 1)
     policies = open_policy(str(trained.folder)), make_policy("random", {})
     settings, folder = learning.plan.practice, learning.folder(number) / "walks"
-    seed = learning.plan.seed * 1000 + number
-    blocked = goals = actions = 0
+    seed, counts = learning.plan.seed * 1000 + number, counts_of(learning, number)
     info = info_of_walks(learning.info, place)
     folder.mkdir(parents=True, exist_ok=True)
     with progress() as bar:
-        task = add_task(bar, f"round {number}: practising", settings.walks, "walks")
-        for index, one in enumerate(practise(place, policies, learning.views, settings, seed)):
-            blocked, goals, actions = blocked + one.blocked, goals + one.goals, actions + len(one.actions)
-            write_trajectory(folder / f"walk-{index:05d}.parquet", info, one.frames())
+        task = add_task(bar, f"round {number}: practising", settings.walks, "walks", done=counts["walks"])
+        for one in practise(place, policies, learning.views, settings, seed, counts["walks"]):
+            write_trajectory(folder / f"walk-{counts['walks']:05d}.parquet", info, one.frames())
+            more = {"walks": 1, "actions": len(one.actions), "blocked": one.blocked, "goals": one.goals}
+            counts = {name: counts[name] + value for name, value in more.items()}
+            if counts["walks"] % settings.batch == 0 or counts["walks"] == settings.walks:
+                write_json(learning.folder(number) / WALKS, counts)
             bar.advance(task)
-    counts = {"walks": settings.walks, "actions": actions, "blocked": blocked, "goals": goals}
-    write_json(learning.folder(number) / WALKS, counts)
 
 
 def recipe_of_round(plan: LearnPlan, before: TrainedPolicy, number: int) -> dict[str, Any]:
@@ -355,17 +362,21 @@ def train(learning: Learning, number: int) -> None:
 
 
 def evaluate(learning: Learning, number: int) -> None:
-    """Run the episodes with the policy after a round, unless that is done.
+    """Run the episodes with the policy after a round that are not done yet.
 
     An older persist measured SoftSPL otherwise and kept no metres of the start: then they are run again.
     """
     file = learning.folder(number) / "episodes.json"
-    if not learning.episodes or (file.is_file() and "start_metres" in read_json(file)["figures"]):
+    kept = read_json(file) if file.is_file() else {}
+    if not learning.episodes or "start_metres" in kept.get("figures", ()):
         return
     assert learning.simulator is not None
     policy, stop = open_policy(str(learning.policy(number).folder)), stop_rule(learning.plan.stop_cost)
-    records = evaluate_policy(policy, learning.simulator, learning.episodes, stop, learning.plan.loop)
-    file.parent.mkdir(parents=True, exist_ok=True)
+    records = [] if "figures" in kept else kept.get("episodes", [])
+    rest = learning.episodes[len(records) :]
+    for record in evaluate_policy(policy, learning.simulator, rest, stop, learning.plan.loop):
+        records.append(record)
+        write_json(file, {"episodes": records})
     write_json(file, {"figures": mean_figures(records), "episodes": records})
 
 

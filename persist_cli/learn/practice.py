@@ -81,6 +81,7 @@ def practise(
     views: Observations,
     settings: PracticeSettings,
     seed: int,
+    done: int = 0,
 ) -> Iterator[PracticeWalk]:
     """Yield walks from random given frames towards the views of others.
 
@@ -90,9 +91,10 @@ def practise(
         views: the given posed frames.
         settings: of the practice.
         seed: of all that is random.
+        done: number of the first walks that are left out, in whole batches; the others are as if they were not.
     """
     shown = ground_of(views, place)
-    for first in range(0, settings.walks, settings.batch):
+    for first in range(done, settings.walks, settings.batch):
         numbers = range(first, min(first + settings.batch, settings.walks))
         walkers = [Walker(place, policies, views, shown, settings, seed * SEEDS + number) for number in numbers]
         place.begin([walker.seen for walker in walkers], [walker.sampling_seed for walker in walkers])

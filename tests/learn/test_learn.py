@@ -19,7 +19,7 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.policy import Goal
 from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
-from persist_cli.data.store import Store
+from persist_cli.data.store import Store, write_trajectory
 from persist_cli.learn.evaluation import mean_figures
 from persist_cli.learn.learn import LearnPlan, open_place, prepare
 from persist_cli.learn.places import ImaginedPlace
@@ -158,8 +158,9 @@ def test_practice_follows_from_its_seed_and_does_not_change_the_memory(place, wa
     assert all(tensor.equal(before[name]) for name, tensor in memory.tensors().items())
 
 
-def test_figures_of_episodes_are_means_of_those_that_are_finite():
-    records = [{"figures": {"spl": spl, "end_metres": metres}} for spl, metres in ((0.1, 2.0), (0.2, float("inf")))]
+@pytest.mark.parametrize("nowhere", [float("inf"), None])  # as measured, and as JSON has it
+def test_figures_of_episodes_are_means_of_those_that_are_finite(nowhere):
+    records = [{"figures": {"spl": spl, "end_metres": metres}} for spl, metres in ((0.1, 2.0), (0.2, nowhere))]
     assert mean_figures(records) == {"spl": pytest.approx(0.15, rel=1e-12), "end_metres": 2.0}
 
 
@@ -201,6 +202,30 @@ def test_a_learning_that_was_stopped_ends_as_one_that_was_not(learn, tmp_path):
         assert learn(out, "--rounds", rounds).code == 0
     whole, halves = (find_policy(tmp_path / out / "round-02/policy").fingerprint for out in ("whole", "halves"))
     assert whole == halves
+
+
+def test_a_learning_that_was_stopped_amid_its_walks_repeats_one_batch_and_ends_as_one_that_was_not(
+    learn, tmp_path, monkeypatch
+):
+    batches = ("--walks", "5", "--batch", "2")
+    assert learn("whole", *batches).code == 0
+    written: list[str] = []
+
+    def stops_at_the_fourth(path, *more):
+        written.append(path.name)
+        if len(written) == 4:
+            raise KeyboardInterrupt
+        return write_trajectory(path, *more)
+
+    monkeypatch.setattr("persist_cli.learn.learn.write_trajectory", stops_at_the_fourth)
+    assert learn("stopped", *batches).code == 130
+    assert learn("stopped", *batches).code == 0
+    assert written[4:] == [f"walk-{number:05d}.parquet" for number in (2, 3, 4)]
+    whole, stopped = (tmp_path / out / "round-01" for out in ("whole", "stopped"))
+    assert (stopped / "walks.json").read_text() == (whole / "walks.json").read_text()
+    assert find_policy(stopped / "policy").fingerprint == find_policy(whole / "policy").fingerprint
+    for one, other in zip(Store(whole / "walks"), Store(stopped / "walks"), strict=True):
+        assert one.read().observations.rgb.equal(other.read().observations.rgb)
 
 
 def test_a_folder_with_another_learning_is_refused(learn):

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,7 @@ from persist_cli.api.checkpoint import CARD, TrainingScenes, find_checkpoint
 from persist_cli.api.observations import Frame
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
+from persist_cli.bench.run_episode import run_closed_loop
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.io.files import read_json, write_json
 from persist_cli.io.sha256sums import write_sums
@@ -92,6 +94,38 @@ def test_a_learning_that_was_stopped_before_its_last_evaluation_ends_as_one_that
     assert again == results
     assert [file.stat().st_mtime_ns for file in walks.iterdir()] == written
     assert (tmp_path / "out/success.png").is_file()
+
+
+def test_an_evaluation_that_was_stopped_goes_on_after_its_last_episode(learn, episodes, tmp_path, monkeypatch):
+    one = EpisodeSet.model_validate_json(episodes.read_text())
+    more = [one.episodes[0].model_copy(update={"name": f"again-{seed}", "seed": seed}) for seed in range(3)]
+    one.model_copy(update={"episodes": more}).write(tmp_path / "three.json")
+    given = ("--episodes", tmp_path / "three.json", "--stop-cost", 0)
+    assert learn(*given, "--out", tmp_path / "whole").code == 0
+    run: list[str] = []
+
+    def stops_at_the_third(scene, *more):
+        run.append(scene.episode.name)
+        if len(run) == 3:
+            raise KeyboardInterrupt
+        return run_closed_loop(scene, *more)
+
+    monkeypatch.setattr("persist_cli.learn.evaluation.run_closed_loop", stops_at_the_third)
+    assert learn(*given).code == 130
+    first = tmp_path / "out/round-00/episodes.json"
+    assert [record["episode"] for record in json.loads(first.read_text())["episodes"]] == ["again-0", "again-1"]
+    assert learn(*given).code == 0
+    assert run[3:] == ["again-2", "again-0", "again-1", "again-2"]  # the rest, and all after the round
+    for file in ("round-00/episodes.json", "round-01/episodes.json", "learn.json"):
+        whole, stopped = (untimed(json.loads((tmp_path / out / file).read_text())) for out in ("whole", "out"))
+        assert str(stopped).replace(str(tmp_path / "out"), str(tmp_path / "whole")) == str(whole)
+
+
+def untimed(value: Any) -> Any:
+    """JSON values without the seconds that something took."""
+    if isinstance(value, dict):
+        return {key: untimed(item) for key, item in value.items() if not key.endswith("_per_decision")}
+    return [untimed(item) for item in value] if isinstance(value, list) else value
 
 
 def test_episodes_of_another_agent_than_that_of_the_views_are_refused(learn, tmp_path):
