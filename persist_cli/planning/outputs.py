@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import UInt8
@@ -18,7 +18,7 @@ from persist_cli.api.ground import GroundMap
 from persist_cli.api.memory import MapPoints
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
-from persist_cli.io.files import write_json
+from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json
 from persist_cli.planning.futures import FutureModel, Imagined, Walk, WorldFutures
 from persist_cli.planning.judge import Candidate
 from persist_cli.planning.planners import Plan
@@ -26,6 +26,8 @@ from persist_cli.planning.true_futures import true_futures
 from persist_cli.viewing.map import DrawnCandidate, draw_candidates
 from persist_cli.viewing.sheet import write_sheet
 from persist_cli.viewing.video import beside, enlarge, labelled, still, write_video
+
+FILES: Final = ("sheet.png", "plan.mp4", "map.png", "plan.json")
 
 Video = UInt8[Tensor, "frame height width 3"]
 
@@ -74,7 +76,7 @@ class Shown:
 
 
 def write_plan(planned: Planned, out: Path, description: dict[str, Any], best: int) -> dict[str, Any]:
-    """Write all files over those of an earlier plan, and return the content of ``plan.json``.
+    """Write all files over those of an earlier plan, or none of them; return the content of ``plan.json``.
 
     Args:
         planned: the plan.
@@ -82,14 +84,19 @@ def write_plan(planned: Planned, out: Path, description: dict[str, Any], best: i
         description: what it was made with, as JSON values.
         best: number of candidates on the sheet.
     """
-    out.mkdir(parents=True, exist_ok=True)
     shown = look_at(planned, best)
-    start = planned.futures.model.agents[0].now
-    write_sheet(out / "sheet.png", sheet_rows(start.rgb[0], planned.goal, shown))
-    write_video(out / "plan.mp4", chosen_video(start.rgb, planned.goal, shown))
-    draw(planned, out / "map.png")
     record = description | record_of(planned, shown)
-    write_json(out / "plan.json", record)
+    start = planned.futures.model.agents[0].now
+    place = out / "plan" if out.is_dir() else out  # what is written aside lies on the same disk
+    remove_leftovers(place.parent, place.name)
+    with empty_folder_aside(place) as aside:
+        write_sheet(aside / "sheet.png", sheet_rows(start.rgb[0], planned.goal, shown))
+        write_video(aside / "plan.mp4", chosen_video(start.rgb, planned.goal, shown))
+        draw(planned, aside / "map.png")
+        write_json(aside / "plan.json", record)
+        out.mkdir(exist_ok=True)
+        for name in FILES:
+            (aside / name).replace(out / name)
     return record
 
 
@@ -107,6 +114,8 @@ def look_at(planned: Planned, best: int) -> Shown:
         return Shown(candidates, imagined, None, None, None, str(error))
     costs = planned.cost.measure(seen.futures, planned.goal, planned.ground)
     true_costs = [float(costs[row, max(one.best - 1, 0)]) for row, one in enumerate(candidates)]
+    if any(map(math.isnan, true_costs)):
+        return Shown(candidates, imagined, None, None, None, f"its cost {planned.cost.name!r} is NaN")
     return Shown(candidates, truth=truth, imagined=imagined, true_walks=seen.walks, true_costs=true_costs, unknown="")
 
 

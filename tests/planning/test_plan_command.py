@@ -1,5 +1,6 @@
 """``persist plan`` on micro models: what it leaves, and what it refuses."""
 
+import errno
 import json
 import math
 
@@ -151,6 +152,41 @@ def test_options_that_cannot_be_used_are_one_line_and_leave_nothing(plan, tmp_pa
     assert message in result.err
     assert len(result.err.splitlines()) == 1
     assert not (tmp_path / "plan").exists()
+
+
+def test_a_cost_that_is_nan_is_one_line_and_leaves_nothing(plan, site, tmp_path):
+    undefined = """
+        import torch
+        from persist_cli.api.cost import Cost
+
+        class Undefined(Cost):
+            reads, sees = "place", False
+            def measure(self, futures, goal, ground):
+                return torch.full(futures.free.shape, torch.nan)
+    """
+    install(site, "persist-undefined", "persist.costs", "undefined = undefined:Undefined", undefined)
+    result = plan("--cost", "undefined")
+    assert (result.code, result.out, len(result.err.splitlines())) == (1, "", 1)
+    assert "cost 'undefined' of " in result.err
+    assert " is NaN (" in result.err
+    assert not (tmp_path / "plan").exists()
+
+
+def test_a_plan_that_cannot_be_written_leaves_nothing_or_the_whole_plan_before(plan, tmp_path, monkeypatch):
+    def full(*anything):
+        raise OSError(errno.ENOSPC, "No space left on device", "map.png")
+
+    out = tmp_path / "plans"
+    with monkeypatch.context() as changed:
+        changed.setattr("persist_cli.planning.outputs.draw_candidates", full)
+        assert plan(*PLACE, out=out).code == 1
+    assert not list(tmp_path.glob("*plans"))
+    assert plan(*PLACE, out=out).code == 0
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    monkeypatch.setattr("persist_cli.planning.outputs.draw_candidates", full)
+    result = plan(*PLACE, "--seed", 1, out=out)
+    assert (result.code, "No space left on device" in result.err) == (1, True)
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
 
 
 @pytest.mark.parametrize(
