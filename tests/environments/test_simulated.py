@@ -108,6 +108,31 @@ def test_a_vector_of_houses_is_equal_to_single_ones_with_its_seeds():
                 alone[number] = env.reset()[0]
 
 
+def test_a_goal_that_is_reached_begins_the_next_episode_of_a_vector_in_the_same_step():
+    near = {"success_radius": 1.4, "goal_distance": [1.5, 2.0]}
+    vector, singles = gymnasium.make_vec(NAME, num_envs=2, **HOUSES, **near), [make(**near) for _ in range(2)]
+    vector.reset(seed=5)
+    for number, env in enumerate(singles):
+        env.reset(seed=5 + number)
+    ends = np.zeros(2, int)
+    while ends.min() == 0 and ends.max() < 9:
+        actions = np.array([greedy(env) for env in singles])
+        seen, rewards, reached, truncated, infos = vector.step(actions)
+        for number, env in enumerate(singles):
+            last, reward, over, _, info = env.step(actions[number])
+            assert (rewards[number], reached[number], truncated[number]) == (reward, over, False)
+            assert bool(infos.get("_final_obs", np.zeros(2))[number]) == over
+            if over:
+                assert infos["final_info"]["is_success"][number]
+                assert infos["final_info"]["distance"][number] == info["distance"] <= 1.4
+                assert np.array_equal(infos["final_obs"][number]["rgb"], last["rgb"])
+                last, info = env.reset()
+            assert infos["distance"][number] == info["distance"] > 1.4
+            assert np.array_equal(seen["rgb"][number], last["rgb"])
+        ends += reached
+    assert ends.min() > 0
+
+
 def test_the_shortest_way_reaches_the_goal_and_earns_its_length_and_the_bonus():
     env = make(step_cost=0.0, collision_penalty=0.0)
     _, info = env.reset(seed=1)
