@@ -1,4 +1,4 @@
-"""The notebook runs, and the example of a plugin is installed like any package and works in every command."""
+"""The notebook runs, and the examples of plugins are installed like any package and work in every command."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.micro_runs import stage, write_loops
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOK = EXAMPLES / "walk.ipynb"
-PACKAGE = EXAMPLES / "persist-last-frame"
+PACKAGES = EXAMPLES / "persist-last-frame", EXAMPLES / "persist-fan"
 
 
 def test_the_notebook_holds_no_output_and_its_cells_are_valid():
@@ -44,26 +44,34 @@ def test_the_cells_of_the_notebook_run_and_the_memory_helps(tmp_path, monkeypatc
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    """A folder into which pip has installed the package."""
-    pytest.importorskip("hatchling", reason="pip builds the example with hatchling, which is in the extra dev")
+    """A folder into which pip has installed the packages."""
+    pytest.importorskip("hatchling", reason="pip builds the examples with hatchling, which is in the extra dev")
     folder = tmp_path_factory.mktemp("site")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*pip, "--target", folder, PACKAGE], check=True, capture_output=True, text=True)
+    subprocess.run([*pip, "--target", folder, *PACKAGES], check=True, capture_output=True, text=True)
     return folder
 
 
 @pytest.fixture
 def installed(site, monkeypatch) -> Path:
-    """The package is found in the environment, by its entry point."""
+    """The packages are found in the environment, by their entry points."""
     monkeypatch.syspath_prepend(str(site))
     return site
 
 
-def test_the_package_is_found_by_its_entry_point(installed, persist):
-    plugin = find_plugin("memory", "last")
-    assert (plugin.package, plugin.target) == ("persist-last-frame", "persist_last_frame:LastFrame")
+@pytest.mark.parametrize(
+    ("kind", "name", "package", "target"),
+    [
+        ("memory", "last", "persist-last-frame", "persist_last_frame:LastFrame"),
+        ("policy", "fan", "persist-fan", "persist_fan:Fan"),
+        ("cost", "colors", "persist-fan", "persist_fan:ColorDifference"),
+    ],
+)
+def test_a_package_is_found_by_its_entry_points(installed, persist, kind, name, package, target):
+    plugin = find_plugin(kind, name)
+    assert (plugin.package, plugin.target) == (package, target)
     rows = json.loads(persist("plugins", "--json").out)
-    assert "persist-last-frame" in json.dumps(rows)
+    assert package in json.dumps(rows)
 
 
 def test_a_memory_of_ones_own_works_in_every_command(installed, persist, walks, stage1, voxel, tmp_path):
@@ -85,8 +93,22 @@ def test_a_memory_of_ones_own_works_in_every_command(installed, persist, walks, 
     assert '"last"' in (tmp_path / "eval/metrics.json").read_text()
 
 
-def test_the_tests_of_the_package_pass(installed, tmp_path):
-    pytest_run = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", PACKAGE / "tests"]
+def test_a_policy_and_a_cost_of_ones_own_make_plans(installed, persist, walks, voxel, tmp_path):
+    way = ("--start", f"{walks}#0:2", "--goal", f"{walks}#0:5", "--horizon", 3, "--steps", 1, "--candidates", 4)
+    ours = ("--method", "rank", "--policy", "fan", "--cost", "colors", "--set", "policy.turns=1", "--json")
+    ended = persist("plan", voxel, *way, *ours, "--set", "cost.cells=4", "--out", tmp_path / "plan")
+    assert ended.code == 0, ended.err
+    record = json.loads(ended.out)
+    found = {candidate["actions"] for candidate in record["candidates"]}
+    assert found >= {"forward*3", "left forward*2", "right forward*2"}
+    assert record["cost"] == {"name": "colors", "settings": {"cells": 4}, "over": "last"}
+    refused = persist("plan", voxel, *way, *ours, "--set", "cost.cell=4", "--out", tmp_path / "refused")
+    assert "unknown key 'cell', did you mean 'cells'?" in refused.err
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
+def test_the_tests_of_a_package_pass(installed, package, tmp_path):
+    pytest_run = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", package / "tests"]
     ended = subprocess.run(pytest_run, capture_output=True, text=True, cwd=tmp_path, env=environment(installed))
     assert ended.returncode == 0, ended.stdout
 
