@@ -60,6 +60,15 @@ def test_a_seed_gives_the_same_plan_with_or_without_a_table(plan, tmp_path):
     assert one["candidates"] == two["candidates"]
 
 
+def test_a_log_shows_the_best_cost_after_each_round(plan, monkeypatch):
+    for seconds in ("FIRST_LINE", "LINE_EVERY"):
+        monkeypatch.setattr(f"persist_cli.viewing.console.{seconds}", 0.0)  # every line is due
+    result = plan("--cost", "distance", "--json")
+    assert result.code == 0, result.err
+    for number, one in enumerate(json.loads(result.out)["rounds"], 1):
+        assert f", round {number} of 2, best cost {one['least_cost']:.4g}\n" in result.err
+
+
 def test_a_ranked_policy_towards_a_place_on_the_map(plan, tmp_path):
     result = plan("--method", "rank", "--policy", "straight", "--set", "cost.unknown=1.5", goal="1.0,-0.5")
     assert result.code == 0, result.err
