@@ -283,9 +283,8 @@ def make_world(
 def make_planner(row: PlanningRow, policy: Policy | None, settings: PlanSettings, horizon: int) -> Planner:
     """Return the planner of a row that imagines."""
     if row.planner == "cem":
-        shift = settings.cem.shift if settings.keep else 0.0
-        sizes = {"horizon": horizon, "candidates": row.candidates, "rounds": settings.rounds}
-        return Cem(replace(settings.cem, shift=shift, **sizes), policy)
+        cem = settings.cem if settings.keep else replace(settings.cem, shift=0.0)
+        return Cem(replace(cem, horizon=horizon, candidates=row.candidates, rounds=settings.rounds), policy)
     if policy is None:
         raise ValueError(f"row {row.name!r} ranks and has no policy")
     return Rank(policy, RankSettings(horizon=horizon, candidates=row.candidates, keep=settings.keep))
