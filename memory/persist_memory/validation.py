@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from enum import IntEnum
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +18,8 @@ from persist_cli.errors import CheckpointError, DataError
 Shape = tuple[int | None, ...]  # None first: as many rows as the first tensor has; None later: any size
 
 ORIGINS = "origins"  # the tensor with the origin of each stored item
+
+NAMED = 5  # names that a message lists at most
 
 
 def check_observations(observations: Observations, where: str) -> None:
@@ -93,15 +97,37 @@ def check_classes(classes: Tensor, count: int, where: str, what: str = "a cell")
 
 
 def check_mergeable(memory: Memory, other: Memory) -> None:
-    """Raise ``CheckpointError`` naming the first difference that keeps two memories apart."""
-    pairs = {
+    """Raise ``CheckpointError`` naming the first difference that keeps two memories apart.
+
+    Settings that are ``changeable`` may differ.
+    """
+    pairs: dict[str, tuple[Any, Any]] = {
         "memory": (memory.name, other.name),
         "frame of reference": (memory.reference.name, other.reference.name),
         "up axis": (memory.reference.world_up, other.reference.world_up),
-        "settings": (memory.settings, other.settings),
         "encoder": (memory.encoder.name, other.encoder.name),
-        "encoder settings": (memory.encoder.settings, other.encoder.settings),
     }
+    mine, theirs = _settings_of(memory), _settings_of(other)
+    pairs |= {name: (value, theirs.get(name)) for name, value in mine.items()}
     for what, (first, second) in pairs.items():
         if first != second:
-            raise CheckpointError(f"memories differ in {what} and cannot be merged: {first} and {second}")
+            raise CheckpointError(f"memories differ in {what} and cannot be merged: {_contrast(first, second)}")
+
+
+def _settings_of(memory: Memory) -> dict[str, Any]:
+    """The settings of a memory and its encoder by name, as in ``memory.size``, without those that are changeable."""
+    own = {f"memory.{name}": value for name, value in _values(memory.settings).items() if name not in memory.changeable}
+    return own | {f"encoder.{name}": value for name, value in _values(memory.encoder.settings).items()}
+
+
+def _values(settings: Any) -> dict[str, Any]:
+    return {field.name: getattr(settings, field.name) for field in fields(settings)}
+
+
+def _contrast(first: Any, second: Any) -> str:
+    """Two values that differ, in words; of lists of names, such as palettes, the names that only one has."""
+    if isinstance(first, tuple) and all(isinstance(name, str) for name in (*first, *second)):
+        alone = sorted({*first} ^ {*second})
+        if alone:
+            return f"only one has {', '.join(alone[:NAMED])}{', …' if len(alone) > NAMED else ''}"
+    return f"{first} and {second}"

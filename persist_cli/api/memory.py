@@ -98,7 +98,7 @@ class Memory(ABC):
     settings_type: ClassVar[type] = NoSettings
     usual_encoder: ClassVar[str] = "patches"  # the encoder when nobody names one
     reads_depth: ClassVar[bool] = True  # where it is false, ``memorize`` hides all depth from ``write``
-    changeable: ClassVar[frozenset[str]] = frozenset()  # settings on which the form of tokens does not depend
+    changeable: ClassVar[frozenset[str]] = frozenset()  # settings on which neither cells nor tokens depend in form
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any, encoder: Encoder, reference: FrameOfReference) -> None:

@@ -141,7 +141,9 @@ def _memory(checkpoint: Checkpoint, name: str, options: PlayOptions, start: Traj
     kind = adapter_memory(checkpoint, name).name
     files = [Path(text) for text in options.given if _is_file(text) and read_header(Path(text))["memory"] == kind]
     if len(files) > 1:
-        raise CheckpointError(f"{files[1]}: a second memory of kind {kind!r}; give one, or `persist merge` them")
+        raise CheckpointError(
+            f"{files[1]}: a second memory of kind {kind!r}; give one, or `persist memorize --merge` them"
+        )
     plan = replace(options.begin.plan, memory=files[0] if files else None)
     return open_memory(checkpoint, name, plan, start.info)
 

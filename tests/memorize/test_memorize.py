@@ -135,6 +135,45 @@ def test_memories_that_cannot_be_merged_are_refused_in_one_line(data, tmp_path, 
     assert not (tmp_path / "merged").exists()
 
 
+def test_scenes_that_imagine_in_different_ways_are_merged_and_the_first_one_stays_as_it_imagines(
+    data, tmp_path, capsys
+):
+    for name in "ab":
+        memorize(capsys, f"{data}#{name}", "--memory", "scene", "--set", "memory.seed=1", "--out", tmp_path / name)
+    other = load_memory(tmp_path / "b")
+    other.settings = replace(other.settings, model="elsewhere", seed=2, steps=3, foresight=2.0)
+    other.save(tmp_path / "b")
+    memorize(capsys, f"{data}#a", f"{data}#b", "--memory", "scene", "--out", tmp_path / "both")
+    memorize(capsys, "--merge", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "merged")
+    first, both, merged = (load_memory(tmp_path / name) for name in ("a", "both", "merged"))
+    assert merged.settings == first.settings
+    assert torch.equal(merged.cells.classes, both.cells.classes)
+
+
+@pytest.mark.parametrize(
+    ("setting", "cause"),
+    [
+        ("memory.size=0.5", "memory.size and cannot be merged: 0.25 and 0.5"),
+        (
+            "memory.palette=[free, solid, outside, sofa, bed]",
+            "memory.palette and cannot be merged: only one has bed, sofa",
+        ),
+        ("memory.palette=[free, solid, outside, a, b, c, d, e, f]", "only one has a, b, c, d, e, …"),
+        ("memory.toggles=[box, solid]", "memory.toggles and cannot be merged: ('solid', 'box') and ('box', 'solid')"),
+        ("encoder.classes=300", "encoder.classes and cannot be merged: 32 and 300"),
+    ],
+)
+def test_scenes_of_other_cells_are_not_merged_and_only_the_setting_that_differs_is_named(
+    data, tmp_path, capsys, setting, cause
+):
+    for name, settings in (("a", ()), ("b", ("--set", setting))):
+        memorize(capsys, f"{data}#{name}", "--memory", "scene", *settings, "--out", tmp_path / name)
+    line = failure(capsys, "--merge", tmp_path / "a", tmp_path / "b", "--out", tmp_path / "merged")
+    assert line.endswith(cause)
+    assert f"{tmp_path / 'a'} and {tmp_path / 'b'}: memories differ in" in line
+    assert not (tmp_path / "merged").exists()
+
+
 def test_plugin_settings_go_to_memory_or_encoder_by_their_first_word():
     parsed = plugin_settings(["memory.cell=[1, 2, 3]", "encoder.seed=4", "memory.max_depth=null"])
     assert parsed == {"memory": {"cell": [1, 2, 3], "max_depth": None}, "encoder": {"seed": 4}}

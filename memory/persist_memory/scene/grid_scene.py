@@ -274,9 +274,10 @@ class GridScene(Scene):
         """Add the cells of another scene: observed ones as if its frames had been written here.
 
         Of other cells the higher origin stays, and of equal ones the own; so do the own view and what is carried here.
+        Model, steps, seed and foresight may differ, and the own ones stay.
 
         Raises:
-            CheckpointError: when the two differ in settings, such as the size of cells, or the place.
+            CheckpointError: when the two differ in another setting, such as the size of cells, or the place.
         """
         check_mergeable(self, other)
         if not isinstance(other, GridScene):
