@@ -11,15 +11,18 @@ import torch
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
+from persist_cli.checkpoints.scene_models import find_scene_model, save_scene_model
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.data.store_header import schema
 from persist_cli.errors import PersistError
 from persist_cli.io import checksums
 from persist_cli.io.checksums import verifying
 from persist_cli.memorize.memory_file import load_memory
+from persist_cli.plugins import make_scene_model
 from persist_cli.train.state import TrainingState
 from tests.support.damage import copied, damages, files_below, without_sums
 from tests.support.export_runs import write_runs
+from tests.support.micro_scenes import MICRO_SCENE
 
 PLACES = 51  # as many flips, zeroed bytes and truncations
 
@@ -60,12 +63,19 @@ def test_no_damaged_checkpoint_or_adapter_is_loaded_as_if_whole(runs, tmp_path, 
         load(tmp_path / "voxel")  # which is whole again
 
 
-@pytest.mark.parametrize("kind", ["voxel", "map2d", "snapshots", "none"])
+@pytest.mark.parametrize("kind", ["voxel", "map2d", "snapshots", "none", "scene"])
 def test_no_damaged_memory_is_loaded_as_if_whole(kind, walks, persist, tmp_path):
-    path = tmp_path / "m.safetensors"
-    assert persist("memorize", f"{walks}#0:0-6", "--memory", kind, "--encoder", "patches", "--out", path).code == 0
+    path, encoder = tmp_path / "m.safetensors", "classes" if kind == "scene" else "patches"
+    assert persist("memorize", f"{walks}#0:0-6", "--memory", kind, "--encoder", encoder, "--out", path).code == 0
     assert taken_for_whole([path], lambda: load_memory(path)) == []
     load_memory(path)
+
+
+def test_no_damaged_model_of_scenes_is_loaded_as_if_whole(tmp_path):
+    save_scene_model(make_scene_model("scene", MICRO_SCENE), "scene", tmp_path, None)
+    assert {"codec.safetensors", "transformer.safetensors"} < {file.name for file in files_below(tmp_path)}
+    assert taken_for_whole(files_below(tmp_path), lambda: find_scene_model(tmp_path).load()) == []
+    find_scene_model(tmp_path).load()
 
 
 def test_no_damaged_training_state_is_loaded_as_if_whole(stage1, tmp_path):

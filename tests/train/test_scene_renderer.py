@@ -185,14 +185,26 @@ def test_another_size_of_cells_for_a_renderer_that_is_trained_on_is_refused(rend
     assert "memory and settings come with that adapter; leave out memory" in result.err
 
 
-def test_a_scene_of_other_classes_than_the_renderers_is_refused_in_one_line(renderer, cells, persist, tmp_path):
+@pytest.mark.parametrize(
+    ("setting", "cause"),
+    [
+        (
+            f"memory.palette={json.dumps([*FORM.palette, 'piano'])}",
+            "its classes of cells are not those that the adapter draws; they differ in piano",
+        ),
+        ("memory.size=0.5", "its cells are 0.5 m wide, those that the adapter draws 0.25 m"),
+    ],
+)
+def test_a_scene_of_other_cells_than_the_renderers_is_refused_in_one_line(
+    renderer, cells, persist, tmp_path, setting, cause
+):
     scene, start = tmp_path / "scene.safetensors", f"{cells}#0:0"
-    palette = json.dumps([*FORM.palette, "piano"])
-    made = persist("memorize", start, "--memory", "scene", "--set", f"memory.palette={palette}", "--out", scene)
+    made = persist("memorize", start, "--memory", "scene", "--set", setting, "--out", scene)
     assert made.code == 0, made.err
-    result = persist("rollout", renderer, "--start", start, "--memory", scene, "--actions", "left", "--out", tmp_path)
-    assert result.code == 1
-    assert "its classes of cells are not those that the adapter draws; they differ in piano" in result.err
+    out = tmp_path / "rollout"
+    result = persist("rollout", renderer, "--start", start, "--memory", scene, "--actions", "left", "--out", out)
+    assert (result.code, result.err.strip().splitlines()[-1]) == (1, f"error: {scene}: {cause}")
+    assert not out.exists()
 
 
 def test_the_recipe_of_the_renderer_has_the_classes_of_the_houses():
