@@ -36,6 +36,17 @@ def test_the_codec_needs_moments_for_its_own_parameters_alone(persist):
     assert (codec["optimizer"], rest["optimizer"]) == (8 * record["scene-codec"], 8 * record["scene"])
 
 
+def test_the_model_of_persists_size_is_planned_as_the_page_of_sizes_says(persist):
+    record = plan(persist, "scene-persist-size", "training.accumulation=64")
+    count, trained = record["total"]["parameters"], record["total"]["trained"]["scene"]
+    need = record["strategies"][0]["need"]
+    assert round(count / 1e6) == 322
+    assert round(need["peak"] / 2**30) == 8
+    assert 4 * count <= need["weights"] < 4.001 * count
+    assert need["optimizer"] == 8 * trained
+    assert need["activations"] > need["weights"]  # of a single sample
+
+
 def test_a_model_of_scenes_is_not_sharded(persist):
     ended = persist("doctor", "tiny-scene", "--gpus", "2", "--gpu-memory", "24", "--fsdp")
     assert (ended.code, "a model of scenes is not sharded" in ended.err) == (1, True)
