@@ -124,6 +124,17 @@ def find_scene_model(path: str | Path) -> TrainedSceneModel:
     )  # fmt: skip
 
 
+def packaged_scene_model() -> str | None:
+    """Return what names the model that comes with the package, ``None`` where none does.
+
+    It is a name, or the folder where that name would be a file or folder of the user.
+    """
+    folder = bundled_folder(PACKAGED)
+    if not (folder / SCENE_CARD).is_file():
+        return None
+    return str(folder.absolute()) if Path(PACKAGED).exists() else PACKAGED
+
+
 def with_absolute_model(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a scene with the place of its model absolute, so that they hold in every folder.
 

@@ -12,7 +12,7 @@ import yaml
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory
-from persist_cli.checkpoints.scene_models import with_absolute_model
+from persist_cli.checkpoints.scene_models import packaged_scene_model, with_absolute_model
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
@@ -31,7 +31,7 @@ class MemorizePlan:
         settings: texts ``memory.KEY=VALUE`` and ``encoder.KEY=VALUE``, values as in YAML.
         checkpoint: folder of the checkpoint whose adapter shall read the memory, ``None`` when none is named.
         model: name or folder of the model that imagines in a scene, ``None`` when none is named.
-        complete: whether the scene is completed around the last frame.
+        complete: whether the scene is completed around the last frame, by the packaged model where none is named.
         seed: seed of what is imagined.
     """
 
@@ -52,6 +52,15 @@ def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]
     """
     if plan.model is not None:
         return _with_model(plan)
+    config, origin = _without_model(plan)
+    packaged = packaged_scene_model() if plan.complete and config.name == SCENE else None
+    if packaged is not None and config.settings.get("model") is None:
+        config = replace(config, settings=config.settings | {"model": packaged})
+    return config, origin
+
+
+def _without_model(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
+    """The configuration that the plan's own settings or an adapter give."""
     own = plan.encoder is not None or bool(plan.settings)
     if own and plan.checkpoint is not None:
         raise PersistError("--checkpoint brings memory settings and encoder along; leave out --encoder and --set")

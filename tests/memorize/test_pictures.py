@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from persist_cli.api.cells import CellOrigin
 from persist_cli.api.geometry import unproject
 from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.data.reference import parse_reference
-from persist_cli.memorize.memory_file import load_memory
+from persist_cli.memorize.memory_file import load_memory, load_paths
+from persist_cli.viewing.map import draw_map
 from tests.memorize.test_memorize import failure, memorize, succeed
 from tests.support.cell_rooms import FORM
 from tests.support.micro_scenes import micro_model
@@ -94,7 +99,14 @@ def test_frames_of_data_are_completed_too_and_their_map_shows_what_is_imagined(m
     result = memorize(capsys, f"{tmp_path}/data#0:0", "--model", model, "--complete", "--out", out)
     assert result["memory"] == "scene"
     assert result["imagined"] > result["observed"] > 50
-    assert out.with_suffix(".png").is_file()
+    scene, drawn = load_memory(out), out.with_suffix(".png").read_bytes()
+    points, up, again = scene.points(), scene.reference.world_up, tmp_path / "again.png"
+    draw_map(points, up, load_paths(out), again)
+    assert again.read_bytes() == drawn
+    draw_map(
+        replace(points, origins=torch.full_like(points.origins, int(CellOrigin.OBSERVED))), up, load_paths(out), again
+    )
+    assert again.read_bytes() != drawn
 
 
 def test_a_second_picture_takes_the_place_of_the_first_one(hall, tmp_path, capsys):
@@ -125,6 +137,26 @@ def test_a_scene_finds_its_model_from_every_folder(hall, model, tmp_path, capsys
     scene = load_memory(out)
     assert scene.wanted_model == str(model)
     assert scene.complete(seed=1) > 0
+
+
+def test_the_packaged_model_imagines_where_none_is_named(hall, model, tmp_path, capsys, monkeypatch):
+    shutil.copytree(model, tmp_path / "home/scene")
+    monkeypatch.setenv("PERSIST_REFERENCE", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    picture, out = (hall / "hall.png", "--depth", hall / "hall.npy", "--memory", "scene"), tmp_path / "out.safetensors"
+
+    def house(*arguments):
+        memorize(capsys, *picture, "--complete", "--seed", 3, *arguments, "--out", out)
+        return load_memory(out)
+
+    named, by_name, unnamed = (house(*words) for words in (("--model", model), ("--model", "scene"), ()))
+    assert by_name.wanted_model == unnamed.wanted_model == "scene"
+    (tmp_path / "scene").mkdir()  # which now is what the name means
+    beside = house()
+    assert beside.wanted_model == str(tmp_path / "home/scene")
+    assert all(torch.equal(one.cells.classes, named.cells.classes) for one in (by_name, unnamed, beside))
+    assert memorize(capsys, *picture, "--out", out)["imagined"] == 0
+    assert load_memory(out).wanted_model is None
 
 
 def test_a_picture_is_not_replaced_by_the_map_of_its_scene(hall, tmp_path, capsys):
@@ -164,7 +196,11 @@ def test_a_picture_is_cropped_and_resized_as_a_model_needs(hall, tmp_path, capsy
         (["--depth", "hall.npy", "--fov", "200"], "between 10 and 150"),
         (["--depth", "hall.npy", "--depth-model", "some"], "not both"),
         (["--depth-model", "empty"], "no usable folder"),
-        (["--depth", "hall.npy", "--complete"], "no model that imagines"),
+        (["--depth", "hall.npy", "--complete"], "no model that imagines; name a trained one by --model FOLDER"),
+        (
+            ["--depth", "hall.npy", "--complete", "--model", "scene"],
+            "no model of scenes comes with this installation; train",
+        ),
         (["--depth", "hall.npy", "--model", "nowhere"], "nowhere"),
     ],
 )
