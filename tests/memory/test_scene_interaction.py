@@ -9,11 +9,12 @@ from persist_cli.api.ground import Body
 from persist_cli.api.scene_edits import Remove
 from persist_cli.errors import CheckpointError
 from persist_cli.memorize.memory_file import load_memory
-from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, WALL, camera_at, cell_room
+from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, FORM, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.scene_worlds import rendering
 
 ACTIONS = walking_actions()
+DOOR = FORM.palette.index("door")
 BEFORE_BOX = (5, 4, 5), (9, 4, 5)  # a metre before the box
 BEFORE_TABLE = (2, 7, 5), (9, 7, 5)
 
@@ -79,6 +80,15 @@ def test_toggling_turns_the_colour_of_a_box_into_its_complement_and_back():
     assert do(scene, "toggle")
     assert torch.equal(now(), color)
     assert not do(scene, "toggle", BEFORE_TABLE)  # a table cannot be toggled
+
+
+def test_a_door_is_no_thing_and_is_not_toggled_even_where_it_is_listed():
+    grid = cell_room()
+    grid.classes[BOX_CELLS] = DOOR
+    scene = empty_scene(toggles=["box", "door"])
+    scene.add(grid)
+    assert not do(scene, "toggle")
+    assert torch.equal(scene.cells.box(grid.corner, grid.shape).colors, grid.colors)
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ class GridSceneSettings:
         foresight: metres of depth up to which what an agent will see is imagined before it looks.
         evolution: whether things are picked up, dropped and toggled by rules, or as the scene model says.
         carries: metres along each axis of the largest thing that can be picked up.
-        toggles: classes of the things that can be toggled.
+        toggles: classes of the things whose colour toggling turns into its complement; walls and doors are no things.
     """
 
     size: Length = 0.25
