@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.cells import CellGrid
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.ground import Body, Cover
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
@@ -31,10 +32,11 @@ from persist_cli.data.held_out import was_trained_on
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
 from persist_cli.io.files import check_folder, write_json
-from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.memorize.factory import MemoryFactory, as_scene
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.navigation.ways import way_is_free
 from persist_cli.plugins import check_simulator, make_simulator
+from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say
@@ -46,6 +48,7 @@ FORMAT, VERSION = "persist-collisions", 1
 KNOWLEDGE: Final = {
     "true map": "all true frames so far",
     "true frame": "the present true frame alone",
+    "true cells": "the true cells of the scene",
     "own map": "the true start frame and all frames imagined since, whose memory holds them too",
     "own frame": "the present imagined frame alone: its predicted depth",
     "memory": "the points of a memory of all true frames so far",
@@ -102,12 +105,14 @@ class TrueWalk:
         frames: that were seen, the start first.
         taken: the action before each of them but the first.
         attempts: all steps forward and backward.
+        cells: of the scene; ``None`` where the simulator knows none.
     """
 
     info: TrajectoryInfo
     frames: Observations
     taken: tuple[str, ...]
     attempts: tuple[Attempt, ...]
+    cells: CellGrid | None = None
 
 
 def run_collisions(path: Path | None, plan: CollisionPlan, out: Path, as_json: bool) -> None:
@@ -201,7 +206,8 @@ def random_walk(simulator: Simulator, random: np.random.Generator, actions: int)
         refused.clear()
         taken.append(action)
         frames.append(simulator.observe())
-    return TrueWalk(simulator.info, observations_of(frames, simulator.info), tuple(taken), tuple(attempts))
+    seen = observations_of(frames, simulator.info)
+    return TrueWalk(simulator.info, seen, tuple(taken), tuple(attempts), simulator.cells())
 
 
 def measure(
@@ -225,6 +231,8 @@ def measure(
         for walks in houses:
             count("true map", [map_verdicts(walk, walk.frames) for walk in walks], walks)
             count("true frame", [frame_verdicts(walk, walk.frames) for walk in walks], walks)
+            if walks[0].cells is not None:
+                count("true cells", [cell_verdicts(walk) for walk in walks], walks)
             bar.advance(task)
         for name, adapter in adapters.items():
             load_adapter(backbone, checkpoint, adapter)
@@ -276,6 +284,18 @@ def frame_verdicts(walk: TrueWalk, frames: Observations) -> list[Cover]:
         mapper.add(frames[attempt.frame : attempt.frame + 1])
         verdicts.append(verdict(walk, attempt, mapper, body))
     return verdicts
+
+
+def cell_verdicts(walk: TrueWalk) -> list[Cover]:
+    """Return the verdict on each attempt by the true cells of the scene alone, which are known everywhere."""
+    assert walk.cells is not None
+    form, body = walk.cells.form, body_of(walk.info)
+    config = MemoryConfig("scene", {"size": form.size, "palette": list(form.palette)}, "classes", {})
+    scene = as_scene(MemoryFactory.of(config).empty(walk.info))
+    scene.add(walk.cells)
+    mapper = GroundMapper(walk.info.world_up, body)
+    mapper.add_memory(scene, mapper.floor_under(walk.frames.cameras.centers[0]))
+    return [verdict(walk, attempt, mapper, body) for attempt in walk.attempts]
 
 
 def memory_verdicts(walk: TrueWalk, factory: MemoryFactory) -> list[Cover]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from persist_cli.api.ground import Cover
-from persist_cli.bench.collisions import frame_verdicts, map_verdicts, outcomes, random_walk, row_json
+from persist_cli.bench.collisions import cell_verdicts, frame_verdicts, map_verdicts, outcomes, random_walk, row_json
 from tests.support.miniworlds import make_world
 
 
@@ -50,6 +50,16 @@ def test_what_a_map_of_true_frames_takes_for_blocked_the_simulator_refuses():
     assert both > missed
 
 
+def test_true_cells_miss_next_to_no_step_that_the_simulator_refuses():
+    world = make_world()
+    world.open_scene(1_100_001)
+    walks = [random_walk(world, np.random.default_rng(seed), 24) for seed in range(4)]
+    both, said, missed, neither, _ = sum(outcomes(cell_verdicts(walk), walk) for walk in walks)
+    assert both > 10 * missed
+    assert both > said
+    assert neither > 10
+
+
 def test_a_verdict_uses_no_frame_that_comes_after_it(walk):
     early = [attempt for attempt in walk.attempts if attempt.frame < 12]
     cut = map_verdicts(walk, walk.frames[:12])[: len(early)]
@@ -75,7 +85,7 @@ def test_the_command_writes_a_row_for_each_way_to_know(persist, voxel, tmp_path)
     assert result.code == 0, result.err
     rows = json.loads((tmp_path / "c.json").read_text())["rows"]
     models = ["voxel, own map", "voxel, own frame", "voxel, memory", "stage1, own map", "stage1, own frame"]
-    assert [row["name"] for row in rows] == ["true map", "true frame", *models]
+    assert [row["name"] for row in rows] == ["true map", "true frame", "true cells", *models]
     assert len({row["steps"] for row in rows}) == 1
     for wrong, cause in ((("--memories", "map2d"), "'map2d'"), (("--scenes", "5:5"), "5:5"), (("--split", "x"), "'x'")):
         result = persist("bench", "collisions", voxel, *options, *wrong)
