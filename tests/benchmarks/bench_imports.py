@@ -1,7 +1,8 @@
 """How long a rollout takes from the shell to its files: ``python tests/benchmarks/bench_imports.py``; asserts nothing.
 
 Six frames of the reference model, in a process of their own, beside importing torch alone, the model's classes as
-persist imports them, and the same classes as diffusers does.
+persist imports them, and the same classes as diffusers does; and the model of scenes, alone and with the scheduler of
+diffusers that would take its steps.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from tests.benchmarks.timing import alternate, say_conditions
 
 ROLLOUT = ("-m", "persist_cli", "rollout", "--start", "sample#0:32", "--actions", "left*6", "--out")
 CLASSES = "AutoencoderKLCogVideoX, CogVideoXTransformer3DModel, UniPCMultistepScheduler"
+SCENES = "import persist_memory.scene_models.scene_diffusion"
+SCHEDULER = "from diffusers import FlowMatchEulerDiscreteScheduler"
 REFERENCE = "import torch"
 
 if __name__ == "__main__":
@@ -28,6 +31,8 @@ if __name__ == "__main__":
             REFERENCE: ["-c", "import torch"],
             "the model's classes": ["-c", "import persist_backbones.diffusers_models"],
             "the same by diffusers": ["-c", f"from diffusers import {CLASSES}"],
+            "the model of scenes": ["-c", SCENES],
+            "the same with a scheduler of diffusers": ["-c", f"{SCENES}; {SCHEDULER}"],
             "persist rollout": [*ROLLOUT, str(Path(folder) / "rollout")],
         }  # fmt: skip
         times = alternate({name: partial(run, arguments) for name, arguments in programs.items()}, rounds=5)

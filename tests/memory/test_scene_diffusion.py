@@ -15,7 +15,14 @@ from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import make_scene_model
 from persist_memory.scene_models.codec import channels_first, fold, unfold, unfolded_cells
 from persist_memory.scene_models.conditions import draw_levels, known_tokens
-from persist_memory.scene_models.scene_diffusion import SceneDiffusion, generators_of, noise_levels, start, truth
+from persist_memory.scene_models.scene_diffusion import (
+    SceneDiffusion,
+    generators_of,
+    noise_levels,
+    noise_like,
+    start,
+    truth,
+)
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 from tests.support.micro_scenes import MICRO_SCENE, micro_model, micro_samples
 from tests.support.random_scenes import PALETTE
@@ -207,11 +214,37 @@ def test_noise_levels_fall_from_one_to_zero(shift):
     assert levels == sorted(levels, reverse=True)
 
 
-def test_guidance_of_one_changes_nothing_and_more_changes_the_sample(samples):
-    guided = micro_model(sampling={"guidance": 3.0})
+def test_where_nothing_is_given_the_steps_are_those_of_the_scheduler_of_diffusers(samples):
+    from diffusers import FlowMatchEulerDiscreteScheduler
+
+    model, steps = moving(micro_model()), 6
+    samples = replace(samples, given=torch.zeros_like(samples.given))
+    scheduler = FlowMatchEulerDiscreteScheduler(shift=model.settings.sampling.shift)
+    scheduler.set_timesteps(sigmas=[1 - step / steps for step in range(steps)])
+    assert scheduler.sigmas.allclose(torch.tensor(noise_levels(steps, scheduler.shift)), atol=1e-6)
     with torch.no_grad():
-        for parameter in guided.transformer.parameters():
+        generators = generators_of(samples)
+        latents = noise_like(model.codec.encode(*start(samples)), generators)
+        told = model.tell(samples, generators, torch.zeros(len(samples.given), dtype=torch.bool))
+        for level, timestep in zip(scheduler.sigmas, scheduler.timesteps, strict=False):
+            of_tokens = level.expand(known_tokens(samples, model.settings).shape)
+            velocity = model.transformer(latents, of_tokens, told.given, told.view, told.action)
+            latents = scheduler.step(velocity, timestep, latents).prev_sample
+        logits, _ = model.codec.decode(latents)
+    logits[..., SOLID] = -torch.inf
+    assert (logits.argmax(-1) == model.sample(samples, steps)[0]).float().mean() > 0.999
+
+
+def moving(model):
+    """The model with a transformer whose velocities are not zero, as those of a new one are."""
+    with torch.no_grad():
+        for parameter in model.transformer.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+    return model
+
+
+def test_guidance_of_one_changes_nothing_and_more_changes_the_sample(samples):
+    guided = moving(micro_model(sampling={"guidance": 3.0}))
     plain = micro_model()
     plain.load_state_dict(guided.state_dict())
     assert not guided.sample(samples, 2)[0].equal(plain.sample(samples, 2)[0])
