@@ -177,6 +177,17 @@ def test_a_round_leaves_walks_that_say_where_they_were_walked_and_a_policy_that_
     assert not all(a.equal(b) for a, b in zip(before, after, strict=True))
 
 
+def test_a_policy_practises_in_a_scene_whose_walls_stop_it(learn, cell_houses, scene_renderer, tmp_path):
+    given = {"data": cell_houses, "model": scene_renderer, "frames": "0-20"}
+    result = learn("out", "--actions", "24", "--proposals", "1", **given)
+    assert result.code == 0, result.err
+    assert json.loads((tmp_path / "out/round-01/walks.json").read_text())["blocked"] > 0
+    for file in Store(tmp_path / "out/round-01/walks"):
+        assert file.info.source["practice"]["adapter"] == "scene"
+        places = file.poses()[:, [0, 2], 3].abs()
+        assert 0.25 < float(places.min()) < float(places.max()) < 3.75  # inside the walls of the first room
+
+
 def test_without_a_known_camera_height_nothing_stops_a_walk_unless_it_is_asked_for(walks, voxel, policy_run, tmp_path):
     plan = LearnPlan(
         views=(f"{walks}#0:0-12",), policy=str(policy_run), inside="model", checkpoint=voxel, adapter=None, rounds=1,

@@ -222,3 +222,22 @@ def test_a_memory_of_another_scene_is_one_line(plan, memory, walks):
     result = plan(*PLACE, "--memory", memory, start=f"{walks}#1:2", goal=f"{walks}#1:5")
     assert result.code == 1
     assert "its reference is 'room-0', wanted here is 'room-1'" in result.err
+
+
+def test_in_a_scene_the_wall_behind_the_agent_stops_plans_though_no_frame_of_theirs_shows_it(
+    persist, cell_houses, scene_renderer, tmp_path
+):
+    scene, place = tmp_path / "house.safetensors", {}
+    made = persist("memorize", f"{cell_houses}#0", "--checkpoint", scene_renderer, "--out", scene)
+    assert made.code == 0, made.err
+    before = scene.read_bytes()
+    for name, memory in (("known", ("--memory", scene)), ("unknown", ())):
+        back = ("--actions", "backward", "--horizon", 8, "--candidates", 2, "--rounds", 1, "--steps", 1)
+        goal = ("--start", f"{cell_houses}#0:0", "--goal=-1.5,2", "--cost", "distance", *memory)
+        result = persist("plan", scene_renderer, *goal, *back, "--out", tmp_path / name)
+        assert result.code == 0, result.err
+        record = json.loads((tmp_path / name / "plan.json").read_text())
+        place[name] = record["candidates"][0]["final_pose"][0][3]
+    assert place["unknown"] == pytest.approx(1.25 - 8 * 0.25)
+    assert 0.3 < place["known"] < 0.7  # the middle of the wall is at 0
+    assert scene.read_bytes() == before

@@ -16,10 +16,11 @@ from persist_cli.checkpoints.scene_models import find_scene_model, save_scene_mo
 from persist_cli.plugins import make_scene_model
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.simulators.house_cells import FORM as HOUSES
+from persist_cli.viewing.video import read_video
 from tests.support.cell_houses import FORM
 from tests.support.cell_walks import write_with_cells
 from tests.support.damage import without_sums
-from tests.support.micro_runs import run_persist, stage
+from tests.support.micro_runs import SIZE, run_persist, stage
 from tests.support.micro_scenes import MICRO_SCENE
 
 SCENE = [
@@ -138,6 +139,21 @@ def test_a_renderer_trained_on_true_cells_is_evaluated_on_its_own_scene_and_on_t
     rows = json.loads((tmp_path / "eval" / "metrics.json").read_text())["tables"][0]["rows"]
     assert [*rows] == ["stage1", "scene", "scene, true cells"]
     assert rows["scene, true cells"]["columns"]["psnr"] != rows["scene"]["columns"]["psnr"]
+
+
+@pytest.mark.parametrize("form", ["cross, heads: 2", "projected, heads: 2", "canvas"])
+def test_other_forms_of_adapter_read_scenes_too(form, cells, stage1, persist, tmp_path):
+    run, start = tmp_path / "run", ("--start", f"{cells}#0:0", "--follow", "--frames", 4, "--steps", 1)
+    adapter = f"adapter={{form: {form}, width: 16, token_budget: 256}}"
+    fast = ("training.steps=2", "training.warmup=0", "training.learning_rate=0.03")  # a new adapter says nothing
+    run_persist(*stage("stage2-voxel", cells, run, f"base={stage1}", *SCENE[:3], adapter, "data.true_cells=1", *fast))
+    made = persist("memorize", f"{cells}#0", "--checkpoint", run, "--out", tmp_path / "scene.safetensors")
+    assert made.code == 0, made.err
+    for name, memory in (("empty", ()), ("known", ("--memory", tmp_path / "scene.safetensors"))):
+        result = persist("rollout", run, *start, *memory, "--out", tmp_path / name)
+        assert result.code == 0, result.err
+    empty, known = (read_video(tmp_path / name / "rgb.mp4", SIZE, SIZE) for name in ("empty", "known"))
+    assert (known != empty).any()
 
 
 def test_true_cells_as_a_control_need_a_scene(voxel, held_out_cells, persist, tmp_path):
