@@ -204,7 +204,7 @@ def test_cells_of_another_size_or_palette_are_refused_in_one_line(change):
 
 
 def test_scenes_of_other_cell_sizes_cannot_be_merged():
-    with pytest.raises(CheckpointError, match="settings"):
+    with pytest.raises(CheckpointError, match=r"memory\.size and cannot be merged: 0\.25 and 0\.5"):
         scene(size=0.25).merge(scene(size=0.5))
 
 
