@@ -1,8 +1,8 @@
 """The part "edits" of the benchmark: whether an edit of the cells is seen in the rendered frames, and only there.
 
-A scene holds the true cells of a house. A thing is taken away, painted or put in at random, where the last frame of a
-clip sees it and the first one, which is given, does not. The clip is imagined before and after the edit with the same
-noise, and before it with other noise, which says how much sampling alone changes.
+A scene holds the true cells of a house. A thing is taken away, painted, put in, moved or copied at random, where the
+last frame of a clip sees it and the first one, which is given, does not. The clip is imagined before and after the edit
+with the same noise, and before it with other noise, which says how much sampling alone changes.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from persist_cli.api.cell_things import find_things
 from persist_cli.api.cells import FREE, CellGrid
 from persist_cli.api.observations import Observations
 from persist_cli.api.scene import Scene
-from persist_cli.api.scene_edits import Edit, Insert, Paint, Remove
+from persist_cli.api.scene_edits import Copy, Edit, Insert, Move, Paint, Remove
 from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.scenes.rendering import RenderedRow, Renderer, RendererLoader, rendered_rows, scene_row
-from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBench
+from persist_cli.bench.scenes.scene_bench import EDIT_KINDS, RenderingPlan, SceneBench
 from persist_cli.bench.scenes.views import View
 from persist_cli.data.reference import parse_reference
 from persist_cli.editing.locality import edit_locality, edited_pixels
@@ -34,8 +34,6 @@ from persist_cli.evaluate.statistics import Draws, mean_figure
 from persist_cli.viewing.console import add_task, progress, warn
 
 PART: Final = "edits"
-
-KINDS: Final = ("remove", "paint", "insert")
 
 COLORS: Final = ((220, 30, 30), (30, 180, 30), (40, 60, 220), (230, 210, 30), (210, 40, 200), (30, 200, 210))
 
@@ -46,6 +44,8 @@ AROUND: Final = 4  # pixels around the edit that are not counted as elsewhere: h
 TRIES: Final = 40  # of clips and edits for each edit that is wanted
 
 REACH: Final = (1.0, 3.5)  # metres from the camera within which a thing is put
+
+MOVED: Final = (0.75, 1.5)  # metres on the ground by which a thing is moved, or its copy put beside it
 
 OTHER_NOISE: Final = 1_000_000  # what a seed grows by for other noise; no other edit has that seed
 
@@ -110,7 +110,7 @@ def edit_name(row: RenderedRow, number: int) -> str:
 def draw_edit(bench: SceneBench, renderer: Renderer, number: int) -> EditTrial | None:
     """Draw a random edit that the last frame of a clip sees and its first one does not; ``None`` without any."""
     random = np.random.default_rng([bench.plan.seed, number])
-    kind = KINDS[number % len(KINDS)]
+    kind = EDIT_KINDS[number % len(EDIT_KINDS)]
     for _ in range(TRIES):
         view, path = draw_clip(bench, random, renderer.backbone.frames_per_clip)
         before = renderer.scene(view)
@@ -149,7 +149,23 @@ def draw_change(kind: str, cells: CellGrid, camera: Cameras, random: np.random.G
     if not things:
         return None
     box = things[int(random.integers(len(things)))].box
-    return Remove(low=box.low, high=box.high) if kind == "remove" else Paint(low=box.low, high=box.high, color=color)
+    match kind:
+        case "remove":
+            return Remove(low=box.low, high=box.high)
+        case "paint":
+            return Paint(low=box.low, high=box.high, color=color)
+        case "move":
+            return Move(low=box.low, high=box.high, by=draw_shift(cells, random))
+        case _:
+            return Copy(low=box.low, high=box.high, by=draw_shift(cells, random))
+
+
+def draw_shift(cells: CellGrid, random: np.random.Generator) -> tuple[float, float, float]:
+    """Return a random vector on the ground, in metres of the world."""
+    angle, length = random.uniform(-np.pi, np.pi), random.uniform(*MOVED)
+    ground = torch.tensor([length * np.cos(angle), length * np.sin(angle), 0.0], dtype=torch.float64)
+    x, y, z = (ground @ cells.axes).tolist()
+    return x, y, z
 
 
 def draw_insertion(
@@ -226,7 +242,7 @@ def edits_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     found = [record for record in records if record["scene"] is not None]
     if len(found) < len(records):
         warn(f"{len(records) - len(found)} of {len(records)} edits: no place was found that a clip comes to see")
-    groups = {"all": found} | {kind: [one for one in found if one["kind"] == kind] for kind in KINDS}
+    groups = {"all": found} | {kind: [one for one in found if one["kind"] == kind] for kind in EDIT_KINDS}
     return {
         "columns": {name: column.definition for name, column in COLUMNS.items()},
         "adapter": row.adapter,

@@ -46,6 +46,8 @@ PARTS: Final = ("completion", "walk", "return", "edits", "speed")
 
 RENDERED: Final = ("return", "edits")  # parts that need a checkpoint which draws scenes
 
+EDIT_KINDS: Final = ("remove", "paint", "insert", "move", "copy")  # edit number n is of kind n modulo their count
+
 MEMORY, ENCODER = "scene", "classes"
 
 
@@ -287,7 +289,7 @@ def part_identities(
     if plan.rendering is not None:
         rendering = rendering_identity(plan.rendering)
         parts["return"] = model | rendering | {"steps": plan.rendering.steps}
-        parts["edits"] = rendering | {"seed": plan.seed}
+        parts["edits"] = rendering | {"seed": plan.seed, "kinds": EDIT_KINDS}
     found = {name: values for name, values in parts.items() if name in plan.parts}
     if "completion" in plan.parts:
         looked_up = {"training houses": digest([house.scene for house in houses])}

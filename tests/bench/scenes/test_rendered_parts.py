@@ -6,9 +6,13 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.scene_edits import Copy, Move
+from persist_cli.bench.scenes.edit_part import MOVED, draw_change
 from persist_cli.bench.scenes.return_part import first_visit, obstacles, psnr, true_detail, true_pieces, walk_values
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, chosen_files, read_views
 from persist_cli.bench.scenes.scene_journal import SceneJournal
@@ -16,7 +20,8 @@ from persist_cli.io.files import read_tensors
 from persist_cli.metrics import i3d
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, WEIGHTS
 from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
-from tests.support.cell_houses import write_cell_houses
+from persist_memory.scene.editing import edit_grid
+from tests.support.cell_houses import TABLE, camera_in, two_rooms, write_cell_houses
 from tests.support.micro_runs import run_persist
 from tests.support.predictions import cache_random
 
@@ -55,6 +60,24 @@ def test_edits_are_rendered_and_counted_by_kind(measured: Path) -> None:
     assert part["wanted"] == 3
     assert part["rows"]["all"]["count"] == sum(row["count"] for name, row in part["rows"].items() if name != "all") > 0
     assert part["rows"]["all"]["outside"]["mean"] >= 0
+    assert 0 <= part["rows"]["all"]["local"]["mean"] <= 1
+    tables = (measured / "tables.md").read_text()
+    assert "| local ↑ |" in tables[tables.index("Random edits") :]
+
+
+@pytest.mark.parametrize(("kind", "edit", "tables"), [("move", Move, 8), ("copy", Copy, 16)])
+def test_a_thing_is_moved_or_copied_over_the_ground_by_a_metre_or_so(kind: str, edit: type, tables: int) -> None:
+    house = two_rooms()
+    house.classes[9:11, 7:9, 1:3] = TABLE
+    lens = torch.tensor([[16.0, 0, 16], [0, 16, 16], [0, 0, 1]])
+    camera = Cameras(camera_in(house)[None], lens[None], 32, 32)
+    drawn = [draw_change(kind, house, camera, np.random.default_rng(seed)) for seed in range(20)]
+    for change in drawn:
+        assert isinstance(change, edit)
+        assert MOVED[0] <= math.hypot(change.by[0], change.by[2]) <= MOVED[1]
+        assert change.by[1] == pytest.approx(0)
+    near = min(drawn, key=lambda change: change.by[0])  # towards the camera, where the room is free
+    assert int((edit_grid(house, [near], None)[0].classes == TABLE).sum()) == tables
 
 
 def test_frames_of_one_clip_are_not_compared_with_each_other() -> None:
