@@ -23,7 +23,8 @@ from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBench
 from persist_cli.bench.scenes.views import View
 from persist_cli.bench.scenes.walk_part import Wanderer, walk_name, walked
 from persist_cli.data.reference import parse_reference
-from persist_cli.evaluate.statistics import Draws, mean_figure, number
+from persist_cli.evaluate.statistics import Array, Draws, curve_figure, mean, mean_figure, number
+from persist_cli.evaluate.windows import least, window_bounds, window_values
 from persist_cli.metrics.fvd import LEAST_FRAMES, WEIGHTS
 from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
 from persist_cli.metrics.lpips import ALEX, LpipsAlex, perceptual_distance, tensor_shapes
@@ -35,6 +36,10 @@ from persist_cli.viewing.console import add_task, progress
 PART: Final = "return"
 
 MOST_TRIES: Final = 4  # actions for each frame of the way out; an agent that is shut in stops there
+
+WINDOW: Final = 16  # frames
+
+ALONG: Final = ("sharpness", "psnr")  # figures of each window
 
 COLUMNS: Final = {
     "psnr": FigureColumn(
@@ -48,6 +53,10 @@ COLUMNS: Final = {
         "sharpness", "higher", False,
         "mean energy of the Laplacian of the walk's imagined frames over that of the true frames of the measured "
         "houses' trajectories, which show other places",
+    ),
+    "sharpness_least": FigureColumn(
+        "sharpness, worst window", "higher", False,
+        f"the least of the means over windows of {WINDOW} frames, of the mean curve of all walks; fog is stable too",
     ),
     "fvd": FigureColumn(
         "FVD", "lower", False,
@@ -125,17 +134,19 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     detail = true_detail(true)
     length = RendererLoader(bench, plan).load(rows[0]).backbone.frames_per_clip - 1
     figures: dict[str, dict[str, Any]] = {}
-    videos = {}
+    windows, videos = {}, {}
     for row in rows:
         walks = [
             [bench.journal.samples(f"{PART} {row.name}", walk_name(view, seed)) for view in views]
             for seed in range(bench.plan.seeds)
         ]
         values = [[walk_values(walk, length, detail) for walk in of_seed] for of_seed in walks]
+        along = [[frame_values(walk, length, detail) for walk in of_seed] for of_seed in walks]
+        windows[row.name], least_sharp = window_figures(along, draws)
         figures[row.name] = {
             name: mean_figure(np.array([[[value[name] for value in seed] for seed in values]]), draws).to_json()
             for name in values[0][0]
-        }
+        } | {"sharpness_least": least_sharp}
         videos[row.name] = [piece for of_seed in walks for walk in of_seed for piece in pieces(walk["rgb"])]
     for name, distance in fvd_of_rows(videos, true).items():
         figures[name]["fvd"] = {"mean": number(distance), "low": None, "high": None}
@@ -145,6 +156,7 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
         "steps": plan.steps,
         "missing": obstacles(true),
         "rows": figures,
+        "windows": windows,
     }
 
 
@@ -157,18 +169,65 @@ def walk_values(walk: dict[str, Tensor], length: int, detail: float) -> dict[str
         detail: mean energy of the Laplacian of true frames; NaN without any.
     """
     rgb, out = walk["rgb"], int(walk["out"])
-    back = [frame for frame in range(out, len(rgb)) if frame - first_visit(frame, out) > length]
-    pairs = rgb[back], rgb[[first_visit(frame, out) for frame in back]]
+    back, first = compared_frames(walk, length)
     moved = walk["poses"][:out, :3, 3].diff(dim=0).norm(dim=1).sum()
     last = len(rgb) > out
+    along = frame_values(walk, length, detail)
     return {
-        "psnr": float(psnr(*pairs).mean()) if back else float("nan"),
-        "lpips": float(lpips(*pairs).mean()) if back and not lpips_obstacle(rgb) else float("nan"),
+        "psnr": float(mean(along["psnr"])),
+        "lpips": float(lpips(rgb[back], rgb[first]).mean()) if back and not lpips_obstacle(rgb) else float("nan"),
         "psnr_start": float(psnr(rgb[-1:], rgb[:1])) if last else float("nan"),
-        "sharpness": float(energy(rgb[1:], LAPLACIAN).mean()) / detail if last and detail else float("nan"),
+        "sharpness": float(mean(along["sharpness"])),
         "metres": float(moved),
         "rate": (len(rgb) - 1) / float(walk["seconds"]),
     }
+
+
+def compared_frames(walk: dict[str, Tensor], length: int) -> tuple[list[int], list[int]]:
+    """Return the frames of the way back that are compared, and those at the same poses on the way out."""
+    out = int(walk["out"])
+    back = [frame for frame in range(out, len(walk["rgb"])) if frame - first_visit(frame, out) > length]
+    return back, [first_visit(frame, out) for frame in back]
+
+
+def frame_values(walk: dict[str, Tensor], length: int, detail: float) -> dict[str, Array]:
+    """Return the figures ``ALONG`` of each frame of a walk, NaN where there is none; see ``walk_values``."""
+    rgb = walk["rgb"]
+    back, first = compared_frames(walk, length)
+    values = {name: np.full(len(rgb), np.nan) for name in ALONG}
+    values["psnr"][back] = psnr(rgb[back], rgb[first]).numpy()
+    if len(rgb) > int(walk["out"]) and detail:
+        values["sharpness"][1:] = energy(rgb[1:], LAPLACIAN).numpy() / detail
+    return values
+
+
+def window_figures(
+    walks: Sequence[Sequence[dict[str, Array]]], draws: Draws
+) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+    """Return the figures of each window of frames, and the sharpness of the worst, as JSON values.
+
+    Args:
+        walks: the figures of each frame, of each seed's walks; those of shorter walks end earlier.
+        draws: of the walks' houses.
+    """
+    frames = max(2, *(len(walk["psnr"]) for of_seed in walks for walk in of_seed))
+    bounds = window_bounds(frames, WINDOW)
+    curves = {name: window_means(walks, name, frames) for name in ALONG}
+    figures = {
+        f"{first}-{last}": {name: mean_figure(curve[0][..., place], draws).to_json() for name, curve in curves.items()}
+        for place, (first, last) in enumerate(bounds)
+    }
+    return figures, curve_figure(*curves["sharpness"], least, draws).to_json()
+
+
+def window_means(walks: Sequence[Sequence[dict[str, Array]]], name: str, frames: int) -> tuple[Array, Array]:
+    """Return means ``[1, seed, walk, window]`` of a figure over windows of frames, and how many frames have it."""
+    numbers = [np.arange(first, last + 1, dtype=np.int64) for first, last in window_bounds(frames, WINDOW)]
+    values = np.full((1, len(walks), len(walks[0]), frames), np.nan)
+    for seed, of_seed in enumerate(walks):
+        for place, walk in enumerate(of_seed):
+            values[0, seed, place, : len(walk[name])] = walk[name]
+    return window_values(values, np.ones_like(values), numbers)
 
 
 def first_visit(frame: int, out: int) -> int:

@@ -7,8 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.bench.scenes.plan_pictures import COLORS, ViewPictures
+from persist_cli.bench.scenes.plan_pictures import COLORS as PLAN_COLORS
+from persist_cli.bench.scenes.plan_pictures import ViewPictures
+from persist_cli.bench.scenes.scene_curves import curve_sections
 from persist_cli.bench.scenes.scene_tables import definitions, tables
+from persist_cli.evaluate.report.curves import COLORS, DARK_COLORS, HEIGHT, WIDTH
 from persist_cli.evaluate.report.templates import page_templates
 from persist_cli.io.files import write_text
 
@@ -23,8 +26,11 @@ def write_scene_report(results: Mapping[str, Any], pictures: Sequence[ViewPictur
         pictures: of some images.
         folder: of the page.
     """
+    curves = curve_sections(results)
+    styles = {style.number: style for curve in curves for style in curve.styles}
     page = page_templates("persist_cli.bench.scenes").get_template("scene_report.html.jinja").render(
         results=results, tables=tables(results, short=False), definitions=definitions(results), pictures=pictures,
-        colors=COLORS, command=shlex.join(results["command"]),
+        plan_colors=PLAN_COLORS, command=shlex.join(results["command"]), curves=curves, styles=list(styles.values()),
+        colors=COLORS, dark_colors=DARK_COLORS, width=WIDTH, height=HEIGHT,
     )  # fmt: skip
     write_text(folder / PAGE, page)

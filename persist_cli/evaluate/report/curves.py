@@ -126,12 +126,17 @@ def _frame_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]], fr
         # the last value is that of the last frame, whether or not the given first frame has one
         numbers = range(frames - len(curve.per_frame), frames)
         series.append(Series(style, list(numbers), curve.per_frame, [f"frame {number}" for number in numbers]))
+    return number_plot(f"{name}-frames", title, "frame", series)
+
+
+def number_plot(name: str, title: str, across: str, series: Sequence[Series]) -> Plot | None:
+    """A plot against whole numbers such as those of frames; ``None`` where no value is known."""
     known = _known(series)
     if not known:
         return None
     low, high = min(place for place, _ in known), max(place for place, _ in known)
     ticks = [(tick, f"{tick:.0f}") for tick in nice_ticks(low, high, 8) if tick == int(tick)]
-    return _lay_out(f"{name}-frames", title, "frame", series, (low, high), ticks)
+    return _lay_out(name, title, across, series, (low, high), ticks)
 
 
 def _share_plot(name: str, title: str, curves: Sequence[tuple[Style, Curve]]) -> Plot | None:

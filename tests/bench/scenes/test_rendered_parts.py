@@ -13,9 +13,20 @@ import torch
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.scene_edits import Copy, Move
 from persist_cli.bench.scenes.edit_part import MOVED, draw_change
-from persist_cli.bench.scenes.return_part import first_visit, obstacles, psnr, true_detail, true_pieces, walk_values
+from persist_cli.bench.scenes.return_part import (
+    WINDOW,
+    first_visit,
+    frame_values,
+    obstacles,
+    psnr,
+    true_detail,
+    true_pieces,
+    walk_values,
+    window_figures,
+)
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, chosen_files, read_views
 from persist_cli.bench.scenes.scene_journal import SceneJournal
+from persist_cli.evaluate.statistics import Draws
 from persist_cli.io.files import read_tensors
 from persist_cli.metrics import i3d
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, WEIGHTS
@@ -33,6 +44,7 @@ def measured(
     """A finished benchmark of the parts that draw frames."""
     out = tmp_path_factory.mktemp("bench") / "rendered"
     options = ("--data", cell_houses, "--parts", "return,edits", "--out", out, "--checkpoint", scene_renderer)
+    options = (*options, "--report", out / "report")
     small = ("--seeds", 1, "--walks", 1, "--return-steps", 9, "--edits", 3, "--denoising-steps", 1, "--radius", 2)
     words = (scene_model, *options, *small, "--memories", "scene,stage1", "--set", "memory.steps=1")
     run_persist("bench", "scene", *map(str, words))
@@ -51,6 +63,27 @@ def test_each_memory_is_a_row_and_a_scene_has_one_with_true_cells(measured: Path
     part = json.loads((measured / "metrics.json").read_text())["return"]
     assert [*part["rows"]] == ["scene", "scene, true grid", "stage1"]
     assert part["rows"]["scene"]["sharpness"]["mean"] > 0
+    assert [*part["windows"]] == [*part["rows"]]
+    page = (measured / "report" / "report.html").read_text()
+    assert "Along walks there and back" in page
+    assert page.count('class="line row-2"') == 2  # sharpness and PSNR of the third row
+
+
+def test_a_walk_that_fades_shows_in_the_worst_window_and_in_a_line_that_falls() -> None:
+    draw = torch.Generator().manual_seed(0)
+    rgb = torch.randint(0, 255, (2 * WINDOW + 1, 16, 16, 3), generator=draw, dtype=torch.uint8)
+    rgb[WINDOW + 1 :] = 128
+    walk = {"rgb": rgb, "poses": torch.eye(4).expand(len(rgb), 4, 4), "out": torch.tensor(WINDOW + 1)}
+    seen = frame_values(walk, 4, true_detail([rgb[: WINDOW + 1]]))
+    short = {name: values[:10] for name, values in seen.items()}
+    windows, worst = window_figures([[seen, short]], Draws.of([0, 1]))
+    assert [*windows] == [f"1-{WINDOW}", f"{WINDOW + 1}-{2 * WINDOW}"]
+    sharp = [window["sharpness"]["mean"] for window in windows.values()]
+    assert sharp == pytest.approx([1.0, 0.0], abs=0.1)
+    assert worst["mean"] == pytest.approx(sharp[1])
+    assert windows[f"1-{WINDOW}"]["psnr"]["mean"] is None  # on the way out there is nothing to compare with
+    whole = walk_values(walk | {"seconds": torch.tensor(1.0)}, 4, true_detail([rgb[: WINDOW + 1]]))
+    assert windows[f"{WINDOW + 1}-{2 * WINDOW}"]["psnr"]["mean"] == pytest.approx(whole["psnr"])
 
 
 def test_edits_are_rendered_and_counted_by_kind(measured: Path) -> None:

@@ -85,6 +85,8 @@ def test_the_report_shows_the_plans_of_every_row(measured: Path) -> None:
     page = (measured / "report" / "report.html").read_text()
     for words in ("model, seed 1", "plan: nearest house", "plan: truth", "plan: seen", "Cost of a completion"):
         assert words in page
+    for words in ("Along walks in imagined scenes", "<title>share of new cells against steps</title>"):
+        assert words in page
     assert "http" not in page.replace("http-equiv", "")  # it needs no other file
 
 
