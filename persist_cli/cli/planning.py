@@ -275,7 +275,7 @@ def bench_scene(
     data: Annotated[str, typer.Option(help="Test houses with cells, as `persist collect miniworld` writes them.")],
     model: Annotated[str | None, typer.Argument(help="A scene model; without one only the other rows.")] = None,
     train: Annotated[Path | None, typer.Option(help="Training houses, for the rows that look them up.")] = None,
-    parts: Annotated[str, typer.Option(help="Of completion, walk, speed, return, edits.")] = "completion",
+    parts: Annotated[str, typer.Option(help="Of completion, walk, speed, return, edits, evolution.")] = "completion",
     images: Annotated[int, typer.Option(min=1, help="Most images, each of another house.")] = 32,
     seeds: Annotated[int, typer.Option(min=1, help="Completions, and walks, of each image.")] = 3,
     radius: Annotated[float, typer.Option(min=0.5, help="Metres around the camera that are measured.")] = 5.0,
@@ -286,6 +286,7 @@ def bench_scene(
     memories: Annotated[str, typer.Option(help="Its adapters that go there and back, with commas.")] = "scene",
     return_steps: Annotated[int, typer.Option(min=1, help="Frames of a way out, and of the way back.")] = 64,
     edits: Annotated[int, typer.Option(min=1, help="Random edits.")] = 100,
+    interactions: Annotated[int, typer.Option(min=1, help="Most interactions of the data: evolution.")] = 100,
     denoising_steps: Annotated[int | None, typer.Option(min=1, help="Of the frames; the checkpoint's.")] = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
@@ -315,6 +316,6 @@ def bench_scene(
         rendering = RenderingPlan(checkpoint, split_names(memories), return_steps, sampling, placement)
     plan = SceneBenchPlan(
         model, data, train, split_names(parts), images, seeds, radius, houses, steps, walks, rendering, edits,
-        tuple(settings or ()), seed, allow_training_scenes,
+        interactions, tuple(settings or ()), seed, allow_training_scenes,
     )  # fmt: skip
     run_scene_bench(plan, out, report, json)

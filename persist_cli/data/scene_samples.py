@@ -297,9 +297,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
     def interactions(self, file: TrajectoryFile) -> list[Interaction]:
         """The interactions that a trajectory really did, in their order."""
         if file.path not in self._interactions:
-            names = {action.name for action in file.info.vocabulary.actions if action.interaction}
-            done = [Interaction(n, name) for n, name in enumerate(file.actions()) if name in names and name is not None]
-            self._interactions[file.path] = done
+            self._interactions[file.path] = interactions_of(file)
         return self._interactions[file.path]
 
     def carried(self, file: TrajectoryFile, frame: int) -> Carried:
@@ -315,6 +313,12 @@ class SceneSampleDataset(Dataset[SceneSamples]):
             return NOTHING
         red, green, blue = before.colors[gone].double().mean(dim=0).round().int().tolist()
         return Carried(int(before.classes[gone].mode().values), (red, green, blue))
+
+
+def interactions_of(file: TrajectoryFile) -> list[Interaction]:
+    """The interactions that a trajectory really did, in their order."""
+    names = {action.name for action in file.info.vocabulary.actions if action.interaction}
+    return [Interaction(n, name) for n, name in enumerate(file.actions()) if name in names and name is not None]
 
 
 def around(whole: CellGrid, window: CellGrid) -> CellGrid:

@@ -102,3 +102,38 @@ def seen_cells(grid: CellGrid, cameras: Cameras) -> Iterator[Frame]:
     for number, pose in enumerate(cameras.world_from_camera.numpy()):
         action = "left" if number + 1 < len(cameras) else None
         yield Frame(colors[number], depth[number], pose, action, number / 10, grid)
+
+
+def write_interactions(folder: Path, dropped: Sequence[tuple[int, int, int]], size: int = 16) -> Path:
+    """Write a data set of houses in which an agent toggles a thing, picks it up, turns left and puts it down.
+
+    Args:
+        folder: the folder to make.
+        dropped: the cell in which each house's thing is then.
+        size: pixels of the side of a frame.
+    """
+    folder.mkdir(parents=True)
+    matrix = torch.tensor([[size / 2, 0, size / 2], [0, size / 2, size / 2], [0, 0, 1]], dtype=torch.float64)
+    actions = ["toggle", "pick_up", *["left"] * 6, "drop", None]
+    for number, place in enumerate(dropped):
+        red, house = torch.tensor([200, 30, 40], dtype=torch.uint8), two_rooms()
+        grids = [with_table(house, (9, 8, 1), red), with_table(house, (9, 8, 1), 255 - red)]
+        grids += [house] * 7 + [with_table(house, place, 255 - red)]
+        vocabulary, pose = walking_actions(), camera_in(house)
+        info = TrajectoryInfo(
+            f"cells/{folder.name}-{number}", matrix, size, size, UP, vocabulary, {"simulator": "cells"}
+        )
+        frames = []
+        for time, (grid, action) in enumerate(zip(grids, actions, strict=True)):
+            [frame] = seen_cells(grid, Cameras(pose[None], matrix[None], size, size))
+            frames.append(Frame(frame.rgb, frame.depth, pose.numpy(), action, time / 10, grid))
+            pose = pose if action is None else vocabulary.move(pose, action, torch.tensor(UP).double())
+        write_trajectory(folder / f"house-{number}.parquet", info, frames)
+    return folder
+
+
+def with_table(house: CellGrid, cell: tuple[int, int, int], color: Tensor) -> CellGrid:
+    """The house with a table of one cell and colour in it."""
+    grid = house.copy()
+    grid.classes[cell], grid.colors[cell] = TABLE, color
+    return grid

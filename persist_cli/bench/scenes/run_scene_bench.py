@@ -8,6 +8,7 @@ from typing import Any, Final
 from persist_cli.bench.scenes.completion_part import completion_json, run_completion
 from persist_cli.bench.scenes.completions import SceneCompletion, Truth
 from persist_cli.bench.scenes.edit_part import edits_json, run_edits
+from persist_cli.bench.scenes.evolution_part import evolution_json, run_evolution
 from persist_cli.bench.scenes.plan_pictures import picture_views
 from persist_cli.bench.scenes.return_part import return_json, run_returns
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, identity, part_identities, prepare
@@ -69,6 +70,8 @@ def run_parts(bench: SceneBench) -> None:
         run_walks(bench)
     if "speed" in bench.plan.parts:
         run_speed(bench)
+    if "evolution" in bench.plan.parts:
+        run_evolution(bench)
     if "return" in bench.plan.parts and rendering is not None:
         run_returns(bench, rendering)
     if "edits" in bench.plan.parts and rendering is not None:
@@ -98,6 +101,8 @@ def results_json(bench: SceneBench) -> dict[str, Any]:
         results["walk"] = walk_json(bench)
     if "speed" in bench.plan.parts:
         results["speed"] = speed_json(bench)
+    if "evolution" in bench.plan.parts:
+        results["evolution"] = evolution_json(bench)
     if "return" in bench.plan.parts and rendering is not None:
         results["return"] = return_json(bench, rendering)
     if "edits" in bench.plan.parts and rendering is not None:

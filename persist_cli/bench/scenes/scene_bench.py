@@ -28,6 +28,7 @@ from persist_cli.bench.scenes.completions import (
     Scenes,
     Truth,
 )
+from persist_cli.bench.scenes.interactions import find_events
 from persist_cli.bench.scenes.scene_journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
@@ -42,7 +43,7 @@ from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.recipe import MemoryConfig
 from persist_cli.viewing.console import add_task, progress, warn
 
-PARTS: Final = ("completion", "walk", "return", "edits", "speed")
+PARTS: Final = ("completion", "walk", "return", "edits", "speed", "evolution")
 
 RENDERED: Final = ("return", "edits")  # parts that need a checkpoint which draws scenes
 
@@ -87,6 +88,7 @@ class SceneBenchPlan:
         walks: most views from which an agent walks.
         rendering: what draws the frames; ``None`` without such parts.
         edits: random edits of the part "edits".
+        interactions: most interactions of the part "evolution".
         settings: texts ``memory.KEY=VALUE``.
         seed: of the choice of frames.
         allow_training_scenes: whether houses that the model was trained on may be measured.
@@ -104,6 +106,7 @@ class SceneBenchPlan:
     walks: int = 4
     rendering: RenderingPlan | None = None
     edits: int = 100
+    interactions: int = 100
     settings: tuple[str, ...] = ()
     seed: int = 0
     allow_training_scenes: bool = False
@@ -171,6 +174,8 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     journal = SceneJournal(out)
     views = read_views(files, plan)
     houses = training_houses(plan, views)
+    if "evolution" in plan.parts:  # raises where there are none
+        find_events(plan.data, {view.scene for view in views}, plan.interactions, plan.seed)
     journal.begin(identity(plan, views), part_identities(plan, houses, trained))
     return SceneBench(plan, views, houses, journal, trained)
 
@@ -282,7 +287,7 @@ def part_identities(
 ) -> dict[str, dict[str, Any]]:
     """Return by part, and by row of the completion, JSON values of all that changes its figures beside ``identity``.
 
-    The numbers of seeds, walks and edits may change: what is there is kept.
+    The numbers of seeds, walks, edits and interactions may change: what is there is kept.
     """
     model = {"model": None if trained is None else trained.fingerprint}
     parts: dict[str, dict[str, Any]] = {"walk": model | {"steps": plan.steps}, "speed": model}
@@ -295,6 +300,8 @@ def part_identities(
         looked_up = {"training houses": digest([house.scene for house in houses])}
         found |= {} if trained is None else {SceneCompletion.name: model}
         found |= {row.name: looked_up for row in (Prior, NearestHouse, NearestHouses) if houses}
+    if "evolution" in plan.parts and trained is not None:
+        found["evolution model"] = model
     return dict(json.loads(json.dumps(found, default=str)))
 
 

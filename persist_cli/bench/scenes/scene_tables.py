@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from persist_cli.bench.figure_text import FigureColumn, markdown_table
-from persist_cli.bench.scenes import completion_part, edit_part, return_part, speed_part, walk_part
+from persist_cli.bench.scenes import completion_part, edit_part, evolution_part, return_part, speed_part, walk_part
 from persist_cli.viewing.console import print_table, say
 
 SHORT: Final = ("miou", "structure", "iou", "doors", "leading", "open", "disagreement", "seconds")
@@ -84,6 +84,14 @@ def other_tables(results: Mapping[str, Any]) -> list[Table]:
         part = results["edits"]
         rows = {f"{name} ({row['count']})": row for name, row in part["rows"].items()}
         found.append(part_table(f"Random edits, drawn by {part['adapter']!r}", "edits", rows, edit_part.COLUMNS))
+    if "evolution" in results:
+        part = results["evolution"]
+        rows = {
+            f"{name}, {group} ({figures['count']})": figures
+            for name, groups in part["rows"].items()
+            for group, figures in groups.items()
+        }
+        found.append(part_table("What becomes of true cells by an interaction", "row", rows, evolution_part.COLUMNS))
     if "speed" in results:
         part = results["speed"]
         title = f"Cost of a completion, {part['threads']} threads"
@@ -108,7 +116,10 @@ def definitions(results: Mapping[str, Any]) -> list[tuple[str, str]]:
         part = results["completion"]
         found += [(name, row["definition"]) for name, row in part["rows"].items()]
         found += [(column.title, part["columns"][name]) for name, column in completion_part.COLUMNS.items()]
-    for module in (walk_part, return_part, edit_part, speed_part):
+    if "evolution" in results:
+        part = results["evolution"]
+        found += [(f"{name} (evolution)", definition) for name, definition in part["definitions"].items()]
+    for module in (walk_part, return_part, edit_part, evolution_part, speed_part):
         if module.PART in results:
             found += [(f"{column.title} ({module.PART})", column.definition) for column in module.COLUMNS.values()]
     return found
