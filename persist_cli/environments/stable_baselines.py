@@ -1,4 +1,4 @@
-"""Several environments of one batch as stable-baselines3 takes them.
+"""stable-baselines3 on the environments: several of one batch as it takes them, a small network, and its success.
 
 For example ``PPO("MultiInputPolicy", VecMonitor(BatchedVecEnv(gymnasium.make_vec("persist/ImaginedHouse-v0", …))))``.
 Single environments need none of this: ``PPO("MultiInputPolicy", gymnasium.make("persist/ImaginedHouse-v0", …))``.
@@ -6,17 +6,28 @@ Single environments need none of this: ``PPO("MultiInputPolicy", gymnasium.make(
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
+import torch
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
+from jaxtyping import Float
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+from torch import Tensor
 
 from persist_cli.environments.task import Array, Observation
 from persist_cli.errors import PersistError
 
 Indices = int | Iterable[int] | None
+
+DEPTH_COLUMNS: Final = 16
+
+USUAL_METRES: Final = 5.0  # of depths and goals, by which they are divided
 
 
 class BatchedVecEnv(VecEnv):  # type: ignore[misc]
@@ -84,6 +95,53 @@ class BatchedVecEnv(VecEnv):  # type: ignore[misc]
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
         """Return that none is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
+
+
+class DepthAndGoal(BaseFeaturesExtractor):  # type: ignore[misc]
+    """The nearest depth in each of 16 parts of the view, as of a laser scanner, and the goal's place; no colours.
+
+    Args:
+        space: of observations with ``observe_goal="place"``, whose images have a multiple of 16 columns.
+
+    Raises:
+        PersistError: for other observations.
+    """
+
+    def __init__(self, space: spaces.Dict) -> None:
+        width, goal = (space[name].shape for name in ("depth", "goal"))
+        if goal != (2,) or width is None or width[1] % DEPTH_COLUMNS:
+            raise PersistError(
+                f"observations with a goal of shape {goal} and depth of shape {width}: take observe_goal='place' and "
+                f"images of a multiple of {DEPTH_COLUMNS} columns"
+            )
+        super().__init__(space, DEPTH_COLUMNS + 2)
+
+    def forward(self, seen: Mapping[str, Tensor]) -> Float[Tensor, "batch 18"]:
+        """Return depths and place over 5 m."""
+        upper = seen["depth"][:, : seen["depth"].shape[1] // 2]  # below, the floor is the nearest
+        nearest = upper.amin(1).unflatten(1, (DEPTH_COLUMNS, -1)).amin(2)
+        return torch.cat([nearest, seen["goal"]], dim=1) / USUAL_METRES
+
+
+def success_rate(model: Any, envs: VectorEnv[Observation, Array, Array], episodes: int, seed: int = 0) -> float:
+    """Return the share of episodes in which a model of stable-baselines3, acting at random, reaches its goal.
+
+    Args:
+        model: the model.
+        envs: where it acts.
+        episodes: number of episodes.
+        seed: of the first environment's episodes; equal seeds draw equal starts and goals.
+    """
+    stepped = VecMonitor(BatchedVecEnv(envs))
+    stepped.seed(seed)
+    ends: list[bool] = []
+
+    def note(names: dict[str, Any], _: dict[str, Any]) -> None:
+        if names["done"]:
+            ends.append(bool(names["info"]["is_success"]))
+
+    evaluate_policy(model, stepped, episodes, deterministic=False, callback=note)
+    return sum(ends) / len(ends)
 
 
 def row_of(infos: dict[str, Any], number: int) -> dict[str, Any]:

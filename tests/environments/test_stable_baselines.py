@@ -12,6 +12,8 @@ import pytest
 
 import persist_cli.environments  # noqa: F401  registers them
 from persist_cli.errors import PersistError
+from tests.support.micro_runs import run_persist
+from tests.support.micro_scenes import house_scene_model
 from tests.support.miniworlds import make_world
 
 pytest.importorskip("stable_baselines3", reason="it is in the extra dev")
@@ -19,7 +21,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecMonitor
 
-from persist_cli.environments.stable_baselines import BatchedVecEnv
+from persist_cli.environments.stable_baselines import BatchedVecEnv, DepthAndGoal, success_rate
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ppo.py"
 
@@ -76,13 +78,54 @@ def test_environments_that_begin_anew_a_step_later_are_refused():
         BatchedVecEnv(gymnasium.make_vec(num_envs=1, vectorization_mode="sync", **TRUE))
 
 
-@pytest.mark.parametrize("where", [[], ["--true"]])
-def test_the_example_learns_and_counts_the_goals_that_are_reached_in_truth(where, monkeypatch, capsys):
+def run_example(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    """Run the example for a step."""
     make_world()
     monkeypatch.delenv("PERSIST_REFERENCE", raising=False)
     few = ["--steps", "1", "--envs", "1", "--episodes", "1"]
-    monkeypatch.setattr(sys, "argv", ["ppo.py", *few, *where])
+    monkeypatch.setattr(sys, "argv", ["ppo.py", *few, *words])
     script = runpy.run_path(str(EXAMPLE))
     script["LEARNING"]["n_steps"] = 4
     script["main"]()
+
+
+@pytest.mark.parametrize("where", [[], ["--true"]])
+def test_the_example_learns_and_counts_the_goals_that_are_reached_in_truth(where, monkeypatch, capsys):
+    run_example(monkeypatch, *where)
     assert "goals reached in the true house: " in capsys.readouterr().out
+
+
+def test_the_example_learns_in_a_scene_that_was_made_of_one_image(monkeypatch, tmp_path, capsys):
+    monkeypatch.delenv("PERSIST_REFERENCE", raising=False)
+    model, house = house_scene_model(tmp_path / "model", "free"), str(tmp_path / "house.safetensors")
+    scene = ("--checkpoint", "reference", "--model", str(model), "--complete")
+    run_persist("memorize", "sample#0:0", *scene, "--out", house)
+    run_example(monkeypatch, "--start", "sample#0:0", "--memory", house, "--adapter", "scene")
+    assert "goals reached in the true house: " in capsys.readouterr().out
+
+
+def test_the_network_takes_a_place_as_its_goal_and_says_so():
+    make_world()
+    with pytest.raises(PersistError, match="take observe_goal='place'"):
+        DepthAndGoal(gymnasium.make(**TRUE).observation_space)
+
+
+class Seeker:
+    """Turns to its goal and goes there."""
+
+    def predict(self, seen, **_):
+        ahead, left = seen["goal"].T
+        angle = np.degrees(np.arctan2(left, ahead))
+        return np.where(np.abs(angle) < 10, 0, np.where(angle > 0, 1, 2)), None
+
+
+def test_success_is_that_of_the_agent_in_the_episodes_of_a_seed():
+    make_world()
+    near = {"observe_goal": "place", "goal_distance": (1.5, 2.5), "distance": "straight", "num_envs": 2}
+
+    def rate(steps):
+        return success_rate(Seeker(), gymnasium.make_vec(**TRUE, **near, max_episode_steps=steps), 8, seed=5)
+
+    assert 0 < rate(30) < 1  # some goals are behind a wall
+    assert rate(30) == rate(30)
+    assert rate(1) == 0  # a step is not far enough

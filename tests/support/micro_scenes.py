@@ -14,8 +14,10 @@ from persist_cli.api.cells import CellGrid, CellOrigin
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.scene_model import SceneForm, SceneSamples
+from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.data.store import write_trajectory
 from persist_cli.io.settings import parse_settings
+from persist_cli.simulators.house_cells import FORM as HOUSES
 from persist_memory.scene_models.scene_diffusion import SceneDiffusion
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 from tests.support.random_scenes import PALETTE, random_camera, random_sample, random_window, see
@@ -35,6 +37,16 @@ def micro_model(seed: int = 0, **settings: Any) -> SceneDiffusion:
     """Make a micro model with weights of a seed."""
     torch.manual_seed(seed)
     return SceneDiffusion(parse_settings(SceneDiffusionSettings, MICRO_SCENE | settings, "the micro model")).eval()
+
+
+def house_scene_model(folder: Path, everywhere: str) -> Path:
+    """Save a micro model of the classes of MiniWorld's houses that imagines one class everywhere."""
+    folder.mkdir()
+    model = micro_model(palette=list(HOUSES.palette), shape=[16, 16, 12])
+    model.codec.cell[1].bias.data[HOUSES.palette.index(everywhere)] = 1000.0
+    model.name = "scene"
+    save_scene_model(model, "scene", folder, None)
+    return folder
 
 
 @cache
