@@ -58,6 +58,8 @@ class PlanSettings:
         body: whether imagined moves over ground known to be occupied do not move.
         keep: whether what is left of the last plan is judged again; ``cem`` begins near its distributions, too.
         approach: whether an agent that recognises the goal goes on to the best view before it stops.
+        explore: whether plans that end where the agent has looked already come last: the true view from there is known,
+            and is not that of the goal image.
         cem: the other settings of ``cem``.
     """
 
@@ -69,21 +71,24 @@ class PlanSettings:
     body: bool = True
     keep: bool = True
     approach: bool = True
+    explore: bool = True
     cem: CemSettings = CEM
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values; of ``cem`` only what is not as usual, so that benchmarks begun without it go on."""
         values = asdict(self)
+        if self.approach:
+            values["approach"] = "straight, else aside"  # once it was straight alone
         changed = {name: value for name, value in values.pop("cem").items() if value != getattr(CEM, name)}
         return values | ({"cem": changed} if changed else {})
 
-    def with_cem(self, texts: Sequence[str]) -> PlanSettings:
+    def of_cem(self, texts: Sequence[str] | None) -> PlanSettings:
         """Return these settings with those of ``cem`` in texts such as ``method.elites=0.1``.
 
         Raises:
             PersistError: one line for what is no setting of these rows, or cannot be.
         """
-        values = plugin_settings(texts, ("method",))["method"]
+        values = plugin_settings(texts or (), ("method",))["method"]
         for name, instead in ELSEWHERE.items():
             if name in values:
                 raise PersistError(f"--set method.{name}: {instead}")
@@ -145,6 +150,7 @@ class Navigator:
         cost = None if parts.cost is None else parts.cost.of_body(body)
         self.row, self.parts, self.settings = row, replace(parts, cost=cost), settings
         self.seen = scene.look()
+        self.looked = [self.seen.cameras.world_from_camera.double().cpu()]
         walk = scene.walk() if row.walk else self.seen[:0]
         self.goal = retrieved(scene.goal, walk, parts.cost) if row.retrieves else told_goal(scene.goal, row)
         self.ground = GroundMapper(self.info.world_up, body)
@@ -164,6 +170,7 @@ class Navigator:
         kept = self.parts.policy.frames if self.parts.policy is not None else 1
         self.seen = Observations.concatenate([self.seen, frames])[-kept:]
         self.ground.add(frames)
+        self.looked.append(frames.cameras.world_from_camera.double().cpu())
         if self.world is not None:
             agent = self.world.agents[0]
             agent.observe(frames)
@@ -234,6 +241,8 @@ class Navigator:
         def imagine(situation: Situation, generator: torch.Generator) -> tuple[tuple[str, ...], int]:
             budget = Budget(self.settings.frames, self.settings.seconds)
             judge = self._judge(self._model(simulator, situation), situation, self.settings.over, budget)
+            if self.settings.explore and self.row.goal == "image":
+                judge.looked = torch.cat(self.looked)
             plan = planner.plan(situation, judge, generator, _no_notice)
             return plan.actions, plan.frames
 

@@ -329,16 +329,13 @@ def find_thresholds(
 def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict[str, Any]:
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
-    planning = plan.planning.to_json()
-    if plan.planning.frames is not None and plan.planning.approach:
-        planning["approach frames"] = "no bound"  # once they were those of a decision
     values = {
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
         "encoder": chosen_encoder().name if cost.name == "dino" or "open" in plan.loops else None,
         "policy": None if plan.policy is None else policy_json(plan.policy),
         "cem candidates": plan.cem_candidates,
-        "planning": planning,
+        "planning": plan.planning.to_json(),
         "loop": asdict(plan.loop) | {"loops": list(plan.loops)},
         "stop cost": plan.stop_cost,
         "checkpoint": None if checkpoint is None else checkpoint_json(checkpoint),

@@ -243,6 +243,7 @@ def bench_plan(
     keep: Annotated[bool, typer.Option(help="What is left of the last plan is a candidate of the next.")] = True,
     settings: CemSettingsOption = None,
     approach: Annotated[bool, typer.Option(help="Go to the best imagined view of a goal in sight, then stop.")] = True,
+    explore: Annotated[bool, typer.Option(help="Plans that end where the agent has looked already come last.")] = True,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
@@ -263,7 +264,7 @@ def bench_plan(
     run_plan_bench.run_plan_bench(plan_bench.BenchPlan(
         plan_bench.EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each),
         checkpoint, split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
-        navigator.PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach).with_cem(settings or ()),
+        navigator.PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach, explore).of_cem(settings),
         split_names(loops), run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
         SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
     ), out, report, json)  # fmt: skip

@@ -176,7 +176,8 @@ class Walker:
         if float(ground.places(goal - now.centers[0]).norm()) <= AT_PLACE:
             return ()
         judge = Judge(PoseFutures(now, self.info, ground, self.body), self.cost, self.goal, ground, "best")
-        return min(judge.judge(ways, 1), key=lambda one: one.cost).chosen
+        nearest = min(judge.judge(ways, 1), key=lambda one: one.cost)
+        return nearest.actions[: nearest.best]  # with those that are blocked, as a policy does them
 
     def saw(self, way: Sequence[str], seen: Observations, free: Sequence[bool]) -> None:
         """Take in the frame after each action; of a blocked one nothing is kept but the count."""

@@ -11,10 +11,10 @@ turned away. Where no straight way is better, the agent compares ways aside, whi
 from __future__ import annotations
 
 import itertools
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 
 from persist_cli.api.actions import Action, ActionVocabulary
-from persist_cli.planning.judge import Candidate, Judge
+from persist_cli.planning.judge import Judge
 from persist_cli.policies.simple import gait
 
 SIDES = 3  # turns to each side at most
@@ -24,8 +24,6 @@ ASIDE = (30.0, 60.0)  # degrees to a side of the ways aside
 METRES = (0.5, 1.0)  # of the ways aside
 
 BACK = 30.0  # degrees beyond the first heading to which they turn back
-
-ALL = 1_000  # more ways than are compared
 
 Way = tuple[str, ...]
 
@@ -70,25 +68,23 @@ def _turned(turn: Action, degrees: float) -> Way:
     return (turn.name,) * max(1, round(degrees / abs(turn.turn)))
 
 
-def approaching(judge: Judge, vocabulary: ActionVocabulary, horizon: int, at_once: int) -> Generator[None, None, Way]:
-    """Do what ``best_approach`` does, and give way after every ``at_once`` ways that were compared."""
-    stay = glances(vocabulary)
-    for ways in filter(None, (straight_ways(vocabulary, horizon), ways_aside(vocabulary))):
-        compared = [*stay, *ways]
-        for first in range(0, len(compared), at_once):
-            judge.judge(compared[first : first + at_once], 1)  # which remembers them
-            yield
-        here, there = _best(judge, stay), _best(judge, ways)
-        if there.cost < here.cost:
-            return there.chosen
-    return ()
+def best_view(judge: Judge, stay: Sequence[Way], ways: Sequence[Way]) -> Way:
+    """Return the actions to the best view on some ways; none where one without a step costs as little.
+
+    What is imagined costs more than what is truly seen, so views without a step are imagined too.
+
+    Args:
+        judge: judges every frame of a candidate (``over`` is ``best``).
+        stay: ways without a step.
+        ways: that are compared with them.
+    """
+    judged = {one.actions: one for one in judge.judge([*stay, *ways], 1)}
+    here, there = (min((judged[way] for way in part), key=lambda one: one.cost) for part in (stay, ways))
+    return there.chosen if there.cost < here.cost else ()
 
 
 def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> Way:
     """Return the actions to the best view on straight ways; where none is better, on ways aside; else none.
-
-    Better is what costs less than the view without a step. What is imagined costs more than what is truly seen, so that
-    view is imagined too, by ``glances``.
 
     Args:
         judge: judges every frame of a candidate (``over`` is ``best``).
@@ -98,13 +94,6 @@ def best_approach(judge: Judge, vocabulary: ActionVocabulary, horizon: int) -> W
     Raises:
         PersistError: when the vocabulary has no step ahead or no turn.
     """
-    parts = approaching(judge, vocabulary, horizon, ALL)
-    while True:
-        try:
-            next(parts)
-        except StopIteration as end:
-            return tuple(end.value)
-
-
-def _best(judge: Judge, ways: Sequence[Way]) -> Candidate:
-    return min(judge.judge(ways, 1), key=lambda one: one.cost)
+    stay = glances(vocabulary)
+    stages = filter(None, (straight_ways(vocabulary, horizon), ways_aside(vocabulary)))
+    return next(filter(None, (best_view(judge, stay, ways) for ways in stages)), ())

@@ -6,9 +6,10 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from persist_cli.api.actions import format_actions
@@ -17,6 +18,12 @@ from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Policy
 from persist_cli.errors import PersistError
 from persist_cli.planning.futures import FutureModel, Over, Walk
+
+NEAR: Final = 0.3  # metres between two poses of one view
+
+TURNED: Final = 20.0  # degrees between them
+
+LAST: Final = 1_000.0  # more than any cost of an image
 
 
 @dataclass(frozen=True)
@@ -58,8 +65,17 @@ class Candidate:
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """Its actions up to the frame that counts."""
-        return self.actions[: self.best]
+        """Its actions up to the frame that counts, without those that move nothing as their way is blocked.
+
+        Where all are blocked they are all there, since what is known of the ground may be wrong.
+        """
+        return tuple(self.actions[number] for number in self.chosen_numbers)
+
+    @property
+    def chosen_numbers(self) -> list[int]:
+        """Numbers, from 0, of the actions that are chosen."""
+        numbers = list(range(self.best))
+        return [number for number in numbers if self.walk.free[number]] or numbers
 
 
 @dataclass
@@ -75,6 +91,8 @@ class Judge:
         budget: the most that may be spent; at least one batch is judged.
         batch: candidates imagined together.
         on_batch: is told how many actions each batch had.
+        looked: world_from_camera of the poses where the agent truly looked and did not find its goal, metres; a frame
+            from one of them comes after all others. ``None`` for a goal of which no image tells whether it is found.
     """
 
     model: FutureModel
@@ -85,6 +103,7 @@ class Judge:
     budget: Budget = field(default_factory=Budget)
     batch: int = 20
     on_batch: Callable[[int], object] | None = None
+    looked: Float[Tensor, "pose 4 4"] | None = None
     judged: dict[tuple[str, ...], Candidate] = field(default_factory=dict, init=False)
     actions: int = field(default=0, init=False)  # judged so far
     seconds: float = field(default=0.0, init=False)  # spent so far
@@ -138,6 +157,8 @@ class Judge:
         imagined = self.model.imagine(candidates, self.over, self.cost.sees)
         costs = self.cost.measure(imagined.futures, self.goal, self.ground).double().cpu()
         self.check(costs, candidates)
+        if self.looked is not None:
+            costs += LAST * as_before(imagined.futures.world_from_camera.double().cpu(), self.looked)
         least, frame = costs.min(dim=1)
         for row, names in enumerate(candidates):
             best = len(names) if self.over == "last" else min(int(frame[row]) + 1, len(names))
@@ -157,6 +178,16 @@ class Judge:
                 f"cost {self.cost.name!r} of {actions!r} is NaN ({len(wrong)} of {len(candidates)} candidates); take "
                 "another --cost, or see what the model imagines with `persist rollout`"
             )
+
+
+def as_before(
+    poses: Float[Tensor, "candidate frame 4 4"], looked: Float[Tensor, "pose 4 4"]
+) -> Bool[Tensor, "candidate frame"]:
+    """Return which poses are within ``NEAR`` metres and ``TURNED`` degrees of one where the agent looked."""
+    apart = (poses[:, :, None, :3, 3] - looked[:, :3, 3]).norm(dim=-1)
+    trace = (poses[:, :, None, :3, :3] * looked[:, :3, :3]).sum((-2, -1))  # 1 + 2 cos of the angle between both
+    again: Tensor = ((apart < NEAR) & (trace > 1 + 2 * math.cos(math.radians(TURNED)))).any(-1)
+    return again
 
 
 def check_goal(goal: Goal, cost: Cost, policy: Policy | None = None) -> None:

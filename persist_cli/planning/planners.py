@@ -46,7 +46,7 @@ class Plan:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The chosen actions; empty means: stay here."""
+        """The chosen actions, without blocked ones; empty means: stay here."""
         return self.best.chosen
 
 
@@ -192,6 +192,9 @@ class Cem:
     policy: Policy | None = None
     settings_type = CemSettings
     _last: tuple[Float[Tensor, "action name"], tuple[str, ...]] | None = field(default=None, init=False)
+    _chosen: list[int] = field(
+        default_factory=list, init=False
+    )  # numbers of the actions of the last plan that are done
 
     def __post_init__(self) -> None:
         check_horizon(self.policy, self.settings.horizon)
@@ -220,18 +223,20 @@ class Cem:
             probabilities = share * probabilities + (1 - share) * frequencies(elites, names, probabilities)
             kept = list(dict.fromkeys(elites))[: round(settings.kept * len(elites))]
         plan = finished(judge, number)
-        self._last = probabilities, plan.best.actions
+        self._last, self._chosen = (probabilities, plan.best.actions), plan.best.chosen_numbers
         return plan
 
     def executed(self, count: int) -> None:
         """Shift the distributions that the next plan begins with by the actions that were done."""
-        if self._last is not None and count >= len(self._last[1]):
+        left = self._chosen[count:]
+        if self._last is None or not left:
             self._last = None  # nothing is left of it
-        if self._last is not None:
-            probabilities, best = self._last
-            uniform = torch.full_like(probabilities, 1 / probabilities.shape[1])
-            shifted = torch.cat([probabilities[count:], uniform[:count]])[: len(probabilities)]
-            self._last = shifted, (best + best[-1:] * count)[count : count + len(best)]
+            return
+        (probabilities, best), done = self._last, left[0]  # blocked actions before the next one are over, too
+        uniform = torch.full_like(probabilities, 1 / probabilities.shape[1])
+        shifted = torch.cat([probabilities[done:], uniform[:done]])[: len(probabilities)]
+        self._last = shifted, (best + best[-1:] * done)[done : done + len(best)]
+        self._chosen = [number - done for number in left]
 
     def _proposals(
         self, situation: Situation, names: Sequence[str], generator: torch.Generator

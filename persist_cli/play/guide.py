@@ -19,7 +19,7 @@ from persist_cli.api.cost import Cost, Futures
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.navigation.routes import distances_to
-from persist_cli.planning.approach import approaching
+from persist_cli.planning.approach import best_view, glances, straight_ways
 from persist_cli.planning.futures import WorldFutures
 from persist_cli.planning.judge import Judge, check_goal
 from persist_cli.play.ground import pose_at, turned
@@ -170,4 +170,8 @@ class Guide:
         known = agent.surroundings
         ground = GroundMap.empty(agent.info.world_up) if known is None else known.map()
         judge = Judge(WorldFutures(world, ground, agent.body), self._cost, self.goal, ground, "best")
-        return (yield from approaching(judge, agent.info.vocabulary, STEPS, WAYS_AT_ONCE))
+        stay, ways = glances(agent.info.vocabulary), straight_ways(agent.info.vocabulary, STEPS)
+        for first in range(0, len(stay) + len(ways), WAYS_AT_ONCE):
+            judge.judge([*stay, *ways][first : first + WAYS_AT_ONCE], 1)  # which remembers them
+            yield
+        return best_view(judge, stay, ways)

@@ -9,7 +9,8 @@ continues where it was stopped and repeats nothing that is done, so this may be 
   the model costs, and rows without imagination what imagining is worth. Its first half comes first, with a report.
 - The proposals of a trained policy are ranked likewise, also to goals that no given image shows from so near that the
   goal could be looked up.
-- The same is ranked without what an agent keeps of its last plan, and without its approach: what do these two give?
+- The same is ranked without what an agent keeps of its last plan, without its approach, and with plans that end where
+  it has looked: what do these three give?
 - The cross-entropy method, another cost of images, and the way that is left follow. They take most of the time.
 """
 
@@ -82,7 +83,7 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
     yield f"{bench} {trained} policy,rank-8,rank-16,rank-16-walk --memories {MEMORIES} {_to(home, 'trained')}"
     without_goal = f"bench plan {model} {SAMPLING} --episodes {home}/gap.json --loops closed"
     yield f"{without_goal} {trained} policy,{CLASSICAL},rank-16 --memories {MEMORIES} {_to(home, 'gap')}"
-    for choice in ("no-keep", "no-approach"):
+    for choice in ("no-keep", "no-approach", "no-explore"):
         yield f"{plan} {LOOP} --{choice} --loops closed --rows rank-16 --memories simulator,voxel {_to(home, choice)}"
     if not (figures.out / "collisions.json").is_file():
         yield f"bench collisions {model} {SAMPLING} --memories voxel,none --out {home}/collisions.json"

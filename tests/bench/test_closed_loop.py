@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from persist_cli.bench.episodes import Episode
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, retrieved
@@ -14,6 +17,7 @@ from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.run_episode import LoopSettings, run_closed_loop
 from persist_cli.bench.stop_rules import StopByCost, view_costs
 from persist_cli.bench.true_scene import TrueScene
+from persist_cli.planning.judge import as_before
 from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.support.pixel_cost import PixelCost
@@ -27,6 +31,15 @@ COST = PixelCost(None)
 def scene(small_world: MiniWorld, found: list[Episode]) -> TrueScene:
     """An episode whose goal is in sight from the start."""
     return TrueScene(small_world, next(episode for episode in found if episode.in_sight))
+
+
+def different_views(poses: Float[Tensor, "pose 4 4"]) -> int:
+    """Count poses that are none of the ones before them again."""
+    kept = poses[:1]
+    for pose in poses[1:]:
+        if not as_before(pose[None, None], kept).item():
+            kept = torch.cat([kept, pose[None]])
+    return len(kept)
 
 
 def recognise_at_once(scene: TrueScene, row: PlanningRow, settings: PlanSettings) -> dict[str, Any]:
@@ -46,6 +59,17 @@ def test_an_agent_that_imagines_goes_to_the_best_view_before_it_stops(scene: Tru
 def test_an_approach_compares_all_its_ways_whatever_a_decision_may_imagine(scene: TrueScene) -> None:
     whole, bounded = (recognise_at_once(scene, RANKED, PlanSettings(frames=frames)) for frames in (None, 16))
     assert bounded["actions"] == whole["actions"] != ""
+
+
+def test_an_agent_that_explores_does_not_plan_to_look_again_from_where_it_has_looked(scene: TrueScene) -> None:
+    views = []
+    for explore in (False, True):
+        scene.back_to_start()
+        row, parts = replace(RANKED, candidates=8), RowParts(make_policy("random", {}), COST)
+        navigator = Navigator(row, parts, PlanSettings(explore=explore), scene, 8)
+        run_closed_loop(scene, navigator, StopByCost(COST, -math.inf), LoopSettings(execute=8, patience=8))
+        views.append(different_views(torch.cat(navigator.looked)))
+    assert views[1] > views[0]
 
 
 def test_what_an_agent_writes_down_after_its_actions_is_timed_apart(scene: TrueScene) -> None:

@@ -229,7 +229,7 @@ def test_how_cem_searches_can_be_set_and_a_benchmark_begun_before_goes_on(bench:
 
 def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_said() -> None:
     row = PlanningRow("cem, simulator", "cem", None, "simulator", "place", walk=True, candidates=7)
-    plans = PlanSettings(rounds=2).with_cem(["method.kept=0.3", "method.smoothing=0"])
+    plans = PlanSettings(rounds=2).of_cem(["method.kept=0.3", "method.smoothing=0"])
     wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
     assert make_planner(row, None, plans, 5).settings == wanted
     assert make_planner(row, None, replace(plans, keep=False), 5).settings == replace(wanted, shift=0.0)

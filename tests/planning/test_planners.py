@@ -60,6 +60,43 @@ def test_what_was_judged_is_not_imagined_again(judge):
     assert one.actions == 2
 
 
+class NoLeftTurns(WorldFutures):
+    """Something is in the way of every turn to the left."""
+
+    def imagine(self, candidates, over, sees=True):
+        """Return what would be seen, with left turns blocked."""
+        seen = super().imagine(candidates, over, sees)
+        frees = [torch.tensor([name != "left" for name in names], dtype=torch.bool) for names in candidates]
+        walks = [dataclasses.replace(walk, free=free) for walk, free in zip(seen.walks, frees, strict=True)]
+        return dataclasses.replace(seen, walks=walks)
+
+
+def test_blocked_actions_are_left_out_of_what_is_chosen(judge, model, situation):
+    blocking = dataclasses.replace(judge(), model=NoLeftTurns(model, situation.ground))
+    some, all_of_it = blocking.judge([["left", "forward", "left", "right"], ["left", "left"]], 1)
+    assert (some.chosen, some.chosen_numbers) == (("forward", "right"), [1, 3])
+    assert all_of_it.chosen == ("left", "left")  # what is known may be wrong
+
+
+def test_a_search_goes_on_behind_the_blocked_actions_of_its_last_plan(judge, model, situation):
+    blocking = dataclasses.replace(judge(), model=NoLeftTurns(model, situation.ground))
+    planner = Cem(CemSettings(horizon=4, candidates=1, rounds=1, shift=0.5))
+    best = planner.plan(situation, dataclasses.replace(blocking), seeded(2)).best
+    assert 1 < len(best.chosen) < len(best.actions)
+    planner.executed(1)
+    done = best.chosen_numbers[1]
+    following = planner.plan(situation, dataclasses.replace(blocking), seeded(9)).candidates[0].actions
+    assert following == (*best.actions[done:], *best.actions[-1:] * done)
+
+
+def test_what_ends_where_the_agent_has_looked_comes_last(judge, model, situation):
+    looked = model.agents[0].cameras_after(AHEAD).world_from_camera[-1:].double()
+    one = judge(looked=looked)
+    there, beside, turned = one.judge([AHEAD, AHEAD[:2], (*AHEAD, "left", "left")], 1)
+    assert there.cost > beside.cost == pytest.approx(0.4)
+    assert turned.cost == pytest.approx(0.0, abs=1e-6)  # another view from the same place
+
+
 def test_frames_that_nobody_imagined_are_not_counted_but_use_up_a_budget(judge, situation):
     one = judge(budget=Budget(8))
     plan = Rank(make_policy("random", {}), RankSettings(4, 5)).plan(situation, one, seeded())
