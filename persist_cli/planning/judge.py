@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.actions import format_actions
 from persist_cli.api.cost import Cost
+from persist_cli.api.geometry import near_poses
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Policy
 from persist_cli.errors import PersistError
@@ -158,7 +159,8 @@ class Judge:
         costs = self.cost.measure(imagined.futures, self.goal, self.ground).double().cpu()
         self.check(costs, candidates)
         if self.looked is not None:
-            costs += LAST * as_before(imagined.futures.world_from_camera.double().cpu(), self.looked)
+            poses = imagined.futures.world_from_camera.double().cpu()
+            costs += LAST * near_poses(poses.flatten(0, 1), self.looked, NEAR, TURNED).any(-1).reshape(costs.shape)
         least, frame = costs.min(dim=1)
         for row, names in enumerate(candidates):
             best = len(names) if self.over == "last" else min(int(frame[row]) + 1, len(names))
@@ -178,16 +180,6 @@ class Judge:
                 f"cost {self.cost.name!r} of {actions!r} is NaN ({len(wrong)} of {len(candidates)} candidates); take "
                 "another --cost, or see what the model imagines with `persist rollout`"
             )
-
-
-def as_before(
-    poses: Float[Tensor, "candidate frame 4 4"], looked: Float[Tensor, "pose 4 4"]
-) -> Bool[Tensor, "candidate frame"]:
-    """Return which poses are within ``NEAR`` metres and ``TURNED`` degrees of one where the agent looked."""
-    apart = (poses[:, :, None, :3, 3] - looked[:, :3, 3]).norm(dim=-1)
-    trace = (poses[:, :, None, :3, :3] * looked[:, :3, :3]).sum((-2, -1))  # 1 + 2 cos of the angle between both
-    again: Tensor = ((apart < NEAR) & (trace > 1 + 2 * math.cos(math.radians(TURNED)))).any(-1)
-    return again
 
 
 def check_goal(goal: Goal, cost: Cost, policy: Policy | None = None) -> None:

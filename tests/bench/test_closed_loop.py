@@ -11,13 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.api.geometry import near_poses
 from persist_cli.bench.episodes import Episode
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, retrieved
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.run_episode import LoopSettings, run_closed_loop
 from persist_cli.bench.stop_rules import StopByCost, view_costs
 from persist_cli.bench.true_scene import TrueScene
-from persist_cli.planning.judge import as_before
+from persist_cli.planning.judge import NEAR, TURNED
 from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.support.pixel_cost import PixelCost
@@ -37,7 +38,7 @@ def different_views(poses: Float[Tensor, "pose 4 4"]) -> int:
     """Count poses that are none of the ones before them again."""
     kept = poses[:1]
     for pose in poses[1:]:
-        if not as_before(pose[None, None], kept).item():
+        if not near_poses(pose[None], kept, NEAR, TURNED).any():
             kept = torch.cat([kept, pose[None]])
     return len(kept)
 
