@@ -100,10 +100,11 @@ def row_seeds(bench: SceneBench, row: EvolutionRow) -> range:
 
 def run_evolution(bench: SceneBench) -> None:
     """Do every interaction in every row, but those that the journal has."""
+    events = chosen_events(bench)
     units = [
         (row, event, seed)
         for row in evolution_rows(bench)
-        for event in chosen_events(bench)
+        for event in events
         for seed in row_seeds(bench, row)
         if not bench.journal.has(row.part, unit_name(event, seed))
     ]

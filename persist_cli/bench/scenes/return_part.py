@@ -140,8 +140,11 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
             [bench.journal.samples(f"{PART} {row.name}", walk_name(view, seed)) for view in views]
             for seed in range(bench.plan.seeds)
         ]
-        values = [[walk_values(walk, length, detail) for walk in of_seed] for of_seed in walks]
         along = [[frame_values(walk, length, detail) for walk in of_seed] for of_seed in walks]
+        values = [
+            [walk_values(walk, frames, length) for walk, frames in zip(*of_seed, strict=True)]
+            for of_seed in zip(walks, along, strict=True)
+        ]
         windows[row.name], least_sharp = window_figures(along, draws)
         figures[row.name] = {
             name: mean_figure(np.array([[[value[name] for value in seed] for seed in values]]), draws).to_json()
@@ -160,19 +163,18 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     }
 
 
-def walk_values(walk: dict[str, Tensor], length: int, detail: float) -> dict[str, float]:
+def walk_values(walk: dict[str, Tensor], along: dict[str, Array], length: int) -> dict[str, float]:
     """Return the figures of one walk; NaN where nothing is compared.
 
     Args:
         walk: as ``there_and_back`` returns it.
+        along: the figures of each of its frames, as ``frame_values`` returns them.
         length: frames that are predicted at once; frames of one clip are not compared.
-        detail: mean energy of the Laplacian of true frames; NaN without any.
     """
     rgb, out = walk["rgb"], int(walk["out"])
     back, first = compared_frames(walk, length)
     moved = walk["poses"][:out, :3, 3].diff(dim=0).norm(dim=1).sum()
     last = len(rgb) > out
-    along = frame_values(walk, length, detail)
     return {
         "psnr": float(mean(along["psnr"])),
         "lpips": float(lpips(rgb[back], rgb[first]).mean()) if back and not lpips_obstacle(rgb) else float("nan"),
@@ -191,7 +193,13 @@ def compared_frames(walk: dict[str, Tensor], length: int) -> tuple[list[int], li
 
 
 def frame_values(walk: dict[str, Tensor], length: int, detail: float) -> dict[str, Array]:
-    """Return the figures ``ALONG`` of each frame of a walk, NaN where there is none; see ``walk_values``."""
+    """Return the figures ``ALONG`` of each frame of a walk, NaN where there is none.
+
+    Args:
+        walk: as ``there_and_back`` returns it.
+        length: frames that are predicted at once; frames of one clip are not compared.
+        detail: mean energy of the Laplacian of true frames; NaN without any.
+    """
     rgb = walk["rgb"]
     back, first = compared_frames(walk, length)
     values = {name: np.full(len(rgb), np.nan) for name in ALONG}

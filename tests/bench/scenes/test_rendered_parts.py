@@ -82,7 +82,7 @@ def test_a_walk_that_fades_shows_in_the_worst_window_and_in_a_line_that_falls() 
     assert sharp == pytest.approx([1.0, 0.0], abs=0.1)
     assert worst["mean"] == pytest.approx(sharp[1])
     assert windows[f"1-{WINDOW}"]["psnr"]["mean"] is None  # on the way out there is nothing to compare with
-    whole = walk_values(walk | {"seconds": torch.tensor(1.0)}, 4, true_detail([rgb[: WINDOW + 1]]))
+    whole = walk_values(walk | {"seconds": torch.tensor(1.0)}, seen, 4)
     assert windows[f"{WINDOW + 1}-{2 * WINDOW}"]["psnr"]["mean"] == pytest.approx(whole["psnr"])
 
 
@@ -116,16 +116,16 @@ def test_a_thing_is_moved_or_copied_over_the_ground_by_a_metre_or_so(kind: str, 
 def test_frames_of_one_clip_are_not_compared_with_each_other() -> None:
     rgb = torch.randint(0, 255, (9, 16, 16, 3), dtype=torch.uint8)
     walk = {"rgb": rgb, "poses": torch.eye(4).expand(9, 4, 4), "out": torch.tensor(5), "seconds": torch.tensor(2.0)}
-    assert math.isnan(walk_values(walk, 8, 1.0)["psnr"])
-    assert math.isfinite(walk_values(walk, 4, 1.0)["psnr"])
-    same = torch.cat([rgb[:5], rgb[:4].flip(0)])
-    assert walk_values(walk | {"rgb": same}, 4, 1.0)["psnr"] == 100.0
+    assert math.isnan(walk_values(walk, frame_values(walk, 8, 1.0), 8)["psnr"])
+    assert math.isfinite(walk_values(walk, frame_values(walk, 4, 1.0), 4)["psnr"])
+    same = walk | {"rgb": torch.cat([rgb[:5], rgb[:4].flip(0)])}
+    assert walk_values(same, frame_values(same, 4, 1.0), 4)["psnr"] == 100.0
 
 
 def test_without_true_frames_there_is_no_sharpness_and_no_fvd() -> None:
     rgb = torch.randint(0, 255, (33, 32, 32, 3), dtype=torch.uint8)
     walk = {"rgb": rgb, "poses": torch.eye(4).expand(33, 4, 4), "out": torch.tensor(17), "seconds": torch.tensor(2.0)}
-    assert math.isnan(walk_values(walk, 4, true_detail([]))["sharpness"])
+    assert math.isnan(walk_values(walk, frame_values(walk, 4, true_detail([])), 4)["sharpness"])
     assert math.isnan(fvd_of_rows({"voxel": pieces(rgb)}, [])["voxel"])
     assert any("has more than 16 frames, so no sharpness and no FVD" in reason for reason in obstacles([]))
 
