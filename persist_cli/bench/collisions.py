@@ -33,10 +33,10 @@ from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
 from persist_cli.io.files import check_folder, write_json
 from persist_cli.memorize.factory import MemoryFactory, as_scene
+from persist_cli.memorize.memory_config import scene_config
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.navigation.ways import way_is_free
 from persist_cli.plugins import check_simulator, make_simulator
-from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say
@@ -289,9 +289,8 @@ def frame_verdicts(walk: TrueWalk, frames: Observations) -> list[Cover]:
 def cell_verdicts(walk: TrueWalk) -> list[Cover]:
     """Return the verdict on each attempt by the true cells of the scene alone, which are known everywhere."""
     assert walk.cells is not None
-    form, body = walk.cells.form, body_of(walk.info)
-    config = MemoryConfig("scene", {"size": form.size, "palette": list(form.palette)}, "classes", {})
-    scene = as_scene(MemoryFactory.of(config).empty(walk.info))
+    body = body_of(walk.info)
+    scene = as_scene(MemoryFactory.of(scene_config(walk.cells.form)).empty(walk.info))
     scene.add(walk.cells)
     mapper = GroundMapper(walk.info.world_up, body)
     mapper.add_memory(scene, mapper.floor_under(walk.frames.cameras.centers[0]))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from persist_cli.api.cells import CellForm
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory
@@ -42,6 +43,12 @@ class MemorizePlan:
     model: str | None = None
     complete: bool = False
     seed: int = 0
+
+
+def scene_config(form: CellForm, settings: Mapping[str, Any] | None = None) -> MemoryConfig:
+    """Return the configuration of scenes with cells of a form, whose tokens are their classes."""
+    own = {"size": form.size, "palette": list(form.palette)}
+    return MemoryConfig(SCENE, own | dict(settings or {}), "classes", {})
 
 
 def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:

@@ -38,7 +38,7 @@ from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.memorize.memory_config import plugin_settings
+from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.recipe import MemoryConfig
 from persist_cli.viewing.console import add_task, progress, warn
@@ -48,8 +48,6 @@ PARTS: Final = ("completion", "walk", "return", "edits", "speed", "evolution")
 RENDERED: Final = ("return", "edits")  # parts that need a checkpoint which draws scenes
 
 EDIT_KINDS: Final = ("remove", "paint", "insert", "move", "copy")  # edit number n is of kind n modulo their count
-
-MEMORY, ENCODER = "scene", "classes"
 
 
 @dataclass(frozen=True)
@@ -113,8 +111,7 @@ class SceneBenchPlan:
 
     def memory(self, form: CellForm) -> MemoryConfig:
         """Return the configuration of scenes with cells of a form."""
-        settings = plugin_settings(self.settings, ("memory",))["memory"]
-        return MemoryConfig(MEMORY, {"size": form.size, "palette": list(form.palette)} | settings, ENCODER, {})
+        return scene_config(form, plugin_settings(self.settings, ("memory",))["memory"])
 
 
 @dataclass(frozen=True)
