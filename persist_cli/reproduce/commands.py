@@ -6,10 +6,10 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
-from persist_cli.errors import INTERRUPTED
+from persist_cli.errors import INTERRUPTED, PersistError
 from persist_cli.viewing.console import say
 
 COLLECT: Final = "collect miniworld --size 64x64"
@@ -24,6 +24,14 @@ def run_command(command: Sequence[str]) -> int:
     finally:
         signal.signal(signal.SIGINT, previous)
     return INTERRUPTED if interrupts else code
+
+
+def run_main(main: Callable[[Sequence[str]], None]) -> None:
+    """Run a program with the arguments of this process; an error ends it with one line and exit code 1."""
+    try:
+        main(sys.argv[1:])
+    except PersistError as error:
+        sys.exit(f"error: {error}")
 
 
 def run_line(line: str) -> None:

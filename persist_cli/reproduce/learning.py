@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, difference, mean
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.learn.learn import FIGURES, RESULTS
 from persist_cli.policies.trained import find_policy, packaged_policy
-from persist_cli.reproduce.commands import run_line
+from persist_cli.reproduce.commands import run_line, run_main
 from persist_cli.reproduce.plan_file import PLAN, keep_plan
 from persist_cli.viewing.console import say
 
@@ -297,7 +296,4 @@ def parse(arguments: Sequence[str]) -> Plan:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except PersistError as error:
-        sys.exit(f"error: {error}")
+    run_main(main)

@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +35,7 @@ from persist_cli.evaluate.provenance import checkpoint_json
 from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, difference, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.plugins import load_plugin
-from persist_cli.reproduce.commands import run_line
+from persist_cli.reproduce.commands import run_line, run_main
 from persist_cli.reproduce.learning import ADVANTAGE, CHANGE, SIMULATOR, figure_text, named
 from persist_cli.reproduce.plan_file import keep_plan
 from persist_cli.simulators.collect import CollectPlan
@@ -374,7 +373,4 @@ def parse(arguments: Sequence[str]) -> Plan:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except PersistError as error:
-        sys.exit(f"error: {error}")
+    run_main(main)
