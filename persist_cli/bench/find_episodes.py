@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -32,6 +33,8 @@ GOALS = 24  # that are looked at for each kind from each start
 
 BELOW = (0.0, 0.5, 1.0)  # metres under the goal's camera at which it is looked for
 
+SIGHTS: Final = {"both": (True, False), "in-sight": (True,), "hidden": (False,)}
+
 Kind = tuple[int, bool]  # the bin, and whether the goal is in sight
 
 
@@ -46,6 +49,7 @@ class EpisodeSearch:
         seed: seed of starts and goals.
         per_scene: most episodes of each of these kinds in one scene.
         goal_gap: metres around the goal from which no frame of the walk is given.
+        goals: ``in-sight`` or ``hidden`` for these alone, else ``both``.
     """
 
     bins: Sequence[int] = (8, 16, 32, 64)
@@ -54,6 +58,7 @@ class EpisodeSearch:
     seed: int = 0
     per_scene: int = 1
     goal_gap: float = 0.0
+    goals: str = "both"
 
     def check(self) -> None:
         """Raise ``DataError`` for a bin, a number or a seed that cannot be."""
@@ -66,11 +71,13 @@ class EpisodeSearch:
             )
         if not 0 <= self.goal_gap < math.inf:
             raise DataError(f"--goal-gap {self.goal_gap:g}: give metres, 0 for none")
+        if self.goals not in SIGHTS:
+            raise DataError(f"--goals {self.goals!r}: give {', '.join(SIGHTS)}")
 
     @property
     def kinds(self) -> list[Kind]:
         """All kinds of episodes that are sought, without repeats."""
-        return [(number, sight) for number in sorted(set(self.bins)) for sight in (True, False)]
+        return [(number, sight) for number in sorted(set(self.bins)) for sight in SIGHTS[self.goals]]
 
 
 def find_episodes(simulator: Simulator, scenes: Sequence[int], search: EpisodeSearch) -> Iterator[list[Episode]]:

@@ -167,6 +167,7 @@ def bench_episodes(
     goal_gap: Annotated[
         float, typer.Option(min=0, help="Metres around the goal from which none is given, so that it must be imagined.")
     ] = 0.0,
+    goals: Annotated[str, typer.Option(help="both, or in-sight or hidden alone.")] = "both",
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts and goals.")] = 0,
     json: JsonOption = False,
 ) -> None:
@@ -178,7 +179,7 @@ def bench_episodes(
     from persist_cli.bench.make_episodes import run_episodes
     from persist_cli.simulators.collect import CollectPlan
 
-    search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed, per_scene, goal_gap)
+    search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed, per_scene, goal_gap, goals)
     run_episodes(CollectPlan(simulator, scenes, size=size, split=split), search, out, json)
 
 

@@ -30,6 +30,15 @@ def test_a_seed_gives_the_same_episodes_again(small_world: MiniWorld, found: lis
     assert len(found) >= 2
 
 
+@pytest.mark.parametrize(("goals", "in_sight"), [("in-sight", True), ("hidden", False)])
+def test_goals_in_sight_or_hidden_alone_are_drawn_where_asked_for(
+    small_world: MiniWorld, goals: str, in_sight: bool
+) -> None:
+    search = replace(SEARCH, goals=goals)
+    found = [episode for scene in find_episodes(small_world, [HOUSE], search) for episode in scene]
+    assert {episode.in_sight for episode in found} == {in_sight}
+
+
 def test_a_scene_can_give_several_episodes_of_a_kind(small_world: MiniWorld, found: list[Episode]) -> None:
     search = replace(SEARCH, bins=(8,), each=3, per_scene=2)
     several = [episode for scene in find_episodes(small_world, [HOUSE], search) for episode in scene]
@@ -177,6 +186,7 @@ def test_the_command_writes_episodes_that_can_be_read(persist: Persist, tmp_path
         (("--scenes", "5:5"), "write A:B with A less than B"),
         (("--simulator", "miniwrld"), "did you mean 'miniworld'"),
         (("--split", "held-out"), "unknown split"),
+        (("--goals", "seen"), "--goals 'seen': give both, in-sight, hidden"),
         (("--goal-gap", "inf"), "--goal-gap inf: give metres, 0 for none"),
     ],
 )
