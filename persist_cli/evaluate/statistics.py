@@ -12,7 +12,7 @@ too small by (n − 1) / n (McCarthy & Snowden 1985): with three training seeds 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -79,6 +79,16 @@ class Draws:
         numbers = np.unique(np.asarray(clusters), return_inverse=True)[1].astype(np.int64)
         scenes = draw_one_fewer(int(numbers.max()) + 1, count, "scenes")
         return Draws(numbers, scenes[:, numbers], draw_one_fewer(len(models), count, "\n".join(models)))
+
+    @staticmethod
+    def of_scenes(names: Iterable[str]) -> Draws:
+        """Draw scenes for rows of one model.
+
+        Args:
+            names: for each clip the name of its scene; scenes are numbered in the order in which they first occur.
+        """
+        numbers: dict[str, int] = {}
+        return Draws.of([numbers.setdefault(name, len(numbers)) for name in names])
 
     @property
     def count(self) -> int:

@@ -132,6 +132,12 @@ def test_clips_without_a_figure_are_left_out():
     assert np.isnan(apart(np.full((1, 1, 4), np.nan)).mean)
 
 
+def test_scenes_are_numbered_in_the_order_in_which_their_names_first_occur():
+    named, numbered = Draws.of_scenes(["b", "a", "b", "c"]), Draws.of([0, 1, 0, 2])
+    assert named.clusters.tolist() == numbered.clusters.tolist()
+    assert np.array_equal(named.clips, numbered.clips)
+
+
 def test_the_interval_of_a_distance_between_sets_lies_around_it():
     values = clips(count=40, seeds=2)[0]
     draws = Draws.of(in_houses(40, 20), count=200)

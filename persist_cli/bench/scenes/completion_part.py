@@ -118,8 +118,7 @@ def sample(row: Completion, view: View, place: int, seeds: Sequence[int]) -> dic
 
 def completion_json(bench: SceneBench) -> dict[str, Any]:
     """Return the figures of all rows as JSON values."""
-    scenes = {scene: place for place, scene in enumerate(dict.fromkeys(view.scene for view in bench.views))}
-    draws = Draws.of([scenes[view.scene] for view in bench.views])
+    draws = Draws.of_scenes(view.scene for view in bench.views)
     counts = {row.name: row_counts(bench, row) for row in bench.rows}
     present = [n for n in things(len(bench.palette)) if counts["truth"][..., n, 2].sum() > 0]
     figures = {row.name: row_figures(bench, row, counts[row.name], present, draws) for row in bench.rows}

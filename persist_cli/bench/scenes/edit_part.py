@@ -253,8 +253,7 @@ def edits_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
 
 def kind_figures(records: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the figures of some edits, as JSON values."""
-    scenes = {scene: place for place, scene in enumerate(dict.fromkeys(record["scene"] for record in records))}
-    draws = Draws.of([scenes[record["scene"]] for record in records])
+    draws = Draws.of_scenes(record["scene"] for record in records)
 
     def values() -> Iterator[tuple[str, list[float]]]:
         for name in ("there", "there_before", "inside", "outside", "noise"):

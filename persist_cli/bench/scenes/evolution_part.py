@@ -229,8 +229,7 @@ def event_figures(records: Sequence[Sequence[dict[str, Any]]], places: Sequence[
         places: numbers of the events.
     """
     chosen = [[of_seed[place] for place in places] for of_seed in records]
-    scenes = {scene: place for place, scene in enumerate(dict.fromkeys(record["scene"] for record in chosen[0]))}
-    draws = Draws.of([scenes[record["scene"]] for record in chosen[0]])
+    draws = Draws.of_scenes(record["scene"] for record in chosen[0])
 
     def count(name: str) -> np.ndarray[Any, Any]:
         return np.array([[record["counts"][name] for record in of_seed] for of_seed in chosen], dtype=np.float64)

@@ -128,8 +128,7 @@ def walk_out(world: WorldModel, wanderer: Wanderer, view: View, steps: int) -> O
 def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     """Return the figures of all rows, as JSON values."""
     views, rows = walked(bench), rendered_rows(plan)
-    scenes = {scene: place for place, scene in enumerate(dict.fromkeys(view.scene for view in views))}
-    draws = Draws.of([scenes[view.scene] for view in views])
+    draws = Draws.of_scenes(view.scene for view in views)
     true = true_pieces(bench)
     detail = true_detail(true)
     length = RendererLoader(bench, plan).load(rows[0]).backbone.frames_per_clip - 1

@@ -136,8 +136,7 @@ def new_cells(before: CellGrid, after: CellGrid, view: View) -> dict[str, Any]:
 def walk_json(bench: SceneBench) -> dict[str, Any]:
     """Return the figures of each window over all walks, as JSON values."""
     views = walked(bench)
-    scenes = {scene: place for place, scene in enumerate(dict.fromkeys(view.scene for view in views))}
-    draws = Draws.of([scenes[view.scene] for view in views])
+    draws = Draws.of_scenes(view.scene for view in views)
     truth = house_shares(views, len(bench.palette))
     rows = {}
     records = [
