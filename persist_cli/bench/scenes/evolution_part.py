@@ -22,7 +22,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.scenes.class_counts import share_figure
 from persist_cli.bench.scenes.completions import Scenes
-from persist_cli.bench.scenes.interactions import Event, find_events
+from persist_cli.bench.scenes.interactions import Event
 from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.views import same_form
 from persist_cli.data.scene_samples import PICK_UP
@@ -83,14 +83,12 @@ def evolution_rows(bench: SceneBench) -> list[EvolutionRow]:
     return [RULES, NOTHING] if bench.trained is None else [MODEL, RULES, NOTHING]
 
 
-def chosen_events(bench: SceneBench) -> list[Event]:
-    """Return the interactions that are measured: those of the plan that the model knows, if there is a model."""
-    plan = bench.plan
-    events = find_events(plan.data, {view.scene for view in bench.views}, plan.interactions, plan.seed)
+def chosen_events(bench: SceneBench) -> Sequence[Event]:
+    """Return the interactions that are measured: those of the benchmark that the model knows, if there is a model."""
     if bench.trained is None:
-        return events
+        return bench.events
     known = bench.trained.form.actions
-    return [event for event in events if event.action in known]
+    return [event for event in bench.events if event.action in known]
 
 
 def row_seeds(bench: SceneBench, row: EvolutionRow) -> range:
@@ -125,10 +123,10 @@ def judge(bench: SceneBench, row: EvolutionRow, event: Event, seed: int) -> dict
     """Do an interaction and return what changes, as JSON values; nothing where its thing is not in the hands."""
     record: dict[str, Any] = {"scene": event.file.info.scene, "action": event.action}
     scenes = with_evolution(bench.scenes.seeded(seed), row.evolution or "rules")
-    scene = scene_before(scenes, event)
+    before, truth = (event.file.cells(event.frame + later) for later in (0, 1))
+    scene = scene_before(scenes, event, before)
     if scene is None:
         return record | {"counts": None}
-    before, truth = (event.file.cells(event.frame + later) for later in (0, 1))
     done = row.evolution is not None and act(scene, event.file, event.frame, event.action)
     after = same_form(scene.cells.box(truth.corner, truth.shape), truth.form, "the scene") if done else before
     return record | {"counts": change_counts(before, after, truth) | {"done": float(done)}}
@@ -141,8 +139,14 @@ def with_evolution(scenes: Scenes, evolution: str) -> Scenes:
     )
 
 
-def scene_before(scenes: Scenes, event: Event) -> Scene | None:
-    """Return a scene just before an interaction; ``None`` where the rules do not pick up what it puts down."""
+def scene_before(scenes: Scenes, event: Event, cells: CellGrid) -> Scene | None:
+    """Return a scene just before an interaction; ``None`` where the rules do not pick up what it puts down.
+
+    Args:
+        scenes: evolve by the model or by rules.
+        event: the interaction.
+        cells: the true ones before it.
+    """
     scene = scenes.empty(event.file.info)
     if event.taken is not None:
         hands = carrying(with_evolution(scenes, "rules"), event.file, event.taken)
@@ -150,7 +154,7 @@ def scene_before(scenes: Scenes, event: Event) -> Scene | None:
             return None
         scene.restore(hands)
     scene.memorize(event.file.read([event.frame]).observations.to(scenes.factory.device))
-    scene.add(event.file.cells(event.frame))
+    scene.add(cells)
     return scene
 
 

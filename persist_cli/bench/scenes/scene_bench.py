@@ -28,7 +28,7 @@ from persist_cli.bench.scenes.completions import (
     Scenes,
     Truth,
 )
-from persist_cli.bench.scenes.interactions import find_events
+from persist_cli.bench.scenes.interactions import Event, find_events
 from persist_cli.bench.scenes.scene_journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
@@ -124,6 +124,7 @@ class SceneBench:
         houses: of the training; empty without any.
         journal: keeps what was run.
         trained: the scene model; ``None`` without one.
+        events: interactions of the measured houses; empty without the part "evolution".
     """
 
     plan: SceneBenchPlan
@@ -131,6 +132,7 @@ class SceneBench:
     houses: Sequence[House]
     journal: SceneJournal
     trained: TrainedSceneModel | None = None
+    events: Sequence[Event] = ()
 
     @cached_property
     def scenes(self) -> Scenes:
@@ -171,10 +173,11 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     journal = SceneJournal(out)
     views = read_views(files, plan)
     houses = training_houses(plan, views)
-    if "evolution" in plan.parts:  # raises where there are none
-        find_events(plan.data, {view.scene for view in views}, plan.interactions, plan.seed)
+    events: list[Event] = []
+    if "evolution" in plan.parts:
+        events = find_events(plan.data, {view.scene for view in views}, plan.interactions, plan.seed)
     journal.begin(identity(plan, views), part_identities(plan, houses, trained))
-    return SceneBench(plan, views, houses, journal, trained)
+    return SceneBench(plan, views, houses, journal, trained, events)
 
 
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
