@@ -89,8 +89,7 @@ def main() -> None:
 
 def report(houses: list[str], figures: dict[str, list[dict[str, float]]]) -> None:
     """Print the means of all rows and their differences from snapshots."""
-    numbers = np.unique(houses, return_inverse=True)[1]
-    draws, table = Draws.of(numbers), []
+    draws, table = Draws.of_scenes(houses), []
     for name, row in figures.items():
         cells = []
         for metric in ("psnr", "lpips-alex"):
