@@ -24,13 +24,12 @@ from persist_cli.bench.episodes import read_episodes
 from persist_cli.bench.rows import NO_MEMORY
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
-from persist_cli.evaluate.provenance import checkpoint_json
-from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, difference, mean_figure
+from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, Figure, difference, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.learn.learn import FIGURES, RESULTS
 from persist_cli.policies.trained import find_policy, packaged_policy
 from persist_cli.reproduce.commands import run_line, run_main
-from persist_cli.reproduce.plan_file import PLAN, keep_plan
+from persist_cli.reproduce.plan_file import PLAN, keep_plan, model_json
 from persist_cli.viewing.console import say
 
 SIMULATOR: Final = "simulator"
@@ -121,9 +120,8 @@ def identity(plan: Plan) -> dict[str, Any]:
         CheckpointError: when model or policy are not there.
     """
     policy = packaged_policy() if plan.policy is None else find_policy(Path(plan.policy))
-    model = checkpoint_json(find_checkpoint(Path(plan.model)))
     return {
-        "model": {"path": plan.model, "fingerprint": model["fingerprint"], "adapters": model["adapters"]},
+        "model": model_json(plan.model),
         "policy": {"path": plan.policy or "that comes with the package", "fingerprint": policy.fingerprint},
         "scenes": plan.scenes, "views": plan.views, "options": plan.options,
     }  # fmt: skip
@@ -223,18 +221,26 @@ def summarise(rows: Mapping[str, Sequence[dict[str, Any]]], rounds: int) -> dict
     }
     reference = NO_MEMORY if NO_MEMORY in figures else next(iter(figures))
     memories = {
-        memory: {
-            name: {
-                "before": before.to_json(),
-                "after": after.to_json(),
-                CHANGE: difference(after, before),
-                ADVANTAGE: None if memory == reference else difference(after, figures[reference][name][1]),
-            }
-            for name, (before, after) in own.items()
-        }
+        memory: {name: comparison(pair, figures[reference][name]) for name, pair in own.items()}
         for memory, own in figures.items()
     }
     return {"compared with": reference, "memories": memories}
+
+
+def comparison(own: Sequence[Figure], other: Sequence[Figure]) -> dict[str, Any]:
+    """Return means before and after learning with paired differences, as JSON values.
+
+    Args:
+        own: the figures before and after.
+        other: those of the memory compared with; for that memory itself the very same.
+    """
+    before, after = own
+    return {
+        "before": before.to_json(),
+        "after": after.to_json(),
+        CHANGE: difference(after, before),
+        ADVANTAGE: None if own is other else difference(after, other[1]),
+    }
 
 
 def values(results: Sequence[dict[str, Any]], name: str, number: int) -> np.ndarray[Any, Any]:
@@ -254,10 +260,15 @@ def table(results: Mapping[str, Any]) -> str:
     ]
     for memory, figures in results["memories"].items():
         for name, cell in figures.items():
-            means = (figure_text(cell[when], "") for when in ("before", "after"))
-            changes = (figure_text(cell[what] or {}, "+") for what in (CHANGE, ADVANTAGE))
-            lines.append(f"| {memory} | {name} | {' | '.join([*means, *changes])} |")
+            lines.append(f"| {memory} | {name} | {comparison_text(cell)} |")
     return "\n".join(lines) + "\n"
+
+
+def comparison_text(compared: Mapping[str, Any]) -> str:
+    """Return what ``comparison`` returned as cells of a Markdown table."""
+    means = (figure_text(compared[when], "") for when in ("before", "after"))
+    changes = (figure_text(compared[what] or {}, "+") for what in (CHANGE, ADVANTAGE))
+    return " | ".join([*means, *changes])
 
 
 def named(weights: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ from typing import Any, Final
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.errors import PersistError
 from persist_cli.evaluate.journal import check_same
+from persist_cli.evaluate.provenance import checkpoint_json
 from persist_cli.io.files import plain, read_json, write_json
 
 PLAN: Final = "plan.json"
@@ -38,6 +39,12 @@ def base_json(base: str) -> dict[str, str]:
     """The place of a base and the hash of its weights; ``CheckpointError`` when there is none."""
     place = str(Path(base).resolve()) if Path(base).is_dir() else base
     return {"path": place, "fingerprint": find_checkpoint(Path(base)).fingerprint}
+
+
+def model_json(model: str) -> dict[str, Any]:
+    """The place of a model with the hashes of its weights and adapters; ``CheckpointError`` when there is none."""
+    hashes = checkpoint_json(find_checkpoint(Path(model)))
+    return {"path": model, "fingerprint": hashes["fingerprint"], "adapters": hashes["adapters"]}
 
 
 def places(folders: Sequence[Path]) -> list[str]:

@@ -31,13 +31,12 @@ from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.checkpoints.scene_models import PACKAGED, find_scene_model
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError, PluginError
-from persist_cli.evaluate.provenance import checkpoint_json
-from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, difference, mean_figure
+from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.plugins import load_plugin
 from persist_cli.reproduce.commands import run_line, run_main
-from persist_cli.reproduce.learning import ADVANTAGE, CHANGE, SIMULATOR, figure_text, named
-from persist_cli.reproduce.plan_file import keep_plan
+from persist_cli.reproduce.learning import SIMULATOR, comparison, comparison_text, named
+from persist_cli.reproduce.plan_file import keep_plan, model_json
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import say
 
@@ -164,9 +163,8 @@ def identity(plan: Plan) -> dict[str, Any]:
         PersistError: when a model, an adapter or stable-baselines3 is missing.
     """
     check_packages()
-    model = checkpoint_json(find_checkpoint(Path(plan.model)))
     described: dict[str, Any] = {
-        "model": {"path": plan.model, "fingerprint": model["fingerprint"], "adapters": model["adapters"]},
+        "model": model_json(plan.model),
         "scenes": plan.scenes, "frames": FRAMES, "steps": plan.steps, "envs": plan.envs, "episodes": plan.episodes,
         "denoising_steps": plan.denoising_steps,
     }  # fmt: skip
@@ -313,14 +311,9 @@ def summarise(rows: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> dict
     return {
         "compared with": reference,
         "memories": {
-            memory: {
-                "before": before.to_json(),
-                "after": after.to_json(),
-                CHANGE: difference(after, before),
-                ADVANTAGE: None if memory == reference else difference(after, figures[reference][1]),
-                "without_goal": sum(one["without_goal"] is not None for house in rows[memory] for one in house),
-            }
-            for memory, (before, after) in figures.items()
+            memory: comparison(own, figures[reference])
+            | {"without_goal": sum(one["without_goal"] is not None for house in rows[memory] for one in house)}
+            for memory, own in figures.items()
         },
     }
 
@@ -338,9 +331,7 @@ def table(results: Mapping[str, Any]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for memory, row in results["memories"].items():
-        cells = [figure_text(row["before"], ""), figure_text(row["after"], "")]
-        cells += [figure_text(row[name] or {}, "+") for name in (CHANGE, ADVANTAGE)]
-        lines.append(f"| {memory} | {' | '.join(cells)} | {row['without_goal']} |")
+        lines.append(f"| {memory} | {comparison_text(row)} | {row['without_goal']} |")
     return "\n".join(lines) + "\n"
 
 
