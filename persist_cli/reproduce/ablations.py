@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,7 +26,7 @@ from persist_cli.evaluate.report.result_file import Cell, read_results
 from persist_cli.io.files import write_json, written_aside
 from persist_cli.io.hub import cached_weight
 from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_names
-from persist_cli.reproduce.commands import COLLECT, run_line
+from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 from persist_cli.reproduce.plan_file import base_json, keep_plan, places
 from persist_cli.viewing.console import say
 from persist_cli.viewing.curve import Curve, draw_curves
@@ -325,8 +324,12 @@ def numbers(text: str) -> tuple[int, ...]:
     return found
 
 
-def main() -> None:
-    """Run the ablations; exit code 1 and one line for an error that the user can mend."""
+def main(arguments: Sequence[str]) -> None:
+    """Run the ablations.
+
+    Raises:
+        PersistError: when there is no such ablation or base, or what ``run_ablations`` raises.
+    """
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.ablations", description=__doc__)
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/ablations"), help="folder of everything")
     parser.add_argument("--samples", type=numbers, default=(4800,), help="training samples, as in 1000,5000,50000")
@@ -337,25 +340,14 @@ def main() -> None:
     parser.add_argument("--houses", type=int, default=HOUSES, help="houses to collect for training")
     parser.add_argument("--clips", type=int, default=48, help="most clips to measure on")
     parser.add_argument("--seed", type=int, default=0, help="seed of the trainings")
-    options = parser.parse_args()
-    try:
-        recipes = chosen_recipes([name for name in options.only.split(",") if name])
-        data, held_out = options.data or default_data(options.out), options.held_out or default_held_out(options.out)
-        plan = Plan(
-            options.out,
-            options.samples,
-            recipes,
-            options.base,
-            tuple(data),
-            tuple(held_out),
-            options.clips,
-            options.seed,
-        )
-        run_ablations(plan, options.houses)
-    except PersistError as error:
-        say(f"error: {error}")
-        sys.exit(1)
+    options = parser.parse_args(arguments)
+    recipes = chosen_recipes([name for name in options.only.split(",") if name])
+    data, held_out = options.data or default_data(options.out), options.held_out or default_held_out(options.out)
+    plan = Plan(
+        options.out, options.samples, recipes, options.base, tuple(data), tuple(held_out), options.clips, options.seed
+    )
+    run_ablations(plan, options.houses)
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.report.result_file import read_results
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.recipe import EXTENDS, apply_overrides, make_recipe, read_recipe
-from persist_cli.reproduce.commands import COLLECT, run_line
+from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 from persist_cli.reproduce.plan_file import base_json, keep_plan, places
 from persist_cli.viewing.console import say
 
@@ -356,8 +355,12 @@ def memories_of(text: str) -> tuple[str, ...]:
     return names
 
 
-def main() -> None:
-    """Make the choices of some memories, and end with the exit code of a command that fails."""
+def main(arguments: Sequence[str]) -> None:
+    """Make the choices of some memories, and end with the exit code of a command that fails.
+
+    Raises:
+        PersistError: when there is no such memory, or what ``run_choose`` raises.
+    """
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.choose")
     parser.add_argument("out", type=Path, help="folder of everything")
     parser.add_argument("--base", default="reference", help="stage-1 run or checkpoint that all stand on")
@@ -366,18 +369,13 @@ def main() -> None:
     parser.add_argument("--memories", default=",".join(TRIALS), help="separated by commas")
     parser.add_argument("--steps", type=int, default=Plan.steps, help="optimizer steps of a trial")
     parser.add_argument("--clips", type=int, default=Plan.clips, help="most clips of an evaluation")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     validation = tuple(options.validation or default_validation(options.out))
-    try:
-        memories = memories_of(options.memories)
-        for memory in memories:
-            make_recipe(read_recipe(f"{RECIPE}{memory}"), f"{RECIPE}{memory}")
-        run_choose(
-            Plan(options.out, options.base, tuple(options.data), validation, memories, options.steps, options.clips)
-        )
-    except PersistError as error:
-        sys.exit(f"error: {error}")
+    memories = memories_of(options.memories)
+    for memory in memories:
+        make_recipe(read_recipe(f"{RECIPE}{memory}"), f"{RECIPE}{memory}")
+    run_choose(Plan(options.out, options.base, tuple(options.data), validation, memories, options.steps, options.clips))
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

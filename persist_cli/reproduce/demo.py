@@ -23,10 +23,11 @@ from typing import Final
 import typer
 
 from persist_cli.cli.app import app
-from persist_cli.errors import INTERRUPTED, PersistError
+from persist_cli.errors import INTERRUPTED
 from persist_cli.evaluate.journal import Journal
 from persist_cli.io.files import read_json
 from persist_cli.io.hub import cached_weight
+from persist_cli.reproduce.commands import run_main
 from persist_cli.viewing.console import say
 
 HALF: Final = 32  # frames after the first that the memory is made of; what follows is the way back, by another way
@@ -180,22 +181,19 @@ def gather_results(out: Path, trajectory: str) -> None:
     shutil.copyfile(out / "eval" / "metrics.json", out / "metrics.json")
 
 
-def main() -> None:
-    """Run a demo; exit code 1 and one line for an error that the user can mend, 130 after Ctrl-C."""
+def main(arguments: Sequence[str]) -> None:
+    """Run a demo; exit code 130 after Ctrl-C, ``PersistError`` where a command raises it."""
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.demo")
     parser.add_argument("out", nargs="?", type=Path, help="folder to write to")
     parser.add_argument("--train", action="store_true", help="collect houses and train small models first")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     demo = TRAINING_DEMO if options.train else REFERENCE_DEMO
     try:
         run_demo(demo, options.out or Path(demo.folder))
-    except PersistError as error:
-        say(f"error: {error}")
-        sys.exit(1)
     except (KeyboardInterrupt, typer.Abort):  # what an interrupted command becomes depends on the version of typer
         say("stopped")
         sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

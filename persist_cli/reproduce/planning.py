@@ -18,16 +18,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.errors import PersistError
-from persist_cli.reproduce.commands import run_line
+from persist_cli.reproduce.commands import run_line, run_main
 from persist_cli.reproduce.plan_file import base_json, keep_plan
-from persist_cli.viewing.console import say
 
 WEIGHTS: Final = ("lpips-alex", "dinov2-s-derived")
 
@@ -104,8 +101,12 @@ def _to(home: str, name: str) -> str:
     return f"--out {home}/{name} --report {home}/report-{name}"
 
 
-def main() -> None:
-    """Run every command until one fails, and end with its exit code."""
+def main(arguments: Sequence[str]) -> None:
+    """Run every command until one fails, and end with its exit code.
+
+    Raises:
+        PersistError: when the folder holds figures of something else, or the checkpoint is not there.
+    """
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.planning")
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/planning"), help="folder of everything")
     parser.add_argument("--checkpoint", default="reference", help="the world model; else that of the package")
@@ -114,18 +115,14 @@ def main() -> None:
     parser.add_argument("--scenes", default="40:96", help="held-out houses")
     parser.add_argument("--each", type=int, default=32, help="most episodes of each bin, in sight and hidden")
     parser.add_argument("--bins", default="8,16", help="actions of the shortest ways")
-    options = parser.parse_args()
-    try:
-        figures = PlanningFigures(
-            options.out, options.checkpoint, options.policy, options.trained, options.scenes, options.each, options.bins
-        )
-        keep_plan(figures.out, identity(figures), "*.json")
-        for line in commands(figures):
-            run_line(line)
-    except PersistError as error:
-        say(f"error: {error}")
-        sys.exit(1)
+    options = parser.parse_args(arguments)
+    figures = PlanningFigures(
+        options.out, options.checkpoint, options.policy, options.trained, options.scenes, options.each, options.bins
+    )
+    keep_plan(figures.out, identity(figures), "*.json")
+    for line in commands(figures):
+        run_line(line)
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from persist_cli.errors import PersistError
 from persist_cli.io.files import written_aside
+from persist_cli.reproduce.commands import run_main
 from persist_cli.reproduce.pages import driven_chromium, served_page, split_arguments, window_size
 from persist_cli.viewing.console import say
 
@@ -88,25 +88,21 @@ def frame_number(page: Page) -> int:
     return int(page.locator("#stage").get_attribute("data-number") or 0)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Take the picture; exit code 1 and one line for an error that the user can mend."""
+def main(arguments: Sequence[str]) -> None:
+    """Take the picture; ``PersistError`` where an option cannot be read, or what ``take_picture`` raises."""
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.play_picture")
     parser.add_argument("out", type=Path, help="PNG file to write")
     parser.add_argument("--walk", default=WALK, help=f"keys, and the frames that each is held for; {WALK!r} by default")
     parser.add_argument("--size", default="1360x800", help="of the window; 1360x800 by default")
     parser.epilog = f"After -- follow arguments of `persist play`; {shlex.join(COMPARED)} by default."
-    own, passed = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, passed = split_arguments(arguments)
     options = parser.parse_args(own)
-    try:
-        presses(options.walk)  # a mistake is said at once
-        size = window_size(options.size)
-        with served_page(shlex.join(["play", *(passed or COMPARED)])) as served:
-            take_picture(served.address, options.out, options.walk, size)
-    except PersistError as error:
-        say(f"error: {error}")
-        sys.exit(1)
+    presses(options.walk)  # a mistake is said at once
+    size = window_size(options.size)
+    with served_page(shlex.join(["play", *(passed or COMPARED)])) as served:
+        take_picture(served.address, options.out, options.walk, size)
     say(f"wrote {options.out}")
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -12,16 +12,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.errors import PersistError
 from persist_cli.reproduce import choose
-from persist_cli.reproduce.commands import COLLECT, run_line
-from persist_cli.viewing.console import say
+from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 
 PACKAGED = ("none", "voxel", "map2d", "snapshots")  # memories of the model that comes with the package
 CHOSEN = (*PACKAGED, "views", "context")  # memories for which choices are made; the first is the baseline
@@ -254,25 +251,21 @@ def table(out: Path, name: str, checkpoints: Sequence[str], options: str) -> str
     return " ".join(["eval", *checkpoints, options, f"--out {home}/eval-{name} --report {home}/report-{name}"])
 
 
-def main() -> None:
-    """Run every command until one fails, and end with its exit code."""
+def main(arguments: Sequence[str]) -> None:
+    """Run every command until one fails, and end with its exit code; ``PersistError`` where a choice cannot be made."""
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.table1")
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/table1"), help="folder of everything")
     parser.add_argument("--reference", action="store_true", help="measure the model of the package, train none")
-    options = parser.parse_args()
-    try:
-        for line in reference_commands(options.out) if options.reference else base_commands(options.out):
-            run_line(line)
-        if options.reference:
-            return
-        choose.run_choose(choice_plan(options.out))
-        chosen = Chosen.of(options.out / "choices")
-        for line in [*memory_commands(options.out, chosen), *evaluate_commands(options.out, chosen)]:
-            run_line(line)
-    except PersistError as error:
-        say(f"error: {error}")
-        sys.exit(1)
+    options = parser.parse_args(arguments)
+    for line in reference_commands(options.out) if options.reference else base_commands(options.out):
+        run_line(line)
+    if options.reference:
+        return
+    choose.run_choose(choice_plan(options.out))
+    chosen = Chosen.of(options.out / "choices")
+    for line in [*memory_commands(options.out, chosen), *evaluate_commands(options.out, chosen)]:
+        run_line(line)
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from persist_cli.errors import PersistError
 from persist_cli.io.files import written_aside
+from persist_cli.reproduce.commands import run_main
 from persist_cli.reproduce.pages import driven_chromium, served_page, split_arguments, window_size
 from persist_cli.viewing.console import say
 
@@ -78,24 +78,20 @@ def steady_picture(page: Page) -> bytes:
     return before
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Take the picture; exit code 1 and one line for an error that the user can mend."""
+def main(arguments: Sequence[str]) -> None:
+    """Take the picture; ``PersistError`` where the size cannot be read, or what ``take_picture`` raises."""
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.view_picture")
     parser.add_argument("out", type=Path, help="PNG file to write")
     parser.add_argument("--press", action="append", default=[], help="tab or button; may be given again")
     parser.add_argument("--size", default="1360x800", help="of the window; 1360x800 by default")
     parser.epilog = "After -- follow the arguments of `persist view`."
-    own, passed = split_arguments(sys.argv[1:] if arguments is None else arguments)
+    own, passed = split_arguments(arguments)
     options = parser.parse_args(own)
-    try:
-        size = window_size(options.size)
-        with served_page(shlex.join(["view", *passed])) as served:
-            take_picture(served.address, options.out, options.press, size)
-    except PersistError as error:
-        say(f"error: {error}")
-        sys.exit(1)
+    size = window_size(options.size)
+    with served_page(shlex.join(["view", *passed])) as served:
+        take_picture(served.address, options.out, options.press, size)
     say(f"wrote {options.out}")
 
 
 if __name__ == "__main__":
-    main()
+    run_main(main)

@@ -31,9 +31,8 @@ def test_an_interrupt_ends_the_demo_in_one_line(monkeypatch, tmp_path, capsys):
     stopped = typer.Typer()
     stopped.command()(stop)
     monkeypatch.setattr(demo, "app", stopped)
-    monkeypatch.setattr("sys.argv", ["demo", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
-        demo.main()
+        demo.main([str(tmp_path)])
     assert ended.value.code == 130
     assert capsys.readouterr().out.splitlines()[-1] == "stopped"
 
