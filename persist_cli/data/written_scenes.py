@@ -23,8 +23,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.data.stored_cells import CellBox, encode_cells
 from persist_cli.errors import PluginError
-from persist_cli.io.settings import parse_settings
-from persist_cli.plugins import find_plugin, load_plugin, make_encoder
+from persist_cli.plugins import find_plugin, load_plugin, make_encoder, make_settings
 
 MEMORY: Final = "scene"  # the plugin that is written
 FORMAT: Final = 1  # of what is kept
@@ -105,8 +104,7 @@ class SceneWriter:
 
     @cached_property
     def _settings(self) -> Any:
-        values = {"size": self.form.size, "palette": list(self.form.palette)}
-        return parse_settings(self._kind.settings_type, values, f"memory {MEMORY!r}")
+        return make_settings("memory", MEMORY, {"size": self.form.size, "palette": list(self.form.palette)})
 
     def _write(self, info: TrajectoryInfo, seen: Observations) -> CellGrid:
         scene = self._kind(self._settings, self._encoder, FrameOfReference(info.scene, info.world_up))

@@ -146,17 +146,13 @@ class ClipCache:
         depends = {name: value for name, value in keys.tokens.items() if name in FEATURES}
         return ClipCache(cache, keys, FeatureCache(cache, depends, encoder))
 
-    def whole(self, frames: ClipFrames) -> bool:
-        """Whether the entry of a clip has the latents of its whole trajectory."""
-        return self.keys.whole(frames)
-
     def latents(self, frames: ClipFrames) -> ClipLatents | None:
         """The latents of a clip, ``None`` where the cache has none."""
         key = self.keys.of_clip(frames).latents
         tensors = None if key is None else self.cache.get(key)
         if tensors is None:
             return None
-        return self.clip_latents(tensors["video"], frames) if self.whole(frames) else ClipLatents(**tensors)
+        return self.clip_latents(tensors["video"], frames) if self.keys.whole(frames) else ClipLatents(**tensors)
 
     def clip_latents(self, trajectory: Tensor, frames: ClipFrames) -> ClipLatents:
         """The latents of a clip out of those of its whole trajectory, in which every frame was encoded alone."""
@@ -184,7 +180,7 @@ class ClipCache:
         """Store the latents of a clip, or of its whole trajectory, while there is room."""
         key = self.keys.of_clip(frames).latents
         if key is not None:
-            tensors = {"video": latents.video} | ({} if self.whole(frames) else {"image": latents.image})
+            tensors = {"video": latents.video} | ({} if self.keys.whole(frames) else {"image": latents.image})
             self.cache.put(key, tensors)
 
     def put_tokens(self, frames: ClipFrames, tokens: MemoryTokens) -> None:
@@ -287,7 +283,7 @@ class ClipEncoder:
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip
             return self.encode(clip)
-        if not self.cache.whole(frames):
+        if not self.cache.keys.whole(frames):
             latents = self.encode(clip)
             self.cache.put_latents(frames, latents)
             return latents
