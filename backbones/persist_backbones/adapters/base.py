@@ -109,16 +109,21 @@ class OriginEmbedding(nn.Module):
 
     Args:
         width: channels of an embedded token.
+        marks: whether any token is marked; else there is nothing to learn, and nothing in the weights.
     """
 
-    def __init__(self, width: int) -> None:
+    imagined: nn.Parameter | None
+
+    def __init__(self, width: int, marks: bool) -> None:
         super().__init__()
-        self.imagined = nn.Parameter(torch.zeros(width))
+        self.register_parameter("imagined", nn.Parameter(torch.zeros(width)) if marks else None)
 
     def forward(
         self, embedded: Float[Tensor, "batch *group token width"], origins: UInt8[Tensor, "batch *group token"]
     ) -> Float[Tensor, "batch *group token width"]:
         """Return embedded tokens with the embedding added to those whose origin is imagined."""
+        if self.imagined is None:
+            return embedded
         imagined = (origins == Origin.IMAGINED)[..., None]
         return embedded + self.imagined.to(embedded.dtype) * imagined
 

@@ -180,7 +180,7 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
             raise CheckpointError(f"splat_pixels must be odd, not {settings.splat_pixels}")
         canvas_channels = settings.canvas_channels
         self.embed = nn.Linear(channels, canvas_channels)
-        self.origin = OriginEmbedding(canvas_channels) if settings.origins else None
+        self.origin = OriginEmbedding(canvas_channels, settings.origins)
         self.patch = video.patch * settings.canvas_scale
         self.patches = nn.Linear((canvas_channels + 2) * video.folded * self.patch**2, settings.width, bias=False)
         layers = range(0, video.layers, settings.every)
@@ -220,8 +220,7 @@ class CanvasAdapter(Adapter[PreparedCanvas]):
         views = cameras.resized(height * self.settings.canvas_scale, width * self.settings.canvas_scale)
         splats = rasterize(tokens.positions, tokens.mask, views, self.settings.token_size, self.settings.splat_pixels)
         batch, frames = tokens.mask.shape[0], views.world_from_camera.shape[1]
-        features = self.embed(tokens.features.to(self.patches.weight.dtype))
-        features = features if self.origin is None else self.origin(features, tokens.origins)
+        features = self.origin(self.embed(tokens.features.to(self.patches.weight.dtype)), tokens.origins)
         return splat(features, splats, (batch, frames, views.height, views.width))
 
     def draw_learned(self, cameras: Cameras) -> Float[Tensor, "batch frame channel height width"]:

@@ -66,7 +66,7 @@ class CrossAdapter(Adapter[CrossMemory]):
             raise CheckpointError("adapter: key_positions needs positions, not none; give positions=relative")
         code = 0 if settings.positions == "none" else 6 * settings.frequencies
         self.embed = nn.Linear(channels + code, settings.width)
-        self.origin = OriginEmbedding(settings.width) if settings.origins else None
+        self.origin = OriginEmbedding(settings.width, settings.origins)
         self.blocks = memory_blocks(settings, video, video.camera_channels)
         keys = code * settings.key_positions + 6 * video.folded * settings.key_camera
         for block in self.blocks.values() if keys else ():
@@ -78,8 +78,7 @@ class CrossAdapter(Adapter[CrossMemory]):
         features, code = tokens.features, self.position_code(tokens, cameras)
         if self.settings.normalize:
             features = F.layer_norm(features, features.shape[-1:])
-        hidden = self.embed(torch.cat([features, code], dim=-1).to(dtype))
-        hidden = hidden if self.origin is None else self.origin(hidden, tokens.origins)
+        hidden = self.origin(self.embed(torch.cat([features, code], dim=-1).to(dtype)), tokens.origins)
         codes = [code[:, None]] if self.settings.key_positions else []
         if self.settings.key_camera:
             rays = fold_frames(token_rays(tokens, cameras).transpose(2, 3), self.video.folded).transpose(2, 3)

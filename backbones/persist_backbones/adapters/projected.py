@@ -64,7 +64,7 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         super().__init__(channels, settings, video)
         code = video.folded * (6 * settings.frequencies + 1)
         self.embed = nn.Linear(channels, settings.width)
-        self.origin = OriginEmbedding(settings.width) if settings.origins else None
+        self.origin = OriginEmbedding(settings.width, settings.origins)
         self.place = nn.Linear(code, settings.width, bias=False)
         self.blocks = memory_blocks(settings, video, video.camera_channels + 4 * settings.frequencies)
 
@@ -75,8 +75,7 @@ class ProjectedAdapter(Adapter[ProjectedMemory]):
         code = torch.cat([self.code(places) * seen[..., None], seen[..., None].float()], dim=-1)
         folded = fold_frames(code.transpose(2, 3), frames).transpose(2, 3)
         mask = fold_frames(seen[:, :, None], frames).any(dim=2)
-        features = self.embed(tokens.features.to(dtype))
-        features = features if self.origin is None else self.origin(features, tokens.origins)
+        features = self.origin(self.embed(tokens.features.to(dtype)), tokens.origins)
         hidden = features[:, None] + self.place(folded.to(dtype))
         places = self.query_places(cameras).to(dtype)
         return self.with_learned(ProjectedMemory(hidden * mask[..., None], mask, places))
