@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -173,6 +173,31 @@ class CemSettings:
                 raise ValueError(f"{name} {value:g} is a share; it must lie {place}")
 
 
+class Remainder(NamedTuple):
+    """What is left of a plan of ``Cem``, from which the next plan may begin.
+
+    Args:
+        probabilities: of each action, where the plan ended.
+        actions: of the best candidate.
+        chosen: numbers, from 0, of those of its actions that were chosen.
+    """
+
+    probabilities: Float[Tensor, "action name"]
+    actions: tuple[str, ...]
+    chosen: list[int]
+
+    def after(self, count: int) -> Remainder | None:
+        """Return what is left after ``count`` of the chosen actions were done; ``None`` when nothing is."""
+        chosen = self.chosen[count:]
+        if not chosen:
+            return None
+        done = chosen[0]  # blocked actions before the next one are over, too
+        uniform = torch.full_like(self.probabilities, 1 / self.probabilities.shape[1])
+        probabilities = torch.cat([self.probabilities, uniform])[done : done + len(uniform)]
+        actions = (*self.actions, *self.actions[-1:] * done)[done:]
+        return Remainder(probabilities, actions, [number - done for number in chosen])
+
+
 @dataclass
 class Cem:
     """Searches over sequences of actions: draws, judges, and follows the best in the next round.
@@ -191,10 +216,7 @@ class Cem:
     settings: CemSettings
     policy: Policy | None = None
     settings_type = CemSettings
-    _last: tuple[Float[Tensor, "action name"], tuple[str, ...]] | None = field(default=None, init=False)
-    _chosen: list[int] = field(
-        default_factory=list, init=False
-    )  # numbers of the actions of the last plan that are done
+    _last: Remainder | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         check_horizon(self.policy, self.settings.horizon)
@@ -223,20 +245,12 @@ class Cem:
             probabilities = share * probabilities + (1 - share) * frequencies(elites, names, probabilities)
             kept = list(dict.fromkeys(elites))[: round(settings.kept * len(elites))]
         plan = finished(judge, number)
-        self._last, self._chosen = (probabilities, plan.best.actions), plan.best.chosen_numbers
+        self._last = Remainder(probabilities, plan.best.actions, plan.best.chosen_numbers)
         return plan
 
     def executed(self, count: int) -> None:
         """Shift the distributions that the next plan begins with by the actions that were done."""
-        left = self._chosen[count:]
-        if self._last is None or not left:
-            self._last = None  # nothing is left of it
-            return
-        (probabilities, best), done = self._last, left[0]  # blocked actions before the next one are over, too
-        uniform = torch.full_like(probabilities, 1 / probabilities.shape[1])
-        shifted = torch.cat([probabilities[done:], uniform[:done]])[: len(probabilities)]
-        self._last = shifted, (best + best[-1:] * done)[done : done + len(best)]
-        self._chosen = [number - done for number in left]
+        self._last = None if self._last is None else self._last.after(count)
 
     def _proposals(
         self, situation: Situation, names: Sequence[str], generator: torch.Generator
@@ -251,10 +265,10 @@ class Cem:
     def _begin(self, names: Sequence[str]) -> tuple[Float[Tensor, "action name"], list[tuple[str, ...]]]:
         """Return the distributions of the first round, and candidates to judge beside those that are drawn."""
         uniform = torch.full((self.settings.horizon, len(names)), 1 / len(names), dtype=torch.float64)
-        if not self.settings.shift or self._last is None or self._last[0].shape != uniform.shape:
+        if not self.settings.shift or self._last is None or self._last.probabilities.shape != uniform.shape:
             return uniform, []
-        probabilities, best = self._last
-        return self.settings.shift * probabilities + (1 - self.settings.shift) * uniform, [best]
+        share = self.settings.shift
+        return share * self._last.probabilities + (1 - share) * uniform, [self._last.actions]
 
 
 def action_names(vocabulary: ActionVocabulary, chosen: Sequence[str]) -> list[str]:

@@ -164,7 +164,7 @@ def test_frequencies_are_shares_of_each_place():
 def test_a_shifted_plan_goes_on_where_the_last_one_was_left(judge, situation):
     planner = Cem(CemSettings(horizon=4, candidates=30, rounds=4, shift=1.0, kept=0.5))
     planner.plan(situation, judge(), seeded())
-    before, best = planner._last
+    before, best, _ = planner._last
     planner.executed(1)
     probabilities, kept = planner._begin(["forward", "left", "right"])
     assert torch.equal(probabilities[:3], before[1:])
