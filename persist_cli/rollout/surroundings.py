@@ -239,13 +239,11 @@ def whole_walks(
     Args:
         camera: with a frame axis of one.
         info: up axis and vocabulary.
-        actions: names in the vocabulary, for each walk; it may have none.
+        actions: names in the vocabulary, for each of one walk or more; a walk may have none.
         surroundings: what all of them know of the ground; ``None`` to go through walls.
     """
     walks = [Walk(info, camera, surroundings) for _ in actions]
-    longest = max(map(len, actions), default=0)
-    if longest:
-        plan_walks(walks, actions, longest)
+    plan_walks(walks, actions, max(map(len, actions)))
     return walks
 
 
