@@ -159,7 +159,7 @@ def draw(planned: Planned, path: Path) -> None:
 
 
 def record_of(planned: Planned, shown: Shown) -> dict[str, Any]:
-    """Return what was found, as JSON values."""
+    """Return what was found, as JSON values; costs may be infinite, which ``write_json`` writes as null."""
     plan = planned.plan
     rows = [candidate_json(candidate) for candidate in planned.ranked()]
     for number, row in enumerate(rows[: len(shown.candidates)]):
@@ -181,7 +181,10 @@ def record_of(planned: Planned, shown: Shown) -> dict[str, Any]:
 
 
 def candidate_json(candidate: Candidate) -> dict[str, Any]:
-    """Return a candidate as JSON values; poses are world_from_camera, blocked actions are numbered from 1."""
+    """Return a candidate as JSON values; poses are world_from_camera, blocked actions are numbered from 1.
+
+    A cost may be infinite, as that of ``geodesic`` where there is no way; the file has null in its place.
+    """
     poses = candidate.walk.poses
     return {
         "actions": format_actions(candidate.actions),

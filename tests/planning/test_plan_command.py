@@ -163,6 +163,23 @@ def test_options_that_cannot_be_used_are_one_line_and_leave_nothing(plan, tmp_pa
     assert not (tmp_path / "plan").exists()
 
 
+@pytest.mark.parametrize("method", ["rank", "cem"])
+def test_a_policy_that_does_not_look_so_far_is_one_line_and_leaves_nothing(plan, site, tmp_path, method):
+    near = """
+        from persist_cli.api.policy import Policy
+
+        class Near(Policy):
+            longest = 2
+            def propose(self, situation, horizon, count, generator):
+                return [("left",) * horizon] * count
+    """
+    install(site, "persist-near", "persist.policies", "near = near:Near", near)
+    result = plan(*PLACE, "--method", method, "--policy", "near")
+    assert (result.code, result.out, len(result.err.splitlines())) == (1, "", 1)
+    assert "policy 'near' looks at most 2 actions ahead, not 3; give --horizon 2" in result.err
+    assert not (tmp_path / "plan").exists()
+
+
 def test_a_cost_that_is_nan_is_one_line_and_leaves_nothing(plan, site, tmp_path):
     undefined = """
         import torch
@@ -179,6 +196,24 @@ def test_a_cost_that_is_nan_is_one_line_and_leaves_nothing(plan, site, tmp_path)
     assert "cost 'undefined' of " in result.err
     assert " is NaN (" in result.err
     assert not (tmp_path / "plan").exists()
+
+
+def test_a_cost_that_is_infinite_is_null_in_the_file(plan, site, tmp_path):
+    endless = """
+        import torch
+        from persist_cli.api.cost import Cost
+
+        class Endless(Cost):
+            reads, sees = "place", False
+            def measure(self, futures, goal, ground):
+                return torch.full(futures.free.shape, torch.inf)
+    """
+    install(site, "persist-endless", "persist.costs", "endless = endless:Endless", endless)
+    result = plan("--cost", "endless")
+    assert result.code == 0, result.err
+    record = json.loads((tmp_path / "plan/plan.json").read_text())
+    assert {candidate["cost"] for candidate in record["candidates"]} == {record["least_cost"]} == {None}
+    assert " inf " in result.out
 
 
 def test_a_plan_that_cannot_be_written_leaves_nothing_or_the_whole_plan_before(plan, tmp_path, monkeypatch):
