@@ -31,6 +31,7 @@ from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics.src import chosen_encoder
+from persist_cli.planning.planners import check_horizon
 from persist_cli.plugins import check_simulator, make_cost, make_simulator
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
@@ -139,6 +140,7 @@ class PlanningBench:
         checkpoint: of the world model; ``None`` where no row has one.
         episodes: to run.
         rows: of the tables.
+        policies: of the rows and the plan, by name; ``None`` for no name.
         cost: of the rows that imagine, by which agents that are shown an image stop.
         simulator: of the episodes.
         journal: keeps what was run.
@@ -149,6 +151,7 @@ class PlanningBench:
     checkpoint: Checkpoint | None
     episodes: EpisodeSet
     rows: Sequence[PlanningRow]
+    policies: Mapping[str | None, Policy | None]
     cost: Cost
     simulator: Simulator
     journal: PlanningJournal
@@ -184,13 +187,14 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     rows = RowChoice(names, plan.memories, plan.policy, cost.reads, plan.cem_candidates).rows()
     if missing := cost.missing():
         raise PersistError(f"cost {cost.name!r}: {missing}")
-    check_policies(rows, plan.planning)
+    policies = open_policies(plan, rows)
+    check_policies(rows, policies, plan.planning.horizon)
     if plan.planning.cem != CEM and all(row.planner != "cem" for row in rows):
         raise PersistError("--set method.…: no row has the cross-entropy method; add cem to --rows, or leave it out")
     checkpoint = find_checkpoint(plan.checkpoint) if any(row.uses_world_model for row in rows) else None
     journal = PlanningJournal(out)
     if processes.main:
-        values = identity(plan, cost, checkpoint)
+        values = identity(plan, cost, checkpoint, policies[plan.policy])
         if journal.begun and journal.identity()["episodes"] == plan.source.identity(unset=True):
             values["episodes"] = journal.identity()["episodes"]
         journal.check(values)
@@ -198,7 +202,8 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         if checkpoint is not None:
             check_model(checkpoint, rows, episodes)
         if not journal.begun or (checkpoint is not None and not journal.identity().get("checkpoint")):
-            check_scenes(episodes.scenes, trained_on(checkpoint, plan.policy), plan.allow_training_scenes)
+            known = trained_on(checkpoint, trained_policy(policies[plan.policy]))
+            check_scenes(episodes.scenes, known, plan.allow_training_scenes)
         check_budget(plan, rows, episodes)
         journal.begin(values, episodes)
     processes.wait()
@@ -208,7 +213,17 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         find_thresholds(plan, cost, rows, simulator, journal)
     processes.wait()  # the others find what the main process kept
     thresholds = find_thresholds(plan, cost, rows, simulator, journal)
-    return PlanningBench(plan, checkpoint, episodes, rows, cost, simulator, journal, thresholds)
+    return PlanningBench(plan, checkpoint, episodes, rows, policies, cost, simulator, journal, thresholds)
+
+
+def open_policies(plan: BenchPlan, rows: Sequence[PlanningRow]) -> dict[str | None, Policy | None]:
+    """Return the policies of the rows and of the plan by name, each opened once; ``None`` for no name.
+
+    Raises:
+        PersistError: when one is not there.
+    """
+    names = dict.fromkeys([*(row.policy for row in rows), plan.policy])
+    return {name: None if name is None else open_policy(name) for name in names}
 
 
 def check_budget(plan: BenchPlan, rows: Sequence[PlanningRow], episodes: EpisodeSet) -> None:
@@ -224,18 +239,12 @@ def check_budget(plan: BenchPlan, rows: Sequence[PlanningRow], episodes: Episode
         raise PersistError(f"--frames {frames}: a plan has up to {needed} actions; give {needed} or more, or {rest}")
 
 
-def check_policies(rows: Sequence[PlanningRow], settings: PlanSettings) -> None:
+def check_policies(rows: Sequence[PlanningRow], policies: Mapping[str | None, Policy | None], horizon: int) -> None:
     """Raise ``PersistError`` when a policy does not look as far ahead as the horizon, or reads no such goal."""
     for row in rows:
-        policy = open_policy(row.policy) if row.policy is not None else None
-        if policy is None:
-            continue
-        if policy.longest is not None and settings.horizon > policy.longest:
-            raise PersistError(
-                f"policy {row.policy!r} looks at most {policy.longest} actions ahead, not {settings.horizon}; give "
-                f"--horizon {policy.longest}"
-            )
-        if policy.reads and row.goal not in policy.reads and row.name not in ALONE:
+        policy = policies[row.policy]
+        check_horizon(policy, horizon)
+        if policy is not None and policy.reads and row.goal not in policy.reads and row.name not in ALONE:
             raise PersistError(
                 f"policy {row.policy!r} needs a goal with {' or '.join(sorted(policy.reads))}, and the cost reads the "
                 f"{row.goal}; take another --cost"
@@ -273,29 +282,29 @@ def check_scenes(scenes: Sequence[str], trained: Mapping[str, Collection[str]], 
             )
 
 
-def trained_on(checkpoint: Checkpoint | None, policy: str | None) -> dict[str, Collection[str]]:
+def trained_on(checkpoint: Checkpoint | None, policy: TrainedPolicy | None) -> dict[str, Collection[str]]:
     """Return the names of the scenes that model and policy were trained on, by words for each."""
     names: dict[str, Collection[str]] = {} if checkpoint is None else {"the model": training_scenes([checkpoint])}
-    trained = None if policy is None else trained_policy(open_policy(policy))
-    if trained is not None:
-        scenes = trained.training_scenes
+    if policy is not None:
+        scenes = policy.training_scenes
         if scenes is None or not scenes.complete:
-            warn(f"{trained.folder}: not all scenes that this policy was trained on are known")
-        names[f"policy {policy!r}"] = scenes.names if scenes is not None else ()
+            warn(f"{policy.folder}: not all scenes that this policy was trained on are known")
+        names[f"policy {str(policy.folder)!r}"] = scenes.names if scenes is not None else ()
     return names
 
 
-def trained_policy(policy: Policy) -> TrainedPolicy | None:
+def trained_policy(policy: Policy | None) -> TrainedPolicy | None:
     """Return what a policy has learned as it lies on disk; ``None`` for a policy that is not trained."""
-    if not hasattr(policy.settings, "checkpoint"):
+    if policy is None or not hasattr(policy.settings, "checkpoint"):
         return None
     checkpoint = policy.settings.checkpoint
     return packaged_policy() if checkpoint is None else find_policy(Path(checkpoint))
 
 
-def policy_json(name: str) -> dict[str, Any]:
-    """Return JSON values that tell policies apart, and how they act."""
-    policy = open_policy(name)
+def policy_json(name: str | None, policy: Policy | None) -> dict[str, Any] | None:
+    """Return JSON values that tell policies apart, and how they act; ``None`` without one."""
+    if policy is None:
+        return None
     trained = trained_policy(policy)
     return {"name": name, "fingerprint": trained and trained.fingerprint, "settings": acting_settings(policy.settings)}
 
@@ -326,14 +335,14 @@ def find_thresholds(
     return StopThresholds.read(kept)
 
 
-def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None) -> dict[str, Any]:
+def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None, policy: Policy | None) -> dict[str, Any]:
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
     values = {
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
         "encoder": chosen_encoder().name if cost.name == "dino" or "open" in plan.loops else None,
-        "policy": None if plan.policy is None else policy_json(plan.policy),
+        "policy": policy_json(plan.policy, policy),
         "cem candidates": plan.cem_candidates,
         "planning": plan.planning.to_json(),
         "loop": asdict(plan.loop) | {"loops": list(plan.loops)},
@@ -365,11 +374,8 @@ class RowLoader:
 
     def load(self, row: PlanningRow) -> RowParts:
         """Return the parts of a row; the backbone has its adapter until another row is loaded."""
-        policy = open_policy(row.policy) if row.policy is not None else None
-        parts, checkpoint = (
-            RowParts(policy, self.bench.cost if row.imagines or row.retrieves else None),
-            self.bench.checkpoint,
-        )
+        checkpoint = self.bench.checkpoint
+        parts = RowParts(self.bench.policies[row.policy], self.bench.cost if row.imagines or row.retrieves else None)
         if checkpoint is None or not row.uses_world_model:
             return parts
         backbone, adapter = self.loader.load(checkpoint), adapter_of(checkpoint, row)

@@ -250,7 +250,7 @@ def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
 def check_held_out(plan: LearnPlan, begin: TrainedPolicy, scene: str) -> None:
     """Raise ``DataError`` when model or policy were trained on the evaluated scene, unless that is allowed."""
     checkpoint = find_checkpoint(plan.checkpoint) if plan.inside == MODEL else None
-    check_scenes([scene], trained_on(checkpoint, str(begin.folder)), plan.allow_training_scenes)
+    check_scenes([scene], trained_on(checkpoint, begin), plan.allow_training_scenes)
 
 
 def episodes_of(file: Path, info: TrajectoryInfo, simulator: Simulator) -> list[Episode]:

@@ -16,7 +16,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Cover
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, make_planner
-from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, trained_on
+from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, trained_on, trained_policy
 from persist_cli.bench.planning_pictures import end_words
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
@@ -24,6 +24,7 @@ from persist_cli.errors import DataError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.planning.planners import CemSettings
 from persist_cli.plugins import make_policy
+from persist_cli.policies.open_policy import open_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult, Persist
 from tests.support.predictions import cache_random
@@ -350,8 +351,8 @@ def test_scenes_that_the_policy_was_trained_on_are_refused(episodes: EpisodeSet,
     room = episodes.episodes[0].model_copy(update={"scene_name": "room-1"})
     known = episodes.model_copy(update={"episodes": [room]})
     with pytest.raises(DataError, match=r"'room-1': policy .* was trained on it"):
-        check_scenes(known.scenes, trained_on(None, str(policy_run)), allowed=False)
-    assert trained_on(None, "random") == {}
+        check_scenes(known.scenes, trained_on(None, trained_policy(open_policy(str(policy_run)))), allowed=False)
+    assert trained_on(None, trained_policy(make_policy("random", {}))) == {}
 
 
 def test_a_policy_that_does_not_look_so_far_is_refused(bench: Bench, policy_run: Path, random_lpips: None) -> None:
