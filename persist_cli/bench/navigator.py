@@ -31,9 +31,9 @@ from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
 APPROACH = 8  # actions of the ways that are compared before an agent stops
 
-CEM: Final = CemSettings(shift=0.5)  # of the rows of ``cem``, where nothing else is said
+CEM: Final = CemSettings(candidates=60, rounds=3, shift=0.5)  # of the rows of ``cem``, where nothing else is said
 
-ELSEWHERE: Final = {  # settings of ``cem`` that are no row's own, and what says them
+ELSEWHERE: Final = {  # settings of ``cem`` that are not set with ``--set``, and what says them
     "horizon": "give --horizon",
     "candidates": "give --candidates",
     "rounds": "give --rounds",
@@ -52,7 +52,6 @@ class PlanSettings:
     Args:
         horizon: most actions that a decision looks ahead.
         over: which frame of a candidate is judged.
-        rounds: most rounds of ``cem``.
         frames: most imagined frames of a decision; ``None`` for no bound. An approach compares all of its few ways.
         seconds: most seconds of a decision, likewise.
         body: whether imagined moves over ground known to be occupied do not move.
@@ -60,12 +59,15 @@ class PlanSettings:
         approach: whether an agent that recognises the goal goes on to the best view before it stops.
         explore: whether plans that end where the agent has looked already come last: the true view from there is known,
             and is not that of the goal image.
-        cem: the other settings of ``cem``.
+        cem: how ``cem`` searches, but for the horizon.
+        cem_options: of the command line that say so.
+
+    Raises:
+        PersistError: when the bounds of a decision let it imagine nothing.
     """
 
     horizon: int = 8
     over: Literal["last", "best"] = "last"
-    rounds: int = 3
     frames: int | None = None
     seconds: float | None = None
     body: bool = True
@@ -73,17 +75,30 @@ class PlanSettings:
     approach: bool = True
     explore: bool = True
     cem: CemSettings = CEM
+    cem_options: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        Budget(self.frames, self.seconds)  # which refuses what would imagine nothing
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values; of ``cem`` only what is not as usual, so that benchmarks begun without it go on."""
         values = asdict(self)
         if self.approach:
             values["approach"] = "straight, else aside"  # once it was straight alone
-        changed = {name: value for name, value in values.pop("cem").items() if value != getattr(CEM, name)}
-        return values | ({"cem": changed} if changed else {})
+        cem = values.pop("cem")
+        del values["cem_options"]
+        changed = {name: value for name, value in cem.items() if value != getattr(CEM, name) and name not in ELSEWHERE}
+        return values | {"rounds": self.cem.rounds} | ({"cem": changed} if changed else {})
 
-    def of_cem(self, texts: Sequence[str] | None) -> PlanSettings:
-        """Return these settings with those of ``cem`` in texts such as ``method.elites=0.1``.
+    def of_cem(
+        self, texts: Sequence[str] | None = None, candidates: int | None = None, rounds: int | None = None
+    ) -> PlanSettings:
+        """Return these settings with others of ``cem``.
+
+        Args:
+            texts: such as ``method.elites=0.1``.
+            candidates: of a round; ``None`` for the usual ones.
+            rounds: most rounds, likewise.
 
         Raises:
             PersistError: one line for what is no setting of these rows, or cannot be.
@@ -94,7 +109,11 @@ class PlanSettings:
                 raise PersistError(f"--set method.{name}: {instead}")
         if "shift" in values and not self.keep:
             raise PersistError("--set method.shift: --no-keep begins each plan anew; leave one of them out")
-        return replace(self, cem=parse_settings(CemSettings, asdict(CEM) | values, "method 'cem'"))
+        named = {"candidates": candidates, "rounds": rounds}
+        given = {name: value for name, value in named.items() if value is not None}
+        cem = parse_settings(CemSettings, asdict(CEM) | values | given, "method 'cem'")
+        options = (*(f"--{name}" for name in given), *(f"--set method.{name}" for name in values))
+        return replace(self, cem=cem, cem_options=options)
 
 
 @dataclass(frozen=True)
@@ -293,7 +312,7 @@ def make_planner(row: PlanningRow, policy: Policy | None, settings: PlanSettings
     """Return the planner of a row that imagines."""
     if row.planner == "cem":
         cem = settings.cem if settings.keep else replace(settings.cem, shift=0.0)
-        return Cem(replace(cem, horizon=horizon, candidates=row.candidates, rounds=settings.rounds), policy)
+        return Cem(replace(cem, horizon=horizon, candidates=row.candidates), policy)
     if policy is None:
         raise ValueError(f"row {row.name!r} ranks and has no policy")
     return Rank(policy, RankSettings(horizon=horizon, candidates=row.candidates, keep=settings.keep))

@@ -18,7 +18,7 @@ from persist_cli.api.simulator import Simulator
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.find_episodes import EpisodeSearch
 from persist_cli.bench.make_episodes import draw_episodes
-from persist_cli.bench.navigator import CEM, Navigator, PlanSettings, RowParts
+from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
 from persist_cli.bench.planning_journal import PlanningJournal
 from persist_cli.bench.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
 from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_open_loop
@@ -105,7 +105,6 @@ class BenchPlan:
         memories: of the world model, and ``simulator``.
         policy: proposes; a name or the folder of a trained one.
         cost: name of the cost.
-        cem_candidates: candidates of a round of ``cem``.
         planning: how rows plan.
         loops: of ``LOOPS``.
         loop: how episodes are run.
@@ -121,7 +120,6 @@ class BenchPlan:
     memories: tuple[str, ...]
     policy: str | None
     cost: str
-    cem_candidates: int
     planning: PlanSettings
     loops: tuple[str, ...]
     loop: LoopSettings
@@ -184,17 +182,18 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
             raise PersistError(f"unknown loop {loop!r}; {hint(loop, LOOPS)}")
     cost = make_cost(plan.cost, {})
     names = plan.rows if plan.rows is not None else default_rows(plan.policy, cost.reads)
-    rows = RowChoice(names, plan.memories, plan.policy, cost.reads, plan.cem_candidates).rows()
+    rows = RowChoice(names, plan.memories, plan.policy, cost.reads, plan.planning.cem.candidates).rows()
     if missing := cost.missing():
         raise PersistError(f"cost {cost.name!r}: {missing}")
     policies = open_policies(plan, rows)
     check_policies(rows, policies, plan.planning.horizon)
-    if plan.planning.cem != CEM and all(row.planner != "cem" for row in rows):
-        raise PersistError("--set method.…: no row has the cross-entropy method; add cem to --rows, or leave it out")
+    if plan.planning.cem_options and not any(row.searches for row in rows):
+        options = ", ".join(plan.planning.cem_options)
+        raise PersistError(f"{options}: no row has the cross-entropy method; add cem to --rows, or leave it out")
     checkpoint = find_checkpoint(plan.checkpoint) if any(row.uses_world_model for row in rows) else None
     journal = PlanningJournal(out)
     if processes.main:
-        values = identity(plan, cost, checkpoint, policies[plan.policy])
+        values = identity(plan, rows, cost, checkpoint, policies[plan.policy])
         if journal.begun and journal.identity()["episodes"] == plan.source.identity(unset=True):
             values["episodes"] = journal.identity()["episodes"]
         journal.check(values)
@@ -335,16 +334,19 @@ def find_thresholds(
     return StopThresholds.read(kept)
 
 
-def identity(plan: BenchPlan, cost: Cost, checkpoint: Checkpoint | None, policy: Policy | None) -> dict[str, Any]:
+def identity(
+    plan: BenchPlan, rows: Sequence[PlanningRow], cost: Cost, checkpoint: Checkpoint | None, policy: Policy | None
+) -> dict[str, Any]:
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
+    searched = any(row.searches for row in rows)
     values = {
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
         "encoder": chosen_encoder().name if cost.name == "dino" or "open" in plan.loops else None,
         "policy": policy_json(plan.policy, policy),
-        "cem candidates": plan.cem_candidates,
-        "planning": plan.planning.to_json(),
+        "cem candidates": plan.planning.cem.candidates if searched else None,
+        "planning": plan.planning.to_json() | ({} if searched else {"rounds": None}),
         "loop": asdict(plan.loop) | {"loops": list(plan.loops)},
         "stop cost": plan.stop_cost,
         "checkpoint": None if checkpoint is None else checkpoint_json(checkpoint),

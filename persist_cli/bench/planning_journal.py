@@ -22,13 +22,14 @@ FOLDER: Final = "parts"
 
 VERSION: Final = 2  # of the records of episodes; those of the first have no version
 
-OF_MODEL: Final = ("checkpoint", "sampling")  # parts of the identity that only rows with a world model have
+OF_ROWS: Final = ("checkpoint", "sampling", "cem candidates")  # parts of the identity that only some rows have
 
 
 class PlanningJournal:
     """The files of a benchmark that is under way or finished.
 
-    What the rows share is its identity. Rows can be added to one that is finished, also the first with a world model.
+    What the rows share is its identity. Rows can be added to one that is finished, also the first with a world model or
+    with ``cem``.
 
     Args:
         out: folder of the benchmark.
@@ -55,7 +56,7 @@ class PlanningJournal:
         return dict(read_json(self.parts / IDENTITY))
 
     def begin(self, identity: dict[str, Any], episodes: EpisodeSet) -> None:
-        """Keep what is measured, on which episodes; the world model of a benchmark that had none is added."""
+        """Keep what is measured, on which episodes; what only some rows have is added when they are."""
         if not self.begun:
             episodes.write(self.out / EPISODES)
             write_json(self.parts / IDENTITY, identity)
@@ -105,8 +106,12 @@ class PlanningJournal:
 
 
 def completed(identity: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
-    """Return an identity; where it has no world model, with that of another one."""
-    return identity | {name: other[name] for name in OF_MODEL if identity.get(name) is None and name in other}
+    """Return an identity; what it lacks, having no row with a world model or with ``cem``, is that of another one."""
+    planning = identity["planning"]
+    if planning.get("rounds") is None:
+        planning = planning | {name: other["planning"][name] for name in ("rounds", "cem") if name in other["planning"]}
+    lacking = {name: other[name] for name in OF_ROWS if identity.get(name) is None and name in other}
+    return identity | {"planning": planning} | lacking
 
 
 def outdated(row: PlanningRow, record: dict[str, Any]) -> str:

@@ -199,7 +199,8 @@ def define(row: PlanningRow, bench: PlanningBench) -> str:
         model += ", which remembers nothing of the walk"
     how = f"ranks {row.candidates} proposals of {row.policy!r}"
     if row.planner == "cem":
-        how = f"cross-entropy method, {row.candidates} candidates a round, at most {bench.plan.planning.rounds} rounds"
+        rounds = bench.plan.planning.cem.rounds
+        how = f"cross-entropy method, {row.candidates} candidates a round, at most {rounds} rounds"
         how += f", the first of them half of {row.policy!r}" if row.policy is not None else ""
     return f"{how} by {bench.cost.name}; {model}; {told}"
 

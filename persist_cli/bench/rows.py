@@ -66,6 +66,11 @@ class PlanningRow:
         return self.planner != "policy"
 
     @property
+    def searches(self) -> bool:
+        """Whether it has the cross-entropy method."""
+        return self.planner == "cem"
+
+    @property
     def uses_world_model(self) -> bool:
         """Whether that model is the checkpoint's."""
         return self.imagines and self.memory != SIMULATOR

@@ -234,10 +234,10 @@ def bench_plan(
     execute: Annotated[int, typer.Option(min=1, help="Actions done before the next plan.")] = 4,
     patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
     max_actions: Annotated[int | None, typer.Option(min=1, help="Most actions of every episode instead: 500.")] = None,
-    candidates: Annotated[int, typer.Option(min=1, help="Of a round of cem.")] = 60,
-    rounds: Annotated[int, typer.Option(min=1, help="Most rounds of cem.")] = 3,
-    frames: Annotated[int | None, typer.Option(min=1, help="Most imagined frames of a decision.")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.001, help="Most seconds of a decision.")] = None,
+    candidates: Annotated[int | None, typer.Option(min=1, help="Of a round of cem; 60.")] = None,
+    rounds: Annotated[int | None, typer.Option(min=1, help="Most rounds of cem; 3.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Most imagined frames of a decision.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Most seconds of a decision.")] = None,
     loops: Annotated[str, typer.Option(help="closed, open or both; open: up to 16 actions.")] = "closed,open",
     stop_cost: Annotated[float | None, typer.Option(help="Cost of a view to stop at; else chosen.")] = None,
     body: Annotated[bool, typer.Option(help="Imagined moves into known obstacles do not move.")] = True,
@@ -264,8 +264,8 @@ def bench_plan(
 
     run_plan_bench.run_plan_bench(plan_bench.BenchPlan(
         plan_bench.EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each),
-        checkpoint, split_names(rows) if rows else None, split_names(memories), policy, cost, candidates,
-        navigator.PlanSettings(horizon, over, rounds, frames, seconds, body, keep, approach, explore).of_cem(settings),
+        checkpoint, split_names(rows) if rows else None, split_names(memories), policy, cost, navigator.PlanSettings(
+            horizon, over, frames, seconds, body, keep, approach, explore).of_cem(settings, candidates, rounds),
         split_names(loops), run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
         SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
     ), out, report, json)  # fmt: skip

@@ -14,6 +14,7 @@ import pytest
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Cover
+from persist_cli.api.policy import Policy
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, make_planner
 from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, trained_on, trained_policy
@@ -194,6 +195,41 @@ def test_rows_with_a_model_can_be_added_to_a_benchmark_begun_without_one(bench: 
     assert "holds another benchmark (sampling steps: 1, now 2)" in refused.err
 
 
+def test_rows_of_cem_with_settings_of_their_own_can_be_added_to_a_benchmark_begun_without_them(bench: Bench) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1)
+    assert bench(*options, "--rows", "random").code == 0
+    added = bench(*options, "--rows", "random,cem", *SIMULATED, "--set", "method.kept=0.3", "--json")
+    assert added.code == 0, added.err
+    assert list(json.loads(added.out)["tables"][0]["rows"]) == ["random", "cem, simulator"]
+    assert bench(*options, "--rows", "random").code == 0  # rows without it still go on
+    refused = bench(*options, "--rows", "random,cem", *SIMULATED)
+    assert "holds another benchmark (planning cem: {'kept': 0.3}, now None)" in refused.err
+
+
+def test_a_benchmark_of_an_earlier_persist_that_had_settings_of_cem_without_a_row_of_it_goes_on(
+    bench: Bench, tmp_path: Path
+) -> None:
+    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1)
+    assert bench(*options, "--rows", "random").code == 0
+    plan = tmp_path / "bench/parts/plan.json"
+    values = json.loads(plan.read_text())
+    plan.write_text(json.dumps(values | {"cem candidates": 2, "planning": values["planning"] | {"rounds": 1}}))
+    assert bench(*options, "--rows", "random,cem", *SIMULATED).code == 0
+
+
+def test_rows_of_one_policy_open_it_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = []
+
+    def open_once_more(name: str) -> Policy:
+        opened.append(name)
+        return open_policy(name)
+
+    monkeypatch.setattr("persist_cli.bench.plan_bench.open_policy", open_once_more)
+    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--memories", "simulator")
+    ended = bench(*options, "--policy", "straight", "--rows", "policy,rank-1,random")
+    assert (ended.code, opened) == (0, ["straight", "random"]), ended.err
+
+
 def test_a_model_that_was_trained_on_the_scenes_of_a_begun_benchmark_is_refused(
     bench: Bench, voxel: Path, episodes: EpisodeSet, tmp_path: Path
 ) -> None:
@@ -230,7 +266,7 @@ def test_how_cem_searches_can_be_set_and_a_benchmark_begun_before_goes_on(bench:
 
 def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_said() -> None:
     row = PlanningRow("cem, simulator", "cem", None, "simulator", "place", walk=True, candidates=7)
-    plans = PlanSettings(rounds=2).of_cem(["method.kept=0.3", "method.smoothing=0"])
+    plans = PlanSettings().of_cem(["method.kept=0.3", "method.smoothing=0"], rounds=2)
     wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
     assert make_planner(row, None, plans, 5).settings == wanted
     assert make_planner(row, None, replace(plans, keep=False), 5).settings == replace(wanted, shift=0.0)
@@ -295,7 +331,14 @@ def test_a_world_model_is_ranked_by_what_it_imagines(bench: Bench, voxel: Path, 
         ((*SEARCH, "--set", "method.horizon=4"), "--set method.horizon: give --horizon"),
         ((*SEARCH, "--set", "cost.unknown=4"), "write method.KEY=VALUE"),
         ((*SEARCH, "--no-keep", "--set", "method.shift=1"), "--no-keep begins each plan anew"),
-        ((*PLACE, "--set", "method.elites=0.1"), "no row has the cross-entropy method; add cem to --rows"),
+        (
+            (*PLACE, "--set", "method.elites=0.1"),
+            "--set method.elites: no row has the cross-entropy method; add cem to --rows, or leave it out",
+        ),
+        ((*PLACE, "--candidates", 60), "--candidates: no row has the cross-entropy method; add cem to --rows"),
+        ((*PLACE, "--rounds", 2, "--candidates", 9), "--candidates, --rounds: no row has the cross-entropy method"),
+        ((*PLACE, "--frames", 0), "a budget of 0 frames imagines nothing"),
+        ((*PLACE, "--seconds", "nan"), "a budget of nan seconds imagines nothing"),
         (("--cost", "distance", "--rows", "policy", "--policy", "rndom"), "unknown policy 'rndom'"),
     ],
 )
