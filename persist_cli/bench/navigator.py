@@ -262,7 +262,7 @@ class Navigator:
             judge = self._judge(self._model(simulator, situation), situation, self.settings.over, budget)
             if self.settings.explore and self.row.goal == "image":
                 judge.looked = torch.cat(self.looked)
-            plan = planner.plan(situation, judge, generator, _no_notice)
+            plan = planner.plan(situation, judge, generator)
             return plan.actions, plan.frames
 
         return imagine
@@ -324,7 +324,3 @@ def _first_proposal(
     if policy is None:
         raise ValueError("a row that does not imagine needs a policy")
     return tuple(policy.propose(situation, horizon, 1, generator)[0])
-
-
-def _no_notice(number: int, cost: float) -> None:
-    """Take no notice of a round."""

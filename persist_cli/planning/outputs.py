@@ -63,6 +63,7 @@ class Shown:
         candidates: the best, the chosen one first.
         imagined: what the model imagines of each.
         truth: what is really seen along each; ``None`` where it is not known.
+        true_walks: where each really leads; ``None`` where it is not known.
         true_costs: cost of the true frame that counts, or of the best of them; ``None`` where it is not known.
         unknown: why the truth is not known, empty where it is.
     """

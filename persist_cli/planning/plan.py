@@ -39,8 +39,7 @@ from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, warn
 
-METHODS = {"rank": RankSettings, "cem": CemSettings}
-BETWEEN_PLANS = {"rank": "keep", "cem": "shift"}  # settings of methods that a single plan has no use for
+METHODS = {"rank": "keep", "cem": "shift"}  # with the setting of each that a single plan has no use for
 OVER: dict[str, Over] = {"last": "last", "best": "best"}
 SHOWN = 5  # candidates in the terminal's table and on the sheet
 
@@ -180,7 +179,7 @@ def chosen_planner(options: PlanOptions, policy: Policy | None, settings: dict[s
         raise PersistError(f"unknown --method {options.method!r}; {hint(options.method, METHODS)}")
     if options.actions and options.method != "cem":
         raise PersistError("--actions are those that --method cem chooses from; a policy has its own")
-    if (between := BETWEEN_PLANS[options.method]) in settings:
+    if (between := METHODS[options.method]) in settings:
         raise PersistError(
             f"--set method.{between} acts between one plan and the next, and this command makes one; leave it out, or "
             "see `persist bench plan`"

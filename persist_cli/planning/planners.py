@@ -50,10 +50,14 @@ class Plan:
         return self.best.chosen
 
 
+def nothing(number: int, cost: float) -> None:
+    """Take no notice of a round."""
+
+
 class Planner(Protocol):
     """A method of planning."""
 
-    def plan(self, situation: Situation, judge: Judge, generator: torch.Generator, on_round: OnRound) -> Plan:
+    def plan(self, situation: Situation, judge: Judge, generator: torch.Generator, on_round: OnRound = nothing) -> Plan:
         """Return a plan from a situation.
 
         Args:
@@ -67,10 +71,6 @@ class Planner(Protocol):
     def executed(self, count: int) -> None:
         """Let the planner know that so many of the chosen actions were done, before it plans again."""
         ...
-
-
-def nothing(number: int, cost: float) -> None:
-    """Take no notice of a round."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,6 @@ class Rank:
     Raises:
         PersistError: when the policy does not look as far ahead as the horizon.
     """
-
-    settings_type = RankSettings
 
     def __init__(self, policy: Policy, settings: RankSettings) -> None:
         check_horizon(policy, settings.horizon)
@@ -215,7 +213,6 @@ class Cem:
 
     settings: CemSettings
     policy: Policy | None = None
-    settings_type = CemSettings
     _last: Remainder | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
