@@ -4,7 +4,8 @@
 held-out houses and takes from it the one image that shows farthest. From this image alone two houses are made: a scene
 that the scene model completes, and a voxel map. PPO learns in the Gymnasium environment of each, and in the true house
 as the ceiling, with equally many steps. It observes depth and the goal's place. How often it reaches its goals in the
-true house is measured before and after, by the same episodes.
+true house is measured before and after, by the same episodes. ``--images 24`` gives all images of the walk, at each of
+which an episode may start.
 
 A scene may shut the agent in, so that no goal is far enough. Then nothing can be learned there, which is counted.
 
@@ -46,7 +47,7 @@ TABLE: Final = "agents.md"
 
 VIEWS: Final = "views"
 
-FRAMES: Final = 24  # of each house, of which one is used
+FRAMES: Final = 24  # of the walk in each house
 
 FIRST: Final = 400  # house of the test split
 
@@ -79,6 +80,7 @@ class Plan:
         envs: agents that learn together.
         episodes: in the true house, before and after.
         denoising_steps: of an imagined frame.
+        images: of each house that are given: the one that shows farthest, or the first ones of the walk.
     """
 
     out: Path
@@ -92,6 +94,7 @@ class Plan:
     envs: int
     episodes: int
     denoising_steps: int
+    images: int = 1
 
     @property
     def scenes(self) -> str:
@@ -166,7 +169,7 @@ def identity(plan: Plan) -> dict[str, Any]:
     described: dict[str, Any] = {
         "model": model_json(plan.model),
         "scenes": plan.scenes, "frames": FRAMES, "steps": plan.steps, "envs": plan.envs, "episodes": plan.episodes,
-        "denoising_steps": plan.denoising_steps,
+        "denoising_steps": plan.denoising_steps, "images": plan.images,
     }  # fmt: skip
     scenes = [memory for memory in plan.memories if memory != SIMULATOR and plan.draws_scenes(memory)]
     if scenes:
@@ -186,8 +189,8 @@ def check_packages() -> None:
 
 
 def learn(learning: Learning) -> None:
-    """Make the memory of a house's image, unless it is there, learn in it, and keep what came of it."""
-    image = image_of(learning)
+    """Make the memory of a house's images, unless it is there, learn in it, and keep what came of it."""
+    image = images_of(learning)
     say(f"\nhouse {learning.house}, {learning.memory}, seed {learning.seed}: learning from {image}")
     if learning.memory != SIMULATOR and not learning.memory_file.is_file():
         learning.memory_file.parent.mkdir(parents=True, exist_ok=True)
@@ -197,17 +200,19 @@ def learn(learning: Learning) -> None:
     write_json(learning.result_file, {"image": image, **outcome, "seconds": time.perf_counter() - begun})
 
 
-def image_of(learning: Learning) -> str:
-    """Return the frame of a house whose mean depth is the largest: as much as one image can show."""
+def images_of(learning: Learning) -> str:
+    """Return the given frames of a house; of one alone its mean depth is the largest: as much as one image can show."""
     views = learning.plan.out / VIEWS
     [seed] = CollectPlan("miniworld", f"{learning.house}:{learning.house + 1}", split="test").generator_seeds
     file = next(file for file in Store(views) if file.info.source["house"] == seed)
+    if learning.plan.images > 1:
+        return f"{views}#{file.name}:0-{learning.plan.images}"
     depth = file.read().observations.depth
     return f"{views}#{file.name}:{int(depth.flatten(1).mean(1).argmax())}"
 
 
 def memorize_line(learning: Learning, image: str) -> str:
-    """Return the command that makes a memory of one image, as the adapter reads it."""
+    """Return the command that makes a memory of the given images, as the adapter reads it."""
     plan = learning.plan
     kind = adapter_memory(find_checkpoint(Path(plan.model)), learning.memory).name
     line = f"memorize {shlex.quote(image)} --checkpoint {shlex.quote(plan.model)} --memory {kind} "
@@ -221,7 +226,7 @@ def practise(learning: Learning, image: str) -> dict[str, Any]:
 
     Args:
         learning: where, and in which memory.
-        image: the frame at which imagined episodes start.
+        image: the frame, or frames, at which imagined episodes start.
 
     Returns:
         The share of goals that it reaches in the true house ``before`` and ``after``, and ``without_goal``, why nothing
@@ -258,7 +263,7 @@ def missing_goal(envs: Any, seed: int) -> str | None:
 
 
 def imagined_house(learning: Learning, image: str) -> Any:
-    """Return agents in a house as a memory of one image has it, each with free known ground as its goal."""
+    """Return agents in a house as a memory of its images has it, each with free known ground as its goal."""
     import gymnasium
 
     import persist_cli.environments  # noqa: F401  registers them
@@ -351,15 +356,18 @@ def parse(arguments: Sequence[str]) -> Plan:
     parser.add_argument("--steps", type=int, default=4096, help="of all agents of a learning together")
     parser.add_argument("--envs", type=int, default=8, help="agents that learn together")
     parser.add_argument("--episodes", type=int, default=100, help="in the true house, before and after")
+    parser.add_argument("--images", type=int, default=1, help=f"given ones of each house, at most {FRAMES}")
     parser.add_argument("--denoising-steps", type=int, default=1, help="of an imagined frame")
     given = parser.parse_args(arguments)
     memories = [name.strip() for name in given.memories.split(",") if name.strip()]
     counts = (given.houses, given.seeds, given.steps, given.envs, given.episodes, given.denoising_steps)
     if not memories or min(counts) < 1 or given.first < 0:
         raise PersistError("--memories, --houses, --seeds, --steps, --envs and --episodes must be at least one each")
+    if not 1 <= given.images <= FRAMES:
+        raise PersistError(f"--images {given.images}: give 1 to {FRAMES}, the frames of the walk")
     return Plan(
         given.out, given.model, given.scene_model, memories, given.houses, given.first, given.seeds, given.steps,
-        given.envs, given.episodes, given.denoising_steps,
+        given.envs, given.episodes, given.denoising_steps, given.images,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 
@@ -79,6 +80,19 @@ def test_policies_learn_in_a_scene_and_in_a_map_of_one_image_and_are_measured_in
         main([*words, "--steps", "8"])
 
 
+def test_of_one_image_the_farthest_is_taken_and_of_several_the_first_of_the_walk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_world()
+    monkeypatch.setattr(scene_agents, "FRAMES", 4)
+    few = ["--houses", "1", "--seeds", "1", "--steps", "4", "--envs", "2", "--episodes", "1", "--memories", "none"]
+    for images, frames in ((1, r":\d"), (3, ":0-3")):
+        out = tmp_path / str(images)
+        main([str(out), *few, "--images", str(images)])
+        [learned] = [json.loads(file.read_text()) for file in out.glob("learned/*/*.json")]
+        assert re.fullmatch(r".*#house-1000400" + frames, learned["image"])
+
+
 def test_houses_that_are_done_in_every_memory_stand_in_the_table_and_the_scene_is_compared_with_the_map(
     plan: Plan,
 ) -> None:
@@ -124,6 +138,7 @@ def test_in_a_scene_that_shuts_the_agent_in_nothing_is_learned_and_the_reason_is
     ("words", "cause"),
     [
         (["--memories", " , "], "must be at least one each"),
+        (["--images", "25"], "--images 25: give 1 to 24, the frames of the walk"),
         (["--memories", "scenes"], "no memory adapter 'scenes' in it"),
         (["--scene-model", "nowhere"], "nowhere"),
     ],
