@@ -6,11 +6,16 @@ Prints a table, asserts nothing; ``--out`` keeps it as ``policy.json``. Moments 
 came to later. The policy is asked with that goal, with the goal of another moment, and without one. For the walk's last
 waypoint, ahead and to the side, the table has its correlation over all moments with the mean over sampled ways; for the
 distance, that with the predicted one. A policy that takes no notice of its goal has the same in all rows.
+
+A second table says how well it knows where a goal lies: goals are any frames up to 5 m away in the same walk, most of
+which the present frame does not show. Metres and degrees are medians; *sure* are those of which it is sure enough to go
+there (``sure`` of ``nomad``). What is always predicted at the agent's place is wrong by the metres of *nothing known*.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,14 +27,17 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.policy_network import PolicySample, PolicySamples
-from persist_cli.data.policy_samples import PolicySampleDataset
+from persist_cli.data.policy_samples import PolicySampleDataset, ground_places, local_places
 from persist_cli.data.reference import sample_data
+from persist_cli.data.store import Store
 from persist_cli.io.files import write_json
 from persist_cli.policies.nomad.network import NomadNetwork
+from persist_cli.policies.nomad.policy import SURE
 from persist_cli.policies.trained import find_policy, packaged_policy
 from persist_cli.viewing.console import print_table, say
 
 BATCH = 50
+FARTHEST = 5.0  # metres to a goal whose place is asked for
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -52,9 +60,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "correlation with what the walk did", ["asked with", "ahead", "to the side", "distance"],
         [[name, *(f"{value:.2f}" for value in row.values())] for name, row in rows.items()],
     )  # fmt: skip
+    places = place_errors(network, options.data or [sample_data()], options.moments, options.seed)
+    print_table("where a goal lies", [*places], [[f"{value:.2f}" for value in places.values()]])
     if options.out:
         options.out.mkdir(parents=True, exist_ok=True)
-        write_json(options.out / "policy.json", {"policy": trained.fingerprint, "moments": len(others), "rows": rows})
+        write_json(
+            options.out / "policy.json",
+            {"policy": trained.fingerprint, "moments": len(others), "rows": rows, "places": places},
+        )
 
 
 def moments(network: NomadNetwork, data: Sequence[Path], count: int, seed: int) -> PolicySamples:
@@ -89,6 +102,40 @@ def correlations(
         "distance": (torch.cat(distance).numpy(), samples.distance.numpy()),
     }
     return {name: float(np.corrcoef(*pair)[0, 1]) for name, pair in pairs.items()}
+
+
+@torch.no_grad()
+def place_errors(network: NomadNetwork, data: Sequence[Path], count: int, seed: int) -> dict[str, float]:
+    """Return median errors of the predicted places of goals anywhere near."""
+    files, random, form = (
+        [file for folder in data for file in Store(folder)],
+        np.random.default_rng(seed),
+        network.settings,
+    )
+    errors, turned, sure, metres = [], [], [], []
+    while len(errors) < count:
+        file = files[int(random.integers(len(files)))]
+        places, headings = ground_places(file.poses(), file.info.world_up)
+        present, goal = int(random.integers(form.context * form.spacing, len(file))), int(random.integers(len(file)))
+        place = local_places(places[[goal]], places[present], headings[present])[0]
+        if not 0 < float(place.norm()) <= FARTHEST:
+            continue
+        seen = file.rgb(range(present - form.context * form.spacing, present + 1, form.spacing))
+        condition = network.condition(seen[None], file.rgb([goal]), torch.tensor([False]))[0]
+        found = network.goal_place(condition)
+        assert found is not None, "a policy that does not predict places"
+        ahead, left = local_places(headings[[goal]], torch.zeros(2).double(), headings[present])[0].tolist()
+        apart = (found.heading - math.degrees(math.atan2(left, ahead)) + 180) % 360 - 180
+        errors.append(math.dist((found.ahead, found.left), place.tolist()))
+        turned.append(abs(apart))
+        sure.append(found.certainty >= SURE)
+        metres.append(float(place.norm()))
+    of_sure = np.array(errors)[sure]
+    return {
+        "nothing known, m": float(np.median(metres)), "wrong by, m": float(np.median(errors)),
+        "turned by, degrees": float(np.median(turned)), "sure": float(np.mean(sure)),
+        "sure, wrong by, m": float(np.median(of_sure)) if len(of_sure) else math.nan,
+    }  # fmt: skip
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
