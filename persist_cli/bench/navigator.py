@@ -310,7 +310,7 @@ def make_world(
 
 def make_planner(row: PlanningRow, policy: Policy | None, settings: PlanSettings, horizon: int) -> Planner:
     """Return the planner of a row that imagines."""
-    if row.planner == "cem":
+    if row.searches:
         cem = settings.cem if settings.keep else replace(settings.cem, shift=0.0)
         return Cem(replace(cem, horizon=horizon, candidates=row.candidates), policy)
     if policy is None:

@@ -119,6 +119,6 @@ def outdated(row: PlanningRow, record: dict[str, Any]) -> str:
     walk = record.get("walk", row.walk if row.memory is None else row.memory != NO_MEMORY)  # as once was
     if walk != row.walk:
         return f"was run when {row.name!r} was {'' if walk else 'not '}given the walk"
-    if row.planner == "cem" and "version" not in record:
+    if row.searches and "version" not in record:
         return "was run when cem still judged the end of a plan that was done"
     return ""

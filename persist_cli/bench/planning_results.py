@@ -198,7 +198,7 @@ def define(row: PlanningRow, bench: PlanningBench) -> str:
     if row.walk and row.memory in FORGETFUL:
         model += ", which remembers nothing of the walk"
     how = f"ranks {row.candidates} proposals of {row.policy!r}"
-    if row.planner == "cem":
+    if row.searches:
         rounds = bench.plan.planning.cem.rounds
         how = f"cross-entropy method, {row.candidates} candidates a round, at most {rounds} rounds"
         how += f", the first of them half of {row.policy!r}" if row.policy is not None else ""
