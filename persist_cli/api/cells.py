@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
@@ -35,6 +36,10 @@ class CellForm:
 
     size: float = 0.25
     palette: tuple[str, ...] = COMMON
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values, which are also the settings of a scene with such cells."""
+        return {"size": self.size, "palette": list(self.palette)}
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,7 @@ class CellBox:
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object that ``from_json`` reads back."""
-        form = {"size": self.form.size, "palette": list(self.form.palette)}
-        return form | {"corner": list(self.corner), "shape": list(self.shape)}
+        return self.form.to_json() | {"corner": list(self.corner), "shape": list(self.shape)}
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> CellBox:

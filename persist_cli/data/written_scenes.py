@@ -104,7 +104,7 @@ class SceneWriter:
 
     @cached_property
     def _settings(self) -> Any:
-        return make_settings("memory", MEMORY, {"size": self.form.size, "palette": list(self.form.palette)})
+        return make_settings("memory", MEMORY, self.form.to_json())
 
     def _write(self, info: TrajectoryInfo, seen: Observations) -> CellGrid:
         scene = self._kind(self._settings, self._encoder, FrameOfReference(info.scene, info.world_up))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from persist_cli.api.cells import CellForm
 from persist_cli.api.memory import Memory
@@ -76,5 +75,5 @@ def of_known_cells(config: MemoryConfig, file: TrajectoryFile | None = None, ask
         form = file.cell_form
     if form is None:
         return config
-    cells: dict[str, Any] = {"palette": list(form.palette), "size": form.size}
+    cells = form.to_json()
     return replace(config, settings=cells | config.settings if asked else config.settings | cells)

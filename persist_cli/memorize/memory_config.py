@@ -47,8 +47,7 @@ class MemorizePlan:
 
 def scene_config(form: CellForm, settings: Mapping[str, Any] | None = None) -> MemoryConfig:
     """Return the configuration of scenes with cells of a form, whose tokens are their classes."""
-    own = {"size": form.size, "palette": list(form.palette)}
-    return MemoryConfig(SCENE, own | dict(settings or {}), "classes", {})
+    return MemoryConfig(SCENE, form.to_json() | dict(settings or {}), "classes", {})
 
 
 def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
