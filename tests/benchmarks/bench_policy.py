@@ -27,9 +27,8 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.api.policy_network import PolicySample, PolicySamples
-from persist_cli.data.policy_samples import PolicySampleDataset, ground_places, local_places
+from persist_cli.data.policy_samples import PolicySampleDataset, SampleFrames
 from persist_cli.data.reference import sample_data
-from persist_cli.data.store import Store
 from persist_cli.io.files import write_json
 from persist_cli.policies.nomad.network import NomadNetwork
 from persist_cli.policies.nomad.policy import SURE
@@ -46,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     trained = packaged_policy() if options.policy is None else find_policy(options.policy)
     network = trained.load()
     assert isinstance(network, NomadNetwork), f"{trained.folder}: of policy {trained.policy!r}, not 'nomad'"
-    samples = moments(network, options.data or [sample_data()], options.moments, options.seed)
+    data = options.data or [sample_data()]
+    samples = moments(network, data, options.moments, options.seed)
     others = torch.randperm(len(samples.goal), generator=torch.Generator().manual_seed(options.seed))
     hidden = torch.ones(len(others), dtype=torch.bool)
     with torch.no_grad():
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "correlation with what the walk did", ["asked with", "ahead", "to the side", "distance"],
         [[name, *(f"{value:.2f}" for value in row.values())] for name, row in rows.items()],
     )  # fmt: skip
-    places = place_errors(network, options.data or [sample_data()], options.moments, options.seed)
+    places = place_errors(network, data, options.moments, options.seed)
     print_table("where a goal lies", [*places], [[f"{value:.2f}" for value in places.values()]])
     if options.out:
         options.out.mkdir(parents=True, exist_ok=True)
@@ -107,29 +107,23 @@ def correlations(
 @torch.no_grad()
 def place_errors(network: NomadNetwork, data: Sequence[Path], count: int, seed: int) -> dict[str, float]:
     """Return median errors of the predicted places of goals anywhere near."""
-    files, random, form = (
-        [file for folder in data for file in Store(folder)],
-        np.random.default_rng(seed),
-        network.settings,
-    )
+    dataset, random = PolicySampleDataset(data, network.sample_form, seed), np.random.default_rng(seed)
+    before = network.settings.context * network.settings.spacing
     errors, turned, sure, metres = [], [], [], []
     while len(errors) < count:
-        file = files[int(random.integers(len(files)))]
-        places, headings = ground_places(file.poses(), file.info.world_up)
-        present, goal = int(random.integers(form.context * form.spacing, len(file))), int(random.integers(len(file)))
-        place = local_places(places[[goal]], places[present], headings[present])[0]
-        if not 0 < float(place.norm()) <= FARTHEST:
+        number = int(random.integers(len(dataset.files)))
+        frames = len(dataset.files[number])
+        present, goal = int(random.integers(before, frames)), int(random.integers(frames))
+        sample = dataset.read(SampleFrames(number, present, number, goal, False, 0))
+        place, heading = sample.goal_place[:2].tolist(), math.degrees(math.atan2(*sample.goal_place[[3, 2]].tolist()))
+        if not 0 < math.hypot(*place) <= FARTHEST:
             continue
-        seen = file.rgb(range(present - form.context * form.spacing, present + 1, form.spacing))
-        condition = network.condition(seen[None], file.rgb([goal]), torch.tensor([False]))[0]
-        found = network.goal_place(condition)
+        found = network.goal_place(network.condition(sample.seen[None], sample.goal[None], torch.tensor([False]))[0])
         assert found is not None, "a policy that does not predict places"
-        ahead, left = local_places(headings[[goal]], torch.zeros(2).double(), headings[present])[0].tolist()
-        apart = (found.heading - math.degrees(math.atan2(left, ahead)) + 180) % 360 - 180
-        errors.append(math.dist((found.ahead, found.left), place.tolist()))
-        turned.append(abs(apart))
+        errors.append(math.dist((found.ahead, found.left), place))
+        turned.append(abs((found.heading - heading + 180) % 360 - 180))
         sure.append(found.certainty >= SURE)
-        metres.append(float(place.norm()))
+        metres.append(math.hypot(*place))
     of_sure = np.array(errors)[sure]
     return {
         "nothing known, m": float(np.median(metres)), "wrong by, m": float(np.median(errors)),
