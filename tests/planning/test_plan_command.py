@@ -180,17 +180,22 @@ def test_a_policy_that_does_not_look_so_far_is_one_line_and_leaves_nothing(plan,
     assert not (tmp_path / "plan").exists()
 
 
-def test_a_cost_that_is_nan_is_one_line_and_leaves_nothing(plan, site, tmp_path):
-    undefined = """
+def install_cost(site, name, value):
+    """Install a cost under a name; whatever is planned costs the given expression of torch."""
+    source = f"""
         import torch
         from persist_cli.api.cost import Cost
 
-        class Undefined(Cost):
+        class Same(Cost):
             reads, sees = "place", False
             def measure(self, futures, goal, ground):
-                return torch.full(futures.free.shape, torch.nan)
+                return torch.full(futures.free.shape, {value})
     """
-    install(site, "persist-undefined", "persist.costs", "undefined = undefined:Undefined", undefined)
+    install(site, f"persist-{name}", "persist.costs", f"{name} = {name}:Same", source)
+
+
+def test_a_cost_that_is_nan_is_one_line_and_leaves_nothing(plan, site, tmp_path):
+    install_cost(site, "undefined", "torch.nan")
     result = plan("--cost", "undefined")
     assert (result.code, result.out, len(result.err.splitlines())) == (1, "", 1)
     assert "cost 'undefined' of " in result.err
@@ -199,16 +204,7 @@ def test_a_cost_that_is_nan_is_one_line_and_leaves_nothing(plan, site, tmp_path)
 
 
 def test_a_cost_that_is_infinite_is_null_in_the_file(plan, site, tmp_path):
-    endless = """
-        import torch
-        from persist_cli.api.cost import Cost
-
-        class Endless(Cost):
-            reads, sees = "place", False
-            def measure(self, futures, goal, ground):
-                return torch.full(futures.free.shape, torch.inf)
-    """
-    install(site, "persist-endless", "persist.costs", "endless = endless:Endless", endless)
+    install_cost(site, "endless", "torch.inf")
     result = plan("--cost", "endless")
     assert result.code == 0, result.err
     record = json.loads((tmp_path / "plan/plan.json").read_text())
