@@ -19,7 +19,7 @@ from persist_cli.api.simulator import Simulator, Stand, random_ground
 from persist_cli.bench.episodes import SIGHT_SHARE, Episode, GivenWalk
 from persist_cli.bench.shortest_actions import ShortestActions
 from persist_cli.bench.true_scene import Geodesic, look_from, observations_of, stand
-from persist_cli.errors import DataError
+from persist_cli.errors import DataError, hint
 from persist_cli.evaluate.coverage import seen_share
 from persist_cli.simulators.free_grid import FreeGrid
 from persist_cli.simulators.policies import go_to
@@ -72,7 +72,7 @@ class EpisodeSearch:
         if not 0 <= self.goal_gap < math.inf:
             raise DataError(f"--goal-gap {self.goal_gap:g}: give metres, 0 for none")
         if self.goals not in SIGHTS:
-            raise DataError(f"--goals {self.goals!r}: give {', '.join(SIGHTS)}")
+            raise DataError(f"unknown --goals {self.goals!r}; {hint(self.goals, SIGHTS)}")
 
     @property
     def kinds(self) -> list[Kind]:

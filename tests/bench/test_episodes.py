@@ -186,7 +186,7 @@ def test_the_command_writes_episodes_that_can_be_read(persist: Persist, tmp_path
         (("--scenes", "5:5"), "write A:B with A less than B"),
         (("--simulator", "miniwrld"), "did you mean 'miniworld'"),
         (("--split", "held-out"), "unknown split"),
-        (("--goals", "seen"), "--goals 'seen': give both, in-sight, hidden"),
+        (("--goals", "seen"), "unknown --goals 'seen'; known: both, in-sight, hidden"),
         (("--goal-gap", "inf"), "--goal-gap inf: give metres, 0 for none"),
     ],
 )
