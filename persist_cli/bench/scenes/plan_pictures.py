@@ -30,6 +30,8 @@ COLORS: Final = {
     "ceiling": (226, 214, 190), "wall": (60, 60, 66), "door": (200, 120, 40),
 }  # fmt: skip
 
+THING_HUES: Final = (0.17, 1.0)  # yellow to red; a door is orange
+
 
 @dataclass(frozen=True)
 class ViewPictures:
@@ -64,11 +66,12 @@ def picture_view(bench: SceneBench, view: View) -> ViewPictures:
 
 
 def class_colors(palette: Sequence[str]) -> UInt8[Tensor, "class 3"]:
-    """Return a colour for each class: fixed ones for what a house is made of, hues for all others."""
+    """Return a colour for each class: fixed ones for what a house is made of, hues unlike a door's for all others."""
     others = [name for name in palette if name not in COLORS]
+    low, high = THING_HUES
     hues = {
-        name: tuple(round(255 * part) for part in colorsys.hsv_to_rgb(number / max(1, len(others)), 0.75, 0.85))
-        for number, name in enumerate(others)
+        name: tuple(round(255 * part) for part in colorsys.hsv_to_rgb(hue, 0.75, 0.85))
+        for name, hue in zip(others, torch.linspace(low, high, len(others)).tolist(), strict=True)
     }
     return torch.tensor([COLORS.get(name, hues.get(name, (0, 0, 0))) for name in palette], dtype=torch.uint8)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from persist_cli.api.actions import walking_actions
+from persist_cli.bench.scenes.plan_pictures import class_colors
 from persist_cli.bench.scenes.run_scene_bench import against_baselines
 from persist_cli.bench.scenes.scene_journal import file_name
 from persist_cli.bench.scenes.walk_part import Wanderer
@@ -88,6 +89,12 @@ def test_the_report_shows_the_plans_of_every_row(measured: Path) -> None:
     for words in ("Along walks in imagined scenes", "<title>share of new cells against steps</title>"):
         assert words in page
     assert "http" not in page.replace("http-equiv", "")  # it needs no other file
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 15])
+def test_no_thing_of_a_plan_has_nearly_the_colour_of_a_door(number: int) -> None:
+    door, *things = class_colors(["door", *(f"thing {n}" for n in range(number))]).int()
+    assert all((thing - door).abs().max() > 60 for thing in things)
 
 
 def test_a_stopped_benchmark_goes_on_and_gives_the_same(
