@@ -48,6 +48,8 @@ class LoopSettings:
     def __post_init__(self) -> None:
         if not 1 <= self.patience < math.inf:
             raise PersistError(f"--patience {self.patience:g}: give a number from 1 on; it must be finite")
+        if self.max_actions is not None and self.patience != type(self).patience:
+            raise PersistError(f"--patience {self.patience:g}, --max-actions {self.max_actions}: give one of the two")
 
     def most(self, shortest: int) -> int:
         """Return the most actions of a closed loop whose shortest way has ``shortest`` actions."""

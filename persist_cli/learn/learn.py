@@ -172,6 +172,8 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
         raise PersistError(
             f"--no-body: nobody goes through the walls of the true house; leave out --inside {SIMULATOR}"
         )
+    if plan.inside == SIMULATOR and plan.adapter is not None:
+        raise PersistError(f"--adapter {plan.adapter}: the true house needs no memory; leave out --inside {SIMULATOR}")
     begin = packaged_policy() if plan.policy is None else find_policy(Path(plan.policy))
     sources = find_sources(list(plan.views))
     common_reference(sources)

@@ -23,6 +23,7 @@ from persist_cli.bench.navigation_metrics import (
     wrong_stop,
 )
 from persist_cli.bench.run_episode import LoopSettings
+from persist_cli.errors import PersistError
 
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
@@ -122,3 +123,5 @@ def test_a_stop_is_wrong_when_far_and_missed_when_the_agent_was_near_and_went_on
 
 def test_a_fixed_budget_of_actions_takes_the_place_of_patience() -> None:
     assert (LoopSettings(patience=2.5).most(9), LoopSettings(max_actions=500).most(9)) == (23, 500)
+    with pytest.raises(PersistError, match=r"--patience 2.5, --max-actions 500: give one of the two"):
+        LoopSettings(patience=2.5, max_actions=500)

@@ -201,10 +201,17 @@ def test_without_a_known_camera_height_nothing_stops_a_walk_unless_it_is_asked_f
         assert free.all() == (body is None)
 
 
-def test_nobody_goes_through_the_walls_of_the_true_house(learn, tmp_path):
-    result = learn("out", "--inside", "simulator", "--no-body")
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [
+        (("--no-body",), "--no-body: nobody goes through the walls of the true house; leave out --inside simulator"),
+        (("--adapter", "none"), "--adapter none: the true house needs no memory; leave out --inside simulator"),
+    ],
+)
+def test_what_the_true_house_has_no_use_for_is_refused(learn, tmp_path, options, cause):
+    result = learn("out", "--inside", "simulator", *options)
     assert (result.code, result.err.count("\n")) == (1, 1)
-    assert "--no-body: nobody goes through the walls of the true house; leave out --inside simulator" in result.err
+    assert cause in result.err
     assert not (tmp_path / "out").exists()
 
 
