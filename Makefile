@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 
-.PHONY: demo demo-train table1 table1-reference ablations gain-curve planning learning test test-slow lint bench docs clean
+.PHONY: demo demo-train table1 table1-reference ablations gain-curve planning learning scenes test test-slow lint bench docs clean
 
 demo: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.demo runs/demo
@@ -29,6 +29,9 @@ planning: $(STAMP)
 
 learning: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.learning runs/learning
+
+scenes: $(STAMP)
+	$(VENV)/bin/python -m persist_cli.reproduce.scenes runs/scenes
 
 # two processes of one thread each take about half the time of one, and each file stays in one process
 test: $(STAMP) lint

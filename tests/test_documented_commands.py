@@ -20,14 +20,13 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import typer
 import yaml
 
-from persist_cli.cli.app import app
 from persist_cli.data.reference import sample_data
 from persist_cli.errors import PluginError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.plugins import make_simulator
+from tests.support.command_lines import parse_words
 from tests.support.documented import Block, commands, read_blocks, run_here, shown_commands, shows
 from tests.support.micro_runs import write_walks
 from tests.support.predictions import cache_random
@@ -149,16 +148,8 @@ def is_not_run(line: str) -> bool:
     if not line.startswith(tuple(NOT_RUN)):
         return False
     if line.startswith("persist ") and "--install-completion" not in line:
-        parse(shlex.split(line)[1:])
+        parse_words(shlex.split(line)[1:])
     return True
-
-
-def parse(words: list[str]) -> None:
-    """Let the command line take these arguments without running the command."""
-    command = typer.main.get_command(app)
-    while words and words[0] in getattr(command, "commands", {}):
-        command, words = command.commands[words[0]], words[1:]
-    command.make_context("persist", list(words))
 
 
 def run_line(line: str) -> tuple[int, str]:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shlex
 from pathlib import Path
 
 import pytest
-import typer.main
 
 from persist_cli.checkpoints.save import write_card
-from persist_cli.cli.app import app
 from persist_cli.errors import PersistError
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.reproduce import ablations
@@ -35,6 +32,7 @@ from persist_cli.reproduce.ablations import (
     write_results,
 )
 from persist_cli.reproduce.plan_file import keep_plan
+from tests.support.command_lines import parse_line
 from tests.support.example_results import example_results
 
 OUT = Path("my runs/ablations")
@@ -50,11 +48,7 @@ LINES = [
 
 @pytest.mark.parametrize("line", LINES)
 def test_every_command_is_one_that_persist_takes(line):
-    name, *arguments = shlex.split(line)
-    command = typer.main.get_command(app).commands[name]
-    while hasattr(command, "commands"):
-        command = command.commands[arguments.pop(0)]
-    command.make_context(name, arguments)
+    parse_line(line)
 
 
 @pytest.mark.parametrize("name", ablation_names())

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.checkpoints.save import write_card
-from persist_cli.cli.app import app
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import PersistError
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
@@ -36,6 +34,7 @@ from persist_cli.reproduce.choose import (
     run_choose,
     train_command,
 )
+from tests.support.command_lines import parse_line
 from tests.support.example_results import example_results
 from tests.support.rooms import Room, walk
 
@@ -59,11 +58,7 @@ def test_every_trial_is_a_recipe_and_commands_that_persist_takes(memory: str, tm
             train_command(asked, memory, name),
             eval_command(asked, memory, name, FIRST),
         ):
-            command, *arguments = shlex.split(line)
-            found = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
-            while hasattr(found, "commands"):
-                found = found.commands[arguments.pop(0)]
-            found.make_context(command, arguments)
+            parse_line(line)
 
 
 def test_only_validation_houses_are_measured(tmp_path: Path) -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import typer
 
-from persist_cli.cli.app import app
 from persist_cli.data.store import Store
 from persist_cli.io.files import write_json
 from persist_cli.reproduce import demo
+from tests.support.command_lines import parse_line
 from tests.support.faulty_data import inverted, rewrite
 
 
@@ -57,7 +57,6 @@ def test_make_demo_shows_the_reference_model_and_make_demo_train_trains_one():
 @pytest.mark.parametrize("commands", [demo.reference_commands, demo.training_commands])
 def test_every_command_is_one_that_persist_takes_whatever_the_folder_is_called(commands):
     for line in commands(Path("my demo")):
-        name, *arguments = shlex.split(line)
-        typer.main.get_command(app).commands[name].make_context(name, arguments)
-        folders = [word for word in arguments if "demo" in word]
+        parse_line(line)
+        folders = [word for word in shlex.split(line) if "demo" in word]
         assert all(word.removeprefix("base=").startswith("my demo/") for word in folders)

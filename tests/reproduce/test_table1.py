@@ -12,12 +12,10 @@ from pathlib import Path
 
 import pytest
 import torch
-import typer.main
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import reference_checkpoint
-from persist_cli.cli.app import app
 from persist_cli.errors import INTERRUPTED
 from persist_cli.io.files import write_json
 from persist_cli.memorize.factory import MemoryFactory
@@ -36,6 +34,7 @@ from persist_cli.reproduce.table1 import (
     memory_commands,
     reference_commands,
 )
+from tests.support.command_lines import parse_line
 from tests.support.predictions import setup
 from tests.support.rooms import Room
 
@@ -58,11 +57,7 @@ sys.exit(run_command([sys.executable, "-c", child]))
 
 @pytest.mark.parametrize("line", [*LINES, *reference_commands(OUT)])
 def test_every_command_is_one_that_persist_takes(line: str) -> None:
-    name, *arguments = shlex.split(line)
-    command = typer.main.get_command(app).commands[name]
-    while hasattr(command, "commands"):
-        command = command.commands[arguments.pop(0)]
-    command.make_context(name, arguments)
+    parse_line(line)
 
 
 OF_SCENES = {"houses-64-stage2-scene", "houses-64-stage2-scene-imagined"}  # another table, with a training of its own

@@ -1,0 +1,25 @@
+"""Command lines of ``persist`` are parsed as its commands would parse them, and nothing is run."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+import typer.main
+
+from persist_cli.cli.app import app
+
+
+def parse_line(line: str) -> dict[str, Any]:
+    """Return the parameters that a line without ``persist`` gives its command; a usage error where it takes none."""
+    return parse_words(shlex.split(line))
+
+
+def parse_words(words: Sequence[str]) -> dict[str, Any]:
+    """The same for words; what ends the parsing of a command, such as ``--help``, ends it here, too."""
+    command: Any = typer.main.get_command(app)
+    rest = [*words]
+    while rest and rest[0] in getattr(command, "commands", {}):
+        command = command.commands[rest.pop(0)]
+    return dict(command.make_context("persist", rest).params)
