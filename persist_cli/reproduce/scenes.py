@@ -24,7 +24,7 @@ from persist_cli.api.checkpoint import REFERENCE
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.reproduce import scene_agents
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
-from persist_cli.reproduce.plan_file import base_json, keep_plan, model_json
+from persist_cli.reproduce.plan_file import keep_plan, model_json
 
 WEIGHTS: Final = ("lpips-alex", "i3d-kinetics-400")
 
@@ -57,6 +57,16 @@ class SceneFigures:
     scene_model: str | None = None
     renderer: str | None = None
 
+    @property
+    def scene(self) -> str:
+        """The model of scenes that is measured."""
+        return str(self.out / "scene") if self.scene_model is None else self.scene_model
+
+    @property
+    def drawing(self) -> str:
+        """The run whose adapter draws scenes."""
+        return str(self.out / "renderer") if self.renderer is None else self.renderer
+
 
 def commands(figures: SceneFigures) -> Iterator[str]:
     """Yield the command lines in order."""
@@ -80,19 +90,19 @@ def training_commands(figures: SceneFigures) -> Iterator[str]:
     if figures.renderer is None:
         walks = f"--data {home}/train/path {kept}"
         yield f"finetune houses-64-stage2-scene {walks} --out {home}/renderer-true {base}"
-        imagined = f"adapter_from={home}/renderer-true memory.settings.model={scene_model(figures)}"
+        imagined = f"adapter_from={home}/renderer-true memory.settings.model={shlex.quote(figures.scene)}"
         yield f"finetune houses-64-stage2-scene-imagined {walks} --out {home}/renderer {base} {imagined}"
 
 
 def measuring_commands(figures: SceneFigures) -> Iterator[str]:
     """Yield the command lines that measure."""
     home, packaged = shlex.quote(str(figures.out)), shlex.quote(figures.checkpoint)
-    drawn = f"{home}/renderer" if figures.renderer is None else shlex.quote(figures.renderer)
+    scene, drawn = shlex.quote(figures.scene), shlex.quote(figures.drawing)
     paths, interactions = f"--data {home}/test/path", f"--data {home}/test/interact"
 
     def bench(data: str, parts: str, name: str, options: str) -> str:
         return (
-            f"bench scene {scene_model(figures)} {data} --parts {parts} --seeds {SEEDS} {options} --out {home}/{name} "
+            f"bench scene {scene} {data} --parts {parts} --seeds {SEEDS} {options} --out {home}/{name} "
             f"--report {home}/report-{name}"
         )
 
@@ -105,14 +115,9 @@ def measuring_commands(figures: SceneFigures) -> Iterator[str]:
     yield bench(paths, "return", "long", f"--checkpoint {drawn} {INVENTING} --walks 4 --return-steps 500")
 
 
-def scene_model(figures: SceneFigures) -> str:
-    """Return the model of scenes as a word of a command line."""
-    return shlex.quote(str(figures.out / "scene") if figures.scene_model is None else figures.scene_model)
-
-
 def identity(figures: SceneFigures) -> dict[str, Any]:
     """Return JSON values of what is trained on and measured."""
-    values = asdict(figures) | {"checkpoint": base_json(figures.checkpoint)}
+    values = asdict(figures) | {"checkpoint": model_json(figures.checkpoint)}
     del values["out"]
     if figures.scene_model is not None:
         values["scene_model"] = find_scene_model(figures.scene_model).fingerprint
@@ -140,8 +145,7 @@ def main(arguments: Sequence[str]) -> None:
     keep_plan(figures.out, identity(figures), "*/metrics.json")
     for line in commands(figures):
         run_line(line)
-    model = options.scene_model or str(figures.out / "scene")
-    scene_agents.main([str(figures.out / "agents"), "--model", figures.checkpoint, "--scene-model", model])
+    scene_agents.main([str(figures.out / "agents"), "--model", figures.checkpoint, "--scene-model", figures.scene])
 
 
 if __name__ == "__main__":

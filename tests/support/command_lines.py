@@ -12,7 +12,10 @@ from persist_cli.cli.app import app
 
 
 def parse_line(line: str) -> dict[str, Any]:
-    """Return the parameters that a line without ``persist`` gives its command; a usage error where it takes none."""
+    """Return the parameters that a line without ``persist`` gives its command.
+
+    An unknown command is a ``KeyError``, and what the command does not take a usage error.
+    """
     return parse_words(shlex.split(line))
 
 
@@ -20,6 +23,6 @@ def parse_words(words: Sequence[str]) -> dict[str, Any]:
     """The same for words; what ends the parsing of a command, such as ``--help``, ends it here, too."""
     command: Any = typer.main.get_command(app)
     rest = [*words]
-    while rest and rest[0] in getattr(command, "commands", {}):
+    while rest and hasattr(command, "commands") and not rest[0].startswith("-"):
         command = command.commands[rest.pop(0)]
     return dict(command.make_context("persist", rest).params)
