@@ -55,7 +55,7 @@ SHORTER = {
     "view": ("--export", "shortened.html"),  # or it would not end
     "learn": (
         "--steps", "1", "--guidance", "1", "--walks", "3", "--actions", "24", "--rounds", "1", "--training-steps", "1",
-        "--set", "training.batch=2", "--set", "training.workers=0", "--patience", "1",
+        "--set", "training.batch=2", "--set", "training.workers=0",
     ),
 }  # fmt: skip
 
@@ -63,6 +63,7 @@ SHORTER = {
 REPLACED = {
     "--scenes 0:200": "--scenes 0:2",
     "--scenes 0:20": "--scenes 0:2",
+    "--episodes runs/episodes.json --out runs/learn": "--patience 1 --episodes runs/episodes.json --out runs/learn",
     "--bins 8,16 --each 4": "--bins 8 --each 1",
     "--scenes 0:48 --each 16": "--scenes 0:2 --bins 8 --each 1",
     "--data DATA": "--data DATA backbone.settings.height=32 backbone.settings.width=32",  # as the walks in GIVEN

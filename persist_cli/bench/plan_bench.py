@@ -187,9 +187,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         raise PersistError(f"cost {cost.name!r}: {missing}")
     policies = open_policies(plan, rows)
     check_policies(rows, policies, plan.planning.horizon)
-    if plan.planning.cem_options and not any(row.searches for row in rows):
-        options = ", ".join(plan.planning.cem_options)
-        raise PersistError(f"{options}: no row has the cross-entropy method; add cem to --rows, or leave it out")
+    check_options(plan, rows, cost)
     checkpoint = find_checkpoint(plan.checkpoint) if any(row.uses_world_model for row in rows) else None
     journal = PlanningJournal(out)
     if processes.main:
@@ -223,6 +221,25 @@ def open_policies(plan: BenchPlan, rows: Sequence[PlanningRow]) -> dict[str | No
     """
     names = dict.fromkeys([*(row.policy for row in rows), plan.policy])
     return {name: None if name is None else open_policy(name) for name in names}
+
+
+def check_options(plan: BenchPlan, rows: Sequence[PlanningRow], cost: Cost) -> None:
+    """Raise ``PersistError`` when an option has no effect on any row."""
+    if plan.planning.cem_options and not any(row.searches for row in rows):
+        options = ", ".join(plan.planning.cem_options)
+        raise PersistError(f"{options}: no row has the cross-entropy method; add cem to --rows, or leave it out")
+    if plan.stop_cost is not None and not stops_by_cost(cost, rows):
+        raise PersistError(f"--stop-cost {plan.stop_cost:g}: agents that are told the place of their goal stop there")
+    sampled = plan.sampling != SamplingOverrides() or plan.placement != InferenceOptions()
+    if sampled and not any(row.uses_world_model for row in rows):
+        raise PersistError(
+            "how to sample is given, but no row has the world model; add one to --rows and --memories, or leave it out"
+        )
+
+
+def stops_by_cost(cost: Cost, rows: Sequence[PlanningRow]) -> bool:
+    """Whether an agent is shown an image of its goal, so that it stops where a view costs little enough."""
+    return cost.reads == "image" and any(row.goal != "place" for row in rows)
 
 
 def check_budget(plan: BenchPlan, rows: Sequence[PlanningRow], episodes: EpisodeSet) -> None:
@@ -322,7 +339,7 @@ def find_thresholds(
     plan: BenchPlan, cost: Cost, rows: Sequence[PlanningRow], simulator: Simulator, journal: PlanningJournal
 ) -> StopThresholds | None:
     """Return the thresholds at which agents that are shown an image stop; ``None`` where there are none."""
-    if cost.reads != "image" or all(row.goal == "place" for row in rows):
+    if not stops_by_cost(cost, rows):
         return None
     if plan.stop_cost is not None:
         return StopThresholds.given(plan.stop_cost)
