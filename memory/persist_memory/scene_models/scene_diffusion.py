@@ -132,11 +132,14 @@ class SceneDiffusion(SceneModel):
         A latent knows of its neighbours. Before the first snap sampling has free cells beside the given ones, and the
         truth there must not leak into the latents of these.
         """
-        true, held = (self.codec.encode(*cells).float() for cells in (truth(samples), start(samples)))
         own = self.settings.sampling
         snapped_from = own.snap_below if own.snap_every else -1.0
-        early = (levels.amax(1, keepdim=True) > snapped_from).expand_as(known)
-        return held.where(self._places((known & early).float()).bool(), true)
+        early = known & (levels.amax(1, keepdim=True) > snapped_from)
+        latents, some = self.codec.encode(*truth(samples)).float(), early.any(1)
+        if some.any():  # most samples have no such token
+            held = self.codec.encode(*(cells[some] for cells in start(samples))).float()
+            latents[some] = held.where(self._places(early[some].float()).bool(), latents[some])
+        return latents
 
     def tell(self, samples: SceneSamples, generators: list[torch.Generator], dropped: Bool[Tensor, " batch"]) -> Told:
         """Return the embedded conditions.
