@@ -14,6 +14,7 @@ from torch import nn
 
 from persist_cli.api.stages import MemorySavings
 from persist_cli.errors import PersistError
+from persist_cli.train.muon import Muon
 from persist_cli.training_settings import TrainingSettings
 
 if TYPE_CHECKING:
@@ -144,9 +145,7 @@ class MuonAndAdamW(Together):
         if not large:
             size = f"{LEAST_SIDE} rows and columns"
             raise PersistError(f"training.optimizer=muon trains matrices of {size}, and there are none; use adamw")
-        parts: list[torch.optim.Optimizer] = [
-            torch.optim.Muon(large, lr=rate, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
-        ]
+        parts: list[torch.optim.Optimizer] = [Muon(large, lr=rate, weight_decay=decay)]
         if others:
             parts.append(torch.optim.AdamW(others, lr=rate, weight_decay=decay))
         super().__init__(parts)

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from persist_cli.errors import PersistError
+from persist_cli.train.muon import Muon, orthogonal
 from persist_cli.train.optimizer import LEAST_SIDE, MuonAndAdamW
 from tests.support.micro_runs import equal_runs, losses, run_result, stage
 
@@ -32,12 +33,33 @@ def descend(optimizers, parameters, steps):
 def test_each_part_trains_as_it_does_alone():
     together, alone = weights(), weights()
     descend([MuonAndAdamW(together.values(), 0.1, 0.01)], together, range(3))
-    muon = torch.optim.Muon([alone["matrix"]], weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
+    muon = Muon([alone["matrix"]], 0.1, 0.01)
     adamw = torch.optim.AdamW([alone["narrow"], alone["bias"]], weight_decay=0.01)
     descend([muon, adamw], alone, range(3))
     for name, weight in weights().items():
         assert torch.equal(together[name], alone[name]), name
         assert not torch.equal(together[name], weight), name
+
+
+@pytest.mark.parametrize("shape", [(LEAST_SIDE, 200), (200, LEAST_SIDE)])
+def test_steps_are_those_of_torch_but_for_its_bfloat16(shape):
+    ours, theirs, before = ({"matrix": nn.Parameter(torch.ones(shape))} for _ in range(3))
+    descend([Muon(ours.values(), 0.1, 0.01)], ours, range(3))
+    like = torch.optim.Muon(theirs.values(), weight_decay=0.01, adjust_lr_fn="match_rms_adamw")
+    descend([like], theirs, range(3))
+    moved, wanted = (part["matrix"].detach() - before["matrix"].detach() for part in (ours, theirs))
+    assert float((moved - wanted).norm() / wanted.norm()) < 0.02
+    assert not torch.equal(moved, wanted)
+
+
+@pytest.mark.parametrize("shape", [(LEAST_SIDE, 200), (200, LEAST_SIDE)])
+def test_steps_have_singular_values_near_one(shape):
+    drawn = torch.randn(shape, generator=torch.manual_seed(1))
+    group = Muon([nn.Parameter(drawn)], 0.1, 0.01).param_groups[0]
+    step = orthogonal(drawn, group["ns_coefficients"], group["ns_steps"], group["eps"])
+    values = torch.linalg.svdvals(step)
+    assert step.shape == shape
+    assert 0.5 < float(values.min()) < float(values.max()) < 1.5
 
 
 def test_its_state_goes_on_where_it_was_saved():
