@@ -28,6 +28,7 @@ from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.bench.true_scene import observations_of
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.held_out import was_trained_on
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
@@ -121,7 +122,7 @@ def run_collisions(path: Path | None, plan: CollisionPlan, out: Path, as_json: b
     Raises:
         PersistError: when the checkpoint lacks a memory, the simulator is missing, or a scene was trained on.
     """
-    plan.placement.device()
+    check_placement(plan.placement)
     plan.scenes.check()
     check_simulator(plan.scenes.simulator)
     checkpoint = find_checkpoint(path or reference_checkpoint())

@@ -25,6 +25,7 @@ from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_ope
 from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThresholds, stop_thresholds
 from persist_cli.bench.true_scene import TrueScene
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.journal import Processes
@@ -176,7 +177,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     Raises:
         PersistError: one line for whatever does not fit.
     """
-    plan.placement.device()
+    check_placement(plan.placement)
     for loop in plan.loops:
         if loop not in LOOPS:
             raise PersistError(f"unknown loop {loop!r}; {hint(loop, LOOPS)}")

@@ -13,6 +13,7 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.checkpoints import lineage
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader, check_bases, common_sampling
@@ -143,7 +144,7 @@ def prepare(
     Raises:
         PersistError: one line for whatever does not fit.
     """
-    plan.placement.device()  # an impossible placement is reported before anything is loaded
+    check_placement(plan.placement)  # an impossible placement is reported before anything is loaded
     checkpoints = list({checkpoint.folder.resolve(): checkpoint for checkpoint in map(find_checkpoint, paths)}.values())
     if plan.memories is None:
         plan = replace(plan, memories=default_memories(checkpoints))

@@ -25,6 +25,7 @@ from persist_cli.api.simulator import Simulator
 from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.plan_bench import check_scenes, trained_on
 from persist_cli.bench.run_episode import LoopSettings
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.checkpoints.retention import ended_recipe
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError, PersistError
@@ -165,7 +166,7 @@ def run_rounds(learning: Learning) -> None:
 def prepare(plan: LearnPlan, out: Path) -> Learning:
     """Check everything that can be checked before the model is loaded, and write nothing."""
     check_folder(out)
-    plan.placement.device()  # a missing accelerator is an error before anything is loaded
+    check_placement(plan.placement)  # a missing accelerator is an error before anything is loaded
     if plan.inside not in (MODEL, SIMULATOR):
         raise PersistError(f"--inside {plan.inside!r}: a policy practises inside the {MODEL} or the {SIMULATOR}")
     if plan.inside == SIMULATOR and plan.body is False:

@@ -19,6 +19,7 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.checkpoints.lineage import training_scenes
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import PersistError, hint
@@ -113,7 +114,7 @@ class PlanParts:
 
 def run_plan(path: Path | None, options: PlanOptions, out: Path, as_json: bool) -> None:
     """Plan with a checkpoint, or the reference model without a path, and write what was found to a folder."""
-    options.placement.device()  # a missing accelerator is an error before anything is loaded
+    check_placement(options.placement)  # a missing accelerator is an error before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = checkpoint.chosen_adapter(options.adapter)
     check_folder(out)

@@ -12,6 +12,7 @@ from persist_cli.api.inference import CONSISTENCY, InferenceOptions, SamplingOve
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Trajectory
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter, load_backbone, warn_of_plain
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.memorize.memory_file import read_header
@@ -69,7 +70,7 @@ def open_walks(options: PlayOptions) -> Callable[[], Play]:
     Raises:
         PersistError: as ``open_play``; what it returns raises it where the settings are wrong.
     """
-    options.placement.device()  # a missing accelerator is an error before anything is loaded
+    check_placement(options.placement)  # a missing accelerator is an error before anything is loaded
     if is_memory_file(options.begin.start) and options.begin.start not in options.given:
         options = replace(options, given=(options.begin.start, *options.given))
     checkpoint = find_checkpoint(Path(options.checkpoint))

@@ -15,6 +15,7 @@ from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.lineage import training_scenes
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError
 from persist_cli.io.files import check_folder
@@ -30,7 +31,7 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
     """Roll out a checkpoint, or the reference model without a path, and write a folder for each branch."""
     if bool(plan.actions) == plan.follow:
         raise PersistError("give either --actions TEXT or --follow")
-    plan.placement.device()  # a missing accelerator is an error before anything is loaded
+    check_placement(plan.placement)  # a missing accelerator is an error before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapter = checkpoint.chosen_adapter(plan.adapter)
     paths = plan_camera_paths(plan)

@@ -40,6 +40,7 @@ from persist_cli.checkpoints.load import (
     with_adapter,
     with_scene_paths,
 )
+from persist_cli.checkpoints.placement import warn_if_slow
 from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.errors import PersistError, RecipeError
@@ -269,6 +270,8 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
         raise PersistError(
             f"training.tracker={tracker} needs the package {tracker}: pip install 'persist-cli[{tracker}]'"
         )
+    if settings.precision == "bf16" and not torch.cuda.is_available():
+        warn_if_slow("training.precision=bf16", torch.bfloat16, "give training.precision=no")
     fsdp, zero = fsdp_plugin(settings.precision), zero_plugin(settings)
     accelerator = Accelerator(
         mixed_precision=settings.precision if zero is None else "no",  # DeepSpeed has its own way

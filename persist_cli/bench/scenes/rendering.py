@@ -14,6 +14,7 @@ from persist_cli.bench.scenes.completions import Scenes
 from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBench
 from persist_cli.bench.scenes.views import View
 from persist_cli.checkpoints.load import adapter_memory, load_adapter
+from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.clips import check_size
 from persist_cli.errors import PersistError
 from persist_cli.evaluate.backbones import BackboneLoader
@@ -128,6 +129,7 @@ class RendererLoader:
 
     def __init__(self, bench: SceneBench, plan: RenderingPlan) -> None:
         self.bench, self.plan = bench, plan
+        check_placement(plan.placement)
         self.checkpoint, self.loader = find_checkpoint(plan.checkpoint), BackboneLoader(plan.placement)
 
     def load(self, row: RenderedRow) -> Renderer:
