@@ -200,7 +200,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         if checkpoint is not None:
             check_model(checkpoint, rows, episodes)
         if not journal.begun or (checkpoint is not None and not journal.identity().get("checkpoint")):
-            known = trained_on(checkpoint, trained_policy(policies[plan.policy]))
+            known = known_scenes(checkpoint, trained_policy(policies[plan.policy]))
             check_scenes(episodes.scenes, known, plan.allow_training_scenes)
         check_budget(plan, rows, episodes)
         journal.begin(values, episodes)
@@ -299,7 +299,7 @@ def check_scenes(scenes: Sequence[str], trained: Mapping[str, Collection[str]], 
             )
 
 
-def trained_on(checkpoint: Checkpoint | None, policy: TrainedPolicy | None) -> dict[str, Collection[str]]:
+def known_scenes(checkpoint: Checkpoint | None, policy: TrainedPolicy | None) -> dict[str, Collection[str]]:
     """Return the names of the scenes that model and policy were trained on, by words for each."""
     names: dict[str, Collection[str]] = {} if checkpoint is None else {"the model": training_scenes([checkpoint])}
     if policy is not None:

@@ -27,7 +27,7 @@ Pose = Float[Tensor, "4 4"]
 
 
 @dataclass(frozen=True)
-class Walk:
+class CandidateWalk:
     """Where a candidate leads.
 
     Args:
@@ -49,7 +49,7 @@ class Imagined:
     """
 
     futures: Futures
-    walks: list[Walk]
+    walks: list[CandidateWalk]
 
 
 class FutureModel(Protocol):
@@ -199,7 +199,7 @@ class SimulatorFutures:
         depth = torch.from_numpy(np.stack([[frame.depth for frame in video] for video in videos])).float()
         return Imagined(Futures(rgb, depth, poses, free), walks)
 
-    def _walk(self, start: Pose, names: Actions, over: Over | None) -> tuple[Walk, list[Frame]]:
+    def _walk(self, start: Pose, names: Actions, over: Over | None) -> tuple[CandidateWalk, list[Frame]]:
         """Do the actions from a pose; return the walk, and the frames to judge: none for ``None``."""
         info, free, poses, frames = self.simulator.info, [], [start], []
         world_up = torch.tensor(info.world_up, dtype=torch.float64)
@@ -212,12 +212,12 @@ class SimulatorFutures:
                 frames.append(self.simulator.observe())
         if over is not None and not frames:
             frames.append(self.simulator.observe())
-        return Walk(torch.stack(poses)[1:], torch.tensor(free, dtype=torch.bool)), frames
+        return CandidateWalk(torch.stack(poses)[1:], torch.tensor(free, dtype=torch.bool)), frames
 
 
 def walk_all(
     camera: Cameras, info: TrajectoryInfo, candidates: Sequence[Actions], ground: GroundMap, body: Body | None
-) -> list[Walk]:
+) -> list[CandidateWalk]:
     """Return where candidates lead from one camera; a move over occupied ground stays where it is.
 
     This is the cheap check: the map as it is now, and unknown ground counts as free.
@@ -230,15 +230,15 @@ def walk_all(
         body: of the agent; ``None`` to go through walls.
     """
     surroundings = None if body is None else FixedSurroundings(body, ground)
-    return [Walk(walk.path, walk.verdicts) for walk in whole_walks(camera, info, candidates, surroundings)]
+    return [CandidateWalk(walk.path, walk.verdicts) for walk in whole_walks(camera, info, candidates, surroundings)]
 
 
-def free_actions(names: Actions, walk: Walk) -> tuple[str, ...]:
+def free_actions(names: Actions, walk: CandidateWalk) -> tuple[str, ...]:
     """Return the actions of a candidate that were free."""
     return tuple(name for name, free in zip(names, walk.free.tolist(), strict=True) if free)
 
 
-def frame_numbers(walk: Walk, count: int, over: Over) -> Int64[Tensor, " frame"]:
+def frame_numbers(walk: CandidateWalk, count: int, over: Over) -> Int64[Tensor, " frame"]:
     """Return which frames of its free actions a candidate sees, 0 for the present one; ``count`` of them.
 
     Args:
@@ -253,7 +253,7 @@ def frame_numbers(walk: Walk, count: int, over: Over) -> Int64[Tensor, " frame"]
 
 
 def padded(
-    walks: Sequence[Walk], start: Float[Tensor, "4 4"], over: Over
+    walks: Sequence[CandidateWalk], start: Float[Tensor, "4 4"], over: Over
 ) -> tuple[Float[Tensor, "candidate frame 4 4"], Bool[Tensor, "candidate frame"]]:
     """Return poses and free ways of the frames to judge; shorter walks repeat their last, empty ones the start."""
     length = 1 if over == "last" else max(1, *(len(walk.poses) for walk in walks))

@@ -18,7 +18,7 @@ from persist_cli.api.geometry import near_poses
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Policy
 from persist_cli.errors import PersistError
-from persist_cli.planning.futures import FutureModel, Over, Walk
+from persist_cli.planning.futures import CandidateWalk, FutureModel, Over
 
 NEAR: Final = 0.3  # metres between two poses of one view
 
@@ -61,7 +61,7 @@ class Candidate:
     actions: tuple[str, ...]
     cost: float
     best: int
-    walk: Walk
+    walk: CandidateWalk
     round: int
 
     @property

@@ -19,7 +19,7 @@ from persist_cli.api.memory import MapPoints
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
 from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json
-from persist_cli.planning.futures import FutureModel, Imagined, Walk, WorldFutures
+from persist_cli.planning.futures import CandidateWalk, FutureModel, Imagined, WorldFutures
 from persist_cli.planning.judge import Candidate
 from persist_cli.planning.planners import Plan
 from persist_cli.planning.true_futures import true_futures
@@ -71,7 +71,7 @@ class Shown:
     candidates: list[Candidate]
     imagined: list[Video]
     truth: list[Video] | None
-    true_walks: list[Walk] | None
+    true_walks: list[CandidateWalk] | None
     true_costs: list[float] | None
     unknown: str
 
@@ -199,7 +199,7 @@ def candidate_json(candidate: Candidate) -> dict[str, Any]:
     }
 
 
-def blocked(walk: Walk) -> list[int]:
+def blocked(walk: CandidateWalk) -> list[int]:
     """Return the numbers of the actions, from 1, that could not move."""
     return [number for number, free in enumerate(walk.free.tolist(), 1) if not free]
 

@@ -24,7 +24,7 @@ from persist_cli.viewer.imagine import Imaginer
 from persist_cli.viewer.imagine_panel import ImaginePanel
 from persist_cli.viewer.notes import Legend, Note, Pictures, error_line
 from persist_cli.viewer.stage import CHANGED, REMOVED, SAME, Look, Stage
-from persist_cli.viewer.subject import Subject, Walk
+from persist_cli.viewer.subject import DrawnWalk, Subject
 
 TOKENS: Final = 256  # that a reading draws when nobody says how many
 MOST_TOKENS: Final = 4096
@@ -299,7 +299,7 @@ class Page:
         self._read_text.say(f"{len(tokens):,} tokens, {imagined:,} of them imagined, {tokens.bytes:,} bytes")
 
 
-def _pictures(walks: Sequence[Walk], frame: int) -> Iterator[tuple[str, Tensor]]:
+def _pictures(walks: Sequence[DrawnWalk], frame: int) -> Iterator[tuple[str, Tensor]]:
     """Yield the pictures of walks at a frame, or at their last one, with their names."""
     for walk in walks:
         number = min(frame, len(walk) - 1)

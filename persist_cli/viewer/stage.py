@@ -19,7 +19,7 @@ from persist_cli.viewer.block_mesh import block_mesh
 from persist_cli.viewer.camera_view import pose_of
 from persist_cli.viewer.drawn_cells import POINT, DrawnCells, cells_of_frames, painted
 from persist_cli.viewer.level_of_detail import DetailTree
-from persist_cli.viewer.subject import MAP, TRUTH, Subject, Walk
+from persist_cli.viewer.subject import MAP, TRUTH, DrawnWalk, Subject
 from persist_cli.viewing.map import ABOVE_CAMERA, PATH_COLORS
 
 Array = np.ndarray[Any, Any]
@@ -164,7 +164,7 @@ class Stage:
                 self.draw_camera(f"{root}/camera {walk.numbers[frame]}", walk, int(frame), 0.12, color)
 
     def draw_camera(
-        self, node: str, walk: Walk, frame: int, size: float, color: tuple[int, int, int] = SELECTED_COLOR
+        self, node: str, walk: DrawnWalk, frame: int, size: float, color: tuple[int, int, int] = SELECTED_COLOR
     ) -> None:
         """Draw one camera of a walk with its picture, ``size`` metres deep."""
         picture = None if walk.pictures is None else walk.pictures[frame].numpy()
@@ -242,7 +242,7 @@ class Stage:
                 precision="float32", point_shading="flat",
             )  # fmt: skip
 
-    def _draw_seen(self, node: str, walk: Walk, frame: int) -> None:
+    def _draw_seen(self, node: str, walk: DrawnWalk, frame: int) -> None:
         assert walk.pictures is not None
         assert walk.depth is not None
         part = slice(frame, frame + 1)
@@ -268,11 +268,11 @@ def _node(layer: str) -> str:
     return f"/{TRUTH}/cells" if layer == TRUTH else f"/layers/{layer}"
 
 
-def _walk_node(number: int, walk: Walk) -> str:
+def _walk_node(number: int, walk: DrawnWalk) -> str:
     return f"/{TRUTH}/walk" if walk.is_truth else f"/walks/{number} {walk.name.replace('/', ' ')}"
 
 
-def _walk_color(number: int, walk: Walk) -> tuple[int, int, int]:
+def _walk_color(number: int, walk: DrawnWalk) -> tuple[int, int, int]:
     if walk.is_truth:
         return TRUTH_COLOR
     text = PATH_COLORS[number % len(PATH_COLORS)].removeprefix("#")

@@ -30,7 +30,7 @@ MAP, POINTS, SCENE, TRUTH = "map", "points", "true cells", "truth"  # names of w
 
 
 @dataclass(frozen=True)
-class Walk:
+class DrawnWalk:
     """A camera's way, with what it saw where that is known.
 
     Args:
@@ -74,7 +74,7 @@ class Subject:
     title: str
     scene: str
     world_up: tuple[float, float, float]
-    walks: tuple[Walk, ...]
+    walks: tuple[DrawnWalk, ...]
     layers: dict[str, DrawnCells]
     memory: Memory | None = None
     file: Path | None = None
@@ -116,21 +116,21 @@ def _of_memory(path: Path) -> Subject:
         numbers, _ = _chosen(range(len(poses)), name)
         if numbers:
             cameras = path_cameras([*poses[numbers].double()], PATH_PIXELS)
-            walks.append(Walk(name, cameras, tuple(numbers)))
+            walks.append(DrawnWalk(name, cameras, tuple(numbers)))
     walks += _stored_frames(memory)
     reference, layers = memory.reference, {MAP: cells_of_memory(memory)}
     notices = () if walks else ("the file keeps no path, so no camera is drawn",)
     return Subject(str(path), reference.name, reference.world_up, (*walks,), layers, memory, path, None, notices)
 
 
-def _stored_frames(memory: Memory) -> list[Walk]:
+def _stored_frames(memory: Memory) -> list[DrawnWalk]:
     """Return the images that a memory of images stores, with their cameras; none of another kind of memory."""
     tensors = memory.tensors()
     if not {"images", "world_from_camera", "intrinsics"} <= set(tensors) or not len(tensors["images"]):
         return []
     images = tensors["images"]
     cameras = Cameras(tensors["world_from_camera"], tensors["intrinsics"], images.shape[1], images.shape[2])
-    return [Walk(f"images of memory {memory.name}", cameras, tuple(range(len(images))), images)]
+    return [DrawnWalk(f"images of memory {memory.name}", cameras, tuple(range(len(images))), images)]
 
 
 def _of_trajectory(text: str) -> Subject:
@@ -140,7 +140,7 @@ def _of_trajectory(text: str) -> Subject:
     )
 
 
-def _layers_of(file: TrajectoryFile, walk: Walk) -> dict[str, DrawnCells]:
+def _layers_of(file: TrajectoryFile, walk: DrawnWalk) -> dict[str, DrawnCells]:
     """Return what the frames of a walk saw, and the scene's own cells where they are stored."""
     assert walk.pictures is not None
     assert walk.depth is not None
@@ -172,7 +172,7 @@ def _of_rollout(folder: Path) -> Subject:
         raise DataError(f"{folder}: rgb.mp4 has {len(rgb)} frames, poses.txt {len(poses)}; roll out anew")
     cameras = file.cameras([first]).at(poses)
     numbers, notices = _chosen(range(len(poses)), "the rollout")
-    walk = _small(Walk("imagined", cameras[numbers], tuple(numbers), rgb[numbers], origin=Origin.IMAGINED))
+    walk = _small(DrawnWalk("imagined", cameras[numbers], tuple(numbers), rgb[numbers], origin=Origin.IMAGINED))
     memory_file = folder / "memory.safetensors"
     subject = Subject(str(folder), info.scene, info.world_up, (walk,), {}, start=file, notices=notices)
     if memory_file.is_file():
@@ -208,11 +208,11 @@ def _check_scene(subject: Subject, file: TrajectoryFile, option: str) -> None:
         )
 
 
-def _read_walk(reference: Reference, name: str) -> tuple[TrajectoryFile, Walk, tuple[str, ...]]:
+def _read_walk(reference: Reference, name: str) -> tuple[TrajectoryFile, DrawnWalk, tuple[str, ...]]:
     file = reference.single()
     numbers, notices = _chosen(file.frame_numbers(reference.frames or slice(None)), reference.text)
     part = file.read(numbers).observations
-    return file, _small(Walk(name, part.cameras, tuple(numbers), part.rgb, part.depth)), notices
+    return file, _small(DrawnWalk(name, part.cameras, tuple(numbers), part.rgb, part.depth)), notices
 
 
 def _chosen(numbers: Sequence[int], name: str) -> tuple[list[int], tuple[str, ...]]:
@@ -223,7 +223,7 @@ def _chosen(numbers: Sequence[int], name: str) -> tuple[list[int], tuple[str, ..
     return [numbers[pick] for pick in picks], (f"{name}: {MOST_FRAMES} of {len(numbers)} frames are shown",)
 
 
-def _small(walk: Walk) -> Walk:
+def _small(walk: DrawnWalk) -> DrawnWalk:
     """Return a walk whose images have every n-th pixel alone, so that the shorter side has at most ``MOST_PIXELS``."""
     assert walk.pictures is not None
     step = -(-min(walk.pictures.shape[1:3]) // MOST_PIXELS)

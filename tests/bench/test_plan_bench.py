@@ -17,7 +17,7 @@ from persist_cli.api.ground import Cover
 from persist_cli.api.policy import Policy
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, make_planner
-from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, trained_on, trained_policy
+from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, known_scenes, trained_policy
 from persist_cli.bench.planning_pictures import end_words
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
@@ -373,7 +373,7 @@ def test_episodes_of_another_image_size_are_refused(
 
 
 def test_scenes_that_the_model_was_trained_on_are_refused(episodes: EpisodeSet, voxel: Path) -> None:
-    trained = trained_on(find_checkpoint(voxel), policy=None)
+    trained = known_scenes(find_checkpoint(voxel), policy=None)
     room = episodes.episodes[0].model_copy(update={"scene_name": "room-0"})
     known = episodes.model_copy(update={"episodes": [room]})
     with pytest.raises(DataError, match="'room-0': the model was trained on it"):
@@ -397,8 +397,8 @@ def test_scenes_that_the_policy_was_trained_on_are_refused(episodes: EpisodeSet,
     room = episodes.episodes[0].model_copy(update={"scene_name": "room-1"})
     known = episodes.model_copy(update={"episodes": [room]})
     with pytest.raises(DataError, match=r"'room-1': policy .* was trained on it"):
-        check_scenes(known.scenes, trained_on(None, trained_policy(open_policy(str(policy_run)))), allowed=False)
-    assert trained_on(None, trained_policy(make_policy("random", {}))) == {}
+        check_scenes(known.scenes, known_scenes(None, trained_policy(open_policy(str(policy_run)))), allowed=False)
+    assert known_scenes(None, trained_policy(make_policy("random", {}))) == {}
 
 
 def test_a_policy_that_does_not_look_so_far_is_refused(bench: Bench, policy_run: Path, random_lpips: None) -> None:
