@@ -223,7 +223,7 @@ class Walker:
         most = max(int(whole // abs(turn.turn)) for turn in self.turns)
         for count in range(1, most + 1):
             for turn in self.turns:
-                if count * abs(turn.turn) <= whole:
+                if count * abs(turn.turn) <= whole and count * abs(turn.turn) < 360:
                     yield [turn.name] * count
 
     def _turns_by(self, degrees: float) -> list[str]:

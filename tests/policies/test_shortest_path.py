@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.ground import Cover, GroundMap, ground_axes
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.errors import RecipeError
 from persist_cli.navigation.ground_mapper import GroundMapper
 from persist_cli.navigation.ways import way_is_free
 from persist_cli.plugins import make_policy
+from persist_cli.policies.shortest_path import Walker
 from tests.support.room_worlds import BODY, room_info, room_views
 from tests.support.rooms import UP, look
 
@@ -129,3 +132,10 @@ def test_an_agent_with_an_image_goal_explores_a_room_until_it_has_seen_it():
 def test_settings_that_cannot_work_are_refused():
     with pytest.raises(RecipeError, match="near -1"):
         make_policy("shortest-path", {"near": -1})
+
+
+def test_who_turns_to_one_side_alone_never_turns_all_the_way_round():
+    actions = tuple(action for action in INFO.vocabulary.actions if action.name != "right")
+    now = replace(situation(open_ground(), (1.0, 0.0)), info=replace(INFO, vocabulary=ActionVocabulary(actions)))
+    turns = list(Walker(now).options())
+    assert [len(names) for names in turns] == list(range(24))  # of 15°
