@@ -152,6 +152,15 @@ class SceneModel(nn.Module, ABC):
             steps: denoising steps.
         """
 
+    def reconstruct(
+        self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]
+    ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
+        """Return the cells of windows as they come out of the model's codec, by default as they went in.
+
+        What is lost on the way no sample can have.
+        """
+        return classes, colors
+
     @abstractmethod
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Freeze all parameters that the stage does not train, and return the others by name."""

@@ -145,6 +145,24 @@ def test_given_cells_come_out_to_the_bit_and_solid_ones_as_something(model, samp
     assert not (classes == SOLID).any()
 
 
+def test_cells_are_reconstructed_as_the_codec_has_them_and_are_never_merely_solid(model, samples):
+    classes, colors = model.reconstruct(samples.true_classes, samples.true_colors)
+    with torch.no_grad():
+        logits, _ = model.codec.decode(model.codec.encode(samples.true_classes, samples.true_colors))
+    likeliest = logits.argmax(-1)
+    assert classes[likeliest != SOLID].equal(likeliest[likeliest != SOLID].to(torch.uint8))
+    assert not (classes == SOLID).any()
+    assert not colors[classes == 0].any()
+
+
+def test_doors_and_things_count_more_in_the_loss_of_the_codec(model):
+    weights = dict(zip(model.settings.palette, model.weights.tolist(), strict=True))
+    assert {name for name, weight in weights.items() if weight == 1} == {
+        "free", "solid", "outside", "floor", "ceiling", "wall",
+    }  # fmt: skip
+    assert weights["door"] == weights["box"] == model.settings.codec.rare_weight > 1
+
+
 def test_a_sample_follows_from_its_seed_alone(model, samples):
     first, again = (model.sample(samples, 2) for _ in range(2))
     assert first[0].equal(again[0])

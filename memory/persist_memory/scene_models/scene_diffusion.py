@@ -43,7 +43,7 @@ from persist_memory.scene_models.transformer import SceneTransformer
 
 CODEC, REST = "codec", ("given", "view", "action", "transformer")  # parts of the model, which the stages train
 FILES = {"scene-codec": "codec.safetensors", "scene": "transformer.safetensors"}
-STRUCTURE = (*COMMON, "floor", "ceiling", "wall", "door")  # all other classes are things
+COMMONEST = (*COMMON, "floor", "ceiling", "wall")  # cells of all other classes, doors and things, are few
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class SceneDiffusion(SceneModel):
         self.codec = SceneCodec(settings)
         self.given, self.view = GivenCells(settings), ViewTokens(settings)
         self.action, self.transformer = ActionEmbedding(settings), SceneTransformer(settings)
-        rare = [1.0 if name in STRUCTURE else settings.codec.furniture_weight for name in settings.palette]
+        rare = [1.0 if name in COMMONEST else settings.codec.rare_weight for name in settings.palette]
         self.register_buffer("weights", torch.tensor(rare), persistent=False)
 
     @property
@@ -215,18 +215,36 @@ class SceneDiffusion(SceneModel):
         self, latents: Float[Tensor, "batch channel *latent"], samples: SceneSamples
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
         """Decode latents to the likeliest class of each cell, and write what is given into it."""
-        logits, colors = self.codec.decode(latents)
-        kept, named = content(samples), len(self.settings.palette) > len(COMMON)
-        if named:
-            logits[..., SOLID] = -torch.inf
+        logits, colors = self._decoded(latents)
+        kept, named = content(samples), self.is_named
         classes = logits.argmax(-1).to(torch.uint8)
         logits[..., [FREE, OUTSIDE]] = -torch.inf
         told = samples.classes
         if named:  # of a cell that is only known to be solid, the likeliest thing that it can be
             told = torch.where(told == SOLID, logits.argmax(-1).to(torch.uint8), told)
         classes = torch.where(kept, told, classes)
-        colors = (colors.clamp(0, 1) * 255).round().to(torch.uint8) * is_solid(classes)[..., None]
-        return classes, torch.where(kept[..., None], samples.colors, colors)
+        return classes, torch.where(kept[..., None], samples.colors, painted(classes, colors))
+
+    @torch.no_grad()
+    def reconstruct(
+        self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]
+    ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
+        """Return the cells as the codec's latents hold them; see ``SceneModel.reconstruct``."""
+        logits, decoded = self._decoded(self.codec.encode(classes, colors))
+        classes = logits.argmax(-1).to(torch.uint8)
+        return classes, painted(classes, decoded)
+
+    def _decoded(self, latents: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits of classes, where things have names never of ``SOLID``, and colours (1 = 255)."""
+        logits, colors = self.codec.decode(latents)
+        if self.is_named:
+            logits[..., SOLID] = -torch.inf
+        return logits, colors
+
+    @property
+    def is_named(self) -> bool:
+        """Whether what is solid has classes."""
+        return len(self.settings.palette) > len(COMMON)
 
     def finish_stage(self, stage: Stage, batches: Iterable[SceneSamples]) -> None:
         """Measure the mean and deviation of the latents after the codec's stage."""
@@ -303,6 +321,11 @@ def start(samples: SceneSamples) -> tuple[Tensor, Tensor]:
     """Return what is given, and free cells where nothing is: what sampling knows before its first step."""
     kept = content(samples)
     return samples.classes * kept, samples.colors * kept[..., None]
+
+
+def painted(classes: UInt8[Tensor, "*batch"], colors: Float[Tensor, "*batch 3"]) -> UInt8[Tensor, "*batch 3"]:
+    """Return decoded colours (1 = 255) of cells, 0 where nothing is."""
+    return (colors.clamp(0, 1) * 255).round().to(torch.uint8) * is_solid(classes)[..., None]
 
 
 def is_solid(classes: UInt8[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:

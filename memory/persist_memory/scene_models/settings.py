@@ -33,7 +33,8 @@ class CodecSettings:
         components: principal components of the latents that the transformer generates; ``None`` for all.
         evenness: of their deviations: 1 makes all alike, 0 leaves them as they are: noise hides small ones first.
         cell: channels of a cell in the decoder, before its class and colour are read off.
-        furniture_weight: weight of a cell in the loss that holds a thing; all others have 1.
+        rare_weight: weight in the loss of a cell of a door or thing; all others have 1. Doors are so few that a codec
+            that does not count them more makes walls of them.
         color_weight: weight of the colours' error.
         kl_weight: weight of the divergence of the latents from a normal distribution.
         noise: of latents before they are decoded in training, as a share of their deviation.
@@ -47,7 +48,7 @@ class CodecSettings:
     components: Positive | None = None
     evenness: Annotated[float, Field(ge=0, le=1)] = 0.5
     cell: Positive = 16
-    furniture_weight: Metres = 4.0
+    rare_weight: Metres = 4.0
     color_weight: Amount = 1.0
     kl_weight: Amount = 1e-6
     noise: Share = 0.1

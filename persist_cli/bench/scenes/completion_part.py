@@ -14,7 +14,7 @@ from torch import Tensor
 from persist_cli.api.cell_things import STRUCTURE
 from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.scenes.class_counts import class_counts, iou_figure, share_figure, things
-from persist_cli.bench.scenes.completions import Completion
+from persist_cli.bench.scenes.completions import CEILINGS, Completion
 from persist_cli.bench.scenes.connectedness import LEAST_GROUND, MARGIN, count_borders, count_doors
 from persist_cli.bench.scenes.layouts import NEIGHBOUR, PLAN, disagreement, distinct, plan_features, precision_recall
 from persist_cli.bench.scenes.scene_bench import SceneBench
@@ -195,7 +195,7 @@ def connectedness(bench: SceneBench, samples: Mapping[str, Mapping[str, Tensor]]
 
 def figures_json(name: str, figures: Mapping[str, Mapping[str, Figure]]) -> dict[str, Any]:
     """Return the figures of a row with the differences of the model to it, as JSON values."""
-    compared = [other for other in figures if name == "model" and other not in (name, "truth")]
+    compared = [other for other in figures if name == "model" and other not in (name, *CEILINGS)]
     return {
         column: figure.to_json()
         | {"differences": {other: difference(figure, figures[other][column]) for other in compared}}

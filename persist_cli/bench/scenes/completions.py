@@ -23,7 +23,7 @@ from persist_cli.bench.scenes.training_houses import (
     region_of_match,
     vote,
 )
-from persist_cli.bench.scenes.views import View, filled, same_form
+from persist_cli.bench.scenes.views import Region, View, filled, same_form, true_region
 from persist_cli.errors import PersistError
 from persist_cli.memorize.factory import MemoryFactory
 
@@ -60,6 +60,35 @@ class Truth(Completion):
     def complete(self, view: View, number: int, seed: int) -> CellGrid:
         """Return the true cells where nothing is known."""
         return filled(view.known, view.truth.classes)
+
+
+class CodedTruth(Completion):
+    """The true cells, through the codec of a scene model: the ceiling of what it can imagine.
+
+    Args:
+        scenes: with the model.
+    """
+
+    name = "truth, coded"
+    definition = "the true cells, through the codec of the scene model: the ceiling of what it can imagine"
+
+    def __init__(self, scenes: Scenes) -> None:
+        self.scenes = scenes
+
+    def complete(self, view: View, number: int, seed: int) -> CellGrid:
+        """Return what comes out of the codec where nothing is known, window by window."""
+        model, region = self.scenes.model, view.region
+        assert model is not None
+        classes, size = view.truth.classes.clone(), model.form.shape
+        for first in range(0, region.shape[0], size[0]):
+            for second in range(0, region.shape[1], size[1]):
+                corner = (region.corner[0] + first, region.corner[1] + second, region.corner[2])
+                window = true_region(view.house, Region(corner, size, 0))
+                cells = (values[None].to(self.scenes.factory.device) for values in (window.classes, window.colors))
+                came = model.reconstruct(*cells)[0][0].cpu()
+                part = classes[first : first + size[0], second : second + size[1], : size[2]]
+                part.copy_(came[tuple(slice(length) for length in part.shape)])
+        return filled(view.known, classes)
 
 
 class Empty(Completion):
@@ -184,6 +213,9 @@ class SceneCompletion(Completion):
         scene = self.scenes.after(view)
         scene.complete(view.region.box(view.truth), seed)
         return same_form(view.region.of(scene.cells), view.truth.form, "the scene model")
+
+
+CEILINGS: Final = (CodedTruth.name, Truth.name)  # rows that read the truth, which nothing is compared with
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.bench.scenes.completion_part import completion_json, run_completion
-from persist_cli.bench.scenes.completions import SceneCompletion, Truth
+from persist_cli.bench.scenes.completions import CEILINGS, SceneCompletion
 from persist_cli.bench.scenes.edit_part import edits_json, run_edits
 from persist_cli.bench.scenes.evolution_part import evolution_json, run_evolution
 from persist_cli.bench.scenes.plan_pictures import picture_views
@@ -117,6 +117,6 @@ def against_baselines(part: dict[str, Any]) -> dict[str, Any]:
     """
     means = {name: row["figures"]["miou"]["mean"] for name, row in part["rows"].items()}
     model = means.pop(SceneCompletion.name, None)
-    best = max((name for name in means if name != Truth.name), key=lambda name: means[name] or 0.0)
+    best = max((name for name in means if name not in CEILINGS), key=lambda name: means[name] or 0.0)
     ratio = model / means[best] if model is not None and means[best] else None
     return {"best_baseline": best, "ratio": ratio}

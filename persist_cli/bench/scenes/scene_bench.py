@@ -17,6 +17,7 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.bench.scenes.completions import (
+    CodedTruth,
     Completion,
     Empty,
     HouseSearch,
@@ -146,8 +147,10 @@ class SceneBench:
         search, looked_up = HouseSearch(self.houses), list[Completion]()
         if self.houses:
             looked_up = [Prior(self.houses), NearestHouse(search), NearestHouses(search)]
-        model: list[Completion] = [] if self.scenes.model is None else [SceneCompletion(self.scenes)]
-        return [*model, Empty(), Outside(), *looked_up, Truth()]
+        without: list[Completion] = [Empty(), Outside(), *looked_up]
+        if self.scenes.model is None:
+            return [*without, Truth()]
+        return [SceneCompletion(self.scenes), *without, CodedTruth(self.scenes), Truth()]
 
     @property
     def palette(self) -> tuple[str, ...]:

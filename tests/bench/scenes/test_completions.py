@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from persist_cli.api.cells import FREE
+from persist_cli.api.scene_model import SceneForm
 from persist_cli.bench.scenes.class_counts import class_counts, class_iou, iou_figure, mean_iou, share_figure, things
-from persist_cli.bench.scenes.completions import Empty, HouseSearch, NearestHouse, NearestHouses, Prior, Truth
+from persist_cli.bench.scenes.completions import (
+    CodedTruth,
+    Empty,
+    HouseSearch,
+    NearestHouse,
+    NearestHouses,
+    Prior,
+    Scenes,
+    Truth,
+)
 from persist_cli.bench.scenes.training_houses import House, nearest_houses
 from persist_cli.bench.scenes.views import Region, same_form
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws
 from tests.support.cell_houses import FORM, TABLE, camera_in, known_room, two_rooms, view_of
+from tests.support.drawn_scenes import DrawnWalls
+
+DOOR = FORM.palette.index("door")
 
 
 def counts_of(said, view):
@@ -36,6 +52,27 @@ def test_what_is_true_has_an_intersection_over_union_of_one_and_what_is_empty_of
     assert np.isnan(class_iou(whole, TABLE))  # there is none
     assert np.isnan(mean_iou(whole, []))
     assert 0 < class_iou(nothing, FREE) < 1
+
+
+class AllDoors(DrawnWalls):
+    """Its codec makes doors of everything."""
+
+    def reconstruct(self, classes: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.full_like(classes, DOOR), colors
+
+
+def test_the_truth_goes_through_the_codec_of_the_model_window_by_window():
+    grid = two_rooms()
+    view = view_of(grid, known_room(grid))
+    form = SceneForm(FORM, (16, 16, 12), (16, 16))  # smaller than the region
+    kept, lost = (
+        CodedTruth(Scenes(SimpleNamespace(device="cpu"), model)).complete(view, 0, 0).classes
+        for model in (DrawnWalls(form), AllDoors(form))
+    )
+    known = view.known.known
+    assert kept.equal(view.truth.classes)
+    assert lost[known].equal(kept[known])
+    assert bool((lost[~known] == DOOR).all())
 
 
 def test_only_unknown_cells_near_the_camera_are_counted():
