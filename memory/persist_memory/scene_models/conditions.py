@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
-from persist_cli.api.cells import COMMON, SOLID
+from persist_cli.api.cells import SOLID
 from persist_cli.api.scene_model import Given, SceneSamples
 from persist_memory.scene_models.codec import (
     COLORS,
@@ -188,7 +188,7 @@ def content(samples: SceneSamples) -> Bool[Tensor, "batch first second level"]:
 
 def known_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Bool[Tensor, "batch token"]:
     """Return which tokens have settled cells only."""
-    kept = settled(samples) if len(settings.palette) > len(COMMON) else content(samples)
+    kept = settled(samples) if settings.is_named else content(samples)
     return every_cell(kept, len(settings.divided), cells_of_a_token(settings)).flatten(1)
 
 

@@ -216,7 +216,7 @@ class SceneDiffusion(SceneModel):
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
         """Decode latents to the likeliest class of each cell, and write what is given into it."""
         logits, colors = self._decoded(latents)
-        kept, named = content(samples), self.is_named
+        kept, named = content(samples), self.settings.is_named
         classes = logits.argmax(-1).to(torch.uint8)
         logits[..., [FREE, OUTSIDE]] = -torch.inf
         told = samples.classes
@@ -237,14 +237,9 @@ class SceneDiffusion(SceneModel):
     def _decoded(self, latents: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of classes, where things have names never of ``SOLID``, and colours (1 = 255)."""
         logits, colors = self.codec.decode(latents)
-        if self.is_named:
+        if self.settings.is_named:
             logits[..., SOLID] = -torch.inf
         return logits, colors
-
-    @property
-    def is_named(self) -> bool:
-        """Whether what is solid has classes."""
-        return len(self.settings.palette) > len(COMMON)
 
     def finish_stage(self, stage: Stage, batches: Iterable[SceneSamples]) -> None:
         """Measure the mean and deviation of the latents after the codec's stage."""

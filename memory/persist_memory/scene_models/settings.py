@@ -137,6 +137,11 @@ class SceneDiffusionSettings:
             raise ValueError(f"image {list(self.image)} must be multiples of view_patch {view}")
 
     @property
+    def is_named(self) -> bool:
+        """Whether what is solid has classes."""
+        return len(self.palette) > len(COMMON)
+
+    @property
     def components(self) -> int:
         """The principal components of the latents that are generated."""
         return self.codec.components or self.codec.latent
