@@ -21,7 +21,8 @@ def test_a_shorter_clip_has_as_many_frames_as_cameras_with_every_form_of_adapter
     assert torch.equal(rgb[:, 0], clips.rgb[:, 0])
     assert depth[:, 1:].std() > 0
     chosen, _ = backbone.generate_frame(clips, Sampling(2, memory_guidance=1.5), [frames - 1] * 2)
-    assert torch.equal(chosen, rgb[:, -1])
+    # decoded beside other frames, a value may lie on the other side of a rounding
+    assert (chosen.int() - rgb[:, -1].int()).abs().max() <= 1
 
 
 def test_positions_of_a_shorter_clip_are_the_first_of_a_whole_one(tmp_path):

@@ -8,7 +8,7 @@ second time, with all clips of the batch in it.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from functools import partial
 from itertools import repeat
 from pathlib import Path
@@ -46,9 +46,9 @@ class FixedBatchTrainer(Trainer):
         """Read the first samples from the store."""
         return [self.dataset[number] for number in range(BATCH)]
 
-    def loader(self) -> Iterator[Clips]:
+    def loader(self) -> Generator[Clips, None, None]:
         """The same batch without end."""
-        return repeat(self.to_batch(self.samples()))
+        yield from repeat(self.to_batch(self.samples()))
 
 
 def make_trainer(recipe_line: str, data: Path, cache: CacheSettings | None = None) -> FixedBatchTrainer:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from functools import partial
 from itertools import repeat
 from typing import Any
@@ -62,9 +62,9 @@ class FixedBatchTrainer(Trainer):
         """No clip."""
         return NoClips()
 
-    def loader(self) -> Iterator[Clips]:
+    def loader(self) -> Generator[Clips, None, None]:
         """The same batch without end."""
-        return repeat(self.batch)
+        yield from repeat(self.batch)
 
 
 def make_batch(bench: Bench, batch: int, tokens: int) -> Clips:
