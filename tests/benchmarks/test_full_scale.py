@@ -9,7 +9,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from tests.benchmarks import bench_full_scale
-from tests.benchmarks.full_scale import sampling, shapes
+from tests.benchmarks.full_scale import measuring, sampling, shapes
 from tests.benchmarks.full_scale.measuring import Timing, Turns
 from tests.benchmarks.full_scale.plain import Plain
 from tests.benchmarks.full_scale.rows import Row, Target
@@ -24,11 +24,11 @@ def micro(monkeypatch):
     """A model so small that all parts take seconds, and one that is measured as those of published size are."""
     monkeypatch.setattr(sampling, "STEPS", (10,))
     monkeypatch.setattr(sampling, "CONTEXT", 2)
-    for name, size in {"hidden_size": 32, "num_attention_heads": 2, "num_hidden_layers": 1}.items():
-        monkeypatch.setitem(sampling.DINO, name, size)
+    monkeypatch.setitem(sampling.DINO, "num_hidden_layers", 1)
+    monkeypatch.setitem(measuring.SIDES, "cpu", 128)
     adapter = {"form": "cross", "every": 2, "width": 16}
     monkeypatch.setitem(shapes.MODELS, "micro", shapes.Model("micro", MICRO, adapter, 2, 8))
-    monkeypatch.setitem(shapes.MODELS, "5b", shapes.Model("5b", MICRO, adapter, 2, 32, published=True))
+    monkeypatch.setitem(shapes.MODELS, "5b", shapes.Model("5b", MICRO, adapter, 2, 384, published=True))
     return shapes.MODELS["micro"]
 
 

@@ -28,6 +28,8 @@ PEAKS = {  # dense bf16 FLOP/s by the vendors' datasheets, the most special name
     "RTX 3090": 71e12,
 }
 
+SIDES = {"cuda": 8192, "cpu": 1024}  # of the square matrices whose product measures a device
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -151,7 +153,7 @@ def peak_flops(device: torch.device, precision: torch.dtype) -> tuple[float, str
 
 def matmul_flops(device: torch.device, precision: torch.dtype) -> float:
     """FLOP/s of large square matrix products, the fastest of ten."""
-    side = 8192 if device.type == "cuda" else 1024
+    side = SIDES.get(device.type, SIDES["cpu"])
     first, second = (torch.randn(side, side, device=device, dtype=precision) for _ in range(2))
     timing = Turns(device, 10).measure({"product": lambda: first @ second})["product"]
     return 2 * side**3 / timing.least if timing else float("nan")
