@@ -48,6 +48,10 @@ CemSettingsOption = Annotated[
     list[str] | None, typer.Option("--set", help="Of cem, as in method.elites=0.1 or method.kept=0.3.")
 ]
 
+LearnSettingsOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Of the training, as in training.learning_rate=3e-5.")
+]
+
 StepsOption = Annotated[int | None, typer.Option("--steps", min=1, help="Denoising steps; the checkpoint's, else 50.")]
 
 SamplerOption = Annotated[

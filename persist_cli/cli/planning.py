@@ -15,6 +15,7 @@ from persist_cli.cli.options import (
     DtypeOption,
     GuidanceOption,
     JsonOption,
+    LearnSettingsOption,
     PlanSettingsOption,
     ReferenceArgument,
     SamplerOption,
@@ -103,6 +104,7 @@ def plan(
 
 @planning_app.command()
 def learn(
+    context: typer.Context,
     views: Annotated[list[str], typer.Option(help="Posed images of the house: DATA#trajectory[:frames]; repeatable.")],
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")],
     checkpoint: Annotated[Path, typer.Argument(help="Run or checkpoint of the world model.")] = Path("reference"),
@@ -116,9 +118,7 @@ def learn(
     proposals: Annotated[int, typer.Option(min=1, help="Of a decision; that nearest to the goal is done.")] = 16,
     explore: Annotated[float, typer.Option(min=0, max=1, help="Share of random decisions.")] = 0.2,
     training_steps: Annotated[int, typer.Option(min=1, help="Training steps of a round.")] = 200,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Of the training, as in training.learning_rate=3e-5.")
-    ] = None,
+    settings: LearnSettingsOption = None,
     body: BodyOption = None,
     episodes: Annotated[Path | None, typer.Option(help="Of `persist bench episodes`: to evaluate in truth.")] = None,
     patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
@@ -143,6 +143,8 @@ def learn(
     from persist_cli.learn.learn import LearnPlan, run_learn
     from persist_cli.learn.practice import PracticeSettings
 
+    if episodes is None:
+        refuse_options(context, "patience stop_cost", "only with --episodes, which are run so")
     plan = LearnPlan(
         views=tuple(views), policy=policy, inside=inside, checkpoint=checkpoint, adapter=adapter, rounds=rounds,
         practice=PracticeSettings(walks, actions, execute, explore, batch, proposals), steps=training_steps,

@@ -175,8 +175,6 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
         )
     if plan.inside == SIMULATOR and plan.adapter is not None:
         raise PersistError(f"--adapter {plan.adapter}: the true house needs no memory; leave out --inside {SIMULATOR}")
-    if plan.episodes is None:
-        check_unused(plan)
     begin = packaged_policy() if plan.policy is None else find_policy(Path(plan.policy))
     sources = find_sources(list(plan.views))
     common_reference(sources)
@@ -192,14 +190,6 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     learning = Learning(plan, out, info, views, begin, simulator, episodes)
     check_plan(learning)
     return learning
-
-
-def check_unused(plan: LearnPlan) -> None:
-    """Raise ``PersistError`` when a plan without episodes says how they are run."""
-    options = {"--patience": (plan.loop.patience, LoopSettings.patience), "--stop-cost": (plan.stop_cost, STOP_COST)}
-    given = [option for option, (value, usual) in options.items() if value != usual]
-    if given:
-        raise PersistError(f"{', '.join(given)}: only with --episodes, which are run so")
 
 
 def identity(learning: Learning) -> dict[str, Any]:

@@ -270,8 +270,6 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
         raise PersistError(
             f"training.tracker={tracker} needs the package {tracker}: pip install 'persist-cli[{tracker}]'"
         )
-    if settings.precision == "bf16" and not torch.cuda.is_available():
-        warn_if_slow("training.precision=bf16", torch.bfloat16, "give training.precision=no")
     fsdp, zero = fsdp_plugin(settings.precision), zero_plugin(settings)
     accelerator = Accelerator(
         mixed_precision=settings.precision if zero is None else "no",  # DeepSpeed has its own way
@@ -282,6 +280,8 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
         deepspeed_plugin=zero,
         kwargs_handlers=[InitProcessGroupKwargs(timeout=LONGEST_WAIT)],
     )
+    if accelerator.is_main_process and settings.precision == "bf16" and not torch.cuda.is_available():
+        warn_if_slow("training.precision=bf16", torch.bfloat16, "give training.precision=no")
     use_fsdp_on_cpus(fsdp)
     use_zero_on_cpus(zero)
     set_seed(settings.seed)

@@ -202,7 +202,7 @@ def test_without_a_known_camera_height_nothing_stops_a_walk_unless_it_is_asked_f
 
 
 def test_how_episodes_are_run_is_refused_without_episodes(learn, tmp_path):
-    for options in (("--patience", "2"), ("--stop-cost", "0.2")):
+    for options in (("--patience", "4"), ("--stop-cost", "0.2")):  # the first as it is by default
         result = learn("out", *options)
         assert (result.code, result.err) == (1, f"error: {options[0]}: only with --episodes, which are run so\n")
     assert not (tmp_path / "out").exists()
