@@ -149,7 +149,7 @@ def test_cells_are_reconstructed_as_the_codec_has_them_and_are_never_merely_soli
     classes, colors = model.reconstruct(samples.true_classes, samples.true_colors)
     with torch.no_grad():
         logits, _ = model.codec.decode(model.codec.encode(samples.true_classes, samples.true_colors))
-    likeliest = logits.argmax(-1)
+    likeliest = (logits - model.weights.log()).argmax(-1)
     assert classes[likeliest != SOLID].equal(likeliest[likeliest != SOLID].to(torch.uint8))
     assert not (classes == SOLID).any()
     assert not colors[classes == 0].any()
@@ -161,6 +161,16 @@ def test_doors_and_things_count_more_in_the_loss_of_the_codec(model):
         "free", "solid", "outside", "floor", "ceiling", "wall",
     }  # fmt: skip
     assert weights["door"] == weights["box"] == model.settings.codec.rare_weight > 1
+
+
+def test_what_a_door_counts_more_in_training_is_divided_out_where_cells_are_read_off(model, samples, monkeypatch):
+    kinds, weight = {name: number for number, name in enumerate(model.settings.palette)}, model.weights.max()
+    for share, read in ((0.9, "wall"), (1.1, "door")):
+        logits = torch.full((*samples.true_classes.shape, len(kinds)), -9.0)
+        logits[..., kinds["wall"]], logits[..., kinds["door"]] = 0.0, share * weight.log()
+        monkeypatch.setattr(model.codec, "decode", lambda _, read_off=logits: (read_off, torch.zeros(1)))
+        classes, _ = model.reconstruct(samples.true_classes, samples.true_colors)
+        assert (classes == kinds[read]).all()
 
 
 def test_a_sample_follows_from_its_seed_alone(model, samples):
@@ -248,8 +258,7 @@ def test_where_nothing_is_given_the_steps_are_those_of_the_scheduler_of_diffuser
             of_tokens = level.expand(known_tokens(samples, model.settings).shape)
             velocity = model.transformer(latents, of_tokens, told.given, told.view, told.action)
             latents = scheduler.step(velocity, timestep, latents).prev_sample
-        logits, _ = model.codec.decode(latents)
-    logits[..., SOLID] = -torch.inf
+        logits, _ = model._decoded(latents)
     assert (logits.argmax(-1) == model.sample(samples, steps)[0]).float().mean() > 0.999
 
 

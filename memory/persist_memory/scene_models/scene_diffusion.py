@@ -101,7 +101,8 @@ class SceneDiffusion(SceneModel):
         divergence = 0.5 * (mean**2 + logarithm.exp() - 1 - logarithm).sum() / classes.numel()
         own = self.settings.codec
         loss = cross_entropy + own.color_weight * color_error + own.kl_weight * divergence
-        wrong = ((logits.detach().argmax(-1) != classes) & solid).sum() / solid.sum().clamp_min(1)
+        likeliest = (logits.detach() - self.weights.log()).argmax(-1)
+        wrong = ((likeliest != classes) & solid).sum() / solid.sum().clamp_min(1)
         return {
             "loss": loss, "cross_entropy": cross_entropy, "color_error": color_error, "divergence": divergence,
             "wrong_solid": wrong,
@@ -235,8 +236,13 @@ class SceneDiffusion(SceneModel):
         return classes, painted(classes, decoded)
 
     def _decoded(self, latents: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of classes, where things have names never of ``SOLID``, and colours (1 = 255)."""
+        """Logits of classes, where things have names never of ``SOLID``, and colours (1 = 255).
+
+        The codec is trained as if there were ``rare_weight`` times as many doors and things. Read off as that, each
+        uncertain door would be one: a piece of wall above a way that is not free.
+        """
         logits, colors = self.codec.decode(latents)
+        logits -= self.weights.log()
         if self.settings.is_named:
             logits[..., SOLID] = -torch.inf
         return logits, colors

@@ -34,7 +34,7 @@ class CodecSettings:
         evenness: of their deviations: 1 makes all alike, 0 leaves them as they are: noise hides small ones first.
         cell: channels of a cell in the decoder, before its class and colour are read off.
         rare_weight: weight in the loss of a cell of a door or thing; all others have 1. Doors are so few that a codec
-            that does not count them more makes walls of them.
+            that does not count them more makes walls of them. Where cells are read off it is divided out again.
         color_weight: weight of the colours' error.
         kl_weight: weight of the divergence of the latents from a normal distribution.
         noise: of latents before they are decoded in training, as a share of their deviation.
