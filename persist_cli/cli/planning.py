@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -35,6 +36,19 @@ PLAN_MEMORIES = "none,voxel,simulator"
 planning_app = typer.Typer()
 bench_app = typer.Typer(no_args_is_help=True, help="Measure plans, collisions and imagined scenes in held-out houses.")
 planning_app.add_typer(bench_app, name="bench")
+
+
+OF_PARTS = {  # parts of `bench scene` that have a use for options
+    "walk_steps": ("walk",), "walks": ("walk", "return"), "return_steps": ("return",), "memories": ("return",),
+    "edits": ("edits",), "interactions": ("evolution",),
+}  # fmt: skip
+
+
+def refuse_other_parts(context: typer.Context, chosen: Sequence[str]) -> None:
+    """Raise ``PersistError`` when options of `bench scene` are given that none of the chosen parts has a use for."""
+    for name, parts in OF_PARTS.items():
+        if not set(parts) & set(chosen):
+            refuse_options(context, name, f"only with --parts {' or '.join(parts)}")
 
 
 def whole_numbers(option: str, text: str) -> tuple[int, ...]:
@@ -284,7 +298,7 @@ def bench_scene(
     seeds: Annotated[int, typer.Option(min=1, help="Completions, and walks, of each image.")] = 3,
     radius: Annotated[float, typer.Option(min=0.5, help="Metres around the camera that are measured.")] = 5.0,
     houses: Annotated[int, typer.Option(min=1, help="Most training houses that are read.")] = 500,
-    steps: Annotated[int, typer.Option(min=1, help="Actions of a walk.")] = 1000,
+    walk_steps: Annotated[int, typer.Option(min=1, help="Actions of a walk.")] = 1000,
     walks: Annotated[int, typer.Option(min=1, help="Most images to walk from.")] = 4,
     checkpoint: Annotated[Path | None, typer.Option(help="World model that draws scenes: return, edits.")] = None,
     memories: Annotated[str, typer.Option(help="Its adapters that go there and back, with commas.")] = "scene",
@@ -310,7 +324,8 @@ def bench_scene(
     from persist_cli.bench.scenes.run_scene_bench import run_scene_bench
     from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBenchPlan
 
-    rendering = None
+    chosen, rendering = split_names(parts), None
+    refuse_other_parts(context, chosen)
     if checkpoint is None:
         unused = "memories return_steps denoising_steps sampler guidance dtype save_memory"
         refuse_options(context, unused, "only with --checkpoint, whose model draws scenes")
@@ -319,7 +334,7 @@ def bench_scene(
         placement = InferenceOptions.of(dtype, save_memory)
         rendering = RenderingPlan(checkpoint, split_names(memories), return_steps, sampling, placement)
     plan = SceneBenchPlan(
-        model, data, train, split_names(parts), images, seeds, radius, houses, steps, walks, rendering, edits,
-        interactions, tuple(settings or ()), seed, allow_training_scenes,
+        model, data, train, chosen, images, seeds, radius, houses, walk_steps, walks, rendering, edits, interactions,
+        tuple(settings or ()), seed, allow_training_scenes,
     )  # fmt: skip
     run_scene_bench(plan, out, report, json)

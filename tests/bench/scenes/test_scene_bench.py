@@ -19,7 +19,8 @@ from tests.conftest import Persist
 from tests.support.cell_houses import write_cell_houses
 from tests.support.micro_runs import run_persist
 
-SMALL = ("--radius", 2, "--seeds", 2, "--steps", 12, "--walks", 1, "--set", "memory.steps=1")
+SMALL = ("--radius", 2, "--seeds", 2, "--set", "memory.steps=1")
+WALKS = ("--walk-steps", 12, "--walks", 1)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,7 @@ def measured(
     out = tmp_path_factory.mktemp("bench") / "scenes"
     options = ("--data", cell_houses, "--train", training_cell_houses, "--parts", "completion,walk,speed", "--out", out)
     options = (*options, "--report", out / "report")
-    run_persist("bench", "scene", *map(str, (scene_model, *options, *SMALL)))
+    run_persist("bench", "scene", *map(str, (scene_model, *options, *SMALL, *WALKS)))
     return out
 
 
@@ -122,14 +123,14 @@ def test_parts_rows_and_seeds_are_added_to_a_finished_benchmark(
     for words in (small, (scene_model, *small, "--seeds", 1)):
         run_persist("bench", "scene", *map(str, (*words, "--parts", "completion")))
     kept = {path: path.stat().st_mtime_ns for path in (out / "parts").glob("empty*/*")}
-    more = ("--train", training_cell_houses, "--parts", "completion,walk")
+    more = ("--train", training_cell_houses, "--parts", "completion,walk", *WALKS)
     assert persist("bench", "scene", scene_model, *small, *more).code == 0
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
     added, whole = (json.loads((folder / "metrics.json").read_text()) for folder in (out, measured))
     for row, part in whole["completion"]["rows"].items():
         assert added["completion"]["rows"][row]["class_iou"] == part["class_iou"]
     assert added["walk"]["windows"]["1-12"]["new"]["mean"] > 0
-    result = persist("bench", "scene", scene_model, *small, *more, "--steps", 13)
+    result = persist("bench", "scene", scene_model, *small, *more, "--walk-steps", 13)
     assert "holds 'walk' of another benchmark" in result.err
 
 
@@ -141,6 +142,8 @@ def test_what_does_not_fit_is_refused_in_one_line(
         (("--parts", "compeltion"), "completion"),
         (("--parts", "walk"), "needs a scene model"),
         (("--parts", "edits"), "--checkpoint"),
+        ((*WALKS, "--parts", "completion"), "--walk-steps: only with --parts walk"),
+        (("--edits", 3, "--parts", "return"), "--edits: only with --parts edits"),
         (("--dtype", "float32", "--denoising-steps", 2), "--denoising-steps, --dtype: only with --checkpoint"),
         (("--train", same), "is measured, too"),
         (("--data", walks), "no cells"),
