@@ -20,8 +20,10 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
 import yaml
 
+from persist_cli.api.half_precision import is_slow
 from persist_cli.data.reference import sample_data
 from persist_cli.errors import PluginError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
@@ -42,12 +44,17 @@ SLOW = {"tutorial"}  # pages that take longer than a minute
 
 LANGUAGES = {"bash", "console", "python", "toml", "yaml", "json", "text", "bibtex"}
 
+# steps in half precision take 50 times as long on processors without instructions for it
+IN_FLOAT32 = ("training.precision=no", "training.frozen_precision=no") if is_slow(torch.bfloat16) else ()
+
 # what is put in the place of large numbers: an option or setting that is given again wins
 SHORTER = {
     "finetune": (
         "training.steps=1", "training.batch=1", "training.accumulation=1", "training.workers=0", "training.warmup=1",
         "training.cooldown=0", "data.clip_frames=[]",  # the small model's codec folds time, and it has one length
+        *IN_FLOAT32,
     ),
+    "inspect": ("--pairs", "8"),
     "rollout": ("--steps", "1"),
     "plan": ("--candidates", "5", "--rounds", "1"),
     "eval": ("--clips", "1", "--seeds", "1", "--steps", "1"),
@@ -55,6 +62,7 @@ SHORTER = {
     "view": ("--export", "shortened.html"),  # or it would not end
     "learn": (
         "--steps", "1", "--guidance", "1", "--walks", "3", "--actions", "24", "--rounds", "1", "--training-steps", "1",
+        "--proposals", "4",
         "--set", "training.batch=2", "--set", "training.workers=0",
     ),
 }  # fmt: skip

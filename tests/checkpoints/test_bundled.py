@@ -155,7 +155,7 @@ def test_an_evaluation_without_a_checkpoint_uses_the_reference_model(persist, re
 
 
 def test_inspect_finds_the_sample_by_name(persist, reference, here):
-    assert len(json.loads(persist("inspect", "sample", "--json").out)["trajectories"]) == 2
+    assert len(json.loads(persist("inspect", "sample", "--pairs", "4", "--json").out)["trajectories"]) == 2
 
 
 def test_a_folder_called_sample_takes_precedence_over_the_bundled_one(reference, here, walks):

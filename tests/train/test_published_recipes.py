@@ -14,7 +14,7 @@ from tests.support.twins import write_twin
 TWINS = {"cogvideox-2b": "2b", "cogvideox-5b-i2v": "5b-i2v"}
 
 SMALL = [
-    f"backbone.settings.height={SIZE}", f"backbone.settings.width={SIZE}", "training.steps=2", "training.batch=2",
+    f"backbone.settings.height={SIZE}", f"backbone.settings.width={SIZE}", "training.steps=2", "training.batch=1",
     "training.accumulation=1", "training.workers=0", "training.warmup=1", "backbone.settings.prompt=null",
 ]  # fmt: skip
 
