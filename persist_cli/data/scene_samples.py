@@ -21,7 +21,7 @@ from persist_cli.api.cell_things import STRUCTURE
 from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellGrid, CellOrigin
 from persist_cli.api.reach import cells_in_reach
 from persist_cli.api.scene_model import Given, SceneForm, SceneSamples, no_view, window_pose
-from persist_cli.data.scene_turns import Turn
+from persist_cli.api.scene_turns import Turn
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.data.written_scenes import SceneWriter, TensorStore, WrittenScene
 from persist_cli.errors import DataError
@@ -45,7 +45,8 @@ class SampleShares:
         walk: up to 24 frames of a walk are known.
         grown: beside the newest frame, a large part of the truth is known, as if it had been imagined before.
         interaction: what becomes of the known cells before the agent by an interaction.
-        named: share of the samples that know the classes of observed cells, as after they were completed.
+        named: share of the frames and walks that know the classes of observed cells, as after they were completed.
+        named_acting: the same share of the interactions.
         unseen: share of the samples of kind grown that have no view.
         idle: share of the interactions that find nothing to act on, and change nothing.
     """
@@ -54,7 +55,8 @@ class SampleShares:
     walk: float = 0.2
     grown: float = 0.2
     interaction: float = 0.15
-    named: float = 0.3
+    named: float = 0.1
+    named_acting: float = 0.5
     unseen: float = 0.3
     idle: float = 0.15
 
@@ -144,16 +146,16 @@ class SceneSampleDataset(Dataset[SceneSamples]):
     def _frame(self, random: np.random.Generator) -> Window:
         """A sample of which one frame is known."""
         file = self._file(random)
-        return self._observed(file, self._frames(file, 2 * int(random.integers(FIXED))), random)
+        return self._observed(file, self._frames(file, 2 * int(random.integers(FIXED))), random, self.shares.named)
 
     def _walk(self, random: np.random.Generator) -> Window:
         """A sample of which some frames of a walk up to now are known."""
-        return self._walk_of(self._file(random), random)
+        return self._walk_of(self._file(random), random, self.shares.named)
 
     def _grown(self, random: np.random.Generator) -> Window:
         """A sample of which much is known by class, and the rest is to go on from it."""
         file = self._file(random)
-        window = self._observed(file, self._frames(file, int(random.integers(2 * FIXED))), random, grown=True)
+        window = self._observed(file, self._frames(file, int(random.integers(2 * FIXED))), random, 1.0, grown=True)
         known = random_part(self.form.shape, random)
         seen, given = window.seen.copy(), window.given.clone()
         fresh = known & (given == Given.NOTHING)
@@ -175,7 +177,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
 
     def _event(self, file: TrajectoryFile, event: Interaction, random: np.random.Generator) -> Window:
         """What an interaction changes; a thing that is picked up is then carried, and in no cell."""
-        before = self._observed(file, self._event_frames(file, event), random)
+        before = self._observed(file, self._event_frames(file, event), random, self.shares.named_acting)
         after = around(self._truth(file, event.frame + 1), before.seen)
         was = around(self._truth(file, event.frame), before.seen)
         if event.action == PICK_UP:
@@ -186,7 +188,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
 
     def _idle(self, file: TrajectoryFile, random: np.random.Generator) -> Window:
         """An interaction that finds nothing to act on; a mere walk where something is in reach."""
-        window = self._walk_of(file, random)
+        window = self._walk_of(file, random, self.shares.named_acting)
         action = self.form.actions[int(random.integers(len(self.form.actions)))]
         pose = window.scene.view.cameras.world_from_camera[0]
         things = is_thing(window.truth) & cells_in_reach(window.truth, pose)
@@ -194,8 +196,8 @@ class SceneSampleDataset(Dataset[SceneSamples]):
             return window
         return self._acted(window, action, (window.truth, torch.zeros_like(things)))
 
-    def _walk_of(self, file: TrajectoryFile, random: np.random.Generator) -> Window:
-        return self._observed(file, self._frames(file, 2 * int(random.integers(FIXED)) + 1), random)
+    def _walk_of(self, file: TrajectoryFile, random: np.random.Generator, named: float) -> Window:
+        return self._observed(file, self._frames(file, 2 * int(random.integers(FIXED)) + 1), random, named)
 
     def _acted(
         self, before: Window, action: str, outcome: tuple[CellGrid, Bool[Tensor, "first second level"]]
@@ -213,18 +215,18 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         return replace(before, given=given, truth=truth, action=action)
 
     def _observed(
-        self, file: TrajectoryFile, frames: list[int], random: np.random.Generator, grown: bool = False
+        self, file: TrajectoryFile, frames: list[int], random: np.random.Generator, named: float, grown: bool = False
     ) -> Window:
-        """A window around the newest of some frames, of which a scene knows what these show.
+        """A window around the newest of some frames, of which a scene knows what these show, some of them by name.
 
-        A grown one is named, and holds the camera anywhere: an agent walks on, and the view stays where it was.
+        A grown one holds the camera anywhere: an agent walks on, and the view stays where it was.
         """
         scene = self.writer.scene(file, frames)
         whole = self._truth(file, frames[-1])
         corner = self._corner(scene, whole, random, max(self.form.shape[:2]) if grown else JITTER)
         seen = scene.known.box(corner, self.form.shape)
         truth = settled(around(whole, seen), seen)
-        if grown or random.random() < self.shares.named:
+        if random.random() < named:
             unnamed = seen.known & (seen.classes == SOLID)
             seen.classes[unnamed] = truth.classes[unnamed]
         given = torch.where(seen.known, int(Given.CONTENT), int(Given.NOTHING)).to(torch.uint8)
@@ -235,14 +237,17 @@ class SceneSampleDataset(Dataset[SceneSamples]):
     ) -> tuple[int, int, int]:
         """The lowest cell of a window around the camera or at most so many cells beside it, from the floor up."""
         first, second, _ = whole.numbers(scene.view.cameras.centers[0]).tolist()
-        jitter = random.integers(-most, most + 1, 2) if random.random() < 0.5 else np.zeros(2, int)
+        most = most if random.random() < 0.5 else 0
         limits = [min(most, side // 2 - 1) for side in self.form.shape[:2]]
-        by_first, by_second = (int(np.clip(by, -limit, limit)) for by, limit in zip(jitter, limits, strict=True))
+        by_first, by_second = (int(random.integers(-limit, limit + 1)) for limit in limits)
         rows, columns, _ = self.form.shape
         return first - rows // 2 + by_first, second - columns // 2 + by_second, whole.corner[2]
 
     def _sample(self, window: Window, random: np.random.Generator) -> SceneSamples:
-        """The sample of a window, turned by right angles and mirrored at random."""
+        """The sample of a window, turned so that its camera looks along the first axis, and mirrored at random.
+
+        One without a view is turned at random, too.
+        """
         known = window.given > Given.NOTHING
         view, form = window.scene.view, self.form
         cells = {
@@ -254,6 +259,8 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         }
         pose, lens = window_pose(window.seen, view.cameras.world_from_camera[0]), view.cameras.intrinsics[0].double()
         turned = Turn.draw(form.shape, random)
+        if not window.blind:
+            turned = Turn.ahead(pose, form.shape, turned.mirrored)
         cells = {name: turned.cells(part) for name, part in cells.items()}
         rgb, depth = (turned.image(image) for image in (view.rgb[0], view.depth[0]))
         pose, lens = turned.pose(pose, form), turned.lens(lens, form.image[1])

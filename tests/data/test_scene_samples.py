@@ -16,8 +16,8 @@ from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellForm
 from persist_cli.api.geometry import unproject
 from persist_cli.api.reach import CHANGED
 from persist_cli.api.scene_model import Given, SceneForm, SceneSamples
+from persist_cli.api.scene_turns import Turn
 from persist_cli.data.scene_samples import SampleShares, SceneSampleDataset
-from persist_cli.data.scene_turns import Turn
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.simulators.collect import CollectPlan, collect_frames
@@ -26,7 +26,7 @@ from tests.support.miniworlds import make_world
 from tests.support.noise import INFO, make_frames
 
 WINDOW = SceneForm(FORM, (40, 40, 12), (32, 32))
-KINDS = [field.name for field in fields(SampleShares) if field.name not in ("named", "unseen", "idle")]
+KINDS = [field.name for field in fields(SampleShares) if field.name not in ("named", "named_acting", "unseen", "idle")]
 
 
 @pytest.fixture(scope="session")
@@ -85,7 +85,7 @@ def test_what_is_given_for_good_is_what_is_there(houses: Path, kind: str) -> Non
 def test_what_the_view_sees_is_known_to_be_solid_in_every_turn(
     houses: Path, turn: Turn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Turn, "draw", staticmethod(lambda shape, random: turn))
+    monkeypatch.setattr(Turn, "ahead", staticmethod(lambda pose, shape, mirrored: turn))
     sample = samples_of(houses, "frame", named=0.0)[0]
     cameras = Cameras(sample.window_from_camera[None].double(), sample.intrinsics[None].double(), *WINDOW.image)
     points = unproject(sample.depth[None], cameras)[0]
@@ -93,6 +93,20 @@ def test_what_the_view_sees_is_known_to_be_solid_in_every_turn(
     cells = ((points + 0.05 * ways / ways.norm(dim=-1, keepdim=True)) / FORM.size).round().long()
     inside = ((cells >= 0) & (cells < torch.tensor(WINDOW.shape))).all(dim=-1) & (sample.depth > 0)
     assert (sample.classes[cells[inside].unbind(-1)] == SOLID).float().mean() > 0.93
+
+
+def test_cameras_look_along_the_first_axis_of_their_window(houses: Path) -> None:
+    for kind in ("frame", "walk"):
+        dataset = samples_of(houses, kind)
+        for number in range(6):
+            first, second = dataset[number].window_from_camera[:2, 2].tolist()
+            assert first >= abs(second)
+
+
+def test_a_turn_is_undone() -> None:
+    cells = torch.rand(40, 40, 12)
+    for turn in (Turn(quarters, mirrored) for quarters in range(4) for mirrored in (False, True)):
+        assert torch.equal(turn.back(turn.cells(cells)), cells)
 
 
 def test_a_turn_of_all_four_quarters_and_two_mirrors_change_nothing() -> None:

@@ -20,6 +20,7 @@ from persist_cli.api.cells import SOLID, CellGrid, CellOrigin
 from persist_cli.api.geometry import unproject
 from persist_cli.api.reach import cells_in_reach
 from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples, no_view, window_pose
+from persist_cli.api.scene_turns import Turn
 from persist_cli.errors import CheckpointError
 from persist_memory.scene.fusion import UNDER, surface_normals
 from persist_memory.validation import Shape, part_of
@@ -165,19 +166,22 @@ class Imagination:
             action: 0 for none, or 1 + the number of an interaction that the model knows.
             seed: seed of the draw; the window's place changes it.
         """
-        known = given > Given.NOTHING
-        classes, colors = window.classes * known, window.colors * known[..., None]
+        known, form = given > Given.NOTHING, self.model.form
         rgb, depth, pose, matrix = self._seen(window)
+        turned = Turn.ahead(pose, form.shape)  # as in training the camera looks along the first axis
+        told = (given, window.classes * known, window.colors * known[..., None])
+        given, classes, colors = (turned.cells(part) for part in told)
         number = torch.tensor(window_seed(seed, window.corner))
         sample = SceneSamples(
-            given, classes, colors, rgb, depth, pose, matrix, torch.tensor(action), torch.tensor(self.carried.kind),
-            self.carried.color.cpu(), number,
+            given, classes, colors, rgb, depth, turned.pose(pose, form), matrix, torch.tensor(action),
+            torch.tensor(self.carried.kind), self.carried.color.cpu(), number,
         )  # fmt: skip
         device = next(self.model.parameters()).device
         with torch.inference_mode():
             drawn = self.model.sample(SceneSamples.stack([sample.to("cpu")]).to(device), self.steps)
         here = window.classes.device
-        return drawn[0][0].to(here).clone(), drawn[1][0].to(here).clone()
+        classes, colors = (turned.back(part[0]).to(here) for part in drawn)
+        return classes.clone(), colors.clone()
 
     def _seen(self, window: CellGrid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return RGB, depth, pose and intrinsics of the view, for a window; without a view in it all pixels are 0."""

@@ -17,18 +17,19 @@ from persist_memory.scene_models.codec import (
     cells_of_a_token,
     convolution,
     every_cell,
+    fold,
     unfold,
 )
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 
 WAVES = 6  # octaves of sines of a coordinate
-SHIFT = 2.0  # of the noise levels in training towards pure noise, from which sampling begins
-EVEN = 0.2  # share of training levels that are drawn evenly
 PIXEL = 14  # channels of a pixel: colour, nearness, whether it has depth, origin, direction and point of its ray
 
 
 class GivenCells(nn.Module):
-    """Embeds what is given of the cells of each token.
+    """Embeds what is given of the cells of each token, and their latents.
+
+    The latents say most where much is given: what the codec makes of it needs not be learned again.
 
     Args:
         settings: sizes of windows and transformer.
@@ -46,9 +47,18 @@ class GivenCells(nn.Module):
             nn.SiLU(),
             kind(width, width, 3, padding=1),
         )
+        patch = settings.transformer.patch
+        self.latents = nn.Linear(settings.components * patch**self.axes, width)
 
-    def forward(self, samples: SceneSamples) -> Float[Tensor, "batch token channel"]:
-        """Return an embedding of each token's cells."""
+    def forward(
+        self, samples: SceneSamples, held: Float[Tensor, "batch channel *latent"]
+    ) -> Float[Tensor, "batch token channel"]:
+        """Return an embedding of each token's cells.
+
+        Args:
+            samples: their given cells are read.
+            held: the latents of what is given.
+        """
         kinds, given = len(self.settings.palette), samples.given.int()
         contents = (1 + samples.classes.int() + kinds * (given == Given.PAST)) * (given != Given.NOTHING)
         told = (given != Given.NOTHING)[..., None]
@@ -56,7 +66,9 @@ class GivenCells(nn.Module):
         colors = self._blocks(samples.colors * told).to(embedded.dtype) / 255
         values = self._patched(torch.cat([embedded, colors], dim=-1).flatten(4)).movedim(-1, 1)
         tokens: Tensor = self.patches[1:](values[..., 0] if self.axes == 2 else values).flatten(2).transpose(1, 2)
-        return tokens
+        coded = fold(held, self.settings.transformer.patch).flatten(2).transpose(1, 2)
+        latents: Tensor = self.latents(coded.to(tokens.dtype))
+        return tokens + latents
 
     def _blocks(self, cells: Shaped[Tensor, "batch first second level *rest"]) -> Tensor:
         """The cells of each token, ``[batch, row, column, layer, cell, …]``: cheaper before they are embedded."""
@@ -193,18 +205,13 @@ def known_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Boo
 
 
 def draw_levels(settings: SceneDiffusionSettings, generators: list[torch.Generator]) -> Float[Tensor, "batch token"]:
-    """Draw noise levels: in half of the samples one for all tokens, else one for each region.
-
-    They are logit-normal, shifted towards noise, or even: training also sees the levels at which a sample begins.
-    """
+    """Draw noise levels, as densely as steps of sampling lie: one for all tokens, in some samples for each region."""
     edge, tokens = settings.transformer.region, settings.tokens
     regions = [-(-length // edge) for length in tokens]
     levels = []
     for generator in generators:
-        normal = shifted(torch.randn(*regions, generator=generator).sigmoid(), SHIFT)
-        even = torch.rand(2, *regions, generator=generator)
-        drawn = torch.where(even[0] < EVEN, even[1], normal)
-        whole = torch.rand((), generator=generator) < 0.5
+        drawn = shifted(torch.rand(*regions, generator=generator), settings.sampling.shift)
+        whole = torch.rand((), generator=generator) >= settings.transformer.own_levels
         drawn = drawn.flatten()[:1].expand(math.prod(regions)).reshape(regions) if whole else drawn
         blocks = drawn[None, None].expand(1, edge ** len(regions), *regions)
         levels.append(unfold(blocks, edge)[0, 0][tuple(slice(length) for length in tokens)].flatten())

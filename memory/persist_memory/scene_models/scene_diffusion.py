@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID
 from persist_cli.api.cpu_attention import products_for_training
-from persist_cli.api.scene_model import SceneForm, SceneModel, SceneSamples
+from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples
 from persist_cli.api.stages import SCENE_STAGES, ParameterGroup, Stage
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
@@ -112,10 +112,11 @@ class SceneDiffusion(SceneModel):
         """The squared error of the velocities of all tokens that are not known."""
         known = known_tokens(samples, self.settings)
         levels = draw_levels(self.settings, generators).to(known.device).masked_fill(known, 0.0)
-        latents = self._latents(samples, known, levels)
+        held = self._held(samples)
+        latents = self._latents(samples, held, known, levels)
         noise = noise_like(latents, generators)
         dropped = torch.cat([torch.rand(1, generator=generator) for generator in generators])
-        told = self.tell(samples, generators, dropped < self.settings.transformer.drop_view)
+        told = self.tell(samples, held, generators, dropped < self.settings.transformer.drop_view)
         noisy = self._mix(latents, noise, levels, known)
         with products_for_training(noisy):
             velocity = self.transformer(noisy, levels, told.given, told.view, told.action).float()
@@ -125,28 +126,40 @@ class SceneDiffusion(SceneModel):
         return {"loss": loss, "known_tokens": known.float().mean()}
 
     @torch.no_grad()
+    def _held(self, samples: SceneSamples) -> Float[Tensor, "batch channel *latent"]:
+        """Latents of what is given."""
+        return self.codec.encode(*start(samples, self.settings)).float()
+
+    @torch.no_grad()
     def _latents(
-        self, samples: SceneSamples, known: Bool[Tensor, "batch token"], levels: Float[Tensor, "batch token"]
+        self,
+        samples: SceneSamples,
+        held: Float[Tensor, "batch channel *latent"],
+        known: Bool[Tensor, "batch token"],
+        levels: Float[Tensor, "batch token"],
     ) -> Float[Tensor, "batch channel *latent"]:
         """Latents of the truth; known tokens hold what they hold in sampling.
 
-        A latent knows of its neighbours. Before the first snap sampling has free cells beside the given ones, and the
+        A latent knows of its neighbours. Before the first snap sampling knows nothing beside the given cells, and the
         truth there must not leak into the latents of these.
         """
         own = self.settings.sampling
         snapped_from = own.snap_below if own.snap_every else -1.0
         early = known & (levels.amax(1, keepdim=True) > snapped_from)
-        latents, some = self.codec.encode(*truth(samples)).float(), early.any(1)
-        if some.any():  # most samples have no such token
-            held = self.codec.encode(*(cells[some] for cells in start(samples))).float()
-            latents[some] = held.where(self._places(early[some].float()).bool(), latents[some])
-        return latents
+        return held.where(self._places(early.float()).bool(), self.codec.encode(*truth(samples)).float())
 
-    def tell(self, samples: SceneSamples, generators: list[torch.Generator], dropped: Bool[Tensor, " batch"]) -> Told:
+    def tell(
+        self,
+        samples: SceneSamples,
+        held: Float[Tensor, "batch channel *latent"],
+        generators: list[torch.Generator],
+        dropped: Bool[Tensor, " batch"],
+    ) -> Told:
         """Return the embedded conditions.
 
         Args:
             samples: the conditions.
+            held: latents of what is given.
             generators: of the samples' noise, in training and in sampling alike.
             dropped: whose view is left out.
         """
@@ -154,7 +167,7 @@ class SceneDiffusion(SceneModel):
         colors = torch.empty(len(samples.rgb), 3, *samples.depth.shape[-2:], device=samples.rgb.device)
         view = self.view(samples, noise_like(colors, generators), share)
         action = self.action(samples, self.view.rays(samples)[0][:, :, 0, 0])
-        return Told(self.given(samples), self.view.without(view, dropped), action)
+        return Told(self.given(samples, held), self.view.without(view, dropped), action)
 
     @torch.no_grad()
     def sample(
@@ -163,9 +176,9 @@ class SceneDiffusion(SceneModel):
         """Return classes and colours of all cells; see ``SceneModel.sample``."""
         generators, own = generators_of(samples), self.settings.sampling
         known = known_tokens(samples, self.settings)
-        held = clean = self.codec.encode(*start(samples))  # what known tokens hold
+        held = clean = self._held(samples)  # what known tokens hold
         rest = noise = noise_like(clean, generators)
-        told, fixed = self._tell_guided(samples, generators), self._places(known.float()).bool()
+        told, fixed = self._tell_guided(samples, held, generators), self._places(known.float()).bool()
         for step, (level, following) in enumerate(pairwise(noise_levels(steps, own.shift)), start=1):
             of_tokens = torch.full(known.shape, level, device=known.device).masked_fill(known, 0.0)
             latents = self._mix(held.where(fixed, clean), noise.where(fixed, rest), of_tokens, known)
@@ -184,10 +197,12 @@ class SceneDiffusion(SceneModel):
         plain: Tensor = self.transformer(latents, levels, unseen.given, unseen.view, unseen.action).float()
         return plain + self.settings.sampling.guidance * (velocity - plain)
 
-    def _tell_guided(self, samples: SceneSamples, generators: list[torch.Generator]) -> tuple[Told, Told | None]:
+    def _tell_guided(
+        self, samples: SceneSamples, held: Tensor, generators: list[torch.Generator]
+    ) -> tuple[Told, Told | None]:
         """The conditions, and those without a view where guidance is on."""
         everyone = torch.ones(len(samples.given), dtype=torch.bool)
-        seen = self.tell(samples, generators, ~everyone)
+        seen = self.tell(samples, held, generators, ~everyone)
         if self.settings.sampling.guidance == 1:
             return seen, None
         return seen, Told(seen.given, self.view.without(seen.view, everyone), seen.action)
@@ -318,10 +333,23 @@ def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
     return samples.true_classes, samples.true_colors
 
 
-def start(samples: SceneSamples) -> tuple[Tensor, Tensor]:
-    """Return what is given, and free cells where nothing is: what sampling knows before its first step."""
-    kept = content(samples)
-    return samples.classes * kept, samples.colors * kept[..., None]
+def start(samples: SceneSamples, settings: SceneDiffusionSettings) -> tuple[Tensor, Tensor]:
+    """Return what sampling knows before its first step: what is given or was there before, and no room elsewhere.
+
+    What is solid, and of no known class, is taken for a floor at the lowest level, a ceiling at the highest, and for a
+    wall between them, where things have names.
+    """
+    told = samples.given != Given.NOTHING
+    guesses = torch.tensor(guessed_levels(settings), dtype=torch.uint8, device=told.device)
+    classes = torch.where(samples.classes == SOLID, guesses, samples.classes)
+    return classes.where(told, OUTSIDE), samples.colors * told[..., None]
+
+
+def guessed_levels(settings: SceneDiffusionSettings) -> list[int]:
+    """Return for each level the class that something solid most likely has there."""
+    palette, levels = settings.palette, settings.shape[2]
+    names = ["floor", *["wall"] * (levels - 2), "ceiling"][:levels]
+    return [palette.index(name) if name in palette else SOLID for name in names]
 
 
 def painted(classes: UInt8[Tensor, "*batch"], colors: Float[Tensor, "*batch 3"]) -> UInt8[Tensor, "*batch 3"]:

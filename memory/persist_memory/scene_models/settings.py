@@ -64,7 +64,8 @@ class TransformerSettings:
         heads: heads of its attentions.
         patch: latents along the edge of a token.
         view_patch: pixels along the edge of a token of the view.
-        region: tokens along the edge of a region, which has a noise level of its own in half of the samples.
+        region: tokens along the edge of a region.
+        own_levels: share of the training samples in which each region has a noise level of its own.
         condition_noise: of given latents and of the view, in training and in sampling: (1 - n) x + n ε.
         drop_view: share of the samples without a view, for guidance.
     """
@@ -75,6 +76,7 @@ class TransformerSettings:
     patch: Positive = 1
     view_patch: Positive = 8
     region: Positive = 4
+    own_levels: Share = 0.15
     condition_noise: Share = 0.1
     drop_view: Share = 0.1
 
@@ -88,7 +90,7 @@ class SamplingSettings:
     """How windows are sampled.
 
     Args:
-        shift: above 1 more steps are at high noise.
+        shift: above 1 more steps, and more of the noise levels in training, are at high noise.
         guidance: how much more the view counts; 1 is off, and else each step takes twice as long.
         snap_every: steps after which the prediction is decoded, snapped to classes and encoded again, as PERSIST's is;
             0 for the end alone, since a small codec loses some of what is one cell thick each time, doors above all.

@@ -25,6 +25,15 @@ class Turn:
     mirrored: bool
 
     @staticmethod
+    def ahead(window_from_camera: Float[Tensor, "4 4"], shape: tuple[int, int, int], mirrored: bool = False) -> Turn:
+        """The turn after which a camera looks along the first axis, as nearly as the symmetries of the shape allow."""
+        first, second = window_from_camera[:2, 2].tolist()
+        first = -first if mirrored else first
+        if shape[0] != shape[1] or abs(first) >= abs(second):
+            return Turn(0 if first >= 0 else 2, mirrored)
+        return Turn(3 if second > 0 else 1, mirrored)
+
+    @staticmethod
     def draw(shape: tuple[int, int, int], random: np.random.Generator) -> Turn:
         """A random one for windows of a shape."""
         quarters, mirrored = int(random.integers(4)), bool(random.integers(2))
@@ -33,6 +42,11 @@ class Turn:
     def cells(self, cells: Tensor) -> Tensor:
         """Cells ``[first, second, level, …]`` turned."""
         return torch.rot90(cells.flip(0) if self.mirrored else cells, self.quarters, (0, 1)).contiguous()
+
+    def back(self, cells: Tensor) -> Tensor:
+        """Turned cells as they were."""
+        before = torch.rot90(cells, -self.quarters, (0, 1))
+        return (before.flip(0) if self.mirrored else before).contiguous()
 
     def image(self, image: Tensor) -> Tensor:
         """The image ``[height, width, …]`` of the turned scene."""
