@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Final
 
@@ -28,6 +29,7 @@ from persist_cli.train.state import save_state
 from persist_cli.train.trainer import Trainer
 
 CODEC_BATCHES: Final = 4  # for measuring the scale of the codec's latents at the end of its stage
+SCENE_WINDOWS: Final = 64  # for measuring that of a model of scenes
 
 
 AnyTrainer = Trainer | PolicyTrainer | SceneTrainer
@@ -136,7 +138,8 @@ class RunFolder:
     def _write_scene_model(self, trainer: SceneTrainer, model: SceneModel, folder: Path) -> None:
         recipe = trainer.recipe
         folder.mkdir()
-        model.finish_stage(recipe.stage, trainer.first_batches(CODEC_BATCHES))
+        batches = trainer.first_batches(math.ceil(SCENE_WINDOWS / recipe.training.batch))
+        model.finish_stage(recipe.stage, batches)
         write_text(folder / RECIPE, to_yaml(recipe))
         save_scene_model(model, recipe.stage, folder, self.scenes)
 

@@ -152,7 +152,7 @@ def test_cells_are_reconstructed_as_the_codec_has_them_and_are_never_merely_soli
     classes, colors = model.reconstruct(samples.true_classes, samples.true_colors)
     with torch.no_grad():
         logits, _ = model.codec.decode(model.codec.encode(samples.true_classes, samples.true_colors))
-    likeliest = (logits - model.weights.log()).argmax(-1)
+    likeliest = (logits - model.codec.class_weights.log()).argmax(-1)
     assert classes[likeliest != SOLID].equal(likeliest[likeliest != SOLID].to(torch.uint8))
     assert not (classes == SOLID).any()
     assert not colors[classes == 0].any()
@@ -166,7 +166,9 @@ def test_doors_and_things_count_more_in_the_loss_of_the_codec(model):
     assert weights["door"] == weights["box"] == model.settings.codec.rare_weight > 1
 
 
-def test_what_a_door_counts_more_in_training_is_divided_out_where_cells_are_read_off(model, samples, monkeypatch):
+def test_what_a_door_counts_more_in_training_is_divided_out_where_cells_are_read_off(samples, monkeypatch):
+    model = micro_model()
+    model.finish_stage("scene-codec", [samples])
     kinds, weight = {name: number for number, name in enumerate(model.settings.palette)}, model.weights.max()
     for share, read in ((0.9, "wall"), (1.1, "door")):
         logits = torch.full((*samples.true_classes.shape, len(kinds)), -9.0)

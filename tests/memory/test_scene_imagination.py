@@ -201,3 +201,26 @@ def test_merging_observed_cells_keeps_an_imagined_class_as_writing_their_frames_
     merged.merge(seen_alone)
     assert torch.equal(merged.cells.classes, written.cells.classes)
     assert int((written.cells.classes == WALL)[written.cells.origins == CellOrigin.OBSERVED].sum()) > 100
+
+
+@pytest.mark.parametrize("degrees", [0.0, 80.0, 170.0, 260.0])
+def test_a_window_is_turned_to_look_ahead_before_the_model_sees_it_and_back_afterwards(degrees):
+    seen_by_model = []
+
+    class Echo(DrawnWalls):
+        def sample(self, samples, steps):
+            seen_by_model.append(samples)
+            return samples.classes, samples.colors
+
+    scene = empty_scene(Echo())
+    scene.write(observe([look((0.0, 1.3, 0.0), degrees, -10.0)], 64, 64))
+    before = scene.cells
+    scene.complete()
+    told = seen_by_model[0]
+    first, second = told.window_from_camera[0, :2, 2].tolist()
+    assert first > abs(second)
+    ahead = (told.classes[0] == SOLID).any(-1).nonzero().double().mean(0) - (torch.tensor(SHAPE[:2]) - 1) / 2
+    assert float(ahead[0]) > abs(float(ahead[1]))  # what the camera saw lies along the first axis, too
+    kept = before.known & (before.classes != SOLID)
+    assert torch.equal(contents(scene, before)[0][kept], before.classes[kept])
+    assert torch.equal(contents(scene, before)[1][before.solid], before.colors[before.solid])

@@ -48,7 +48,7 @@ class GridSceneSettings:
     model: str | None = None
     steps: PositiveInt = 10
     seed: NonNegativeInt = 0
-    foresight: Distance = 8.0
+    foresight: Distance = 5.0
     evolution: Literal["rules", "model"] = "rules"
     carries: Length = 0.75
     toggles: tuple[str, ...] = ("solid", "box")

@@ -26,7 +26,8 @@ class SceneCodec(nn.Module):
     """Encodes windows of cells as latents and decodes these.
 
     What is generated are the first principal components of the latents, by a mean, axes and deviations that ``measure``
-    sets and checkpoints hold: of the channels many say nearly the same, and noise is the same in every direction.
+    sets and checkpoints hold: of the channels many say nearly the same, and noise is the same in every direction. What
+    each class counted in training is held too, since it is divided out where cells are read off.
 
     Args:
         settings: sizes of windows and codec.
@@ -35,6 +36,7 @@ class SceneCodec(nn.Module):
     latent_mean: Tensor
     latent_axes: Tensor
     latent_deviation: Tensor
+    class_weights: Tensor
 
     def __init__(self, settings: SceneDiffusionSettings) -> None:
         super().__init__()
@@ -56,6 +58,7 @@ class SceneCodec(nn.Module):
         self.register_buffer("latent_mean", torch.zeros(codec.latent))
         self.register_buffer("latent_axes", torch.eye(codec.latent)[:, : settings.components])
         self.register_buffer("latent_deviation", torch.ones(settings.components))
+        self.register_buffer("class_weights", torch.ones(len(settings.palette)))
 
     def posterior(
         self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]

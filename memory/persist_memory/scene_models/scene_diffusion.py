@@ -257,14 +257,15 @@ class SceneDiffusion(SceneModel):
         uncertain door would be one: a piece of wall above a way that is not free.
         """
         logits, colors = self.codec.decode(latents)
-        logits -= self.weights.log()
+        logits -= self.codec.class_weights.log()
         if self.settings.is_named:
             logits[..., SOLID] = -torch.inf
         return logits, colors
 
     def finish_stage(self, stage: Stage, batches: Iterable[SceneSamples]) -> None:
-        """Measure the mean and deviation of the latents after the codec's stage."""
+        """Measure the mean and deviation of the latents after the codec's stage, and keep what each class counted."""
         if stage == "scene-codec":
+            self.codec.class_weights.copy_(self.weights)
             with torch.no_grad():
                 self.codec.measure([self.codec.posterior(*truth(batch))[0] for batch in batches])
 
