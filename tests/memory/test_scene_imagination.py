@@ -63,6 +63,8 @@ def test_a_region_is_completed_and_nothing_beside_it():
     imagined = scene.cells.origins == CellOrigin.IMAGINED
     assert bool(region.contains(scene.cells.centers()[imagined]).all())
     assert torch.equal(contents(scene, before)[2][before.known], before.origins[before.known])
+    beside = before.known & ~region.contains(before.centers())
+    assert torch.equal(contents(scene, before)[0][beside], before.classes[beside])
 
 
 def test_a_region_larger_than_a_window_is_completed_by_several():

@@ -351,10 +351,9 @@ class GridScene(Scene):
         Where none is unknown, but the class of a solid one is, the model still says which class it has.
         """
         window = self._store.box.box(corner, imagination.model.form.shape)
-        unnamed = window.known & (window.classes == SOLID)
-        wanted = torch.ones_like(unnamed) if region is None else region.contains(window.centers())
-        chosen = ~window.known & wanted
-        if bool((chosen | (unnamed & wanted)).any()):
+        wanted = torch.ones_like(window.known) if region is None else region.contains(window.centers())
+        unnamed, chosen = wanted & window.known & (window.classes == SOLID), wanted & ~window.known
+        if bool((chosen | unnamed).any()):
             filled = imagination.fill(window, seed)
             self._store.reach(corner, [a + b for a, b in zip(corner, window.shape, strict=True)])
             self._store.replace(filled, chosen)
