@@ -11,7 +11,8 @@ from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from tests.support.micro_model import CHANNELS, micro, with_adapter
 
 FORM_KEYS = {
-    "cross": {"heads", "frequencies", "origins", "positions", "normalize", "key_positions", "key_camera"},
+    "cross": {"heads", "frequencies", "origins", "positions", "normalize", "key_positions", "key_camera",
+              "ray_frequencies"},
     "projected": {"heads", "frequencies", "origins"},
     "canvas": {"origins", "canvas_channels", "canvas_scale", "token_size", "splat_pixels", "head_width"},
     "rendered": {

@@ -29,6 +29,7 @@ every_form = pytest.mark.parametrize("form", POINT_FORMS)
 
 
 CROSS = [{"normalize": True}, {"key_positions": True}, {"key_camera": True}, {"positions": "none"},
+         {"key_camera": True, "ray_frequencies": 3},
          {"normalize": True, "key_positions": True, "key_camera": True}]  # fmt: skip
 every_option_of_cross = pytest.mark.parametrize("options", CROSS, ids=lambda options: "+".join(options))
 
@@ -169,6 +170,23 @@ def test_the_ray_to_a_token_has_the_direction_of_the_pixel_that_sees_it():
     tokens = MemoryTokens(torch.zeros(1, 1, CHANNELS), place[:, None], torch.ones(1, 1, dtype=torch.bool))
     ray, pixel = token_rays(tokens, cameras)[0, 5, 0], plucker(cameras)[0, 5, 7, 11]
     torch.testing.assert_close(ray, pixel / pixel[3:].norm(), atol=1e-9, rtol=0)
+
+
+def test_queries_and_keys_have_the_same_code_of_a_direction():
+    adapter = with_adapter(micro(), key_camera=True, ray_frequencies=3).adapter
+    rays = torch.randn(2, 5, 6 * adapter.video.folded)
+    coded, longer = adapter.with_direction_code(rays), adapter.with_direction_code(2 * rays)
+    assert coded.shape == (2, 5, 4 * 6 * adapter.video.folded)
+    assert torch.equal(coded[..., : rays.shape[-1]], rays)
+    torch.testing.assert_close(coded[..., rays.shape[-1] :], longer[..., rays.shape[-1] :])
+    near = rays.clone()
+    near[..., 3] += 0.1 * near[..., 3:6].norm(dim=-1)
+    assert not torch.allclose(adapter.with_direction_code(near)[..., rays.shape[-1] :], coded[..., rays.shape[-1] :])
+
+
+def test_a_code_of_rays_needs_the_rays():
+    with pytest.raises(CheckpointError, match="give key_camera=true"):
+        with_adapter(micro(), ray_frequencies=3)
 
 
 def test_positions_in_the_keys_need_positions():

@@ -57,7 +57,7 @@ def test_an_ablation_differs_from_the_papers_recipe_in_one_part_of_memory_or_ada
     adapters = {key for key in paper.adapter | changed.adapter if paper.adapter.get(key) != changed.adapter.get(key)}
     memories = dataclasses.replace(changed, memory=paper.memory, adapter=paper.adapter, description=paper.description)
     assert memories == paper
-    changes = {PREFIX: 0, f"{PREFIX}-improved": 2}
+    changes = {PREFIX: 0, f"{PREFIX}-improved": 2, f"{PREFIX}-coded-rays": 2}
     assert (changed.memory != paper.memory) + len(adapters) == changes.get(name, 1)
 
 

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from pydantic import NonNegativeInt
 from torch import Tensor, nn
 
 from persist_backbones.adapters.base import Adapter, OriginEmbedding, OriginSettings, PreparedMemory, VideoShape
@@ -18,13 +19,17 @@ from persist_cli.api.geometry import transform
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 
+RAY = 6  # channels of a Plücker ray
+
+NARROWEST, WIDEST = 0.25, 8.0  # wavelengths of the code of directions, where 1 is the radius of their sphere
+
 
 @dataclass(frozen=True)
 class CrossSettings(AttentionSettings, OriginSettings):
     """Settings of the paper's cross-attention to tokens with positions in metres.
 
     The paper concatenates the position code to a token's features, so that keys and values have it, and the camera to
-    the video's queries. The last three settings are options of our own, for ablations.
+    the video's queries. The last four settings are options of our own, for ablations.
 
     Args:
         positions: ``relative`` to the first camera of the clip, ``absolute`` in the world, as in the paper, or
@@ -34,6 +39,8 @@ class CrossSettings(AttentionSettings, OriginSettings):
         key_positions: whether the position code is given to the keys of every block too.
         key_camera: whether the keys of each latent frame also have the ray from its cameras to the token, in the form
             in which the queries have the camera: then a token lies on a video token's ray where the two are alike.
+        ray_frequencies: wavelengths of a code of these rays' directions that queries and keys have too; 0 for none.
+            From bare directions attention becomes sharp only by large weights, which take many steps to grow.
     """
 
     form: Literal["cross"] = "cross"
@@ -41,6 +48,7 @@ class CrossSettings(AttentionSettings, OriginSettings):
     normalize: bool = False
     key_positions: bool = False
     key_camera: bool = False
+    ray_frequencies: NonNegativeInt = 0
 
 
 @dataclass(frozen=True)
@@ -64,11 +72,14 @@ class CrossAdapter(Adapter[CrossMemory]):
         super().__init__(channels, settings, video)
         if settings.key_positions and settings.positions == "none":
             raise CheckpointError("adapter: key_positions needs positions, not none; give positions=relative")
+        if settings.ray_frequencies and not settings.key_camera:
+            raise CheckpointError("adapter: ray_frequencies codes rays of queries and keys; give key_camera=true")
         code = 0 if settings.positions == "none" else 6 * settings.frequencies
         self.embed = nn.Linear(channels + code, settings.width)
         self.origin = OriginEmbedding(settings.width, settings.origins)
-        self.blocks = memory_blocks(settings, video, video.camera_channels)
-        keys = code * settings.key_positions + 6 * video.folded * settings.key_camera
+        coded = 1 + settings.ray_frequencies  # sine and cosine of three axes: as many as a ray has channels
+        self.blocks = memory_blocks(settings, video, video.camera_channels * coded)
+        keys = code * settings.key_positions + RAY * video.folded * settings.key_camera * coded
         for block in self.blocks.values() if keys else ():
             block.add_key_code(keys)  # type: ignore[operator]  # a ModuleDict does not know the type of its values
 
@@ -82,6 +93,7 @@ class CrossAdapter(Adapter[CrossMemory]):
         codes = [code[:, None]] if self.settings.key_positions else []
         if self.settings.key_camera:
             rays = fold_frames(token_rays(tokens, cameras).transpose(2, 3), self.video.folded).transpose(2, 3)
+            rays = self.with_direction_code(rays)
             codes = [part.expand(-1, rays.shape[1], -1, -1) for part in codes] + [rays.float()]
         learned = self.settings.learned_tokens  # they are nowhere, so that their code is zero
         joined = F.pad(torch.cat(codes, dim=-1), (0, 0, 0, learned)).to(dtype) if codes else None
@@ -100,8 +112,17 @@ class CrossAdapter(Adapter[CrossMemory]):
         self, block: nn.Module, video: Tensor, memory: CrossMemory, camera: Tensor, time: Tensor
     ) -> Float[Tensor, "batch token channel"]:
         """Return the video after the memory block."""
-        changed: Tensor = block(video, memory.tokens, memory.mask, camera, time, memory.codes)
+        rays = self.with_direction_code(camera)
+        changed: Tensor = block(video, memory.tokens, memory.mask, rays, time, memory.codes)
         return changed
+
+    def with_direction_code(self, rays: Float[Tensor, "*batch folded"]) -> Float[Tensor, "*batch coded"]:
+        """Return Plücker rays, several as channels, and the code of their directions."""
+        if not self.settings.ray_frequencies:
+            return rays
+        directions = F.normalize(rays.unflatten(-1, (-1, RAY))[..., RAY // 2 :].float(), dim=-1)
+        code = position_code(directions, self.settings.ray_frequencies, NARROWEST, WIDEST).flatten(-2)
+        return torch.cat([rays, code.to(rays.dtype)], dim=-1)
 
 
 def token_rays(tokens: MemoryTokens, cameras: Cameras) -> Float[Tensor, "batch frame token 6"]:
