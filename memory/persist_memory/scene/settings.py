@@ -46,7 +46,7 @@ class GridSceneSettings:
     unknown: Literal["clear", "ends"] = "clear"
     writes_imagined: bool = False
     model: str | None = None
-    steps: PositiveInt = 10
+    steps: PositiveInt = 30
     seed: NonNegativeInt = 0
     foresight: Distance = 5.0
     evolution: Literal["rules", "model"] = "rules"

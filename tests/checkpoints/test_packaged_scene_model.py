@@ -1,0 +1,60 @@
+"""The scene model that comes with the package is whole and small, and what it imagines are rooms."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+
+import pytest
+import torch
+
+from persist_cli.api.cells import CellGrid
+from persist_cli.bench.scenes.connectedness import count_borders
+from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
+from persist_cli.data.reference import parse_reference
+from persist_cli.memorize.memory_file import load_memory
+
+MOST_BYTES = 15e6
+
+
+@pytest.fixture
+def packaged(monkeypatch) -> TrainedSceneModel:
+    """The one in the package; other tests have none, or use their own."""
+    monkeypatch.delenv("PERSIST_REFERENCE")
+    return find_scene_model("scene")
+
+
+def test_every_file_has_its_hash_and_all_are_small(packaged):
+    lines = [line.split("  ") for line in (packaged.folder / "SHA256SUMS").read_text().splitlines()]
+    assert {name for _, name in lines} | {"SHA256SUMS", "README.md"} == {one.name for one in packaged.folder.iterdir()}
+    for digest, name in lines:
+        assert sha256((packaged.folder / name).read_bytes()).hexdigest() == digest, name
+    assert sum((packaged.folder / name).stat().st_size for _, name in lines) <= MOST_BYTES
+
+
+def test_it_was_not_trained_on_the_sample_houses(packaged):
+    names = {parse_reference(text).single().info.scene for text in ("sample#0:20", "sample#1:0")}
+    assert not any(name in packaged.training_scenes.names for name in names)
+
+
+def test_it_imagines_closed_rooms_around_one_image_and_others_with_another_seed(packaged, persist, tmp_path):
+    image = persist("memorize", "sample#0:20", "--memory", "scene", "--out", tmp_path / "image.safetensors")
+    assert image.code == 0
+    known = load_memory(tmp_path / "image.safetensors").cells
+    houses = []
+    for seed in (3, 4):
+        out = tmp_path / f"{seed}.safetensors"
+        words = ("memorize", "sample#0:20", "--memory", "scene", "--complete", "--seed", seed, "--out", out)
+        assert persist(*words).code == 0
+        houses.append(load_memory(out).cells)
+    for house in houses:
+        floor, wall = (house.classes == house.form.palette.index(name) for name in ("floor", "wall"))
+        assert int(floor.sum()) > 200
+        assert int(wall.sum()) > 1000
+        faces = count_borders(house, known_in(house, known))
+        assert faces.open < 0.3 * (faces.open + faces.closed)
+    assert not torch.equal(houses[0].classes, houses[1].classes)
+
+
+def known_in(house: CellGrid, known: CellGrid) -> torch.Tensor:
+    """Which cells of a completed house were known after the image."""
+    return known.box(house.corner, house.shape).known
