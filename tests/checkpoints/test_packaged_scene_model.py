@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from hashlib import sha256
-
 import pytest
 import torch
 
 from persist_cli.api.cells import CellGrid
 from persist_cli.bench.scenes.connectedness import count_borders
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
-from persist_cli.data.reference import parse_reference
 from persist_cli.memorize.memory_file import load_memory
+from tests.support.packaged_models import check_files, check_sample_is_unseen
 
 MOST_BYTES = 15e6
 
@@ -24,16 +22,11 @@ def packaged(monkeypatch) -> TrainedSceneModel:
 
 
 def test_every_file_has_its_hash_and_all_are_small(packaged):
-    lines = [line.split("  ") for line in (packaged.folder / "SHA256SUMS").read_text().splitlines()]
-    assert {name for _, name in lines} | {"SHA256SUMS", "README.md"} == {one.name for one in packaged.folder.iterdir()}
-    for digest, name in lines:
-        assert sha256((packaged.folder / name).read_bytes()).hexdigest() == digest, name
-    assert sum((packaged.folder / name).stat().st_size for _, name in lines) <= MOST_BYTES
+    check_files(packaged.folder, MOST_BYTES)
 
 
 def test_it_was_not_trained_on_the_sample_houses(packaged):
-    names = {parse_reference(text).single().info.scene for text in ("sample#0:20", "sample#1:0")}
-    assert not any(name in packaged.training_scenes.names for name in names)
+    check_sample_is_unseen(packaged.training_scenes)
 
 
 def test_it_imagines_closed_rooms_around_one_image_and_others_with_another_seed(packaged, persist, tmp_path):

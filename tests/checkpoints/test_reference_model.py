@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-from hashlib import sha256
 
 import pytest
 
 from persist_cli.api.checkpoint import reference_checkpoint
+from tests.support.packaged_models import check_files
 
 MOST_BYTES = 40e6
 
@@ -23,13 +22,7 @@ def packaged(monkeypatch):
 
 
 def test_every_file_has_its_hash_and_all_are_small_enough(packaged):
-    lines = [line.split("  ") for line in (packaged / "SHA256SUMS").read_text().splitlines()]
-    assert {name for _, name in lines} | {"SHA256SUMS", "README.md"} == {
-        os.path.relpath(path, packaged) for path in packaged.rglob("*") if path.is_file()
-    }
-    for digest, name in lines:
-        assert sha256((packaged / name).read_bytes()).hexdigest() == digest, name
-    assert sum((packaged / name).stat().st_size for _, name in lines) <= MOST_BYTES
+    check_files(packaged, MOST_BYTES)
 
 
 def test_with_memory_the_way_back_is_closer_to_the_truth_than_without(packaged, persist, tmp_path):

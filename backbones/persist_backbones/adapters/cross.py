@@ -12,14 +12,12 @@ from pydantic import NonNegativeInt
 from torch import Tensor, nn
 
 from persist_backbones.adapters.base import Adapter, OriginEmbedding, OriginSettings, PreparedMemory, VideoShape
-from persist_backbones.adapters.memory_block import AttentionSettings, memory_blocks, position_code
+from persist_backbones.adapters.memory_block import RAY, AttentionSettings, memory_blocks, position_code
 from persist_backbones.tensors import fold_frames
 from persist_cli.api.cameras import Cameras, invert_rigid
 from persist_cli.api.geometry import transform
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
-
-RAY = 6  # channels of a Plücker ray
 
 NARROWEST, WIDEST = 0.25, 8.0  # wavelengths of the code of directions, where 1 is the radius of their sphere
 

@@ -18,7 +18,7 @@ from pydantic import PositiveInt
 from torch import Tensor, nn
 
 from persist_backbones.adapters.base import Adapter, Encode, PreparedMemory, VideoShape
-from persist_backbones.adapters.memory_block import AttentionSettings, memory_blocks, position_code
+from persist_backbones.adapters.memory_block import RAY, AttentionSettings, memory_blocks, position_code
 from persist_backbones.noise_levels import add_level
 from persist_cli.api.cameras import Cameras, invert_rigid
 from persist_cli.api.geometry import plucker
@@ -26,7 +26,6 @@ from persist_cli.api.observations import Origin
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 
-RAY = 6  # channels of a Plücker ray
 WAVELENGTHS = (0.25, 16.0)  # of the code of rays: metres of their moments, lengths of their directions
 
 

@@ -16,6 +16,8 @@ from persist_backbones.adapters.base import AdapterSettings, VideoShape
 from persist_backbones.tensors import zero_init
 from persist_cli.errors import CheckpointError
 
+RAY = 6  # channels of a Plücker ray
+
 SHORTEST, LONGEST = 0.5, 128.0  # wavelengths of the position code in metres: two cells, twice the paper's map
 
 

@@ -180,6 +180,11 @@ def fold(values: Shaped[Tensor, "batch channel *place"], edge: int) -> Shaped[Te
     return values.permute(order).flatten(1, 1 + axes)
 
 
+def folded_tokens(values: Shaped[Tensor, "batch channel *place"], edge: int) -> Shaped[Tensor, "batch token folded"]:
+    """Fold blocks of places into channels, and return the blocks as tokens."""
+    return fold(values, edge).flatten(2).transpose(1, 2)
+
+
 def unfold(values: Shaped[Tensor, "batch folded *place"], edge: int) -> Shaped[Tensor, "batch channel *finer"]:
     """Undo ``fold``."""
     axes = values.ndim - 2

@@ -17,7 +17,7 @@ from persist_memory.scene_models.codec import (
     cells_of_a_token,
     convolution,
     every_cell,
-    fold,
+    folded_tokens,
     unfold,
 )
 from persist_memory.scene_models.settings import SceneDiffusionSettings
@@ -66,7 +66,7 @@ class GivenCells(nn.Module):
         colors = self._blocks(samples.colors * told).to(embedded.dtype) / 255
         values = self._patched(torch.cat([embedded, colors], dim=-1).flatten(4)).movedim(-1, 1)
         tokens: Tensor = self.patches[1:](values[..., 0] if self.axes == 2 else values).flatten(2).transpose(1, 2)
-        coded = fold(held, self.settings.transformer.patch).flatten(2).transpose(1, 2)
+        coded = folded_tokens(held, self.settings.transformer.patch)
         latents: Tensor = self.latents(coded.to(tokens.dtype))
         return tokens + latents
 

@@ -28,7 +28,7 @@ from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSampl
 from persist_cli.api.stages import SCENE_STAGES, ParameterGroup, Stage
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
-from persist_memory.scene_models.codec import SceneCodec, fold, unfold
+from persist_memory.scene_models.codec import SceneCodec, folded_tokens, unfold
 from persist_memory.scene_models.conditions import (
     ActionEmbedding,
     GivenCells,
@@ -225,7 +225,7 @@ class SceneDiffusion(SceneModel):
         return unfold(values.expand(-1, patch ** len(tokens), *[-1] * len(tokens)), patch)
 
     def _tokens(self, latents: Float[Tensor, "batch channel *latent"]) -> Float[Tensor, "batch token folded"]:
-        return fold(latents, self.settings.transformer.patch).flatten(2).transpose(1, 2)
+        return folded_tokens(latents, self.settings.transformer.patch)
 
     def _snapped(
         self, latents: Float[Tensor, "batch channel *latent"], samples: SceneSamples

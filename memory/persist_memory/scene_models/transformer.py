@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_memory.scene_models.codec import fold, unfold
+from persist_memory.scene_models.codec import folded_tokens, unfold
 from persist_memory.scene_models.conditions import coordinates_of_tokens
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 
@@ -115,7 +115,7 @@ class SceneTransformer(nn.Module):
             action: embedding of action and camera.
         """
         patch = self.settings.transformer.patch
-        tokens = self.inputs(fold(latents, patch).flatten(2).transpose(1, 2)) + given + self.places
+        tokens = self.inputs(folded_tokens(latents, patch)) + given + self.places
         time = self.level(waves_of(levels).to(tokens.dtype)) + action[:, None]
         level = self.modulation(F.silu(time)).unflatten(-1, (MODULATIONS, -1))
         rotary = rotary_positions(self.settings, tokens.device)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from hashlib import sha256
-
 import pytest
 import torch
 from torch import Tensor
 
 from persist_cli.api.policy_network import PolicySamples
-from persist_cli.data.reference import parse_reference, sample_data
+from persist_cli.data.reference import sample_data
 from persist_cli.policies.nomad.network import NomadNetwork, squashed
 from persist_cli.policies.trained import TrainedPolicy, packaged_policy
 from tests.benchmarks.bench_policy import moments
+from tests.support.packaged_models import check_files, check_sample_is_unseen
 
 MOST_BYTES = 10e6
 
@@ -25,16 +24,11 @@ def packaged(monkeypatch) -> TrainedPolicy:
 
 
 def test_every_file_has_its_hash_and_all_are_small(packaged):
-    lines = [line.split("  ") for line in (packaged.folder / "SHA256SUMS").read_text().splitlines()]
-    assert {name for _, name in lines} | {"SHA256SUMS", "README.md"} == {one.name for one in packaged.folder.iterdir()}
-    for digest, name in lines:
-        assert sha256((packaged.folder / name).read_bytes()).hexdigest() == digest, name
-    assert sum((packaged.folder / name).stat().st_size for _, name in lines) <= MOST_BYTES
+    check_files(packaged.folder, MOST_BYTES)
 
 
 def test_it_was_not_trained_on_the_sample_houses(packaged):
-    names = {parse_reference(text).single().info.scene for text in ("sample#0:0", "sample#1:0")}
-    assert not any(name in packaged.training_scenes.names for name in names)
+    check_sample_is_unseen(packaged.training_scenes)
 
 
 def test_it_knows_better_where_a_goal_lies_when_it_sees_that_goal_than_when_it_sees_another(packaged):
