@@ -33,9 +33,9 @@ learning: $(STAMP)
 scenes: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.scenes runs/scenes
 
-# two processes of one thread each take about half the time of one, and each file stays in one process
+# two processes of one thread each take about half the time of one, and each file stays in one process, the longest first
 test: $(STAMP) lint
-	$(VENV)/bin/python -m pytest -n 2 --dist loadfile --durations=20 -m "not slow and not gpu"
+	$(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=20 -m "not slow and not gpu"
 
 test-slow: $(STAMP)
 	$(VENV)/bin/python -m pytest -m slow

@@ -31,6 +31,18 @@ DIFFUSERS_MARKERS = (  # of diffusers' own tests, which test_diffusers_mixins ru
 )  # fmt: skip
 
 
+LONGEST = (  # files that take minutes begin first, so that none is left to one process at the end
+    "test_documented_commands.py", "test_processes.py", "test_doctor.py", "test_without_extras.py", "test_collect.py",
+    "test_finetune.py", "test_measured.py", "test_reference_model.py", "test_bundled.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests of the longest files first."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.name, len(places)))
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Register the markers of diffusers' own tests."""
     for name in DIFFUSERS_MARKERS if os.environ.get("DIFFUSERS_CHECKOUT") else ():

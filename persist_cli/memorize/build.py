@@ -60,6 +60,8 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
             map_file = out.with_suffix(".map.png")  # the picture is not replaced by the map of its scene
         extra["start"] = f"{sources[0].file.path.parent}#{sources[0].file.name}:0"
     _save_and_print(memory, paths, (out, map_file), json, extra)
+    if "start" in extra and not json:
+        say(walking_words(memory, out, str(extra["start"]), plan.checkpoint))
 
 
 def _with_picture(data: list[str], options: PictureOptions, out: Path) -> list[str]:
@@ -151,17 +153,13 @@ def _save_and_print(
         if extra.get("settings_of"):
             say(f"settings and encoder: those of {extra['settings_of']}")
         say(f"memory: {out}\nmap: {map_file}")
-        if "start" in extra:
-            say(walking_words(memory, out, extra["start"]))
 
 
-def walking_words(memory: Memory, out: Path, start: str) -> str:
-    """Return the command that walks in the memory of a picture, and what its checkpoint must have."""
-    reads = "draws scenes" if isinstance(memory, Scene) else f"reads {memory.name}"
-    return (
-        f"walk in it: persist rollout CHECKPOINT --start {start} --memory {out} --actions ...\n"
-        f"CHECKPOINT is a world model with an adapter that {reads}"
-    )
+def walking_words(memory: Memory, out: Path, start: str, checkpoint: Path | None) -> str:
+    """Return the command that walks in the memory of a picture, by default with the packaged world model."""
+    model = "" if checkpoint is None else f"{checkpoint} "
+    walk = f'--adapter {memory.name} --start {start} --memory {out} --actions "right*6"'
+    return f"walk in it: persist rollout {model}{walk}"
 
 
 def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -1,7 +1,7 @@
 """A start in a memory file, where no frame was observed: what the memory holds is drawn as the first frame.
 
 A walk begins where the last path of the file ends, since something is known around it. In a file without paths, such as
-a scene that was completed, it begins on the ground that is farthest from all that is in the way.
+one that was made in Python, it begins on the ground that is farthest from all that is in the way.
 """
 
 from __future__ import annotations

@@ -331,8 +331,7 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
     if recipe.stage == "scene-codec":
         return f"persist finetune {name.removesuffix('-codec')} {data} base={run}"
     if recipe.stage == "scene":
-        train = " ".join(f"--train {folder}" for folder in recipe.data.path)
-        return f"persist bench scene {run} --data HELD_OUT_DATA {train} --out runs/bench-scene"
+        return f"persist bench scene {run} --data HELD_OUT_DATA --train {recipe.data.path[0]} --out runs/bench-scene"
     if recipe.distill is not None and recipe.stage == "1":
         return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN}"
     if recipe.memory is not None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 
 from persist_cli.api.cells import CellGrid
 from persist_cli.bench.scenes.connectedness import count_borders
-from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
+from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model, write_scene_card
 from persist_cli.memorize.memory_file import load_memory
 from tests.support.packaged_models import check_files, check_sample_is_unseen
 
@@ -23,6 +25,17 @@ def packaged(monkeypatch) -> TrainedSceneModel:
 
 def test_every_file_has_its_hash_and_all_are_small(packaged):
     check_files(packaged.folder, MOST_BYTES)
+
+
+def test_its_card_has_the_fingerprint_of_its_weights(packaged, tmp_path):
+    copy = shutil.copytree(packaged.folder, tmp_path / "copy")
+    write_scene_card(copy, packaged.plugin, packaged.settings, packaged.stage, packaged.training_scenes)
+    assert find_scene_model(copy).fingerprint == packaged.fingerprint
+
+
+def test_it_keeps_how_small_pieces_of_a_class_are(packaged):
+    least = dict(zip(packaged.form.cells.palette, packaged.load().codec.least_cells.tolist(), strict=True))
+    assert least["door"] > least["table"] > least["potion"] == least["free"] == 1
 
 
 def test_it_was_not_trained_on_the_sample_houses(packaged):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from persist_cli.api.cells import CellOrigin
 from persist_cli.api.geometry import unproject
 from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.data.reference import parse_reference
+from persist_cli.memorize.build import walking_words
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.viewing.map import draw_map
 from tests.memorize.test_memorize import failure, memorize, succeed
@@ -119,12 +121,13 @@ def test_a_second_picture_takes_the_place_of_the_first_one(hall, tmp_path, capsy
     assert [path.name for path in (tmp_path / "scene.frame").iterdir()] == ["hall.parquet"]
 
 
-def test_the_command_that_walks_in_a_picture_names_a_checkpoint(hall, tmp_path, capsys):
+def test_the_command_that_walks_in_a_picture_is_printed(hall, tmp_path, capsys):
     out = tmp_path / "hall.safetensors"
     succeed(hall / "hall.png", "--memory", "scene", "--depth", hall / "hall.npy", "--out", out)
-    text = capsys.readouterr().out.replace("\n", " ")
-    assert "persist rollout CHECKPOINT --start" in text
-    assert "CHECKPOINT is a world model with an adapter that draws scenes" in text
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"walk in it: persist rollout --adapter scene --start {tmp_path}/hall.frame#hall:0 --memory {out}" in text
+    words = walking_words(load_memory(out), out, "hall.frame#hall:0", Path("runs/mine"))
+    assert words.startswith("walk in it: persist rollout runs/mine --adapter scene --start hall.frame#hall:0")
 
 
 @pytest.mark.parametrize("option", ["--set memory.model={}", "--model {}"])

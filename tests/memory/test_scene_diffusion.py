@@ -8,14 +8,15 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
-from persist_cli.api.cells import FREE, SOLID
+from persist_cli.api.cells import FREE, OUTSIDE, SOLID
 from persist_cli.api.meta_device import without_weights
 from persist_cli.api.scene_model import Given, SceneSamples
 from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import make_scene_model
 from persist_memory.scene_models.codec import channels_first, fold, unfold, unfolded_cells
-from persist_memory.scene_models.conditions import draw_levels, known_tokens
+from persist_memory.scene_models.conditions import changed_tokens, draw_levels, known_tokens
 from persist_memory.scene_models.scene_diffusion import (
     SceneDiffusion,
     generators_of,
@@ -25,6 +26,7 @@ from persist_memory.scene_models.scene_diffusion import (
     truth,
 )
 from persist_memory.scene_models.settings import SceneDiffusionSettings
+from persist_memory.scene_models.specks import least_cells
 from tests.support.micro_scenes import MICRO_SCENE, micro_model, micro_samples
 from tests.support.random_scenes import PALETTE
 
@@ -192,6 +194,96 @@ def test_what_is_past_may_change(model, samples):
     classes, _ = model.sample(replace(samples, given=past, classes=samples.true_classes), 1)
     assert not classes.equal(samples.true_classes)
     assert not known_tokens(replace(samples, given=past), model.settings).any()
+
+
+PLACE = (1, -5, 2, 1)  # of the second window, in the last but one token along the first axis
+
+
+def acted(samples, change=lambda classes, colors: None, given=Given.PAST):
+    """Samples of cells that may all have changed, of which some truly do; one of them held a box."""
+    classes, colors = samples.true_classes.clone(), samples.true_colors.clone()
+    classes[PLACE] = PALETTE.index("box")
+    before = {"classes": classes.clone(), "colors": colors.clone()}
+    change(classes, colors)
+    all_given = torch.full_like(samples.given, int(given))
+    return replace(samples, given=all_given, **before, true_classes=classes, true_colors=colors)
+
+
+def taken(classes, colors):
+    """The box is gone."""
+    classes[PLACE] = FREE
+
+
+def painted_green(classes, colors):
+    """The box has another colour."""
+    colors[PLACE] = torch.tensor([3, 200, 4])
+
+
+@pytest.mark.parametrize("folded", [True, False])
+@pytest.mark.parametrize("change", [taken, painted_green])
+def test_tokens_change_where_a_cell_does(samples, change, folded):
+    settings = micro_model(codec=MICRO_SCENE["codec"] | {"fold_levels": folded}).settings
+    changed = changed_tokens(acted(samples, change), settings).unflatten(1, settings.tokens)
+    assert changed.nonzero().tolist() == [[1, settings.tokens[0] - 2, *[0] * (len(settings.tokens) - 1)]]
+    assert not changed_tokens(acted(samples), settings).any()
+    assert not changed_tokens(acted(samples, change, given=Given.CONTENT), settings).any()
+    solid = (samples.true_classes != FREE) & (samples.true_classes != OUTSIDE)
+    unnamed = replace(acted(samples), classes=torch.where(solid, SOLID, samples.true_classes))
+    assert not changed_tokens(unnamed, settings).any()
+
+
+def test_a_token_that_changes_counts_more_in_the_loss(samples):
+    def loss(weight, change):
+        model = micro_model(transformer=MICRO_SCENE["transformer"] | {"change_weight": weight})
+        return model(acted(samples, change), "scene")["loss"].item()
+
+    tokens = samples.given.shape[0] * 4 * 4  # of which one changes
+    plain, more, most = (loss(weight, taken) for weight in (1.0, 9.0, 1e9))
+    assert more == pytest.approx((tokens * plain + 8 * most) / (tokens + 8), rel=1e-4)
+    assert most != pytest.approx(plain, rel=1e-2)
+    assert loss(9.0, lambda classes, colors: None) == loss(1.0, lambda classes, colors: None)
+
+
+@pytest.mark.parametrize(("before", "after"), [(FREE, "wall"), (SOLID, "wall"), ("door", "door")])
+def test_a_speck_is_what_is_next_most_likely_unless_it_was_there_before(samples, monkeypatch, before, after):
+    model = micro_model()
+    model.codec.least_cells[PALETTE.index("door")] = 4
+    number = {name: place for place, name in enumerate(PALETTE)} | {FREE: FREE, SOLID: SOLID}
+    logits = torch.full((*samples.classes.shape, len(PALETTE)), -9.0)
+    logits[..., FREE] = 2.0
+    logits[1, 5, 5, 2, PALETTE.index("door")], logits[1, 5, 5, 2, PALETTE.index("wall")] = 4.0, 3.0
+    monkeypatch.setattr(model.codec, "decode", lambda _: (logits.clone(), torch.zeros(*samples.classes.shape, 3)))
+    given, told = torch.full_like(samples.given, int(Given.PAST)), torch.full_like(samples.classes, FREE)
+    told[1, 5, 5, 2] = number[before]
+    if before == SOLID:
+        given[1, 5, 5, 2] = int(Given.CONTENT)
+    classes, _ = model.sample(replace(samples, given=given, classes=told), 1)
+    assert int(classes[1, 5, 5, 2]) == number[after]
+    assert int((classes != FREE).sum()) == 1
+
+
+def test_how_small_things_are_is_measured_with_the_codec_and_kept_in_its_file(samples, tmp_path):
+    model, others = micro_model(), micro_model(seed=1)
+    windows = torch.cat([samples.true_classes] * 9)
+    many = replace(samples, true_classes=windows, true_colors=torch.cat([samples.true_colors] * 9))
+    model.finish_stage("scene-codec", [many])
+    assert model.codec.least_cells.equal(least_cells(windows, len(PALETTE)))
+    assert model.codec.least_cells.max() > 1
+    model.save(tmp_path, "scene-codec")
+    others.load(tmp_path, "scene-codec")
+    assert others.codec.least_cells.equal(model.codec.least_cells)
+
+
+def test_a_codec_of_an_earlier_version_takes_nothing_for_a_speck(tmp_path):
+    model = micro_model()
+    model.codec.least_cells.fill_(5)
+    model.save(tmp_path, "scene-codec")
+    path = tmp_path / "codec.safetensors"
+    tensors = read_tensors(path)[0]
+    del tensors["codec.least_cells"]
+    write_tensors(path, tensors)
+    model.load(tmp_path, "scene-codec")
+    assert (model.codec.least_cells == 1).all()
 
 
 def test_true_cells_are_not_read_when_sampling(model, samples):

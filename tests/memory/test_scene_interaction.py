@@ -170,6 +170,61 @@ def test_a_model_that_blurs_colours_and_names_classes_changes_nothing_else():
     assert int((origins == CellOrigin.IMAGINED).sum()) == 1
 
 
+AHEAD, ASIDE = ((5, 4, 5), (9, 4, 1)), ((9, 8, 5), (9, 4, 1))  # along either axis of the ground
+
+
+@pytest.mark.parametrize("stance", [AHEAD, ASIDE])
+def test_what_the_codec_alone_does_to_colours_is_no_change(stance):
+    def dulled(colors):
+        """The farther ahead a cell is the darker."""
+        far = torch.linspace(1.0, 0.3, colors.shape[1])[:, None, None, None]
+        return (colors * far).to(torch.uint8)
+
+    class Dulling(DrawnWalls):
+        def sample(self, samples, steps):
+            classes, colors = super().sample(samples, steps)
+            return classes, dulled(colors)
+
+        def reconstruct(self, classes, colors):
+            return classes, dulled(colors)
+
+    scene = furnished(Dulling(), evolution="model")
+    scene.write(rendering(cell_room(), camera_at(cell_room(), *stance)))  # a view, ahead of which windows are turned
+    scene.add(cell_room())
+    before = int((scene.cells.origins == CellOrigin.IMAGINED).sum())
+    assert do(scene, "pick_up", stance)
+    assert int((scene.cells.origins == CellOrigin.IMAGINED).sum()) == before + 1
+
+
+def test_what_the_codec_loses_stays_as_it_is():
+    class Losing(DrawnWalls):
+        def reconstruct(self, classes, colors):
+            lost = classes == BOX
+            return torch.where(lost, FREE, classes), colors * ~lost[..., None]
+
+    scene = furnished(Losing(), evolution="model")
+    before = scene.cells
+    assert not do(scene, "toggle")
+    assert not do(scene, "pick_up")  # the model says that it is gone, as its codec does of what was there
+    assert scene.cells is before
+
+
+def test_solid_cells_are_coded_by_the_classes_that_the_model_sees_in_them():
+    class Naming(DrawnWalls):
+        def sample(self, samples, steps):
+            classes, colors = super().sample(samples, steps)
+            return torch.where(classes == SOLID, WALL, classes), colors
+
+        def reconstruct(self, classes, colors):
+            return torch.where(classes == SOLID, FREE, classes), colors
+
+    scene, grid = furnished(Naming(), evolution="model"), cell_room()
+    grid.classes[grid.classes == WALL] = SOLID
+    scene.add(grid)
+    assert do(scene, "pick_up")
+    assert int((scene.cells.origins == CellOrigin.IMAGINED).sum()) == 1
+
+
 @pytest.mark.parametrize("change", ["pick_up", "edit"])
 def test_the_view_that_a_model_is_told_of_no_longer_shows_what_is_gone(change):
     scene, camera = furnished(), camera_at(cell_room(), (5, 4, 5), (9, 4, 1))

@@ -16,10 +16,11 @@ import torch
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
-from persist_cli.recipe import make_recipe
+from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.finetune import next_command
 from persist_cli.train.log import StepLog
 from persist_cli.train.trainer import Trainer
+from tests.support.command_lines import parse_line
 from tests.support.damage import without_sums
 from tests.support.disk import file_limit
 from tests.support.micro_runs import (
@@ -394,6 +395,13 @@ def test_the_next_stage_is_of_the_same_recipes(recipe, following):
     values = {"stage": "codec" if "codec" in recipe else "1", "data": {"path": "d"}}
     command = next_command(recipe, make_recipe(values, recipe), Path("run"))
     assert command == f"persist finetune {following} --data d base=run"
+
+
+def test_a_scene_model_is_measured_next_with_a_data_set_of_its_training(tmp_path):
+    recipe = make_recipe(read_recipe("tiny-scene") | {"data": {"path": ["one", "two"]}}, "tiny-scene")
+    command = next_command("tiny-scene", recipe, tmp_path)
+    parse_line(command.removeprefix("persist "))
+    assert "--train one --out" in command
 
 
 @pytest.fixture

@@ -183,6 +183,24 @@ class Imagination:
         classes, colors = (turned.back(part[0]).to(here) for part in drawn)
         return classes.clone(), colors.clone()
 
+    def coded(self, window: CellGrid, drawn: CellGrid) -> CellGrid:
+        """Return a window as the model's codec holds it, in which small things may be lost and colours are dull.
+
+        Args:
+            window: the cells.
+            drawn: says what is in unknown cells, and of what class solid ones are.
+        """
+        unnamed = window.known & (window.classes == SOLID) & drawn.solid
+        classes = torch.where(window.known & ~unnamed, window.classes, drawn.classes)
+        colors = torch.where(window.known[..., None], window.colors, drawn.colors)
+        turned = Turn.ahead(self._seen(window)[2], self.model.form.shape)  # the codec sees what ``sample`` lets it see
+        device = next(self.model.parameters()).device
+        told = (turned.cells(part)[None].to(device) for part in (classes, colors))
+        with torch.inference_mode():
+            held = self.model.reconstruct(*told)
+        classes, colors = (turned.back(part[0]).to(window.classes.device).clone() for part in held)
+        return replace(window, classes=classes, colors=colors)
+
     def _seen(self, window: CellGrid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return RGB, depth, pose and intrinsics of the view, for a window; without a view in it all pixels are 0."""
         form = self.model.form
@@ -287,7 +305,9 @@ def evolved(
 ) -> CellGrid | None:
     """Return a window after an interaction, as the model says, or ``None`` when it says that nothing changes.
 
-    The model is given the known cells in reach as what they were before, and all other known ones as they are.
+    The model is given the known cells in reach as what they were before, and all other known ones as they are. What it
+    says is compared with what its codec makes of the cells before. So what the codec loses is no change, and what it
+    does not hold the model cannot take away.
 
     Raises:
         CheckpointError: when the model does not know this interaction.
@@ -300,9 +320,11 @@ def evolved(
     given = torch.where(reach, int(Given.PAST), given).to(torch.uint8)
     classes, colors = imagination.sample(window, given, 1 + known.index(action), seed)
     after = replace(window, classes=classes, colors=colors)
-    repainted = (colors.int() - window.colors.int()).abs().amax(-1) > REPAINTED
-    other = (classes != window.classes) & (window.classes != SOLID)  # else it is only told what it is
-    differs = reach & ((after.solid != window.solid) | (window.solid & (other | repainted)))
+    before = imagination.coded(window, after)
+    other = (classes != before.classes) & (window.classes != SOLID)  # else it is only told what it is
+    repainted = after.solid & before.solid & ((colors.int() - before.colors.int()).abs().amax(-1) > REPAINTED)
+    differs = (after.solid != before.solid) | (after.solid & other) | repainted
+    differs &= reach & ((classes != window.classes) | repainted)
     if not bool(differs.any()):
         return None
     after = window.copy()

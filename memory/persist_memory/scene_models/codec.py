@@ -27,7 +27,7 @@ class SceneCodec(nn.Module):
 
     What is generated are the first principal components of the latents, by a mean, axes and deviations that ``measure``
     sets and checkpoints hold: of the channels many say nearly the same, and noise is the same in every direction. What
-    each class counted in training is held too, since it is divided out where cells are read off.
+    each class counted in training, and how small its pieces are in the data, is held too, for where cells are read off.
 
     Args:
         settings: sizes of windows and codec.
@@ -37,6 +37,7 @@ class SceneCodec(nn.Module):
     latent_axes: Tensor
     latent_deviation: Tensor
     class_weights: Tensor
+    least_cells: Tensor
 
     def __init__(self, settings: SceneDiffusionSettings) -> None:
         super().__init__()
@@ -59,6 +60,7 @@ class SceneCodec(nn.Module):
         self.register_buffer("latent_axes", torch.eye(codec.latent)[:, : settings.components])
         self.register_buffer("latent_deviation", torch.ones(settings.components))
         self.register_buffer("class_weights", torch.ones(len(settings.palette)))
+        self.register_buffer("least_cells", torch.ones(len(settings.palette)))
 
     def posterior(
         self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]

@@ -6,11 +6,11 @@ import math
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from persist_cli.api.cells import SOLID
+from persist_cli.api.cells import FREE, OUTSIDE, SOLID
 from persist_cli.api.scene_model import Given, SceneSamples
 from persist_memory.scene_models.codec import (
     COLORS,
@@ -202,6 +202,22 @@ def known_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Boo
     """Return which tokens have settled cells only."""
     kept = settled(samples) if settings.is_named else content(samples)
     return every_cell(kept, len(settings.divided), cells_of_a_token(settings)).flatten(1)
+
+
+def changed_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Bool[Tensor, "batch token"]:
+    """Return which tokens have a cell that the action truly changes; samples must have true cells."""
+    assert samples.true_classes is not None
+    assert samples.true_colors is not None
+    before, after = is_solid(samples.classes), is_solid(samples.true_classes)
+    other = (samples.classes != samples.true_classes) & (samples.classes != SOLID)
+    repainted = (samples.colors != samples.true_colors).any(-1)
+    changed = (samples.given == Given.PAST) & ((before != after) | (after & (other | repainted)))
+    return ~every_cell(~changed, len(settings.divided), cells_of_a_token(settings)).flatten(1)
+
+
+def is_solid(classes: UInt8[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
+    """Return which classes are of something."""
+    return (classes != FREE) & (classes != OUTSIDE)
 
 
 def draw_levels(settings: SceneDiffusionSettings, generators: list[torch.Generator]) -> Float[Tensor, "batch token"]:

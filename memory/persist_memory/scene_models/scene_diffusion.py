@@ -33,12 +33,15 @@ from persist_memory.scene_models.conditions import (
     ActionEmbedding,
     GivenCells,
     ViewTokens,
+    changed_tokens,
     content,
     draw_levels,
+    is_solid,
     known_tokens,
     shifted,
 )
 from persist_memory.scene_models.settings import SceneDiffusionSettings
+from persist_memory.scene_models.specks import least_cells, without_specks
 from persist_memory.scene_models.transformer import SceneTransformer
 
 CODEC, REST = "codec", ("given", "view", "action", "transformer")  # parts of the model, which the stages train
@@ -121,8 +124,9 @@ class SceneDiffusion(SceneModel):
         with products_for_training(noisy):
             velocity = self.transformer(noisy, levels, told.given, told.view, told.action).float()
         errors = self._tokens(velocity - (noise - latents)).square().mean(-1)
-        unknown = (~known).float()
-        loss = (errors * unknown).sum() / unknown.sum().clamp_min(1)
+        weights = (~known).float()
+        weights *= 1 + (self.settings.transformer.change_weight - 1) * changed_tokens(samples, self.settings)
+        loss = (errors * weights).sum() / weights.sum().clamp_min(1)
         return {"loss": loss, "known_tokens": known.float().mean()}
 
     @torch.no_grad()
@@ -232,21 +236,25 @@ class SceneDiffusion(SceneModel):
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
         """Decode latents to the likeliest class of each cell, and write what is given into it."""
         logits, colors = self._decoded(latents)
-        kept, named = content(samples), self.settings.is_named
-        classes = logits.argmax(-1).to(torch.uint8)
-        logits[..., [FREE, OUTSIDE]] = -torch.inf
-        told = samples.classes
-        if named:  # of a cell that is only known to be solid, the likeliest thing that it can be
-            told = torch.where(told == SOLID, logits.argmax(-1).to(torch.uint8), told)
-        classes = torch.where(kept, told, classes)
-        return classes, torch.where(kept[..., None], samples.colors, painted(classes, colors))
+        kept, unnamed = content(samples), content(samples) & (samples.classes == SOLID)
+        if self.settings.is_named:  # what is only known to be solid is the likeliest thing that it can be
+            things = logits.index_fill(-1, torch.tensor([FREE, OUTSIDE], device=logits.device), -torch.inf)
+            logits, kept = torch.where(unnamed[..., None], things, logits), kept & ~unnamed
+        classes = torch.where(kept, samples.classes, logits.argmax(-1).to(torch.uint8))
+        same = (samples.given == Given.PAST) & (classes == samples.classes)  # also what was small before
+        parts = zip(logits, classes, kept | same, strict=True)
+        classes = torch.stack([without_specks(*part, self.codec.least_cells) for part in parts])
+        return classes, torch.where(content(samples)[..., None], samples.colors, painted(classes, colors))
 
     @torch.no_grad()
     def reconstruct(
         self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
-        """Return the cells as the codec's latents hold them; see ``SceneModel.reconstruct``."""
-        logits, decoded = self._decoded(self.codec.encode(classes, colors))
+        """Return the cells as the codec's latents hold them; see ``SceneModel.reconstruct``.
+
+        What is solid, and of no known class, is taken for what it is taken for in sampling.
+        """
+        logits, decoded = self._decoded(self.codec.encode(named(classes, self.settings), colors))
         classes = logits.argmax(-1).to(torch.uint8)
         return classes, painted(classes, decoded)
 
@@ -263,11 +271,14 @@ class SceneDiffusion(SceneModel):
         return logits, colors
 
     def finish_stage(self, stage: Stage, batches: Iterable[SceneSamples]) -> None:
-        """Measure the mean and deviation of the latents after the codec's stage, and keep what each class counted."""
+        """Measure latents and pieces of the classes after the codec's stage, and keep what each class counted."""
         if stage == "scene-codec":
+            cells = [truth(batch) for batch in batches]
             self.codec.class_weights.copy_(self.weights)
+            windows = torch.cat([classes for classes, _ in cells])
+            self.codec.least_cells.copy_(least_cells(windows, len(self.settings.palette)))
             with torch.no_grad():
-                self.codec.measure([self.codec.posterior(*truth(batch))[0] for batch in batches])
+                self.codec.measure([self.codec.posterior(*part)[0] for part in cells])
 
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Freeze all parameters that the stage does not train, and return the others by name."""
@@ -292,7 +303,10 @@ class SceneDiffusion(SceneModel):
         """Load the codec, and for the last stage the rest."""
         for trained in stages_to(stage):
             path = folder / FILES[trained]
-            load_exactly(self, read_tensors(path)[0], set(self._tensors_of(trained)), path)
+            tensors = read_tensors(path)[0]
+            if trained == "scene-codec":  # those of earlier versions say nothing of specks, and keep them
+                tensors.setdefault("codec.least_cells", torch.ones(len(self.settings.palette)))
+            load_exactly(self, tensors, set(self._tensors_of(trained)), path)
         if self.weights.is_meta:
             self.weights = type(self)(self.settings).weights
 
@@ -341,9 +355,13 @@ def start(samples: SceneSamples, settings: SceneDiffusionSettings) -> tuple[Tens
     wall between them, where things have names.
     """
     told = samples.given != Given.NOTHING
-    guesses = torch.tensor(guessed_levels(settings), dtype=torch.uint8, device=told.device)
-    classes = torch.where(samples.classes == SOLID, guesses, samples.classes)
-    return classes.where(told, OUTSIDE), samples.colors * told[..., None]
+    return named(samples.classes, settings).where(told, OUTSIDE), samples.colors * told[..., None]
+
+
+def named(classes: UInt8[Tensor, "*batch level"], settings: SceneDiffusionSettings) -> UInt8[Tensor, "*batch level"]:
+    """Return classes with a guess, by its level, where something is solid and of no known class."""
+    guesses = torch.tensor(guessed_levels(settings), dtype=torch.uint8, device=classes.device)
+    return torch.where(classes == SOLID, guesses, classes)
 
 
 def guessed_levels(settings: SceneDiffusionSettings) -> list[int]:
@@ -356,8 +374,3 @@ def guessed_levels(settings: SceneDiffusionSettings) -> list[int]:
 def painted(classes: UInt8[Tensor, "*batch"], colors: Float[Tensor, "*batch 3"]) -> UInt8[Tensor, "*batch 3"]:
     """Return decoded colours (1 = 255) of cells, 0 where nothing is."""
     return (colors.clamp(0, 1) * 255).round().to(torch.uint8) * is_solid(classes)[..., None]
-
-
-def is_solid(classes: UInt8[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
-    """Return which classes are of something."""
-    return (classes != FREE) & (classes != OUTSIDE)

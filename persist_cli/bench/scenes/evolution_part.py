@@ -24,6 +24,7 @@ from persist_cli.bench.scenes.class_counts import share_figure
 from persist_cli.bench.scenes.completions import Scenes
 from persist_cli.bench.scenes.interactions import Event
 from persist_cli.bench.scenes.scene_bench import SceneBench
+from persist_cli.bench.scenes.untold import Untold
 from persist_cli.bench.scenes.views import same_form
 from persist_cli.data.scene_samples import PICK_UP
 from persist_cli.data.store import TrajectoryFile
@@ -73,14 +74,20 @@ class EvolutionRow:
 
 MODEL: Final = EvolutionRow("model", "model", "the scene model, from the true cells before and the present frame")
 
+UNTOLD: Final = EvolutionRow(
+    "model, not told", "model",
+    "the same without the action: what it would change for no reason. It still knows which cells may change, and what "
+    "is carried, and no sample of its training was such",
+)  # fmt: skip
+
 RULES: Final = EvolutionRow("rules", "rules", "the rules of the memory, from the same cells")
 
 NOTHING: Final = EvolutionRow("nothing", None, "no cell changes")
 
 
 def evolution_rows(bench: SceneBench) -> list[EvolutionRow]:
-    """Return the rows; that of the model only where there is one."""
-    return [RULES, NOTHING] if bench.trained is None else [MODEL, RULES, NOTHING]
+    """Return the rows; those of the model only where there is one."""
+    return [RULES, NOTHING] if bench.trained is None else [MODEL, UNTOLD, RULES, NOTHING]
 
 
 def chosen_events(bench: SceneBench) -> Sequence[Event]:
@@ -93,7 +100,7 @@ def chosen_events(bench: SceneBench) -> Sequence[Event]:
 
 def row_seeds(bench: SceneBench, row: EvolutionRow) -> range:
     """Return the seeds of a row; only a model draws anything."""
-    return range(bench.plan.seeds if row == MODEL else 1)
+    return range(bench.plan.seeds if row in (MODEL, UNTOLD) else 1)
 
 
 def run_evolution(bench: SceneBench) -> None:
@@ -123,6 +130,8 @@ def judge(bench: SceneBench, row: EvolutionRow, event: Event, seed: int) -> dict
     """Do an interaction and return what changes, as JSON values; nothing where its thing is not in the hands."""
     record: dict[str, Any] = {"scene": event.file.info.scene, "action": event.action}
     scenes = with_evolution(bench.scenes.seeded(seed), row.evolution or "rules")
+    if row == UNTOLD and scenes.model is not None:
+        scenes = replace(scenes, model=Untold(scenes.model))
     before, truth = (event.file.cells(event.frame + later) for later in (0, 1))
     scene = scene_before(scenes, event, before)
     if scene is None:

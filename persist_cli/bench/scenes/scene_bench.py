@@ -304,7 +304,8 @@ def part_identities(
         found |= {} if trained is None else {SceneCompletion.name: model}
         found |= {row.name: looked_up for row in (Prior, NearestHouse, NearestHouses) if houses}
     if "evolution" in plan.parts and trained is not None:
-        found["evolution model"] = model
+        compared = model | {"compared with": "the cells as the codec holds them"}
+        found |= {f"evolution {name}": compared for name in ("model", "model, not told")}
     return dict(json.loads(json.dumps(found, default=str)))
 
 

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from persist_cli.api.cells import FREE
+from persist_cli.api.scene_model import Given
 from persist_cli.bench.scenes.interactions import find_events
+from persist_cli.bench.scenes.untold import Untold
 from persist_cli.data.store import Store
 from tests.conftest import Persist
 from tests.support.cell_houses import write_interactions
+from tests.support.cell_rooms import BOX
+from tests.support.drawn_scenes import DrawnWalls
+from tests.support.micro_scenes import micro_samples
 
 BY_RULE = (5, 10, 1)  # where the rules put the thing down
 
@@ -61,11 +69,21 @@ def test_a_model_is_asked_what_changes_and_a_stopped_benchmark_goes_on(
     assert untrained["false"]["mean"] > first["rows"]["rules"]["all"]["false"]["mean"]
     assert untrained["done"]["mean"] > 0
     kept = {path: path.stat().st_mtime_ns for path in (out / "parts").rglob("*seed*")}
-    assert len(kept) == 6 * (2 + 1 + 1)  # seeds of the model, rules, nothing
-    removed = next(path for path in kept if path.parent.name.startswith("evolution-model"))
-    removed.unlink()
+    assert len(kept) == 6 * (2 + 2 + 1 + 1)  # seeds of the model, told and not told, rules, nothing
+    removed = {path.parent: path for path in kept if path.parent.name.startswith("evolution-model")}.values()
+    for path in removed:  # of either row of the model one
+        path.unlink()
     assert evolution(persist, *words)["rows"] == first["rows"]
-    assert all(path.stat().st_mtime_ns == time for path, time in kept.items() if path != removed)
+    assert all(path.stat().st_mtime_ns == time for path, time in kept.items() if path not in removed)
+
+
+def test_the_control_is_not_told_that_somebody_picks_up() -> None:
+    model, samples = DrawnWalls(), micro_samples(2)
+    boxes, past = (torch.full_like(samples.classes, number) for number in (BOX, int(Given.PAST)))
+    acting = replace(samples, action=torch.ones_like(samples.action), classes=boxes, given=past)
+    assert (model.sample(acting, 1)[0] == FREE).all()
+    assert (Untold(model).sample(acting, 1)[0] == BOX).all()
+    assert Untold(model).form == model.form
 
 
 def test_a_drop_is_left_out_where_the_rules_cannot_fill_the_hands(
