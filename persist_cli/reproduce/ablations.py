@@ -57,6 +57,7 @@ class Plan:
         held_out: folders of the houses that gain is measured on.
         clips: most clips that gain is measured on.
         seed: seed of the trainings.
+        settings: further settings of all trainings, ``KEY=VALUE``.
     """
 
     out: Path
@@ -67,6 +68,7 @@ class Plan:
     held_out: tuple[Path, ...]
     clips: int = 48
     seed: int = 0
+    settings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -163,9 +165,8 @@ def train_command(plan: Plan, name: str, steps: int) -> str:
     """
     home, data = shlex.quote(str(plan.out)), " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.data)
     settings = f"base={shlex.quote(plan.base)} training.steps={steps} training.cooldown=0 training.warmup=20"
-    return (
-        f"finetune {name} {data} --out {home}/{name} --resume --cache {home}/cache {settings} training.seed={plan.seed}"
-    )
+    settings = " ".join([settings, f"training.seed={plan.seed}", *map(shlex.quote, plan.settings)])
+    return f"finetune {name} {data} --out {home}/{name} --resume --cache {home}/cache {settings}"
 
 
 def eval_command(plan: Plan, name: str, memory: str, samples: int, checkpoint: Path) -> str:
@@ -286,7 +287,7 @@ def identity(plan: Plan, houses: int) -> dict[str, Any]:
         "clips": plan.clips,
         "seed": plan.seed,
         "sampling": SAMPLING,
-    }
+    } | ({"settings": [*plan.settings]} if plan.settings else {})
 
 
 def run_ablations(plan: Plan, houses: int = HOUSES) -> None:
@@ -340,12 +341,16 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--houses", type=int, default=HOUSES, help="houses to collect for training")
     parser.add_argument("--clips", type=int, default=48, help="most clips to measure on")
     parser.add_argument("--seed", type=int, default=0, help="seed of the trainings")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="of all trainings, as in training.precision=no"
+    )
     options = parser.parse_args(arguments)
     recipes = chosen_recipes([name for name in options.only.split(",") if name])
     data, held_out = options.data or default_data(options.out), options.held_out or default_held_out(options.out)
     plan = Plan(
-        options.out, options.samples, recipes, options.base, tuple(data), tuple(held_out), options.clips, options.seed
-    )
+        options.out, options.samples, recipes, options.base, tuple(data), tuple(held_out), options.clips, options.seed,
+        tuple(options.set),
+    )  # fmt: skip
     run_ablations(plan, options.houses)
 
 

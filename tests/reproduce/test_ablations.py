@@ -46,6 +46,16 @@ LINES = [
 ]
 
 
+def test_settings_are_those_of_every_training_and_of_the_folder(monkeypatch):
+    monkeypatch.delenv("PERSIST_REFERENCE")
+    changed = dataclasses.replace(PLAN, settings=("training.precision=no", "data.mirror=0"))
+    for name in PLAN.recipes[:2]:
+        line = train_command(changed, name, 63)
+        assert line == f"{train_command(PLAN, name, 63)} training.precision=no data.mirror=0"
+        parse_line(line)
+    assert identity(changed, 40) == identity(PLAN, 40) | {"settings": [*changed.settings]}
+
+
 @pytest.mark.parametrize("line", LINES)
 def test_every_command_is_one_that_persist_takes(line):
     parse_line(line)
