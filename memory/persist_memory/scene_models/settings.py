@@ -13,7 +13,7 @@ from persist_cli.api.scene_model import SceneForm
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Weight = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 
@@ -49,7 +49,7 @@ class CodecSettings:
     components: Positive | None = None
     evenness: Annotated[float, Field(ge=0, le=1)] = 0.5
     cell: Positive = 16
-    rare_weight: Weight = 8.0
+    rare_weight: Factor = 8.0
     color_weight: Amount = 1.0
     kl_weight: Amount = 1e-6
     noise: Share = 0.1
@@ -70,7 +70,7 @@ class TransformerSettings:
         condition_noise: of given latents and of the view, in training and in sampling: (1 - n) x + n ε.
         drop_view: share of the samples without a view, for guidance.
         change_weight: weight in the loss of a token in which an interaction changes a cell; all others have 1. Mostly a
-            single cell changes, and with weight 1 the packaged model of 3,600 steps did not learn what its actions do.
+            single cell changes, which would hardly count.
     """
 
     layers: Positive = 6
@@ -82,7 +82,7 @@ class TransformerSettings:
     own_levels: Share = 0.15
     condition_noise: Share = 0.1
     drop_view: Share = 0.1
-    change_weight: Weight = 32.0
+    change_weight: Factor = 32.0
 
     def __post_init__(self) -> None:
         if self.width % (2 * self.heads):
@@ -101,7 +101,7 @@ class SamplingSettings:
         snap_below: noise level from which on that is done.
     """
 
-    shift: Weight = 3.0
+    shift: Factor = 3.0
     guidance: Amount = 1.0
     snap_every: Count = 0
     snap_below: Annotated[float, Field(ge=0, le=1)] = 0.5
