@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import torch
 from jaxtyping import Bool
+from numpy.typing import NDArray
 from torch import Tensor
 
 from persist_cli.api.cells import SOLID, Box, CellGrid
@@ -93,20 +95,25 @@ def structure(grid: CellGrid) -> Bool[Tensor, "first second level"]:
     return named | walls(grid)
 
 
-def find_things(grid: CellGrid) -> list[Thing]:
-    """Return the things of a grid, by class and place: the cells of a class that touch each other, diagonally too."""
+def pieces(mask: NDArray[np.bool_]) -> Iterator[NDArray[np.intp]]:
+    """Yield the places ``[cell, 3]`` of the cells of each piece: cells that touch each other, diagonally too."""
     from scipy import ndimage
 
+    labels, _ = ndimage.label(mask, structure=np.ones((3, 3, 3)))
+    for label, box in enumerate(ndimage.find_objects(labels), start=1):
+        yield np.argwhere(labels[box] == label) + [part.start for part in box]
+
+
+def find_things(grid: CellGrid) -> list[Thing]:
+    """Return the things of a grid, by class and place: the pieces of each class."""
     free_standing, things = grid.solid & ~structure(grid), []
     counts: Counter[str] = Counter()
     for number in torch.unique(grid.classes[free_standing]).tolist():
         mask = (free_standing & (grid.classes == number)).numpy()
-        labels, count = ndimage.label(mask, structure=np.ones((3, 3, 3)))
-        for label in range(1, count + 1):
+        for cells in pieces(mask):
             kind = grid.form.palette[number]
             counts[kind] += 1
-            cells = torch.from_numpy(np.argwhere(labels == label))
-            things.append(make_thing(grid, f"{kind}#{counts[kind]}", cells))
+            things.append(make_thing(grid, f"{kind}#{counts[kind]}", torch.from_numpy(cells)))
     return things
 
 

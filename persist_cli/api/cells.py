@@ -17,6 +17,11 @@ FREE, SOLID, OUTSIDE = 0, 1, 2  # the first classes of every palette
 COMMON = ("free", "solid", "outside")  # "solid" is something of which no more is known, "outside" is where no room is
 
 
+def is_solid(classes: UInt8[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
+    """Return which classes are of something."""
+    return (classes != FREE) & (classes != OUTSIDE)
+
+
 class CellOrigin(IntEnum):
     """Where a cell comes from; where two meet, the higher one stays. The first two are those of ``Origin``."""
 
@@ -110,7 +115,7 @@ class CellGrid:
     @property
     def solid(self) -> Bool[Tensor, "first second level"]:
         """Which cells are known and hold something."""
-        return self.known & (self.classes != FREE) & (self.classes != OUTSIDE)
+        return self.known & is_solid(self.classes)
 
     def numbers(self, positions: Float[Tensor, "*batch 3"]) -> Int64[Tensor, "*batch 3"]:
         """Return the numbers of the cells in which positions in world metres lie."""

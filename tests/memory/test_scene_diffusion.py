@@ -16,14 +16,13 @@ from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import make_scene_model
 from persist_memory.scene_models.codec import channels_first, fold, unfold, unfolded_cells
-from persist_memory.scene_models.conditions import changed_tokens, draw_levels, known_tokens
+from persist_memory.scene_models.conditions import changed_tokens, draw_levels, known_tokens, truth
 from persist_memory.scene_models.scene_diffusion import (
     SceneDiffusion,
     generators_of,
     noise_levels,
     noise_like,
     start,
-    truth,
 )
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 from persist_memory.scene_models.specks import least_cells

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int64, Shaped
 from torch import Tensor
 from torch.nn import functional
 
-from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellGrid, CellOrigin
+from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellGrid, CellOrigin, is_solid
 from persist_cli.errors import CheckpointError, DataError
 from persist_memory.scene.fusion import Votes
 from persist_memory.validation import ORIGINS, Shape, check_classes, check_tensors
@@ -152,7 +152,7 @@ class CellStore:
         at = (chosen & voted & (columns[ORIGINS] != CellOrigin.EDITED)).nonzero(as_tuple=True)
         hits, passes, sums, was = (columns[name][at] for name in ("hits", "passes", "sums", "classes"))
         solid = (hits > 0) & (hits >= passes)
-        named = (was != FREE) & (was != OUTSIDE) & (columns[ORIGINS][at] > 0)
+        named = is_solid(was) & (columns[ORIGINS][at] > 0)
         empty = torch.where((was == OUTSIDE) & (columns[ORIGINS][at] == CellOrigin.OBSERVED), OUTSIDE, FREE)
         columns["classes"][at] = torch.where(solid, torch.where(named, was, SOLID), empty).to(torch.uint8)
         count = sums[:, 3:].clamp_min(1)

@@ -6,12 +6,13 @@ import math
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
 
-from persist_cli.api.cells import FREE, OUTSIDE, SOLID
+from persist_cli.api.cells import SOLID, is_solid
 from persist_cli.api.scene_model import Given, SceneSamples
+from persist_cli.errors import CheckpointError
 from persist_memory.scene_models.codec import (
     COLORS,
     cells_of_a_token,
@@ -204,20 +205,25 @@ def known_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Boo
     return every_cell(kept, len(settings.divided), cells_of_a_token(settings)).flatten(1)
 
 
+def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
+    """Return the true classes and colours.
+
+    Raises:
+        CheckpointError: when the samples have none.
+    """
+    if samples.true_classes is None or samples.true_colors is None:
+        raise CheckpointError("a model of scenes is trained on samples with true cells, these have none")
+    return samples.true_classes, samples.true_colors
+
+
 def changed_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Bool[Tensor, "batch token"]:
-    """Return which tokens have a cell that the action truly changes; samples must have true cells."""
-    assert samples.true_classes is not None
-    assert samples.true_colors is not None
-    before, after = is_solid(samples.classes), is_solid(samples.true_classes)
-    other = (samples.classes != samples.true_classes) & (samples.classes != SOLID)
-    repainted = (samples.colors != samples.true_colors).any(-1)
+    """Return which tokens have a cell that the action truly changes."""
+    classes, colors = truth(samples)
+    before, after = is_solid(samples.classes), is_solid(classes)
+    other = (samples.classes != classes) & (samples.classes != SOLID)
+    repainted = (samples.colors != colors).any(-1)
     changed = (samples.given == Given.PAST) & ((before != after) | (after & (other | repainted)))
     return ~every_cell(~changed, len(settings.divided), cells_of_a_token(settings)).flatten(1)
-
-
-def is_solid(classes: UInt8[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
-    """Return which classes are of something."""
-    return (classes != FREE) & (classes != OUTSIDE)
 
 
 def draw_levels(settings: SceneDiffusionSettings, generators: list[torch.Generator]) -> Float[Tensor, "batch token"]:

@@ -22,11 +22,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
-from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID
+from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, is_solid
 from persist_cli.api.cpu_attention import products_for_training
 from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples
 from persist_cli.api.stages import SCENE_STAGES, ParameterGroup, Stage
-from persist_cli.errors import CheckpointError
 from persist_cli.io.files import load_exactly, read_tensors, write_tensors
 from persist_memory.scene_models.codec import SceneCodec, folded_tokens, unfold
 from persist_memory.scene_models.conditions import (
@@ -36,9 +35,9 @@ from persist_memory.scene_models.conditions import (
     changed_tokens,
     content,
     draw_levels,
-    is_solid,
     known_tokens,
     shifted,
+    truth,
 )
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 from persist_memory.scene_models.specks import least_cells, without_specks
@@ -236,15 +235,16 @@ class SceneDiffusion(SceneModel):
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
         """Decode latents to the likeliest class of each cell, and write what is given into it."""
         logits, colors = self._decoded(latents)
-        kept, unnamed = content(samples), content(samples) & (samples.classes == SOLID)
+        given = kept = content(samples)
         if self.settings.is_named:  # what is only known to be solid is the likeliest thing that it can be
+            unnamed = given & (samples.classes == SOLID)
             things = logits.index_fill(-1, torch.tensor([FREE, OUTSIDE], device=logits.device), -torch.inf)
-            logits, kept = torch.where(unnamed[..., None], things, logits), kept & ~unnamed
+            logits, kept = torch.where(unnamed[..., None], things, logits), given & ~unnamed
         classes = torch.where(kept, samples.classes, logits.argmax(-1).to(torch.uint8))
         same = (samples.given == Given.PAST) & (classes == samples.classes)  # also what was small before
         parts = zip(logits, classes, kept | same, strict=True)
         classes = torch.stack([without_specks(*part, self.codec.least_cells) for part in parts])
-        return classes, torch.where(content(samples)[..., None], samples.colors, painted(classes, colors))
+        return classes, torch.where(given[..., None], samples.colors, painted(classes, colors))
 
     @torch.no_grad()
     def reconstruct(
@@ -335,17 +335,6 @@ def noise_levels(steps: int, shift: float) -> list[float]:
     """Return the noise levels of so many Euler steps, from 1 to 0; a shift above 1 moves them up."""
     even = torch.tensor([1 - step / steps for step in range(steps + 1)], dtype=torch.float64)
     return [float(level) for level in shifted(even, shift)]
-
-
-def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
-    """Return the true classes and colours.
-
-    Raises:
-        CheckpointError: when the samples have none.
-    """
-    if samples.true_classes is None or samples.true_colors is None:
-        raise CheckpointError("a model of scenes is trained on samples with true cells, these have none")
-    return samples.true_classes, samples.true_colors
 
 
 def start(samples: SceneSamples, settings: SceneDiffusionSettings) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from persist_cli.api.cell_things import pieces
 from persist_cli.api.cells import FREE
 
 LARGEST: Final = 8  # cells; larger pieces of a strange size are no specks
@@ -22,19 +23,14 @@ SMALL: Final = 0.05  # share of a class's pieces in the data that may be smaller
 ENOUGH: Final = 10  # pieces of a class that tell how small it can be
 ROUNDS: Final = 4  # the class after the likeliest may make a speck too; after so many rounds it stays
 
-EVERYWHERE: Final = np.ones((3, 3, 3))  # cells of a piece touch each other, diagonally too
 
-
-def pieces(mask: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.intp], bool]]:
-    """Yield the places of the cells of each piece, and whether it ends at a side of the window, which may cut it."""
-    from scipy import ndimage
-
-    labels, _ = ndimage.label(mask, EVERYWHERE)
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        corner = [part.start for part in box]
-        cells = np.argwhere(labels[box] == number) + corner
-        cut = any(part.start == 0 or part.stop == side for part, side in zip(box[:2], mask.shape[:2], strict=True))
-        yield cells, cut
+def whole_pieces(mask: NDArray[np.bool_]) -> Iterator[NDArray[np.intp]]:
+    """Yield the places of the cells of each piece, but of those at a side of the window, which may cut them."""
+    last = np.array(mask.shape[:2]) - 1
+    for cells in pieces(mask):
+        ground = cells[:, :2]
+        if (ground > 0).all() and (ground < last).all():
+            yield cells
 
 
 def least_cells(windows: UInt8[Tensor, "window first second level"], classes: int) -> Float[Tensor, " klass"]:
@@ -49,7 +45,7 @@ def least_cells(windows: UInt8[Tensor, "window first second level"], classes: in
     sizes: list[list[int]] = [[] for _ in range(classes)]
     for window in windows.cpu().numpy():
         for number in np.unique(window[window != FREE]).tolist():
-            sizes[number] += [len(cells) for cells, cut in pieces(window == number) if not cut]
+            sizes[number] += map(len, whole_pieces(window == number))
     least = [float(np.quantile(found, SMALL, method="lower")) if len(found) >= ENOUGH else 1.0 for found in sizes]
     return torch.tensor(least).clamp_max(LARGEST)
 
@@ -75,8 +71,8 @@ def without_specks(
             (number, tuple(cells.T))
             for number in np.unique(there).tolist()
             if smallest[number] > 1
-            for cells, cut in pieces(there == number)
-            if not cut and len(cells) < smallest[number] and not settled[tuple(cells.T)].any()
+            for cells in whole_pieces(there == number)
+            if len(cells) < smallest[number] and not settled[tuple(cells.T)].any()
         ]
         if not found:
             break

@@ -14,7 +14,7 @@ from jaxtyping import Bool, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from persist_cli.api.cells import FREE, OUTSIDE
+from persist_cli.api.cells import is_solid
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
 
 Counts = NDArray[np.int64]
@@ -43,14 +43,9 @@ def class_counts(
         torch.bincount(one, minlength=classes),
         torch.bincount(two, minlength=classes),
     ]
-    full_one, full_two = is_occupied(one), is_occupied(two)
+    full_one, full_two = is_solid(one), is_solid(two)
     occupied = torch.stack([(full_one & full_two).sum(), full_one.sum(), full_two.sum()])
     return np.concatenate([torch.stack(rows, -1).numpy(), occupied.numpy()[None]]).astype(np.int64)
-
-
-def is_occupied(classes: Tensor) -> Tensor:
-    """Return which classes stand for something."""
-    return (classes != FREE) & (classes != OUTSIDE)
 
 
 def things(classes: int) -> range:

@@ -100,7 +100,7 @@ def chosen_events(bench: SceneBench) -> Sequence[Event]:
 
 def row_seeds(bench: SceneBench, row: EvolutionRow) -> range:
     """Return the seeds of a row; only a model draws anything."""
-    return range(bench.plan.seeds if row in (MODEL, UNTOLD) else 1)
+    return range(bench.plan.seeds if row.evolution == "model" else 1)
 
 
 def run_evolution(bench: SceneBench) -> None:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from persist_cli.api.cells import FREE, OUTSIDE, CellForm
+from persist_cli.api.cells import FREE, OUTSIDE, CellForm, is_solid
 from persist_cli.bench.scenes.connectedness import DOOR
 from persist_cli.bench.scenes.views import Region
 
@@ -40,7 +40,7 @@ def plan_features(
     level = min(max(round(EYE / form.size) - region.corner[2], 0), region.shape[2] - 1)
     cut = region.ahead(classes)[..., level]
     doors = region.ahead((classes == form.palette.index(DOOR)).any(-1)) if DOOR in form.palette else cut < 0
-    shares = torch.stack([cut == FREE, (cut != FREE) & (cut != OUTSIDE), cut == OUTSIDE, doors]).float()
+    shares = torch.stack([cut == FREE, is_solid(cut), cut == OUTSIDE, doors]).float()
     return functional.avg_pool2d(shares, max(1, round(BLOCK / form.size))).flatten()
 
 

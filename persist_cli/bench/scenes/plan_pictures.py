@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, UInt8
 from torch import Tensor
 
-from persist_cli.api.cells import FREE, OUTSIDE, SOLID
+from persist_cli.api.cells import OUTSIDE, SOLID, is_solid
 from persist_cli.bench.scenes.completion_part import kept_samples
 from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.views import View
@@ -90,7 +90,7 @@ def plan(
         shown[shown == SOLID] = palette.index("floor")  # what was seen down there
     seen = known.any(-1)
     for level in range(1, top):
-        something = known[..., level] & (classes[..., level] != FREE) & (classes[..., level] != OUTSIDE)
+        something = known[..., level] & is_solid(classes[..., level])
         shown = torch.where(something, classes[..., level], shown)
     beyond = (known & (classes == OUTSIDE))[..., :top].any(-1)
     shown = torch.where(beyond, OUTSIDE, shown)

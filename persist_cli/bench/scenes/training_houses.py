@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
-from persist_cli.api.cells import CellForm, CellGrid
-from persist_cli.bench.scenes.class_counts import is_occupied
+from persist_cli.api.cells import CellForm, CellGrid, is_solid
 from persist_cli.bench.scenes.views import Region, View, same_form, true_region
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.viewing.console import add_task, progress
@@ -154,7 +153,7 @@ def _view_spectra(views: Sequence[View], size: int) -> Iterator[tuple[int, Tenso
 
 
 def _known_signs(view: View) -> Float[Tensor, "first second level"]:
-    occupied = torch.where(is_occupied(view.known.classes), 1.0, -1.0)
+    occupied = torch.where(is_solid(view.known.classes), 1.0, -1.0)
     return torch.where(view.known.known, occupied, 0.0)
 
 
