@@ -33,7 +33,7 @@ class MemorizePlan:
         checkpoint: folder of the checkpoint whose adapter shall read the memory, ``None`` when none is named.
         model: name or folder of the model that imagines in a scene, ``None`` when none is named.
         complete: whether the scene is completed around the last frame, by the packaged model where none is named.
-        seed: seed of what is imagined.
+        seed: seed of what is imagined, now and later; ``memory.seed`` in ``settings`` gives later a seed of its own.
     """
 
     memory: str | None = None
@@ -59,10 +59,14 @@ def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]
     if plan.model is not None:
         return _with_model(plan)
     config, origin = _without_model(plan)
-    packaged = packaged_scene_model() if plan.complete and config.name == SCENE else None
-    if packaged is not None and config.settings.get("model") is None:
-        config = replace(config, settings=config.settings | {"model": packaged})
-    return config, origin
+    if config.name != SCENE:
+        return config, origin
+    settings = dict(config.settings)
+    if plan.complete and settings.get("model") is None and (packaged := packaged_scene_model()) is not None:
+        settings["model"] = packaged
+    if "seed" not in plugin_settings(plan.settings)["memory"]:
+        settings["seed"] = plan.seed
+    return replace(config, settings=settings), origin
 
 
 def _without_model(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:

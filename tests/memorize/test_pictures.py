@@ -75,6 +75,7 @@ def test_a_seed_makes_one_house_of_a_picture_and_another_seed_another(hall, mode
         scene = load_memory(out)
         assert result["completed"] == scene.figures().imagined == result["imagined"] > 500
         assert scene.settings.palette == PALETTE
+        assert scene.settings.seed == seed  # what it imagines later is of the same house
         return scene.cells.classes
 
     assert not torch.equal(house(3), house(4))
