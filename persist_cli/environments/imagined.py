@@ -11,12 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from persist_cli.api.backbone import Interactions
-from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import REFERENCE, find_checkpoint
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.api.observations import Observations, Origin, TrajectoryInfo
+from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
 from persist_cli.environments.goals import Goals, KnownGround, PosedFrames, find_goals
 from persist_cli.environments.task import Attempt, TaskSettings, View
@@ -25,6 +23,7 @@ from persist_cli.io.settings import parse_settings
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of, knows_floor
 from persist_cli.navigation.routes import check_within_reach
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
+from persist_cli.rollout.clip_lengths import shortest_clip
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
@@ -49,6 +48,8 @@ class ImaginedSettings(TaskSettings):
         sampling: steps, sampler and guidance in place of the checkpoint's own.
         step: metres of an action, in place of the data set's own.
         turn: degrees of an action.
+        clip_frames: frames of a clip, the present one included; ``None`` for as few as show ``chunk`` actions, which
+            takes the least time.
     """
 
     start: str
@@ -61,6 +62,7 @@ class ImaginedSettings(TaskSettings):
     sampling: SamplingOverrides = field(default_factory=SamplingOverrides)
     step: float | None = None
     turn: float | None = None
+    clip_frames: int | None = None
 
     @property
     def memory_file(self) -> Path | None:
@@ -91,8 +93,8 @@ class ImaginedScenes(Scenes):
             self.given.check_scene(self.starts.info.scene)
         world, info = open_house(settings, self.starts)
         super().__init__(info, settings)
-        self.world: WorldModel = SteppedWorld(world.backbone, [], world.sampling)
-        self.first = world.agents[0]
+        self.world, self.first = world, world.agents[0]
+        world.clip_frames = settings.clip_frames or shortest_clip(world.backbone, settings.chunk)
         if self.given is not None:
             memorize_frames(world, self.given)
         self.known = KnownGround(self._map(settings), body_of(info).radius, settings)
@@ -179,24 +181,6 @@ class ImaginedScenes(Scenes):
         if settings.memory_file is not None and self.first.memory is not None:
             mapper.add_memory(self.first.memory, mapper.floor_under(self.starts.positions.mean(0)))
         return mapper.map()
-
-
-class SteppedWorld(WorldModel):
-    """A world model that decodes of each clip the one frame that is seen, where no agent takes more than one action.
-
-    That takes half of the time at one denoising step. The other frames of the clip stand still at the same camera.
-    """
-
-    def predict(
-        self, moving: Sequence[int], ways: Sequence[Cameras], interactions: Sequence[Interactions]
-    ) -> list[Observations]:
-        """Return what some agents would see along their next cameras; arguments as of ``recall``."""
-        if any(len(way) > 1 for way in ways):
-            return super().predict(moving, ways, interactions)
-        clips = self.recall(moving, ways, interactions)
-        rgb, depth = self.denoise_frame(clips, [1] * len(ways))
-        frames = zip(rgb[:, None], depth[:, None], ways, strict=True)
-        return [Observations(image, metres, way).with_origin(Origin.IMAGINED) for image, metres, way in frames]
 
 
 def open_house(settings: ImaginedSettings, starts: PosedFrames) -> tuple[WorldModel, TrajectoryInfo]:

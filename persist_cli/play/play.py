@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from persist_cli.api.actions import Action
-from persist_cli.api.backbone import Backbone, Sampling
+from persist_cli.api.backbone import Sampling
 from persist_cli.api.observations import Observations, Origin, Trajectory, TrajectoryInfo
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
@@ -26,6 +26,7 @@ from persist_cli.play.settings import GROWTH, GroundPose, PlaySettings, Shown
 from persist_cli.play.surveyor import Surveyor
 from persist_cli.play.walkers import Ahead, Pose, Walkers
 from persist_cli.plugins import make_cost
+from persist_cli.rollout.clip_lengths import makes_clips
 from persist_cli.rollout.world_model import WorldModel
 
 THOUGHT: Final = 1  # what is imagined ahead is as long as this clip under newly held keys, counted from 0
@@ -360,7 +361,7 @@ class Play:
         longest = settings.clip_frames or backbone.frames_per_clip
         if longest != backbone.frames_per_clip:
             backbone.check_clip_frames(longest)
-        shorter = [frames for frames in GROWTH if frames < longest and _can_make(backbone, frames)]
+        shorter = [frames for frames in GROWTH if frames < longest and makes_clips(backbone, frames)]
         return (*shorter * settings.growing, longest)
 
     def _take(self, ahead: Ahead, begun: float) -> Shown:
@@ -399,12 +400,3 @@ class Play:
     @staticmethod
     def _sampling(world: WorldModel, settings: PlaySettings) -> Sampling:
         return dataclasses.replace(world.sampling, steps=settings.steps, memory_guidance=settings.guidance)
-
-
-def _can_make(backbone: Backbone, frames: int) -> bool:
-    """Return whether a model can make clips of so many frames."""
-    try:
-        backbone.check_clip_frames(frames)
-    except PersistError:
-        return False
-    return True

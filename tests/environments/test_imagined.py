@@ -45,8 +45,8 @@ def test_a_step_shows_what_the_world_model_imagines(settings, persist, voxel, wa
     for action, name in ((1, "left"), (0, "forward"), (2, "right")):
         seen = env.step(action)[0]
         (expected,) = world.step([[name]])
-        assert np.abs(seen["rgb"] - expected.seen.rgb[0].numpy().astype(int)).max() <= 1  # the other frames are not
-        assert np.allclose(seen["depth"], expected.seen.depth[0].numpy(), rtol=1e-3)  # decoded: sums round otherwise
+        assert np.array_equal(seen["rgb"], expected.seen.rgb[0].numpy())
+        assert np.array_equal(seen["depth"], expected.seen.depth[0].numpy())
 
 
 def test_a_memory_file_is_the_same_as_the_frames_that_it_was_made_of(settings, persist, voxel, walks, tmp_path):
@@ -104,6 +104,17 @@ def test_a_chunk_of_actions_is_seen_as_one_clip(settings):
     env.reset(seed=0)
     env.step(np.array([1, 1, 0]))
     assert env.unwrapped.scenes._agents[0].clips == 1
+
+
+@pytest.mark.parametrize(("chunk", "asked", "frames"), [(1, None, 2), (3, None, 4), (20, None, 9), (1, 5, 5)])
+def test_clips_are_no_longer_than_a_step_needs_unless_asked_for(packaged, chunk, asked, frames):
+    env = gymnasium.make(**packaged, chunk=chunk, clip_frames=asked).unwrapped
+    assert env.scenes.world.clip_frames == frames
+
+
+def test_clips_that_the_model_cannot_make_are_refused_in_one_line(packaged):
+    with pytest.raises(PersistError, match=r"^clips of 10 frames, .* makes clips of 2 to 9 frames$"):
+        gymnasium.make(**packaged, clip_frames=10)
 
 
 def test_a_vector_is_equal_to_single_environments_with_its_seeds(settings):
