@@ -23,14 +23,18 @@ SAMPLINGS: dict[str, dict[str, Any]] = {
     "1 step, no guidance": {"steps": 1, "memory_guidance": 1.0},
 }
 
-SHAPES = {"1": (1, 1), "8": (8, 1), "8, chunk 8": (8, 8)}  # environments, and actions of a step
+SHAPES: dict[str, dict[str, Any]] = {
+    "1": {"num_envs": 1},
+    "8": {"num_envs": 8},
+    "8, clips of 9 frames": {"num_envs": 8, "clip_frames": 9},
+    "8, chunk 8": {"num_envs": 8, "chunk": 8},
+}
 
 
-def actions_a_second(sampling: dict[str, Any], count: int, chunk: int) -> float:
+def actions_a_second(sampling: dict[str, Any], shape: dict[str, Any]) -> float:
     """Actions of all environments in a second of the processor."""
-    envs = gymnasium.make_vec(
-        "persist/ImaginedHouse-v0", num_envs=count, chunk=chunk, sampling=sampling, max_episode_steps=100, **HOUSE
-    )
+    envs = gymnasium.make_vec("persist/ImaginedHouse-v0", sampling=sampling, max_episode_steps=100, **HOUSE, **shape)
+    count, chunk = shape["num_envs"], shape.get("chunk", 1)
     envs.action_space.seed(0)
     envs.reset(seed=0)
     envs.step(envs.action_space.sample())  # the first call prepares
@@ -44,9 +48,9 @@ def actions_a_second(sampling: dict[str, Any], count: int, chunk: int) -> float:
 def main() -> None:
     """Print a line of JSON for each sampling."""
     torch.set_num_threads(1)
-    for name, sampling in SAMPLINGS.items():
-        rates = {shape: round(actions_a_second(sampling, *sizes), 1) for shape, sizes in SHAPES.items()}
-        print(json.dumps({"sampling": name, "actions a second": rates}), flush=True)
+    for label, sampling in SAMPLINGS.items():
+        rates = {name: round(actions_a_second(sampling, shape), 1) for name, shape in SHAPES.items()}
+        print(json.dumps({"sampling": label, "actions a second": rates}), flush=True)
 
 
 if __name__ == "__main__":
