@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
+import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -65,6 +67,12 @@ app.add_typer(scenes_app)
 app.add_typer(viewing_app)
 
 
+@functools.cache
+def commands() -> Any:
+    """The commands as click knows them, which typer makes of the signatures."""
+    return typer.main.get_command(app)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; an error that the user can mend is printed in one line and ends with exit code 1.
 
@@ -72,11 +80,9 @@ def main(arguments: list[str] | None = None) -> None:
     """
     limit_spinning(os.environ)
     try:
-        app(args=arguments)
+        commands()(args=arguments)
     except PersistError as error:
         if os.environ.get(TRACEBACK):
-            import traceback
-
             traceback.print_exc()
         typer.secho(f"error: {error}", fg=typer.colors.RED, err=True)
         sys.exit(1)

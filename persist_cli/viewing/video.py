@@ -69,7 +69,9 @@ def write_video(path: Path, video: Iterable[UInt8[Tensor, "height width 3"]], fr
     import av
 
     with written_aside(path) as aside, av.open(str(aside), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=Fraction(frames_per_second), options={"crf": "18"})
+        stream = container.add_stream(
+            "libx264", rate=Fraction(frames_per_second), options={"crf": "18", "preset": "veryfast"}
+        )
         stream.pix_fmt = "yuv420p"
         for number, picture in enumerate(video):
             image = enlarge(picture[None])[0]

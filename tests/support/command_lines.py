@@ -6,9 +6,7 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-import typer.main
-
-from persist_cli.cli.app import app
+from persist_cli.cli.app import commands
 
 
 def parse_line(line: str) -> dict[str, Any]:
@@ -21,7 +19,7 @@ def parse_line(line: str) -> dict[str, Any]:
 
 def parse_words(words: Sequence[str]) -> dict[str, Any]:
     """The same for words; what ends the parsing of a command, such as ``--help``, ends it here, too."""
-    command: Any = typer.main.get_command(app)
+    command: Any = commands()
     rest = [*words]
     while rest and hasattr(command, "commands") and not rest[0].startswith("-"):
         command = command.commands[rest.pop(0)]
