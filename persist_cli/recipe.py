@@ -96,8 +96,9 @@ class Recipe:
 
     Args:
         stage: what is trained: ``codec`` (the VAE), ``1`` (the video model), ``2`` (a memory adapter, all else
-            frozen), ``policy`` (an agent that acts in the model, by itself), ``scene-codec`` or ``scene`` (a model that
-            imagines scenes: the codec of its cells, and then the rest).
+            frozen), ``policy`` (an agent that acts in the model, by itself), ``scene-codec``, ``scene`` or
+            ``scene-outcome`` (a model that imagines scenes: the codec of its cells, what fills them, and what
+            interactions change).
         description: one line for ``persist recipes``.
         chosen_on: the data on which its settings were chosen, as in ``20 houses of the split validation``, for readers
             of its figures; empty where that is not known.
@@ -113,7 +114,7 @@ class Recipe:
         adversarial: train against a discriminator that tells predicted clips from true ones, for few denoising steps
             with less blur; stages 1 and 2 only.
         policy: the policy, stage policy only.
-        scene: the model of scenes, stages scene-codec and scene only.
+        scene: the model of scenes, its three stages only.
         data: the clips.
         training: steps, batch, optimizer and what else decides how long and how it is trained.
     """
@@ -378,7 +379,7 @@ def _of_a_network(recipe: Recipe) -> list[str]:
     if (kind == "policy") != (recipe.policy is not None):
         return ["stage policy needs policy, as in policy: {name: nomad}; the other stages do not take it"]
     if (kind == "scene") != (recipe.scene is not None):
-        return ["stages scene-codec and scene need scene, as in scene: {name: scene}; the others do not take it"]
+        return [f"stages {', '.join(SCENE_STAGES)} need scene, as in scene: {{name: scene}}; the others do not take it"]
     if kind is None:
         return []
     data, allowed = recipe.data, DataSettings(**{key: getattr(recipe.data, key) for key in DATA_OF[kind]})
@@ -386,8 +387,9 @@ def _of_a_network(recipe: Recipe) -> list[str]:
     wrong += [f"data.{key}" for key, value in vars(allowed).items() if getattr(data, key) != value]
     wrong += [f"training.{key}" for key in OF_A_BACKBONE if getattr(recipe.training, key) not in (False, "no")]
     problems = [f"stage {recipe.stage} takes no {', '.join(wrong)}; leave them out"] if wrong else []
-    if recipe.stage == "scene" and recipe.base is None:
-        problems.append("stage scene needs base: the scene-codec run it stands on")
+    if recipe.stage in SCENE_STAGES[1:] and recipe.base is None:
+        before = SCENE_STAGES[SCENE_STAGES.index(recipe.stage) - 1]
+        problems.append(f"stage {recipe.stage} needs base: the {before} run it stands on")
     return problems
 
 

@@ -71,6 +71,7 @@ SHORTER = {
 REPLACED = {
     "--scenes 0:200": "--scenes 0:2",
     "--scenes 0:20": "--scenes 0:2",
+    "--scenes 3000:3300 --frames 48": "--scenes 3000:3003 --frames 32",
     "--episodes runs/episodes.json --out runs/learn": "--patience 1 --episodes runs/episodes.json --out runs/learn",
     "--bins 8,16 --each 4": "--bins 8 --each 1",
     "--scenes 0:48 --each 16": "--scenes 0:2 --bins 8 --each 1",

@@ -136,7 +136,7 @@ class SceneModel(nn.Module, ABC):
 
         Args:
             samples: a batch with true classes and colours.
-            stage: ``scene-codec`` or ``scene``.
+            stage: ``scene-codec``, ``scene`` or ``scene-outcome``.
         """
 
     @abstractmethod
@@ -160,6 +160,18 @@ class SceneModel(nn.Module, ABC):
         What is lost on the way no sample can have.
         """
         return classes, colors
+
+    def outcome(
+        self, samples: SceneSamples
+    ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]] | None:
+        """Return classes and colours of windows after the interactions, ``None`` where only ``sample`` says it.
+
+        Cells that do not change come out as they went in.
+
+        Args:
+            samples: windows with ``Given.PAST`` cells; the pose is that of the agent that acts, and there is no view.
+        """
+        return None
 
     @abstractmethod
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:

@@ -10,9 +10,9 @@ import torch
 from pydantic import Field
 from torch import nn
 
-Stage = Literal["codec", "1", "2", "policy", "scene-codec", "scene"]  # of a backbone, a policy, a model of scenes
+Stage = Literal["codec", "1", "2", "policy", "scene-codec", "scene", "scene-outcome"]
 STAGES: tuple[Stage, ...] = ("codec", "1", "2")  # of a backbone
-SCENE_STAGES: tuple[Stage, ...] = ("scene-codec", "scene")  # of a model of scenes
+SCENE_STAGES: tuple[Stage, ...] = ("scene-codec", "scene", "scene-outcome")  # of a model of scenes
 
 
 @dataclass(frozen=True)

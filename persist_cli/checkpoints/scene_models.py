@@ -67,7 +67,7 @@ class TrainedSceneModel:
         """
         self._check_stage()
         model = make_scene_model(self.plugin, self.settings)
-        self.load_into(model, "scene")
+        self.load_into(model, self.stage)
         return model.eval()
 
     def load_into(self, model: SceneModel, stage: Stage) -> None:
@@ -80,7 +80,7 @@ class TrainedSceneModel:
         model.load(self.folder, stage)
 
     def _check_stage(self) -> None:
-        if self.stage != "scene":
+        if self.stage == "scene-codec":
             raise CheckpointError(f"{self.folder}: the codec of a model of scenes alone; train the rest: {TRAIN}")
 
 

@@ -307,6 +307,15 @@ class SceneSampleDataset(Dataset[SceneSamples]):
             self._interactions[file.path] = interactions_of(file)
         return self._interactions[file.path]
 
+    def check_interactions(self) -> None:
+        """Raise ``DataError`` when no trajectory has an interaction that the form knows."""
+        known = self.form.actions
+        if not any(event.action in known for file in self.files for event in self.interactions(file)):
+            where = " and ".join(dict.fromkeys(str(file.path.parent) for file in self.files))
+            raise DataError(
+                f"{where}: nobody does {', '.join(known)} there; `persist collect miniworld --policy interact` does"
+            )
+
     def carried(self, file: TrajectoryFile, frame: int) -> Carried:
         """What the agent carries at a frame: what vanished from its place when it was picked up."""
         handled = [

@@ -254,6 +254,8 @@ def prepare_scene_model(recipe: Recipe, run: Path) -> tuple[SceneModel, Training
     begun = find_scene_model(steps[-1] if steps else str(recipe.base))
     if begun.plugin != recipe.scene.name:
         raise RecipeError(f"base {recipe.base} is a model of scenes {begun.plugin!r}, not {recipe.scene.name!r}")
+    if begun.stage == "scene-codec" and recipe.stage == "scene-outcome":
+        raise RecipeError(f"base {recipe.base} is the codec of a model of scenes alone; name a run of stage scene")
     begun.load_into(model, min(begun.stage, recipe.stage, key=SCENE_STAGES.index))
     return model, begun.training_scenes or TrainingScenes(complete=False)
 
@@ -330,6 +332,8 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
     data = " ".join(f"--data {folder}" for folder in recipe.data.path)
     if recipe.stage == "scene-codec":
         return f"persist finetune {name.removesuffix('-codec')} {data} base={run}"
+    if recipe.stage == "scene-outcome":
+        return f"persist bench scene {run} --data HELD_OUT_DATA --parts evolution --out runs/bench-evolution"
     if recipe.stage == "scene":
         return f"persist bench scene {run} --data HELD_OUT_DATA --train {recipe.data.path[0]} --out runs/bench-scene"
     if recipe.distill is not None and recipe.stage == "1":

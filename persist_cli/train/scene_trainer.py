@@ -19,6 +19,10 @@ from persist_cli.train.training_loop import TrainingLoop
 # a codec sees the true cells alone, and samples of a single frame are read fastest
 WHOLE_CELLS: Final = SampleShares(frame=1, walk=0, grown=0, interaction=0)
 
+ACTING: Final = SampleShares(frame=0, walk=0, grown=0, interaction=1)  # what becomes of cells by interactions
+
+SHARES: Final = {"scene-codec": WHOLE_CELLS, "scene-outcome": ACTING}  # of stages that are trained on some kinds alone
+
 
 class SceneTrainer(TrainingLoop[SceneModel]):
     """Trains a stage of a model of scenes.
@@ -45,8 +49,9 @@ class SceneTrainer(TrainingLoop[SceneModel]):
         super().__init__(recipe, accelerator)
         folders = [data_folder(path) for path in recipe.data.path]
         kept = None if cache is None else TensorCache(cache)
-        shares = WHOLE_CELLS if recipe.stage == "scene-codec" else None
-        samples = SceneSampleDataset(folders, model.form, recipe.training.seed, shares, kept)
+        samples = SceneSampleDataset(folders, model.form, recipe.training.seed, SHARES.get(recipe.stage), kept)
+        if recipe.stage == "scene-outcome":
+            samples.check_interactions()
         self.dataset = samples
         self.scenes = scenes | TrainingScenes(frozenset(trained_scene(file.info) for file in samples.files))
         self.prepare(model, model.trained_parameters(recipe.stage))

@@ -7,6 +7,7 @@ from persist_cli.api.actions import walking_actions
 from persist_cli.api.cells import FREE, SOLID, CellOrigin
 from persist_cli.api.ground import Body
 from persist_cli.api.scene_edits import Remove
+from persist_cli.api.scene_model import Given
 from persist_cli.errors import CheckpointError
 from persist_cli.memorize.memory_file import load_memory
 from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, FORM, WALL, camera_at, cell_room
@@ -194,6 +195,33 @@ def test_what_the_codec_alone_does_to_colours_is_no_change(stance):
     before = int((scene.cells.origins == CellOrigin.IMAGINED).sum())
     assert do(scene, "pick_up", stance)
     assert int((scene.cells.origins == CellOrigin.IMAGINED).sum()) == before + 1
+
+
+def test_a_model_that_was_trained_on_interactions_says_itself_what_changes_from_where_the_agent_stands():
+    poses = []
+
+    class Knowing(DrawnWalls):
+        """Takes away what the rules of ``DrawnWalls`` do, and never samples."""
+
+        def outcome(self, samples):
+            poses.append(samples.window_from_camera[0])
+            picked = (samples.action == 1)[:, None, None, None]
+            taken = (samples.given == Given.PAST) & (samples.classes == BOX) & picked
+            return torch.where(taken, FREE, samples.classes), samples.colors * ~taken[..., None]
+
+        def sample(self, samples, steps):
+            raise AssertionError("nothing has to be drawn")
+
+    scene = furnished(Knowing(), evolution="model")
+    scene.write(rendering(cell_room(), camera_at(cell_room(), *BEFORE_TABLE)))  # seen from elsewhere
+    scene.add(cell_room())
+    before = int((scene.cells.origins == CellOrigin.IMAGINED).sum())
+    assert do(scene, "pick_up")
+    assert int(classes(scene)[BOX_CELLS]) == FREE
+    assert int((scene.cells.origins == CellOrigin.IMAGINED).sum()) == before + 1
+    [pose] = poses
+    assert pose[:3, 2].tolist() == pytest.approx([1, 0, 0], abs=1e-6)  # it looks along the first axis of its window
+    assert not do(scene, "toggle", BEFORE_TABLE)
 
 
 def test_what_the_codec_loses_stays_as_it_is():

@@ -13,9 +13,11 @@ from persist_cli.api.scene_model import SceneSamples
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors
+from tests.support.cell_houses import FORM, write_cell_houses, write_interactions
 from tests.support.micro_runs import equal_runs, losses, run_persist
 from tests.support.micro_scenes import MICRO_SCENE, micro_samples, scene_stage, write_scenes
 
+PALETTE, CLASSES = "scene.settings.palette", json.dumps(list(FORM.palette))  # of houses with interactions
 KEPT = ("training.checkpoint_every=2", "training.keep_checkpoints=9")
 
 
@@ -27,9 +29,17 @@ def scenes(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def runs(scenes, tmp_path_factory):
-    """A run of each stage."""
-    folder = tmp_path_factory.mktemp("runs")
+def acted(tmp_path_factory):
+    """Houses in which an agent interacts."""
+    return write_interactions(tmp_path_factory.mktemp("data") / "acted", [(5, 10, 1), (5, 11, 1)])
+
+
+@pytest.fixture(scope="module")
+def runs(scenes, acted, tmp_path_factory):
+    """A run of each stage, and those of other classes of which the third stage is trained."""
+    folder, classes = tmp_path_factory.mktemp("runs"), f"{PALETTE}={CLASSES}"
+    run_persist(*scene_stage("tiny-scene-codec", acted, folder / "acting-codec", classes))
+    run_persist(*scene_stage("tiny-scene", acted, folder / "acting", f"base={folder / 'acting-codec'}", classes))
     run_persist(*scene_stage("tiny-scene-codec", scenes, folder / "codec", *KEPT))
     run_persist(*scene_stage("tiny-scene", scenes, folder / "scene", f"base={folder / 'codec'}", *KEPT))
     return folder
@@ -124,6 +134,45 @@ def test_what_means_nothing_to_a_model_of_scenes_is_refused_before_anything_is_w
     assert message in ended.err
     assert len(ended.err.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_the_third_stage_learns_interactions_and_keeps_what_it_stands_on(persist, acted, runs, tmp_path):
+    kept, base = ("training.checkpoint_every=2", "training.keep_checkpoints=9"), f"base={runs / 'acting'}"
+    words = [base, *kept, f"{PALETTE}={CLASSES}"]
+    ended = persist(*scene_stage("houses-64-scene-outcome", acted, tmp_path / "run", *words))
+    assert ended.code == 0, ended.err
+    assert "--parts evolution" in ended.out
+    found = find_scene_model(tmp_path / "run")
+    assert found.stage == "scene-outcome"
+    assert found.load().knows_outcomes
+    assert {"change", "kind", "missed"} < set(json.loads(first_line(tmp_path / "run")))
+    for name in ("codec", "transformer"):
+        one, other = (read_tensors(find_scene_model(run).folder / f"{name}.safetensors")[0]
+                      for run in (tmp_path / "run", runs / "acting"))  # fmt: skip
+        assert all(one[key].equal(value) for key, value in other.items())
+    shutil.copytree(tmp_path / "run", tmp_path / "halves")
+    shutil.rmtree(tmp_path / "halves/step-00000004")
+    ended = persist(*scene_stage("houses-64-scene-outcome", acted, tmp_path / "halves", *words, "--resume"))
+    assert ended.code == 0, ended.err
+    assert equal_runs(tmp_path / "run", tmp_path / "halves")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("null", True, "stage scene-outcome needs base: the scene run it stands on"),
+        ("acting-codec", True, "is the codec of a model of scenes alone; name a run of stage scene"),
+        ("acting", False, "nobody does pick_up, drop, toggle there; `persist collect miniworld --policy"),
+    ],
+)
+def test_the_third_stage_needs_a_whole_model_and_interactions(persist, acted, runs, tmp_path, case):
+    name, interactive, message = case
+    folder = acted if interactive else write_cell_houses(tmp_path / "still", [6], size=16, frames=4)
+    base = f"base={name if name == 'null' else runs / name}"
+    classes = f"{PALETTE}={CLASSES}"
+    ended = persist(*scene_stage("houses-64-scene-outcome", folder, tmp_path / "run", base, classes))
+    assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
+    assert message in ended.err
 
 
 def test_data_without_cells_are_refused(persist, walks, tmp_path):

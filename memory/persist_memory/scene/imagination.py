@@ -176,12 +176,46 @@ class Imagination:
             given, classes, colors, rgb, depth, turned.pose(pose, form), matrix, torch.tensor(action),
             torch.tensor(self.carried.kind), self.carried.color.cpu(), number,
         )  # fmt: skip
-        device = next(self.model.parameters()).device
+        device = self.device
         with torch.inference_mode():
             drawn = self.model.sample(SceneSamples.stack([sample.to("cpu")]).to(device), self.steps)
         here = window.classes.device
         classes, colors = (turned.back(part[0]).to(here) for part in drawn)
         return classes.clone(), colors.clone()
+
+    def outcome(
+        self, window: CellGrid, past: Bool[Tensor, "first second level"], action: int, pose: Float[Tensor, "4 4"]
+    ) -> CellGrid | None:
+        """Return a window after an interaction, ``None`` where the model does not say it but by ``sample``.
+
+        Args:
+            window: a box of the model's shape.
+            past: the cells that may change.
+            action: 1 + the number of the interaction.
+            pose: world_from_camera of the agent.
+        """
+        form = self.model.form
+        rgb, depth, _, matrix = no_view(form)
+        pose = window_pose(window, pose.cpu())
+        turned = Turn.ahead(pose, form.shape)
+        given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING))
+        given = torch.where(past, int(Given.PAST), given).to(torch.uint8)
+        given, classes, colors = (turned.cells(part) for part in (given, window.classes, window.colors))
+        sample = SceneSamples(
+            given, classes, colors, rgb, depth, turned.pose(pose, form).float(), matrix, torch.tensor(action),
+            torch.tensor(self.carried.kind), self.carried.color.cpu(), torch.tensor(0),
+        )  # fmt: skip
+        with torch.inference_mode():
+            said = self.model.outcome(SceneSamples.stack([sample.to("cpu")]).to(self.device))
+        if said is None:
+            return None
+        classes, colors = (turned.back(part[0]).to(window.classes.device).clone() for part in said)
+        return replace(window, classes=classes, colors=colors)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return next(self.model.parameters()).device
 
     def coded(self, window: CellGrid, drawn: CellGrid) -> CellGrid:
         """Return a window as the model's codec holds it, in which small things may be lost and colours are dull.
@@ -194,7 +228,7 @@ class Imagination:
         classes = torch.where(window.known & ~unnamed, window.classes, drawn.classes)
         colors = torch.where(window.known[..., None], window.colors, drawn.colors)
         turned = Turn.ahead(self._seen(window)[2], self.model.form.shape)  # the codec sees what ``sample`` lets it see
-        device = next(self.model.parameters()).device
+        device = self.device
         told = (turned.cells(part)[None].to(device) for part in (classes, colors))
         with torch.inference_mode():
             held = self.model.reconstruct(*told)
@@ -305,9 +339,9 @@ def evolved(
 ) -> CellGrid | None:
     """Return a window after an interaction, as the model says, or ``None`` when it says that nothing changes.
 
-    The model is given the known cells in reach as what they were before, and all other known ones as they are. What it
-    says is compared with what its codec makes of the cells before. So what the codec loses is no change, and what it
-    does not hold the model cannot take away.
+    The model is given the known cells in reach as what they were before, and all other known ones as they are. Where it
+    has to draw the cells afterwards, they are compared with what its codec makes of those before. So what the codec
+    loses is no change, and what it does not hold the model cannot take away.
 
     Raises:
         CheckpointError: when the model does not know this interaction.
@@ -316,19 +350,31 @@ def evolved(
     if action not in known:
         raise CheckpointError(f"the scene model knows the interactions {', '.join(known)}, not {action!r}")
     reach = cells_in_reach(window, world_from_camera) & window.known
+    number = 1 + known.index(action)
+    said = imagination.outcome(window, reach, number, world_from_camera)
+    if said is None:
+        said, differs = _drawn(imagination, window, reach, number, seed)
+    else:
+        differs = (said.classes != window.classes) | (said.colors != window.colors).any(-1)
+    if not bool(differs.any()):
+        return None
+    after = window.copy()
+    after.classes[differs] = said.classes[differs]
+    after.colors[differs] = said.colors[differs] * after.solid[differs][:, None]
+    after.origins[differs] = CellOrigin.IMAGINED
+    return after
+
+
+def _drawn(
+    imagination: Imagination, window: CellGrid, reach: Bool[Tensor, "first second level"], action: int, seed: int
+) -> tuple[CellGrid, Bool[Tensor, "first second level"]]:
+    """The window that the model draws after an action, and the cells in reach that the action changes by it."""
     given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING))
     given = torch.where(reach, int(Given.PAST), given).to(torch.uint8)
-    classes, colors = imagination.sample(window, given, 1 + known.index(action), seed)
+    classes, colors = imagination.sample(window, given, action, seed)
     after = replace(window, classes=classes, colors=colors)
     before = imagination.coded(window, after)
     other = (classes != before.classes) & (window.classes != SOLID)  # else it is only told what it is
     repainted = after.solid & before.solid & ((colors.int() - before.colors.int()).abs().amax(-1) > REPAINTED)
     differs = (after.solid != before.solid) | (after.solid & other) | repainted
-    differs &= reach & ((classes != window.classes) | repainted)
-    if not bool(differs.any()):
-        return None
-    after = window.copy()
-    after.classes[differs] = classes[differs]
-    after.colors[differs] = colors[differs] * after.solid[differs][:, None]
-    after.origins[differs] = CellOrigin.IMAGINED
-    return after
+    return after, differs & reach & ((classes != window.classes) | repainted)

@@ -216,14 +216,19 @@ def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
     return samples.true_classes, samples.true_colors
 
 
-def changed_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Bool[Tensor, "batch token"]:
-    """Return which tokens have a cell that the action truly changes."""
+def changed_cells(samples: SceneSamples) -> Bool[Tensor, "batch first second level"]:
+    """Return which cells the action truly changes; of ``SOLID`` ones only the class is told besides."""
     classes, colors = truth(samples)
     before, after = is_solid(samples.classes), is_solid(classes)
     other = (samples.classes != classes) & (samples.classes != SOLID)
     repainted = (samples.colors != colors).any(-1)
-    changed = (samples.given == Given.PAST) & ((before != after) | (after & (other | repainted)))
-    return ~every_cell(~changed, len(settings.divided), cells_of_a_token(settings)).flatten(1)
+    return (samples.given == Given.PAST) & ((before != after) | (after & (other | repainted)))
+
+
+def changed_tokens(samples: SceneSamples, settings: SceneDiffusionSettings) -> Bool[Tensor, "batch token"]:
+    """Return which tokens have a cell that the action truly changes."""
+    unchanged = ~changed_cells(samples)
+    return ~every_cell(unchanged, len(settings.divided), cells_of_a_token(settings)).flatten(1)
 
 
 def draw_levels(settings: SceneDiffusionSettings, generators: list[torch.Generator]) -> Float[Tensor, "batch token"]:

@@ -39,12 +39,21 @@ from persist_memory.scene_models.conditions import (
     shifted,
     truth,
 )
+from persist_memory.scene_models.outcome import Outcome
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 from persist_memory.scene_models.specks import least_cells, without_specks
 from persist_memory.scene_models.transformer import SceneTransformer
 
-CODEC, REST = "codec", ("given", "view", "action", "transformer")  # parts of the model, which the stages train
-FILES = {"scene-codec": "codec.safetensors", "scene": "transformer.safetensors"}
+PARTS: dict[Stage, tuple[str, ...]] = {  # of the model, which the stages train
+    "scene-codec": ("codec",),
+    "scene": ("given", "view", "action", "transformer"),
+    "scene-outcome": ("outcomes",),
+}
+FILES: dict[Stage, str] = {
+    "scene-codec": "codec.safetensors",
+    "scene": "transformer.safetensors",
+    "scene-outcome": "outcome.safetensors",
+}
 COMMONEST = (*COMMON, "floor", "ceiling", "wall")  # cells of all other classes, doors and things, are few
 
 
@@ -75,6 +84,7 @@ class SceneDiffusion(SceneModel):
         self.codec = SceneCodec(settings)
         self.given, self.view = GivenCells(settings), ViewTokens(settings)
         self.action, self.transformer = ActionEmbedding(settings), SceneTransformer(settings)
+        self.outcomes, self.knows_outcomes = Outcome(settings), False
         rare = [1.0 if name in COMMONEST else settings.codec.rare_weight for name in settings.palette]
         self.register_buffer("weights", torch.tensor(rare), persistent=False)
 
@@ -84,8 +94,10 @@ class SceneDiffusion(SceneModel):
         return self.settings.form
 
     def forward(self, samples: SceneSamples, stage: Stage) -> dict[str, Tensor]:
-        """Return the losses of the codec, or of the transformer on the codec's latents."""
+        """Return the losses of the codec, of the transformer on the codec's latents, or of what interactions change."""
         generators = generators_of(samples)
+        if stage == "scene-outcome":
+            return self.outcomes.loss(samples, generators)
         return self._code(samples, generators) if stage == "scene-codec" else self._diffuse(samples, generators)
 
     def _code(self, samples: SceneSamples, generators: list[torch.Generator]) -> dict[str, Tensor]:
@@ -247,6 +259,13 @@ class SceneDiffusion(SceneModel):
         return classes, torch.where(given[..., None], samples.colors, painted(classes, colors))
 
     @torch.no_grad()
+    def outcome(
+        self, samples: SceneSamples
+    ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]] | None:
+        """Return the windows after the interactions, if the model was trained on these; see ``SceneModel.outcome``."""
+        return self.outcomes.after(samples) if self.knows_outcomes else None
+
+    @torch.no_grad()
     def reconstruct(
         self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:
@@ -283,7 +302,7 @@ class SceneDiffusion(SceneModel):
     def trained_parameters(self, stage: Stage) -> dict[str, nn.Parameter]:
         """Freeze all parameters that the stage does not train, and return the others by name."""
         self.requires_grad_(False)
-        for name in (CODEC,) if stage == "scene-codec" else REST:
+        for name in PARTS[stage]:
             self.get_submodule(name).requires_grad_(True)
         return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
 
@@ -291,27 +310,28 @@ class SceneDiffusion(SceneModel):
         """Return the parameters by the parts of the model."""
         return [
             ParameterGroup(part, {f"{part}.{name}": value for name, value in module.named_parameters()})
-            for part, module in ((part, self.get_submodule(part)) for part in (CODEC, *REST))
+            for part, module in ((part, self.get_submodule(part)) for parts in PARTS.values() for part in parts)
         ]
 
     def save(self, folder: Path, stage: Stage) -> None:
-        """Write the codec, and after its stage the rest, each into a safetensors file."""
+        """Write the parts of the stages up to this one, those of each into a safetensors file."""
         for trained in stages_to(stage):
             write_tensors(folder / FILES[trained], self._tensors_of(trained))
 
     def load(self, folder: Path, stage: Stage) -> None:
-        """Load the codec, and for the last stage the rest."""
+        """Load the parts of the stages up to this one."""
         for trained in stages_to(stage):
             path = folder / FILES[trained]
             tensors = read_tensors(path)[0]
             if trained == "scene-codec":  # those of earlier versions say nothing of specks, and keep them
                 tensors.setdefault("codec.least_cells", torch.ones(len(self.settings.palette)))
             load_exactly(self, tensors, set(self._tensors_of(trained)), path)
+        self.knows_outcomes = stage == "scene-outcome"
         if self.weights.is_meta:
             self.weights = type(self)(self.settings).weights
 
     def _tensors_of(self, stage: Stage) -> dict[str, Tensor]:
-        parts = (CODEC,) if stage == "scene-codec" else REST
+        parts = PARTS[stage]
         return {name: tensor for name, tensor in self.state_dict().items() if name.partition(".")[0] in parts}
 
 

@@ -90,6 +90,23 @@ class TransformerSettings:
 
 
 @dataclass(frozen=True)
+class OutcomeSettings:
+    """The sizes of the network that says what interactions change.
+
+    Args:
+        embedding: channels of a cell's class.
+        width: channels of a cell.
+        blocks: residual blocks, each of which sees two cells farther.
+        drop_action: share of the training samples that are not told the action, so that it is known what that is worth.
+    """
+
+    embedding: Positive = 8
+    width: Positive = 32
+    blocks: Positive = 2
+    drop_action: Share = 0.1
+
+
+@dataclass(frozen=True)
 class SamplingSettings:
     """How windows are sampled.
 
@@ -119,6 +136,7 @@ class SceneDiffusionSettings:
         actions: names of the interactions that it knows.
         codec: the codec.
         transformer: the transformer.
+        outcome: the network that says what interactions change.
         sampling: how windows are sampled.
     """
 
@@ -129,6 +147,7 @@ class SceneDiffusionSettings:
     actions: tuple[str, ...] = ("pick_up", "drop", "toggle")
     codec: CodecSettings = field(default_factory=CodecSettings)
     transformer: TransformerSettings = field(default_factory=TransformerSettings)
+    outcome: OutcomeSettings = field(default_factory=OutcomeSettings)
     sampling: SamplingSettings = field(default_factory=SamplingSettings)
 
     def __post_init__(self) -> None:

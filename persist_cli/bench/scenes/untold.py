@@ -40,6 +40,12 @@ class Untold(SceneModel):
         """Return what the other model draws without actions."""
         return self.model.sample(without_action(samples), steps)
 
+    def outcome(
+        self, samples: SceneSamples
+    ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]] | None:
+        """Return what the other model says without actions."""
+        return self.model.outcome(without_action(samples))
+
     def reconstruct(
         self, classes: UInt8[Tensor, "batch first second level"], colors: UInt8[Tensor, "batch first second level 3"]
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]]:

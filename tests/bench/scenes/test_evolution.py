@@ -83,6 +83,10 @@ def test_the_control_is_not_told_that_somebody_picks_up() -> None:
     acting = replace(samples, action=torch.ones_like(samples.action), classes=boxes, given=past)
     assert (model.sample(acting, 1)[0] == FREE).all()
     assert (Untold(model).sample(acting, 1)[0] == BOX).all()
+    model.outcome = lambda told: (told.action, told.classes)  # type: ignore[method-assign]
+    told = Untold(model).outcome(acting)
+    assert told is not None
+    assert (told[0] == 0).all()
     assert Untold(model).form == model.form
 
 
