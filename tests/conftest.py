@@ -34,9 +34,9 @@ DIFFUSERS_MARKERS = (  # of diffusers' own tests, which test_diffusers_mixins ru
 )  # fmt: skip
 
 
-LONGEST = (  # files that take minutes begin first, so that none is left to one process at the end
-    "test_documented_commands.py", "test_processes.py", "test_doctor.py", "test_without_extras.py", "test_collect.py",
-    "test_finetune.py", "test_measured.py", "test_reference_model.py", "test_bundled.py",
+LONGEST = (  # files that take a minute or more begin first, so that none is left to one process at the end
+    "test_documented_commands.py", "test_doctor.py", "test_processes.py", "test_finetune.py", "test_collect.py",
+    "test_without_extras.py", "test_memory_savings.py", "test_plan_bench.py", "test_pipeline.py", "test_bundled.py",
 )  # fmt: skip
 
 
