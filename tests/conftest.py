@@ -6,12 +6,15 @@ import json
 import os
 import signal
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from persist_cli.train.log import StepLog
 from tests.support.cell_houses import FORM, write_cell_houses
 from tests.support.micro_policies import policy_stage
 from tests.support.micro_runs import MICRO_SETTINGS, run_persist, stage, write_loops, write_walks
@@ -31,9 +34,9 @@ DIFFUSERS_MARKERS = (  # of diffusers' own tests, which test_diffusers_mixins ru
 )  # fmt: skip
 
 
-LONGEST = (  # files that take minutes begin first, so that none is left to one process at the end
-    "test_documented_commands.py", "test_processes.py", "test_doctor.py", "test_without_extras.py", "test_collect.py",
-    "test_finetune.py", "test_measured.py", "test_reference_model.py", "test_bundled.py",
+LONGEST = (  # files that take a minute or more begin first, so that none is left to one process at the end
+    "test_documented_commands.py", "test_doctor.py", "test_processes.py", "test_finetune.py", "test_collect.py",
+    "test_without_extras.py", "test_memory_savings.py", "test_plan_bench.py", "test_pipeline.py", "test_bundled.py",
 )  # fmt: skip
 
 
@@ -100,6 +103,40 @@ def fresh_accelerator() -> Iterator[None]:
     AcceleratorState._reset_state(reset_partial_state=True)
     yield
     AcceleratorState._reset_state(reset_partial_state=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def draw_loss() -> Iterator[Callable[[StepLog, Path], None]]:
+    """What draws the loss of a run, which few tests look at: for others the file is made empty."""
+    drawn = StepLog.draw
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StepLog, "draw", lambda self, path: path.touch())
+        yield drawn
+
+
+class HereExecutor(Executor):
+    """Runs what is submitted at once and in this process, where a new worker would import for seconds."""
+
+    def __init__(self, _workers: int, _context: Any, initializer: Callable[..., None], initargs: tuple[Any, ...]):
+        initializer(*initargs)
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+        """Run a function; its result or error."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*arguments, **options))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture
+def collecting_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let ``persist collect`` walk in this process."""
+    from persist_cli.simulators import collect
+
+    monkeypatch.setattr(collect, "ProcessPoolExecutor", HereExecutor)
+    monkeypatch.setattr(collect, "_worker", {})
 
 
 @pytest.fixture(scope="session")

@@ -20,17 +20,16 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import torch
 import yaml
 
-from persist_cli.api.half_precision import is_slow
 from persist_cli.data.reference import sample_data
 from persist_cli.errors import PluginError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.plugins import make_simulator
+from persist_cli.train.log import StepLog
 from tests.support.command_lines import parse_words
 from tests.support.documented import Block, commands, read_blocks, run_here, shown_commands, shows
-from tests.support.micro_runs import write_walks
+from tests.support.micro_runs import IN_FLOAT32, write_walks
 from tests.support.predictions import cache_random
 from tests.support.rooms import write_sequence
 from tests.support.text_encoder import write_text_encoder
@@ -44,9 +43,6 @@ SLOW = {"tutorial"}  # pages that take longer than a minute
 
 LANGUAGES = {"bash", "console", "python", "toml", "yaml", "json", "text", "bibtex"}
 
-# steps in half precision take 50 times as long on processors without instructions for it
-IN_FLOAT32 = ("training.precision=no", "training.frozen_precision=no") if is_slow(torch.bfloat16) else ()
-
 # what is put in the place of large numbers: an option or setting that is given again wins
 SHORTER = {
     "finetune": (
@@ -54,7 +50,7 @@ SHORTER = {
         "training.cooldown=0", "data.clip_frames=[]",  # the small model's codec folds time, and it has one length
         *IN_FLOAT32,
     ),
-    "inspect": ("--pairs", "8"),
+    "inspect": ("--pairs", "4"),
     "rollout": ("--steps", "1"),
     "plan": ("--candidates", "5", "--rounds", "1"),
     "eval": ("--clips", "1", "--seeds", "1", "--steps", "1"),
@@ -62,7 +58,7 @@ SHORTER = {
     "view": ("--export", "shortened.html"),  # or it would not end
     "learn": (
         "--steps", "1", "--guidance", "1", "--walks", "3", "--actions", "24", "--rounds", "1", "--training-steps", "1",
-        "--proposals", "4",
+        "--proposals", "1",
         "--set", "training.batch=2", "--set", "training.workers=0",
     ),
 }  # fmt: skip
@@ -75,6 +71,7 @@ REPLACED = {
     "--episodes runs/episodes.json --out runs/learn": "--patience 1 --episodes runs/episodes.json --out runs/learn",
     "--bins 8,16 --each 4": "--bins 8 --each 1",
     "--scenes 0:48 --each 16": "--scenes 0:2 --bins 8 --each 1",
+    "right*6 forward right*6 forward*14": "right*6 forward*3",
     "--data DATA": "--data DATA backbone.settings.height=32 backbone.settings.width=32",  # as the walks in GIVEN
     "cogvideox-5b-i2v-stage1-lora --data": "cogvideox-5b-i2v-stage1-lora lora.rank=2 --data",
     "cogvideox-5b-i2v-stage2-voxel --data": "cogvideox-5b-i2v-stage2-voxel memory.encoder=patches "
@@ -117,8 +114,9 @@ SKETCHES = {
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collecting_here, draw_loss) -> Path:
     """A fresh working folder of a user, with a capture, data and a pretrained model in diffusers' layout."""
+    monkeypatch.setattr(StepLog, "draw", draw_loss)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PERSIST_REFERENCE", raising=False)  # pages use the packaged model
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))

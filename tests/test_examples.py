@@ -80,7 +80,7 @@ def test_a_memory_of_ones_own_works_in_every_command(installed, persist, walks, 
         assert ended.code == 0, ended.err
         return ended.out
 
-    run("inspect", walks)
+    run("inspect", walks, "--pairs", 8)
     run(*stage("stage2-voxel", walks, tmp_path / "last", f"base={stage1}", "memory.name=last"))
     run("memorize", f"{walks}#0:0-8", "--checkpoint", tmp_path / "last", "--out", tmp_path / "last.safetensors")
     way = ("--start", f"{walks}#0:8", "--actions", "left*2", "--steps", 2)
@@ -106,9 +106,9 @@ def test_a_policy_and_a_cost_of_ones_own_make_plans(installed, persist, walks, v
     assert "unknown key 'cell', did you mean 'cells'?" in refused.err
 
 
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
-def test_the_tests_of_a_package_pass(installed, package, tmp_path):
-    pytest_run = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", package / "tests"]
+def test_the_tests_of_the_packages_pass(installed, tmp_path):
+    options = ["-q", "-p", "no:cacheprovider", "--import-mode=importlib"]
+    pytest_run = [sys.executable, "-m", "pytest", *options, *(package / "tests" for package in PACKAGES)]
     ended = subprocess.run(pytest_run, capture_output=True, text=True, cwd=tmp_path, env=environment(installed))
     assert ended.returncode == 0, ended.stdout
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import typing
 from collections.abc import Mapping
@@ -45,9 +46,7 @@ def settings_of(kind: type, defaults: Mapping[str, Any] | None = None) -> list[S
         kind: the dataclass, whose docstring has a part ``Args``.
         defaults: plain values that stand in for the defaults of the fields.
     """
-    meanings, kinds = meanings_in(kind), typing.get_type_hints(kind, include_extras=True)
-    own = [field for field in dataclasses.fields(kind) if field.init]
-    return [_setting(field, kinds[field.name], meanings.get(field.name, ""), defaults or {}) for field in own]
+    return _read_settings(kind, defaults) if defaults else [*_own_settings(kind)]
 
 
 def meanings_in(kind: type) -> dict[str, str]:
@@ -68,6 +67,17 @@ def plain_setting(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: plain_setting(inner) for key, inner in value.items()}
     return [plain_setting(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+@functools.cache
+def _own_settings(kind: type) -> tuple[Setting, ...]:
+    return tuple(_read_settings(kind, {}))
+
+
+def _read_settings(kind: type, defaults: Mapping[str, Any]) -> list[Setting]:
+    meanings, kinds = meanings_in(kind), typing.get_type_hints(kind, include_extras=True)
+    own = [field for field in dataclasses.fields(kind) if field.init]
+    return [_setting(field, kinds[field.name], meanings.get(field.name, ""), defaults) for field in own]
 
 
 def _setting(field: dataclasses.Field[Any], kind: Any, meaning: str, defaults: Mapping[str, Any]) -> Setting:

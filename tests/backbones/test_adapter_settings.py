@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from tests.support.micro_model import CHANNELS, micro, with_adapter
 
@@ -27,25 +31,39 @@ SHARED_KEYS = {
 }  # fmt: skip
 
 
+Saved = Callable[[str], tuple[CogVideoX, Path]]
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
+    """A function that gives a backbone with an adapter of a form, and the folder that this was saved to."""
+
+    @functools.cache
+    def of(form: str) -> tuple[CogVideoX, Path]:
+        backbone, folder = with_adapter(micro(), form=form), tmp_path_factory.mktemp(form)
+        backbone.save_adapter(folder)
+        return backbone, folder
+
+    return of
+
+
 @pytest.mark.parametrize("form", FORM_KEYS)
-def test_every_adapter_form_has_exactly_the_settings_that_it_uses(form: str, tmp_path: Path) -> None:
-    with_adapter(micro(), form=form).save_adapter(tmp_path)
-    assert set(json.loads((tmp_path / "adapter.json").read_text())) == SHARED_KEYS | FORM_KEYS[form]
+def test_every_adapter_form_has_exactly_the_settings_that_it_uses(form: str, saved: Saved) -> None:
+    assert set(json.loads((saved(form)[1] / "adapter.json").read_text())) == SHARED_KEYS | FORM_KEYS[form]
 
 
 @pytest.mark.parametrize(
     ("form", "key"),
     [(form, key) for form in FORM_KEYS for key in sorted(set().union(*FORM_KEYS.values()) - FORM_KEYS[form])],
 )
-def test_a_setting_of_another_form_is_refused(form: str, key: str, tmp_path: Path) -> None:
-    backbone = with_adapter(micro(), form=form)
+def test_a_setting_of_another_form_is_refused(form: str, key: str, saved: Saved, tmp_path: Path) -> None:
+    backbone, folder = saved(form)
     with pytest.raises(RecipeError, match=f"^adapter 'other': unknown key '{key}'"):
         backbone.add_adapter("other", CHANNELS, {"form": form, key: 1})
-    backbone.save_adapter(tmp_path)
-    card = tmp_path / "adapter.json"
+    card = shutil.copytree(folder, tmp_path / "adapter") / "adapter.json"
     card.write_text(json.dumps(json.loads(card.read_text()) | {key: 1}))
     with pytest.raises(RecipeError, match=f"adapter.json: unknown key '{key}'"):
-        backbone.load_adapter("other", tmp_path)
+        backbone.load_adapter("other", card.parent)
 
 
 @pytest.mark.parametrize(

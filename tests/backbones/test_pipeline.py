@@ -1,5 +1,6 @@
 """The pipeline of diffusers' kind gives its backbone's clips with every feature that diffusers' users expect."""
 
+import functools
 from pathlib import Path
 
 import accelerate
@@ -89,15 +90,16 @@ def test_in_bfloat16_a_clip_comes_out_near_that_of_float32(form):
 @pytest.mark.parametrize("settings", [{}, FRAMEWISE], ids=["4 frames a latent", "framewise"])
 @FORMS
 def test_offloaded_weights_change_no_result(form, settings):
-    exact = call(WorldPipeline.of(trained(form, **settings)))
+    once = functools.partial(call, num_inference_steps=1)
+    exact = once(WorldPipeline.of(trained(form, **settings)))
     whole, layers = (WorldPipeline.of(trained(form, **settings)) for _ in range(2))
     whole.enable_model_cpu_offload(device="cpu")  # with all hooks, but to the same device
-    assert same(call(whole), exact)
-    assert same(call(whole), exact)
+    assert same(once(whole), exact)
+    assert same(once(whole), exact)
     for part in layers.components.values():
         if isinstance(part, torch.nn.Module):
             accelerate.cpu_offload(part, "cpu")  # like enable_sequential_cpu_offload, which takes no device "cpu"
-    assert same(call(layers), exact)
+    assert same(once(layers), exact)
     assert layers.transformer.device.type == layers.vae.device.type == layers.adapter.device.type == "meta"
 
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from persist_cli.bench.episodes import Episode, EpisodeSet
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.simulators.miniworld import MiniWorld
-from tests.support.micro_policies import policy_stage
-from tests.support.micro_runs import run_persist
 from tests.support.miniworlds import make_world
 
 HOUSE = 1_000_001  # of the test split, with one room
@@ -34,11 +30,3 @@ def found(small_world: MiniWorld) -> list[Episode]:
 def episodes(found: list[Episode]) -> EpisodeSet:
     """The same as a set that can be run."""
     return EpisodeSet(simulator="miniworld", settings=SETTINGS, split="test", seed=0, episodes=found)
-
-
-@pytest.fixture(scope="session")
-def policy_run(walks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of four steps of a micro policy."""
-    run = tmp_path_factory.mktemp("policies") / "policy"
-    run_persist(*policy_stage(walks, run))
-    return run

@@ -20,6 +20,14 @@ def walk():
     return random_walk(world, np.random.default_rng(3), 24)
 
 
+@pytest.fixture(scope="module")
+def four_walks():
+    """Random walks through another held-out house."""
+    world = make_world()
+    world.open_scene(1_100_001)
+    return [random_walk(world, np.random.default_rng(seed), 24) for seed in range(4)]
+
+
 def test_a_random_walk_is_deterministic_and_tries_no_refused_step_again(walk):
     world = make_world()
     world.open_scene(1_100_000)
@@ -40,21 +48,15 @@ def test_no_step_counts_twice_from_one_pose():
         assert len(tried) == len(set(tried))
 
 
-def test_what_a_map_of_true_frames_takes_for_blocked_the_simulator_refuses():
-    world = make_world()
-    world.open_scene(1_100_001)
-    walks = [random_walk(world, np.random.default_rng(seed), 24) for seed in range(4)]
-    both, said, missed, _, _ = sum(outcomes(map_verdicts(walk, walk.frames), walk) for walk in walks)
+def test_what_a_map_of_true_frames_takes_for_blocked_the_simulator_refuses(four_walks):
+    both, said, missed, _, _ = sum(outcomes(map_verdicts(walk, walk.frames), walk) for walk in four_walks)
     assert both > 10
     assert both > 5 * said
     assert both > missed
 
 
-def test_true_cells_miss_next_to_no_step_that_the_simulator_refuses():
-    world = make_world()
-    world.open_scene(1_100_001)
-    walks = [random_walk(world, np.random.default_rng(seed), 24) for seed in range(4)]
-    both, said, missed, neither, _ = sum(outcomes(cell_verdicts(walk), walk) for walk in walks)
+def test_true_cells_miss_next_to_no_step_that_the_simulator_refuses(four_walks):
+    both, said, missed, neither, _ = sum(outcomes(cell_verdicts(walk), walk) for walk in four_walks)
     assert both > 10 * missed
     assert both > said
     assert neither > 10

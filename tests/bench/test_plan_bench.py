@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from persist_cli.plugins import make_policy
 from persist_cli.policies.open_policy import open_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult, Persist
+from tests.support.micro_runs import run_persist
 from tests.support.predictions import cache_random
 from tests.support.processes import run_command, run_in_pair
 
@@ -53,6 +55,26 @@ def bench(persist: Persist, episodes: EpisodeSet, tmp_path: Path) -> Bench:
         return persist("bench", "plan", "--episodes", tmp_path / "episodes.json", "--out", tmp_path / out, *options)
 
     return run
+
+
+EASY = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1)
+
+
+@pytest.fixture(scope="module")
+def random_row(episodes: EpisodeSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a benchmark of the row ``random``, without a model."""
+    folder = tmp_path_factory.mktemp("random")
+    episodes.write(folder / "episodes.json")
+    files = ("--episodes", folder / "episodes.json", "--out", folder / "bench")
+    run_persist("bench", "plan", *map(str, (*files, *EASY, "--rows", "random")))
+    return folder / "bench"
+
+
+@pytest.fixture
+def begun(bench: Bench, random_row: Path, tmp_path: Path) -> Bench:
+    """The function, which goes on with that benchmark."""
+    shutil.copytree(random_row, tmp_path / "bench")
+    return bench
 
 
 def records(folder: Path) -> dict[str, Any]:
@@ -184,37 +206,32 @@ def test_a_benchmark_that_named_its_episodes_with_what_the_file_leaves_unset_goe
     assert "holds another benchmark (episodes sha256" in bench(*options, "--patience", 1).err
 
 
-def test_rows_with_a_model_can_be_added_to_a_benchmark_begun_without_one(bench: Bench, voxel: Path) -> None:
-    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--memories", "none")
-    assert bench(*options, "--rows", "random").code == 0
-    added = bench(voxel, *options, "--steps", 1, "--rows", "random,rank-1", "--json")
+def test_rows_with_a_model_can_be_added_to_a_benchmark_begun_without_one(begun: Bench, voxel: Path) -> None:
+    options = (*EASY, "--memories", "none")
+    added = begun(voxel, *options, "--steps", 1, "--rows", "random,rank-1", "--json")
     assert added.code == 0, added.err
     assert list(json.loads(added.out)["tables"][0]["rows"]) == ["random", "rank-1, none"]
-    assert bench(*options, "--rows", "random").code == 0  # rows without a model still go on
-    refused = bench(voxel, *options, "--steps", 2, "--rows", "random,rank-1")
+    assert begun(*options, "--rows", "random").code == 0  # rows without a model still go on
+    refused = begun(voxel, *options, "--steps", 2, "--rows", "random,rank-1")
     assert "holds another benchmark (sampling steps: 1, now 2)" in refused.err
 
 
-def test_rows_of_cem_with_settings_of_their_own_can_be_added_to_a_benchmark_begun_without_them(bench: Bench) -> None:
-    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1)
-    assert bench(*options, "--rows", "random").code == 0
-    added = bench(*options, "--rows", "random,cem", *SIMULATED, "--set", "method.kept=0.3", "--json")
+def test_rows_of_cem_with_settings_of_their_own_can_be_added_to_a_benchmark_begun_without_them(begun: Bench) -> None:
+    added = begun(*EASY, "--rows", "random,cem", *SIMULATED, "--set", "method.kept=0.3", "--json")
     assert added.code == 0, added.err
     assert list(json.loads(added.out)["tables"][0]["rows"]) == ["random", "cem, simulator"]
-    assert bench(*options, "--rows", "random").code == 0  # rows without it still go on
-    refused = bench(*options, "--rows", "random,cem", *SIMULATED)
+    assert begun(*EASY, "--rows", "random").code == 0  # rows without it still go on
+    refused = begun(*EASY, "--rows", "random,cem", *SIMULATED)
     assert "holds another benchmark (planning cem: {'kept': 0.3}, now None)" in refused.err
 
 
 def test_a_benchmark_of_an_earlier_persist_that_had_settings_of_cem_without_a_row_of_it_goes_on(
-    bench: Bench, tmp_path: Path
+    begun: Bench, tmp_path: Path
 ) -> None:
-    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1)
-    assert bench(*options, "--rows", "random").code == 0
     plan = tmp_path / "bench/parts/plan.json"
     values = json.loads(plan.read_text())
     plan.write_text(json.dumps(values | {"cem candidates": 2, "planning": values["planning"] | {"rounds": 1}}))
-    assert bench(*options, "--rows", "random,cem", *SIMULATED).code == 0
+    assert begun(*EASY, "--rows", "random,cem", *SIMULATED).code == 0
 
 
 def test_rows_of_one_policy_open_it_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,15 +248,14 @@ def test_rows_of_one_policy_open_it_once(bench: Bench, monkeypatch: pytest.Monke
 
 
 def test_a_model_that_was_trained_on_the_scenes_of_a_begun_benchmark_is_refused(
-    bench: Bench, voxel: Path, episodes: EpisodeSet, tmp_path: Path
+    begun: Bench, voxel: Path, episodes: EpisodeSet, tmp_path: Path
 ) -> None:
-    options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--memories", "none")
-    assert bench(*options, "--rows", "random").code == 0
+    options = (*EASY, "--memories", "none")
     file = tmp_path / "bench/episodes.json"
     file.write_text(file.read_text().replace(episodes.scenes[0], "room-0"))
-    refused = bench(voxel, *options, "--rows", "rank-1")
+    refused = begun(voxel, *options, "--rows", "rank-1")
     assert "scene 'room-0': the model was trained on it" in refused.err
-    assert bench(*options, "--rows", "random", "--json").code == 0  # and nothing of the model was kept
+    assert begun(*options, "--rows", "random", "--json").code == 0  # and nothing of the model was kept
 
 
 def test_what_cem_did_before_it_forgot_plans_that_were_done_is_refused(bench: Bench, tmp_path: Path) -> None:

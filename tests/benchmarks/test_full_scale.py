@@ -32,13 +32,16 @@ def micro(monkeypatch):
     return shapes.MODELS["micro"]
 
 
+def measured_rows(folder, *options):
+    """The rows that the benchmark writes for the CPU."""
+    bench_full_scale.main(["--quick", *options, "--device", "cpu", "--json", str(folder / "rows.json")])
+    return json.loads((folder / "rows.json").read_text())["rows"]
+
+
 @pytest.mark.usefixtures("fresh_accelerator")
-@pytest.mark.parametrize(("name", "precision"), [("micro", "float32"), ("5b", "bfloat16"), ("5b", "mixed")])
+@pytest.mark.parametrize(("name", "precision"), [("micro", "float32"), ("5b", "bfloat16")])
 def test_every_part_of_the_benchmark_runs_on_the_cpu(name, precision, micro, tmp_path, capsys):
-    file = tmp_path / "rows.json"
-    options = ["--models", name, "--precision", precision, "--device", "cpu", "--json", str(file)]
-    bench_full_scale.main(["--quick", *options])
-    rows = json.loads(file.read_text())["rows"]
+    rows = measured_rows(tmp_path, "--models", name, "--precision", precision)
     assert [row["what"].split(",")[0] for row in rows] == [
         "stage-1 step", "stage-2 step", "clip", "clip with voxel map", "VAE", "VAE", "map", "map",
     ]  # fmt: skip
@@ -47,6 +50,16 @@ def test_every_part_of_the_benchmark_runs_on_the_cpu(name, precision, micro, tmp
     targets = [target["text"] for row in rows for target in row["targets"]]
     assert targets == (["no slower than plain", "utilisation ≥ 45%", "≤ 1 s", "≤ 10 % more"] if name == "5b" else [])
     assert "stage-1" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("fresh_accelerator", "micro")
+def test_a_model_of_published_size_takes_its_steps_in_mixed_precision(tmp_path):
+    rows = measured_rows(tmp_path, "--models", "5b", "--precision", "mixed", "--only", "steps")
+    assert [row["what"].split(",")[0] for row in rows] == ["stage-1 step", "stage-2 step"]
+    assert all(0 < row["utilisation"] < 1 for row in rows)
+    assert all(row["ratio"] > 0 for row in rows if row["beside"])
+    targets = [target["text"] for row in rows for target in row["targets"]]
+    assert targets == ["no slower than plain", "utilisation ≥ 45%"]
 
 
 def test_the_plain_model_with_our_weights_predicts_what_ours_does(micro):

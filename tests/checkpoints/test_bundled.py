@@ -192,6 +192,7 @@ def test_the_demo_leaves_videos_a_map_figures_and_a_report(reference, here, monk
 
     monkeypatch.setattr(demo, "HALF", 11)
     monkeypatch.setattr(demo, "CLIPS", 1)
+    monkeypatch.setattr("persist_cli.data.check.convention.MOST_TRIED", 4)
     monkeypatch.setenv("PERSIST_CACHE", str(here / "cache"))
     demo.run_demo(demo.REFERENCE_DEMO, here / "demo")
     names = {path.name for path in (here / "demo").iterdir()}

@@ -29,7 +29,8 @@ def test_a_command_warns_before_it_is_slow(
     persist: Persist, walks: Path, voxel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: bool
 ) -> None:
     monkeypatch.setattr("persist_cli.checkpoints.placement.is_slow", lambda dtype: slow)
-    words = ("rollout", voxel, "--start", f"{walks}#0:4", "--follow", "--frames", 5, "--out", tmp_path / "out")
+    way = ("--start", f"{walks}#0:4", "--follow", "--frames", 5, "--steps", 1)
+    words = ("rollout", voxel, *way, "--out", tmp_path / "out")
     ended = persist(*words, "--dtype", "bfloat16")
     assert ended.code == 0, ended.err
     assert (f"--dtype bfloat16: {LINE}; leave it out" in ended.err) is slow

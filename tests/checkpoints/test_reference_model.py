@@ -11,7 +11,7 @@ from tests.support.packaged_models import check_files
 
 MOST_BYTES = 40e6
 
-BACK = ("--start", "sample#0:32", "--follow", "--frames", 24, "--seed", 0)
+BACK = ("--start", "sample#0:32", "--follow", "--frames", 16, "--seed", 0)
 
 
 @pytest.fixture

@@ -56,10 +56,12 @@ def print_without_extras(log: Path, commands: list[list[object]]) -> list[str]:
 def printed(walks, held_out, stage1, voxel, tmp_path_factory) -> list[str]:
     """What each command printed that needs no extra, then what those printed that need one."""
     out = tmp_path_factory.mktemp("without")
+    own = out / "own.yaml"  # whose name has no stage 2 that the doctor would compare it with
+    own.write_text("extends: tiny-stage1\n")
     few = ["--metrics", "psnr", "--controls", "copy", "--seeds", 1, "--clips", 1, "--steps", 1, "--memories", "voxel"]
     commands = [
-        ["recipes"], ["recipes", "tiny-stage1"], ["plugins"], ["weights", "list"], ["inspect", walks],
-        ["doctor", "tiny-stage1", *MICRO_SETTINGS, *SAVING, "base=null", "--gpu-memory", 80],
+        ["recipes"], ["recipes", "tiny-stage1"], ["plugins"], ["weights", "list"], ["inspect", walks, "--pairs", 8],
+        ["doctor", own, *MICRO_SETTINGS, *SAVING, "base=null", "--gpu-memory", 80],
         [*stage("stage1", walks, out / "run", f"base={stage1}", "training.steps=1")],
         ["memorize", f"{walks}#0:0-5", "--out", out / "m.safetensors"],
         ["rollout", voxel, "--start", f"{walks}#0:4", "--actions", "left", "--steps", 1, "--out", out / "rollout"],

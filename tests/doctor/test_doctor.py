@@ -6,6 +6,7 @@ import functools
 import json
 import shlex
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
 from persist_cli.doctor.machine import GIB, Machine
 from persist_cli.doctor.memory_estimate import Launch
-from persist_cli.doctor.meta_model import build_meta_model
+from persist_cli.doctor.meta_model import MetaModel, build_meta_model
 from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
 from persist_cli.doctor.tracing import LiveBytes, fake_tensors
 from persist_cli.train.distributed import check_sharded
@@ -47,6 +48,18 @@ def estimator(*settings: str):
 
 def estimate(*settings: str, launch: Launch = ONE_GPU):
     return estimator().estimate(micro_meta_model(*settings).recipe, launch)
+
+
+def without_step(*settings: str, launch: Launch = ONE_GPU):
+    """An estimate of what no step has to run for."""
+    return estimator().without_step(micro_meta_model(*settings).recipe, launch)
+
+
+def without_stage_2(folder: Path) -> Path:
+    """The recipe by a name of which persist has no stage 2 to compare with."""
+    path = folder / "own.yaml"
+    path.write_text("extends: tiny-stage1\n")
+    return path
 
 
 def encoded():
@@ -87,14 +100,14 @@ def test_samples_can_be_taken_one_by_one_where_the_given_frame_is_drawn_into_all
 
 def test_lora_has_fewer_gradients():
     lora = ["lora={rank: 4, targets: [to_q]}"]
-    with_lora = estimator(*lora).estimate(micro_meta_model(*lora).recipe, ONE_GPU)
-    assert with_lora.gradients < estimate().gradients
+    meta_model = micro_meta_model(*lora)
+    with_lora = meta_model.estimator().without_step(meta_model.recipe, ONE_GPU)
+    assert with_lora.gradients < without_step().gradients
 
 
 def test_a_distillation_holds_the_weights_of_its_teacher_too():
-    plain, own, other = (
-        estimate("base=elsewhere", *more) for more in ((), ("distill.levels=8",), ("distill.teacher=elsewhere",))
-    )
+    plain, own = (estimate("base=elsewhere", *more) for more in ((), ("distill.levels=8",)))
+    other = without_step("base=elsewhere", "distill.teacher=elsewhere")
     trained = sum(parameter.nbytes for parameter in estimator().backbone.trained_parameters("1").values())
     assert own.weights - plain.weights == trained
     assert other.weights - plain.weights == sum(parameter.nbytes for parameter in estimator().backbone.parameters())
@@ -116,7 +129,7 @@ def test_a_discriminator_is_counted_with_all_that_its_training_takes():
 
 
 def test_fsdp_divides_what_is_trained_by_the_number_of_processes():
-    whole, shared = estimate(), estimate(launch=Launch(8, True, sharded=True))
+    whole, shared = without_step(), without_step(launch=Launch(8, True, sharded=True))
     for name in ("optimizer", "gradients", "average"):
         assert shared.to_json()[name] == pytest.approx(whole.to_json()[name] / 8, abs=8)
 
@@ -135,8 +148,8 @@ def test_offloading_moves_all_but_what_is_never_sharded_into_the_memory_of_the_c
 def test_an_average_on_the_cpu_is_whole_for_each_process_and_divided_with_fsdp():
     average = "training.ema_device=cpu"
     trained = sum(parameter.nbytes for parameter in estimator().backbone.trained_parameters("1").values())
-    assert estimate(average, launch=Launch(2, True)).host == 2 * trained
-    assert estimate(average, launch=Launch(2, True, sharded=True)).host == trained
+    assert without_step(average, launch=Launch(2, True)).host == 2 * trained
+    assert without_step(average, launch=Launch(2, True, sharded=True)).host == trained
 
 
 @pytest.mark.parametrize(
@@ -155,12 +168,13 @@ def test_no_strategy_is_refused_by_the_training_that_it_is_for(recipe, settings,
         check_sharded(doctor.changed_recipe(strategy), meta_model.backbone)
 
 
-def test_the_smallest_change_that_is_reported_fits_when_it_is_made(persist):
+def test_the_smallest_change_that_is_reported_fits_when_it_is_made(persist, tmp_path):
+    name = without_stage_2(tmp_path)
     settings = [*MICRO, *SEARCHED, "--gpu-memory", str(estimate(*SEARCHED).peak * 0.8 / GIB)]
-    before = json.loads(persist("doctor", "tiny-stage1", *settings, "--json").out)
+    before = json.loads(persist("doctor", name, *settings, "--json").out)
     assert not before["fits"]
     assert before["smallest"]["settings"]
-    after = json.loads(persist("doctor", "tiny-stage1", *settings, *before["smallest"]["settings"], "--json").out)
+    after = json.loads(persist("doctor", name, *settings, *before["smallest"]["settings"], "--json").out)
     assert after["fits"]
     assert after["smallest"]["settings"] == []
     assert after["strategies"][0]["need"] == before["smallest"]["need"]
@@ -168,6 +182,7 @@ def test_the_smallest_change_that_is_reported_fits_when_it_is_made(persist):
 
 def test_no_smaller_set_of_changes_would_have_fitted():
     doctor = Doctor(micro_meta_model(), Machine("cuda", 1, round(estimate().peak * 0.7)), sharded=False)
+    doctor.estimators[None] = estimator()  # which has run most of the steps
     best = doctor.smallest()
     cheaper = [finding for finding in doctor.findings() if finding.strategy.cost < best.strategy.cost]
     assert not any(finding.fits for finding in cheaper)
@@ -197,10 +212,10 @@ def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
     assert not any(strategy["name"] == "stage 2 only" for strategy in stage2)
 
 
-def test_the_launch_command_has_the_users_options_and_the_pretrained_weights_to_begin_with(persist):
+def test_the_launch_command_has_the_users_options_and_the_pretrained_weights_to_begin_with(persist, tmp_path):
     machine = ["--gpus", "2", "--gpu-memory", "80", "--fsdp"]
     changes = [*MICRO, *SAVING, "lora={rank: 2}"]
-    words = shlex.split(persist("doctor", "tiny-stage1", *machine, *changes).out.splitlines()[-1])
+    words = shlex.split(persist("doctor", without_stage_2(tmp_path), *machine, *changes).out.splitlines()[-1])
     assert words[:6] == ["accelerate", "launch", "--num_processes", "2", "--use_fsdp", "--fsdp_version"]
     assert words[words.index("DATA") + 1 :] == [*changes, "backbone.settings.pretrained=DIR"]
 
@@ -250,9 +265,11 @@ def test_an_impossible_recipe_or_machine_is_reported_in_one_line(persist, option
     assert (ended.code, cause in ended.err) == (1, True)
 
 
-def test_what_is_not_installed_is_one_proposal_less_and_no_error(persist, monkeypatch):
+def test_what_is_not_installed_is_one_proposal_less_and_no_error(persist, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "peft", None)
-    arguments = ["doctor", "tiny-stage1", *MICRO, *SAVING, "--gpu-memory", "80"]
+    shared = estimator(*SAVING)
+    monkeypatch.setattr(MetaModel, "estimator", lambda meta_model: shared)
+    arguments = ["doctor", without_stage_2(tmp_path), *MICRO, *SAVING, "--gpu-memory", "80"]
     ended, record = persist(*arguments), json.loads(persist(*arguments, "--json").out)
     cause = "lora needs the package peft: pip install 'persist-cli[lora]'"
     assert (ended.code, f"\nnot considered: LoRA ({cause})\n" in ended.out) == (0, True)
@@ -263,5 +280,6 @@ def test_what_is_not_installed_is_one_proposal_less_and_no_error(persist, monkey
 def test_the_optimizer_of_a_package_that_is_not_here_comes_with_its_installation(monkeypatch):
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
     doctor = Doctor(micro_meta_model(), Machine("cuda", 1, 80 * GIB), False)
+    doctor.estimators[None] = estimator()
     verdict = _verdict(doctor, [], doctor.examine(Strategy((EIGHT_BIT,))))
     assert "\npip install 'persist-cli[bitsandbytes]'\npersist finetune tiny-stage1 " in verdict

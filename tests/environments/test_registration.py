@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-import subprocess
+import importlib
 import sys
 
-PROGRAM = """
-import sys
-sys.modules["gymnasium"] = None
-from persist_cli.errors import PluginError
-try:
-    import persist_cli.environments
-except PluginError as error:
-    print(error)
-"""
+import gymnasium
+import pytest
+
+import persist_cli.environments  # noqa: F401  so that all is put back that is taken away
+from persist_cli.errors import PersistError, PluginError
+
+
+@pytest.fixture(autouse=True)
+def _not_imported(monkeypatch):
+    """No environment is registered, and no module of theirs imported."""
+    for name in [name for name in gymnasium.registry if name.startswith("persist/")]:
+        monkeypatch.delitem(gymnasium.registry, name)
+    for name in [name for name in sys.modules if name.startswith("persist_cli.environments")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr("persist_cli.environments", None, raising=False)
 
 
 def test_the_name_of_a_module_in_front_of_an_environment_is_enough_to_make_it():
-    program = "import gymnasium; gymnasium.make('persist_cli.environments:persist/SimulatedHouse-v0', sceens='0:2')"
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert "unknown key 'sceens', did you mean 'scenes'?" in ended.stderr
+    with pytest.raises(PersistError, match="unknown key 'sceens', did you mean 'scenes'"):
+        gymnasium.make("persist_cli.environments:persist/SimulatedHouse-v0", sceens="0:2")
 
 
-def test_without_gymnasium_one_line_says_which_extra_is_needed():
-    ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
-    assert ended.stdout == "the environments need the package gymnasium: pip install 'persist-cli[gym]'\n"
+def test_without_gymnasium_one_line_says_which_extra_is_needed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(PluginError) as error:
+        importlib.import_module("persist_cli.environments")
+    assert str(error.value) == "the environments need the package gymnasium: pip install 'persist-cli[gym]'"

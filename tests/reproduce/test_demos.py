@@ -19,7 +19,7 @@ def test_a_command_that_fails_ends_the_demo(walks, tmp_path, capsys):
     for file in Store(walks):
         rewrite(file.path, tmp_path / file.path.name, inverted)
     with pytest.raises(SystemExit) as ended:
-        demo.run_commands([f"inspect {shlex.quote(str(tmp_path))}", "recipes"])
+        demo.run_commands([f"inspect {shlex.quote(str(tmp_path))} --pairs 8", "recipes"])
     assert ended.value.code == 1
     assert "persist recipes" not in capsys.readouterr().out
 

@@ -38,10 +38,12 @@ def house_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def packaged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The packaged world model, which draws scenes and maps; commands run in this process."""
+def packaged(monkeypatch: pytest.MonkeyPatch, collecting_here: None) -> None:
+    """The packaged world model, which draws scenes and maps; commands run in this process, and episodes are short."""
     monkeypatch.delenv("PERSIST_REFERENCE", raising=False)
     monkeypatch.setattr(scene_agents, "run_line", lambda line: run_persist(*shlex.split(line)))
+    monkeypatch.setattr(scene_agents, "TRUE_AGENTS", 1)
+    monkeypatch.setitem(scene_agents.TASK, "max_episode_steps", 4)
 
 
 @pytest.fixture
@@ -61,7 +63,6 @@ def test_policies_learn_in_a_scene_and_in_a_map_of_one_image_and_are_measured_in
 ) -> None:
     make_world()
     monkeypatch.setattr(scene_agents, "FRAMES", 4)
-    monkeypatch.setattr(scene_agents, "TRUE_AGENTS", 1)
     out = tmp_path / "out"
     few = ["--houses", "1", "--seeds", "1", "--steps", "4", "--envs", "2", "--episodes", "1"]
     words = [str(out), "--scene-model", str(house_model), *few]

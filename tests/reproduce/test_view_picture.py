@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from persist_cli.errors import PersistError
+from persist_cli.reproduce import view_picture
 from persist_cli.reproduce.pages import CHROMIUM
 from persist_cli.reproduce.view_picture import take_picture
 from persist_cli.viewer.page import Page
@@ -20,7 +21,10 @@ from persist_cli.viewing.own_address import address_of
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 
 
-def test_the_picture_shows_the_page_after_what_was_pressed(walks: Path, tmp_path: Path) -> None:
+def test_the_picture_shows_the_page_after_what_was_pressed(
+    walks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_picture, "STEADY", 200)
     subject = open_subject(f"{walks}#0:0-4")
     with page_server("127.0.0.1", 0) as server:
         Page(server, subject, Look(layers={POINTS}), None, None)

@@ -70,14 +70,16 @@ def test_collecting_again_changes_nothing(collected: Path, capsys: pytest.Captur
     assert json.loads(capsys.readouterr().out)["new_trajectories"] == 0
 
 
-def test_scenes_can_be_added_to_a_folder_later(collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scenes_can_be_added_to_a_folder_later(
+    collected: Path, collecting_here: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     run_collect(replace(SMALL, scenes="1:4"), collected, 1, json=True)
     figures = json.loads(capsys.readouterr().out)
     assert (figures["trajectories"], figures["new_trajectories"], figures["frames"]) == (3, 1, 18)
     assert len(Store(collected)) == 4
 
 
-def test_each_scene_draws_its_own_camera_steps_and_turns(tmp_path: Path) -> None:
+def test_each_scene_draws_its_own_camera_steps_and_turns(tmp_path: Path, collecting_here: None) -> None:
     make_world()
     plan = replace(SMALL, fov="45:90", height="0.6:1.7", pitch="-25:10", turn="5:20", step="0.05:0.3")
     run_collect(plan, tmp_path, 1, json=True)
@@ -91,16 +93,19 @@ def test_each_scene_draws_its_own_camera_steps_and_turns(tmp_path: Path) -> None
         assert float(file.poses()[0, 1, 2]) == pytest.approx(math.sin(math.radians(camera["pitch"])))
 
 
-def test_a_scene_has_the_same_camera_whichever_process_collects_it(tmp_path: Path) -> None:
+def test_a_scene_has_the_same_camera_whichever_process_collects_it(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     make_world()
     plan = replace(SMALL, fov="45:90", turn="5:20", light="0.6:1.2", tint="0.2", depth_sensor="kinect")
-    run_collect(plan, tmp_path / "one", 1, json=True)
     run_collect(replace(plan, scenes="2:3"), tmp_path / "two", 1, json=True)
+    request.getfixturevalue("collecting_here")
+    run_collect(plan, tmp_path / "one", 1, json=True)
     name = "house-000002.parquet"
     assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
-def test_one_value_in_place_of_a_range_changes_no_byte(collected: Path, tmp_path: Path) -> None:
+def test_one_value_in_place_of_a_range_changes_no_byte(collected: Path, tmp_path: Path, collecting_here: None) -> None:
     run_collect(replace(SMALL, scenes="0:1", fov="75", height="1.25", pitch="0"), tmp_path, 1, json=True)
     before, after = (Store(folder)[0].read() for folder in (collected, tmp_path))
     assert torch.equal(before.observations.rgb, after.observations.rgb)
@@ -182,7 +187,7 @@ def test_a_camera_that_the_simulator_does_not_allow_is_refused_by_the_name_of_it
         run_collect(replace(SMALL, fov="45:170"), tmp_path / "out", 1, json=False)
 
 
-def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
+def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Path, collecting_here: None) -> None:
     make_world()
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     run_collect(FIVE, whole, 1, json=True)
@@ -196,7 +201,9 @@ def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Pa
     assert contents(killed) == contents(whole)
 
 
-def test_what_another_command_collects_into_the_folder_is_left_alone(collected: Path, tmp_path: Path) -> None:
+def test_what_another_command_collects_into_the_folder_is_left_alone(
+    collected: Path, tmp_path: Path, collecting_here: None
+) -> None:
     out = tmp_path / "out"
     shutil.copytree(collected, out)
     (out / "house-000001.parquet").unlink()

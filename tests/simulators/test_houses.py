@@ -75,7 +75,7 @@ def test_rooms_do_not_overlap(houses: list[House]) -> None:
 
 
 def test_an_agent_can_walk_to_nearly_all_free_ground(houses: list[House]) -> None:
-    for house in houses[:20]:
+    for house in houses[:8]:
         cells = free_cells(house)
         assert largest_piece(cells) > 0.99 * len(cells)  # a nook behind a cabinet may be cut off
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-import subprocess
-import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,35 +18,17 @@ from persist_cli.plugins import make_simulator
 from persist_cli.simulators.building import build_house
 from persist_cli.simulators.miniworld import MiniWorld, MiniWorldSettings
 from persist_cli.simulators.rendering import Renderer
-from tests.support.miniworlds import make_world, put_somewhere
+from tests.support.miniworlds import fingerprint, make_world, print_errors_without, print_fingerprint, put_somewhere
+from tests.support.processes import ForkedProcess
 
-FINGERPRINT = """
-import hashlib, sys
-from persist_cli.plugins import make_simulator
-world = make_simulator("miniworld", {})
-world.open_scene(3)
-world.place((float(sys.argv[1]), float(sys.argv[2])), 0.3)
-frame = world.observe()
-print(hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest())
-"""
-OPEN = """
-import sys
-from persist_cli.plugins import make_simulator
-from persist_cli.errors import PersistError
-for missing in sys.argv[1:] or [""]:
-    sys.modules[missing] = None
-    try:
-        make_simulator("miniworld", {})
-    except PersistError as error:
-        print(error)
-    del sys.modules[missing]
-"""
+LIBRARIES = "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri"
 
 
-def run_python(code: str, *arguments: str, **environment: str) -> str:
-    command = [sys.executable, "-c", code, *arguments]
-    completed = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
-    return completed.stdout.strip()
+def printed(file: Path, function: Callable[..., None], *arguments: object, **environment: str) -> str:
+    """What a function prints in a process of its own."""
+    process = ForkedProcess(function, *arguments, environment=environment, output=file)
+    assert process.wait() == 0, file.read_text()
+    return file.read_text().strip()
 
 
 def camera(world: MiniWorld, frame: Frame) -> Cameras:
@@ -64,10 +44,9 @@ def depth_at(depth: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     return 1 / sampled[0, 0, 0]
 
 
-def test_another_process_gives_equal_pixels_for_a_house(world: MiniWorld) -> None:
+def test_another_process_gives_equal_pixels_for_a_house(world: MiniWorld, tmp_path: Path) -> None:
     frame, ((x, z), _) = world.observe(), world.agent
-    here = hashlib.sha256(frame.rgb.tobytes() + frame.depth.tobytes()).hexdigest()
-    assert run_python(FINGERPRINT, repr(x), repr(z)) == here
+    assert printed(tmp_path / "printed", print_fingerprint, x, z) == fingerprint(frame)
 
 
 def test_another_house_gives_different_pixels(world: MiniWorld) -> None:
@@ -240,14 +219,15 @@ def test_wrong_settings_are_refused_with_a_hint() -> None:
         make_simulator("miniworld", {"fov": 200.0})
 
 
-def test_a_missing_driver_is_reported_with_the_packages_to_install() -> None:
-    line = run_python(OPEN, __EGL_VENDOR_LIBRARY_DIRS="/nonexistent")
+def test_a_missing_driver_is_reported_with_the_packages_to_install(tmp_path: Path) -> None:
+    line = printed(tmp_path / "printed", print_errors_without, [""], __EGL_VENDOR_LIBRARY_DIRS="/nonexistent")
     assert "EGL" in line
-    assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in line
+    assert LIBRARIES in line
     assert len(line.splitlines()) == 1
 
 
-def test_a_missing_library_or_package_is_reported_with_how_to_install_it() -> None:
-    package, library = run_python(OPEN, "miniworld", "pyglet.libs.egl").splitlines()
+def test_a_missing_library_or_package_is_reported_with_how_to_install_it(tmp_path: Path) -> None:
+    missing = ["miniworld", "pyglet.libs.egl"]
+    package, library = printed(tmp_path / "printed", print_errors_without, missing).splitlines()
     assert "pip install 'persist-cli[miniworld]'" in package
-    assert "libegl1 libgl1 libglu1-mesa libgl1-mesa-dri" in library
+    assert LIBRARIES in library

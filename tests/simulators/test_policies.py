@@ -19,11 +19,23 @@ from persist_cli.simulators.collect import CollectPlan, collect_frames
 from persist_cli.simulators.free_grid import FreeGrid, clear_distance
 from persist_cli.simulators.miniworld import MiniWorld
 from persist_cli.simulators.policies import POLICIES, walk
+from persist_cli.simulators.rendering import Renderer
 from tests.support.miniworlds import make_world, put_somewhere
 
 MOVES = ("forward", "backward")
 HOUSE_OF_THINGS = 9001
 INTERACTIONS = ("pick_up", "drop", "toggle")
+
+
+IN_THE_DARK = pytest.mark.usefixtures("dark")  # where only actions, poses and cells are looked at
+
+
+@pytest.fixture
+def dark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Black pictures, which take no time."""
+    black = np.zeros((64, 64, 3), np.uint8), np.zeros((64, 64), np.float32)
+    monkeypatch.setattr(Renderer, "load", lambda *_: None)
+    monkeypatch.setattr(Renderer, "render", lambda *_: black)
 
 
 def collect(world: MiniWorld, policy: str, scene: int, frames: int = 60, seed: int = 0) -> list[Frame]:
@@ -35,6 +47,7 @@ def grounds(frames: list[Frame]) -> list[tuple[float, float]]:
     return [(frame.world_from_camera[0, 3], frame.world_from_camera[2, 3]) for frame in frames]
 
 
+@IN_THE_DARK
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_a_walk_has_exactly_the_number_of_frames_of_its_plan(world: MiniWorld, policy: str) -> None:
     for count in (2, 3, 20, 21):
@@ -43,6 +56,7 @@ def test_a_walk_has_exactly_the_number_of_frames_of_its_plan(world: MiniWorld, p
         assert [frame.action is None for frame in frames] == [False] * (count - 1) + [True]
 
 
+@IN_THE_DARK
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_every_recorded_action_was_done(world: MiniWorld, policy: str) -> None:
     for frame, following in pairwise(collect(world, policy, 6)):
@@ -57,10 +71,12 @@ def test_equal_seeds_walk_equal_ways(world: MiniWorld, policy: str) -> None:
     assert all(np.array_equal(frame.rgb, repeated.rgb) for frame, repeated in zip(first, again, strict=True))
 
 
+@IN_THE_DARK
 def test_another_seed_walks_another_way(world: MiniWorld) -> None:
     assert grounds(collect(world, "explore", 7, 30)) != grounds(collect(world, "explore", 7, 30, seed=1))
 
 
+@IN_THE_DARK
 def test_explore_does_not_grind_along_walls(world: MiniWorld) -> None:
     for scene in range(6):
         frames = collect(world, "explore", scene)
@@ -70,6 +86,7 @@ def test_explore_does_not_grind_along_walls(world: MiniWorld) -> None:
         assert len(places) > 10
 
 
+@IN_THE_DARK
 def test_explore_never_tries_a_step_that_is_blocked(world: MiniWorld) -> None:
     world.open_scene(5)
     put_somewhere(world)
@@ -80,6 +97,7 @@ def test_explore_never_tries_a_step_that_is_blocked(world: MiniWorld) -> None:
         action = actions.send(True)
 
 
+@IN_THE_DARK
 def test_path_goes_to_far_places(world: MiniWorld) -> None:
     spans = []
     for scene in (0, 1, 4, 7):
@@ -88,6 +106,7 @@ def test_path_goes_to_far_places(world: MiniWorld) -> None:
     assert np.mean(spans) > 3.0
 
 
+@IN_THE_DARK
 def test_path_sometimes_looks_around_first(world: MiniWorld) -> None:
     starts = [[frame.action for frame in collect(world, "path", 5, 30, seed)[:24]] for seed in range(8)]
     look_arounds = [actions == ["left"] * 24 for actions in starts]
@@ -104,11 +123,13 @@ def test_there_and_back_returns_to_the_first_frame_pixel_for_pixel(world: MiniWo
         assert np.array_equal(frames[0].world_from_camera, frames[-1].world_from_camera)
 
 
+@IN_THE_DARK
 def test_there_and_back_takes_the_reversed_actions_back(world: MiniWorld) -> None:
     actions = [frame.action for frame in collect(world, "there-and-back", 6, 41)][:-1]
     assert tuple(actions[20:]) == world.vocabulary.reversed([str(action) for action in actions[:20]])
 
 
+@IN_THE_DARK
 def test_a_loop_comes_back_through_poses_that_the_way_out_does_not_come_near(world: MiniWorld) -> None:
     for scene in (2, 6):
         poses = torch.from_numpy(np.stack([frame.world_from_camera for frame in collect(world, "loop", scene, 49)]))
@@ -128,6 +149,7 @@ def test_a_loop_shows_on_its_way_back_what_it_saw_on_its_way_out(world: MiniWorl
     assert float(np.mean(shares)) > 0.6
 
 
+@IN_THE_DARK
 def test_policies_work_with_large_turns_and_steps() -> None:
     world = make_world(turn=90.0, step=0.6)
     for policy in POLICIES:
@@ -159,6 +181,7 @@ def test_a_walk_ends_with_an_error_where_the_agent_cannot_move(world: MiniWorld)
         list(walk(world, stubborn, np.random.default_rng(0), 3))
 
 
+@IN_THE_DARK
 def test_interactions_are_really_done_and_change_the_cells_before_the_agent(world: MiniWorld) -> None:
     frames = collect(world, "interact", HOUSE_OF_THINGS, 96)
     for frame, following in pairwise(frames):
@@ -171,6 +194,7 @@ def test_interactions_are_really_done_and_change_the_cells_before_the_agent(worl
             assert (frame.cells.centers()[changed] - place).norm(dim=-1).max() < 3.0
 
 
+@IN_THE_DARK
 def test_things_are_picked_up_and_put_down_elsewhere(world: MiniWorld) -> None:
     actions = [frame.action for frame in collect(world, "interact", HOUSE_OF_THINGS, 96)]
     handled = [action for action in actions if action in ("pick_up", "drop")]
@@ -178,6 +202,7 @@ def test_things_are_picked_up_and_put_down_elsewhere(world: MiniWorld) -> None:
     assert "forward" in actions[actions.index("pick_up") : actions.index("drop")]
 
 
+@IN_THE_DARK
 def test_where_nothing_can_be_moved_interact_walks_on(world: MiniWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(world, "movable", lambda: [])
     frames = collect(world, "interact", HOUSE_OF_THINGS, 20)

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from persist_cli.reproduce.pages import CHROMIUM, OFFLINE
-
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
-
-QUIET = ("--headless", *OFFLINE, "--virtual-time-budget=10000", "--enable-logging=stderr")
+    from playwright.sync_api import Browser, Page
 
 # A script that describes the page from inside. It runs in a copy, because the page's own policy forbids scripts.
 DESCRIBE_PAGE = """<script>
@@ -43,14 +38,23 @@ addEventListener("load", () => {
 POLICY = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
 
 
-def open_page(page: Path, profile: Path, width: int = 1280) -> tuple[str, list[str]]:
-    """Open a page and return its DOM after loading and the complaints in the browser's console."""
-    ended = subprocess.run(
-        [str(CHROMIUM), *QUIET, f"--window-size={width},900", f"--user-data-dir={profile}", "--dump-dom",
-         page.as_uri()],
-        capture_output=True, text=True, check=True, timeout=120,
-    )  # fmt: skip
-    return ended.stdout, [line for line in ended.stderr.splitlines() if "CONSOLE" in line]
+def open_page(browser: Browser, page: Path, width: int = 1280, wanted: str = "body") -> tuple[str, list[str]]:
+    """Open a page in a fresh context; its DOM after loading, and the complaints in the browser's console.
+
+    Args:
+        browser: the browser.
+        page: the file.
+        width: pixels of the window.
+        wanted: the selector of an element that is waited for.
+    """
+    complaints: list[str] = []
+    with browser.new_context(viewport={"width": width, "height": 900}) as context:
+        tab = context.new_page()
+        tab.on("console", lambda message: complaints.append(message.text))
+        tab.on("pageerror", lambda error: complaints.append(str(error)))
+        tab.goto(page.as_uri())
+        tab.wait_for_selector(wanted, state="attached")
+        return tab.content(), complaints
 
 
 def watched(page: Page) -> list[str]:

@@ -62,5 +62,6 @@ def resident_bytes(run: Run) -> int:
 
 if __name__ == "__main__":
     runs: list[Run] = json.loads(sys.argv[1])
-    resident_bytes(runs[0])
+    recipe, data, settings = runs[0]
+    resident_bytes((recipe, data, [*settings, "training.steps=1"]))
     print(json.dumps([resident_bytes(run) for run in runs]))  # noqa: T201

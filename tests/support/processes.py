@@ -56,6 +56,11 @@ class ForkedProcess:
         assert self._process.pid is not None
         os.kill(self._process.pid, number)
 
+    def send_to_group(self, number: signal.Signals) -> None:
+        """Send it and the processes that it started a signal; it must lead a session."""
+        assert self._process.pid is not None
+        os.killpg(self._process.pid, number)
+
     def wait(self) -> int:
         """Wait for its end; the exit code, negative for a signal. It is killed when it takes too long."""
         self._process.join(TIMEOUT)
@@ -79,24 +84,32 @@ def wait_until(condition: Callable[[], Any], process: ForkedProcess) -> None:
 
 
 def run_in_pair(target: Callable[..., Any], *arguments: Any, output: Path) -> list[int]:
-    """Run a function in two processes that find each other as those of ``accelerate launch`` do; their exit codes.
+    """Run a function in two processes as ``start_pair`` does; their exit codes."""
+    return [process.wait() for process in start_pair(target, *arguments, output=output)]
+
+
+def start_pair(
+    target: Callable[..., Any], *arguments: Any, output: Path, environment: Mapping[str, str] | None = None
+) -> list[ForkedProcess]:
+    """Start a function in two processes that find each other as those of ``accelerate launch`` do.
 
     Args:
         target: the function.
         arguments: its arguments.
         output: a folder for the files ``0.log`` and ``1.log`` with what each printed.
+        environment: more variables than those that join the processes.
     """
     shared = {
         "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()),
         "ACCELERATE_USE_CPU": "true", "ACCELERATE_MIXED_PRECISION": "no", "ACCELERATE_DYNAMO_BACKEND": "no",
+        **(environment or {}),
     }  # fmt: skip
-    pair = [
+    return [
         ForkedProcess(
             target, *arguments, environment=shared | {"RANK": rank, "LOCAL_RANK": rank}, output=output / f"{rank}.log"
         )
         for rank in ("0", "1")
     ]
-    return [process.wait() for process in pair]
 
 
 def free_port() -> int:
@@ -112,6 +125,12 @@ def run_command(arguments: list[str]) -> None:
     from persist_cli.cli.app import main
 
     main(arguments)
+
+
+def run_in_a_session(arguments: list[str]) -> None:
+    """Run ``persist`` as ``run_command`` does, in a session of its own."""
+    os.setsid()
+    run_command(arguments)
 
 
 def _run(target: Callable[..., Any], arguments: tuple[Any, ...], variables: dict[str, str], output: Path) -> None:

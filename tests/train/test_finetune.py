@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import shutil
 import signal
-import subprocess
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
@@ -25,7 +25,6 @@ from tests.support.damage import without_sums
 from tests.support.disk import file_limit
 from tests.support.micro_runs import (
     MICRO_SETTINGS,
-    PERSIST,
     SHORT,
     equal_runs,
     first_gradients,
@@ -34,7 +33,7 @@ from tests.support.micro_runs import (
     run_result,
     stage,
 )
-from tests.support.processes import start_persist, wait_until
+from tests.support.processes import ForkedProcess, run_in_a_session, start_persist, wait_until
 
 
 def test_a_run_writes_its_recipe_logs_loss_curve_and_checkpoint(codec):
@@ -46,14 +45,24 @@ def test_a_run_writes_its_recipe_logs_loss_curve_and_checkpoint(codec):
     assert rows[0]["learning_rate"] < rows[-1]["learning_rate"]
 
 
+def test_the_loss_curve_is_a_picture_and_there_is_none_before_the_first_step(draw_loss, codec, tmp_path):
+    log = StepLog(Path(shutil.copy(codec / "log.jsonl", tmp_path)), 4)
+    draw_loss(log, tmp_path / "loss.png")
+    picture = np.asarray(Image.open(tmp_path / "loss.png"))
+    assert picture.shape == (480, 840, 4)
+    assert picture.std() > 0
+    draw_loss(StepLog(tmp_path / "empty.jsonl", 0), tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+
+
 @pytest.mark.parametrize("number", ["codec", "stage1", "stage2-voxel"])
-def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(persist, walks, codec, stage1, tmp_path, number):
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(walks, codec, stage1, voxel, tmp_path, number):
+    whole = {"codec": codec, "stage1": stage1, "stage2-voxel": voxel}[number]
     base = {"codec": MICRO_SETTINGS, "stage1": [f"base={codec}"], "stage2-voxel": [f"base={stage1}"]}[number]
-    assert persist(*stage(number, walks, tmp_path / "whole", *base)).code == 0
-    assert persist(*stage(number, walks, tmp_path / "halves", *base, "training.steps=1")).code == 0
-    assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base, "training.steps=2")).code == 0
-    assert persist(*stage(number, walks, tmp_path / "halves", "--resume", *base)).code == 0
-    assert equal_runs(tmp_path / "whole", tmp_path / "halves")
+    run_persist(*stage(number, walks, tmp_path / "halves", *base, "training.steps=1"))
+    run_persist(*stage(number, walks, tmp_path / "halves", "--resume", *base, "training.steps=2"))
+    run_persist(*stage(number, walks, tmp_path / "halves", "--resume", *base))
+    assert equal_runs(whole, tmp_path / "halves")
 
 
 def test_a_run_resumes_that_a_version_without_one_of_the_settings_began(persist, walks, codec, tmp_path):
@@ -220,20 +229,13 @@ def test_a_run_trains_on_the_bundled_sample_data(persist, walks, codec, tmp_path
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_ctrl_c_and_preemption_save_a_checkpoint_and_say_how_to_resume(walks, codec, tmp_path, sent, code):
     changes = ["training.steps=100000", "training.workers=1"]
-    command = [*PERSIST, *stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)]
-    outputs = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    child = subprocess.Popen(command, **outputs, text=True, start_new_session=True)
-    try:
-        deadline = time.monotonic() + 300
-        log = tmp_path / "run/log.jsonl"
-        while not (log.is_file() and log.stat().st_size) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        os.killpg(child.pid, sent)  # its process that reads data gets it too, as from a terminal or a scheduler
-        out, _ = child.communicate(timeout=300)
-    finally:
-        child.kill()  # the run has no end of its own
-    assert child.returncode == code
-    assert "go on with --resume" in out
+    arguments = stage("stage1", walks, tmp_path / "run", f"base={codec}", *changes)
+    child = ForkedProcess(run_in_a_session, arguments, output=tmp_path / "printed")
+    log = tmp_path / "run/log.jsonl"
+    wait_until(lambda: log.is_file() and log.stat().st_size, child)
+    child.send_to_group(sent)  # its process that reads data gets it too, as from a terminal or a scheduler
+    assert child.wait() == code
+    assert "go on with --resume" in (tmp_path / "printed").read_text()
     find_checkpoint(tmp_path / "run")
 
 

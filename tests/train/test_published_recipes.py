@@ -8,7 +8,7 @@ import pytest
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
-from tests.support.micro_runs import SIZE, run_result
+from tests.support.micro_runs import IN_FLOAT32, SIZE, run_result
 from tests.support.twins import write_twin
 
 TWINS = {"cogvideox-2b": "2b", "cogvideox-5b-i2v": "5b-i2v"}
@@ -16,6 +16,7 @@ TWINS = {"cogvideox-2b": "2b", "cogvideox-5b-i2v": "5b-i2v"}
 SMALL = [
     f"backbone.settings.height={SIZE}", f"backbone.settings.width={SIZE}", "training.steps=2", "training.batch=1",
     "training.accumulation=1", "training.workers=0", "training.warmup=1", "backbone.settings.prompt=null",
+    *IN_FLOAT32,
 ]  # fmt: skip
 
 BLOCKS = ["memory.encoder=patches", "adapter={width: 16, heads: 2, token_budget: 32}", "data.context_frames=4"]

@@ -42,10 +42,11 @@ def uncommented(text: str) -> str:
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_what_is_shown_is_the_recipe_with_all_settings_and_a_comment_at_each(name, tmp_path):
-    (tmp_path / "mine.yaml").write_text(shown(name))
+    text = shown(name)
+    (tmp_path / "mine.yaml").write_text(text)
     recipe = make_recipe(read_recipe(str(tmp_path / "mine.yaml")), "mine.yaml")
     assert recipe == make_recipe(read_recipe(name), name)
-    lines = shown(name).splitlines()
+    lines = text.splitlines()
     hidden = OF_A_BACKBONE if recipe.policy or recipe.scene else ()
     for setting in (field for field in dataclasses.fields(recipe.training) if field.name not in hidden):
         number = next(number for number, line in enumerate(lines) if line.startswith(f"  {setting.name}: "))
