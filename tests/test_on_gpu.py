@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.cells import Box
 from persist_cli.api.ground import Body
 from persist_cli.api.scene_edits import Insert, Remove
+from persist_cli.api.scene_model import Given
 from persist_cli.cli.app import main
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.store import Store
@@ -26,6 +28,7 @@ from tests.support.cell_rooms import camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.micro_model import micro, random_clips, random_tokens, shaken, with_adapter
 from tests.support.micro_runs import MICRO_SETTINGS, SIZE, losses, run_persist, stage
+from tests.support.micro_scenes import micro_model, micro_samples
 from tests.support.room_views import empty_memory, room_walk, same_bits
 
 DEVICE = os.environ.get("PERSIST_TEST_DEVICE", "cuda")
@@ -95,6 +98,19 @@ def test_a_scene_lies_where_its_frames_do_and_is_that_of_the_cpu():
     pairs = [*zip(here.tensors().values(), there.tensors().values(), strict=True)]
     pairs += zip(*(one.values() for one in tokens), strict=True)
     assert all(close(one, other) for one, other in pairs)
+
+
+def test_what_interactions_change_is_said_as_on_the_cpu():
+    samples = micro_samples(2)
+    samples = replace(samples, given=torch.full_like(samples.given, int(Given.PAST)), action=samples.action + 1)
+    here, there = micro_model(), micro_model().to(DEVICE)
+    losses = [model(part, "scene-outcome") for model, part in ((here, samples), (there, samples.to(DEVICE)))]
+    assert all(close(value, losses[1][name]) for name, value in losses[0].items())
+    for model in (here, there):
+        model.knows_outcomes = True
+        model.outcomes.last.bias.data[0] = 100.0  # each cell changes
+    said, others = here.outcome(samples), there.outcome(samples.to(DEVICE))
+    assert (said[0] == others[0].cpu()).float().mean() > 0.999
 
 
 @pytest.mark.parametrize("evolution", ["rules", "model"])

@@ -1,5 +1,7 @@
 """The model of scenes: a codec from cells to latents, and a diffusion transformer that fills windows of them.
 
+What interactions change a third network says (``outcome``), if the model was trained for that.
+
 Training follows PERSIST (arXiv 2603.03482): rectified flow on velocities, with noise levels of their own for regions,
 so that known places are clean where others are noise. Sampling takes Euler steps. At the end, or after each step as in
 PERSIST, the prediction is decoded, given cells are written into it, and it is snapped to classes.
