@@ -115,6 +115,21 @@ class Backbone(nn.Module, ABC):
                 f"{self.frames_per_clip} frames only"
             )
 
+    def makes_clips(self, frames: int) -> bool:
+        """Return whether ``generate`` can make clips of so many frames, the given one included."""
+        if frames == self.frames_per_clip:
+            return True
+        try:
+            self.check_clip_frames(frames)
+        except PersistError:
+            return False
+        return True
+
+    def shortest_clip(self, actions: int) -> int:
+        """Return the frames of the shortest clip that shows so many actions, of the longest one when none does."""
+        longest = self.frames_per_clip
+        return next(frames for frames in range(min(actions + 1, longest), longest + 1) if self.makes_clips(frames))
+
     @property
     def gives_depth(self) -> bool:
         """Whether generated frames have depth; else their depth is 0."""

@@ -119,6 +119,7 @@ class SceneModel(nn.Module, ABC):
     """
 
     settings_type: ClassVar[type] = NoSettings
+    stages: ClassVar[tuple[Stage, ...]] = ("scene-codec", "scene")  # and scene-outcome, if it has one
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:
@@ -164,7 +165,7 @@ class SceneModel(nn.Module, ABC):
     def outcome(
         self, samples: SceneSamples
     ) -> tuple[UInt8[Tensor, "batch first second level"], UInt8[Tensor, "batch first second level 3"]] | None:
-        """Return classes and colours of windows after the interactions, ``None`` where only ``sample`` says it.
+        """Return classes and colours of windows after an interaction; ``None`` where the model can only sample them.
 
         Cells that do not change come out as they went in.
 

@@ -15,7 +15,7 @@ from persist_cli.api.meta_device import without_weights
 from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
 from persist_cli.api.scene_model import SceneForm, SceneModel
 from persist_cli.api.stages import SCENE_STAGES, Stage
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import bundled_folder
 from persist_cli.io.sha256sums import check_sums, write_sums
 from persist_cli.plugins import make_scene_model
@@ -82,6 +82,12 @@ class TrainedSceneModel:
     def _check_stage(self) -> None:
         if self.stage == "scene-codec":
             raise CheckpointError(f"{self.folder}: the codec of a model of scenes alone; train the rest: {TRAIN}")
+
+
+def check_stage(model: SceneModel, stage: Stage) -> None:
+    """Raise ``RecipeError`` when a model, made by the registry, has no such stage."""
+    if stage not in model.stages:
+        raise RecipeError(f"the model of scenes {model.name!r} has no stage {stage}; it has {', '.join(model.stages)}")
 
 
 def save_scene_model(model: SceneModel, stage: Stage, folder: Path, scenes: TrainingScenes | None) -> None:

@@ -266,7 +266,7 @@ def memorize(
     ] = None,
     model: Annotated[str | None, typer.Option(help="Of a scene: the trained scene model that imagines in it.")] = None,
     complete: Annotated[bool, typer.Option("--complete", help="Of a scene: imagine what was not seen.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of what is imagined: other seeds, other houses.")] = 0,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of what is imagined: other seeds, other houses; 0.")] = None,
     depth: Annotated[
         Path | None, typer.Option(help="Of a picture: .npy in metres, or PNG of 16 bits in millimetres.")
     ] = None,

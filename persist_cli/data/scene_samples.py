@@ -313,7 +313,8 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         if not any(event.action in known for file in self.files for event in self.interactions(file)):
             where = " and ".join(dict.fromkeys(str(file.path.parent) for file in self.files))
             raise DataError(
-                f"{where}: nobody does {', '.join(known)} there; `persist collect miniworld --policy interact` does"
+                f"{where}: no trajectory has an action {', '.join(known)}; `persist collect miniworld "
+                "--policy interact` writes such"
             )
 
     def carried(self, file: TrajectoryFile, frame: int) -> Carried:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from persist_cli.api.meta_device import without_weights
-from persist_cli.api.stages import SCENE_STAGES, ParameterGroup, Stage
+from persist_cli.api.stages import ParameterGroup, Stage
+from persist_cli.checkpoints.scene_models import check_stage
 from persist_cli.doctor.machine import gib
 from persist_cli.doctor.meta_model import MetaModel, build_meta_model
 from persist_cli.plugins import make_scene_model
@@ -58,7 +59,8 @@ def network_dry_run(recipe: Recipe) -> dict[str, Any]:
             return named | _parts(network.parameter_groups(), trained)
         assert recipe.scene is not None
         model = make_scene_model(recipe.scene.name, recipe.scene.settings)
-    trained = {stage: set(model.trained_parameters(stage)) for stage in SCENE_STAGES}
+    check_stage(model, recipe.stage)
+    trained = {stage: set(model.trained_parameters(stage)) for stage in model.stages}
     named = {"stage": recipe.stage, "scene": recipe.scene.name, "base": recipe.base}
     return named | _parts(model.parameter_groups(), trained)
 

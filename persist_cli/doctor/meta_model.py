@@ -20,6 +20,7 @@ from persist_cli.checkpoints.load import (
     starts_from_random_codec,
     with_adapter,
 )
+from persist_cli.checkpoints.scene_models import check_stage
 from persist_cli.doctor.memory_estimate import BackboneEstimator, SceneEstimator
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory
@@ -100,6 +101,7 @@ def build_scene_meta_model(name: str, recipe: Recipe) -> SceneMetaModel:
     assert recipe.scene is not None
     with without_weights():
         model = make_scene_model(recipe.scene.name, recipe.scene.settings)
+    check_stage(model, recipe.stage)
     return SceneMetaModel(name, recipe, model)
 
 

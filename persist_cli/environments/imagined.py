@@ -23,7 +23,6 @@ from persist_cli.io.settings import parse_settings
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of, knows_floor
 from persist_cli.navigation.routes import check_within_reach
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
-from persist_cli.rollout.clip_lengths import shortest_clip
 from persist_cli.rollout.open_world import assemble_world
 from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
@@ -48,8 +47,8 @@ class ImaginedSettings(TaskSettings):
         sampling: steps, sampler and guidance in place of the checkpoint's own.
         step: metres of an action, in place of the data set's own.
         turn: degrees of an action.
-        clip_frames: frames of a clip, the present one included; ``None`` for as few as show ``chunk`` actions, which
-            takes the least time.
+        clip_frames: frames of a clip, the present one included, at least 2; ``None`` for as few as show ``chunk``
+            actions, which takes the least time.
     """
 
     start: str
@@ -94,7 +93,8 @@ class ImaginedScenes(Scenes):
         world, info = open_house(settings, self.starts)
         super().__init__(info, settings)
         self.world, self.first = world, world.agents[0]
-        world.clip_frames = settings.clip_frames or shortest_clip(world.backbone, settings.chunk)
+        shortest = world.backbone.shortest_clip(settings.chunk)
+        world.clip_frames = settings.clip_frames if settings.clip_frames is not None else shortest
         if self.given is not None:
             memorize_frames(world, self.given)
         self.known = KnownGround(self._map(settings), body_of(info).radius, settings)

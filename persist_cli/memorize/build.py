@@ -52,7 +52,8 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     if scene is not None:
         began = time.perf_counter()
         with busy("imagining"):
-            extra["completed"] = scene.complete(seed=plan.seed)
+            seed = config.settings.get("seed", 0) if plan.seed is None else plan.seed
+            extra["completed"] = scene.complete(seed=seed)
         extra["seconds_imagining"] = time.perf_counter() - began
     map_file = out.with_suffix(".png")
     if is_picture(data[0]):

@@ -34,6 +34,7 @@ class MemorizePlan:
         model: name or folder of the model that imagines in a scene, ``None`` when none is named.
         complete: whether the scene is completed around the last frame, by the packaged model where none is named.
         seed: seed of what is imagined, now and later; ``memory.seed`` in ``settings`` gives later a seed of its own.
+            ``None`` for that of the memory's settings.
     """
 
     memory: str | None = None
@@ -42,7 +43,7 @@ class MemorizePlan:
     checkpoint: Path | None = None
     model: str | None = None
     complete: bool = False
-    seed: int = 0
+    seed: int | None = None
 
 
 def scene_config(form: CellForm, settings: Mapping[str, Any] | None = None) -> MemoryConfig:
@@ -64,7 +65,7 @@ def resolve_memory_config(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]
     settings = dict(config.settings)
     if plan.complete and settings.get("model") is None and (packaged := packaged_scene_model()) is not None:
         settings["model"] = packaged
-    if "seed" not in plugin_settings(plan.settings)["memory"]:
+    if plan.seed is not None and "seed" not in plugin_settings(plan.settings)["memory"]:
         settings["seed"] = plan.seed
     return replace(config, settings=settings), origin
 

@@ -26,7 +26,6 @@ from persist_cli.play.settings import GROWTH, GroundPose, PlaySettings, Shown
 from persist_cli.play.surveyor import Surveyor
 from persist_cli.play.walkers import Ahead, Pose, Walkers
 from persist_cli.plugins import make_cost
-from persist_cli.rollout.clip_lengths import makes_clips
 from persist_cli.rollout.world_model import WorldModel
 
 THOUGHT: Final = 1  # what is imagined ahead is as long as this clip under newly held keys, counted from 0
@@ -361,7 +360,7 @@ class Play:
         longest = settings.clip_frames or backbone.frames_per_clip
         if longest != backbone.frames_per_clip:
             backbone.check_clip_frames(longest)
-        shorter = [frames for frames in GROWTH if frames < longest and makes_clips(backbone, frames)]
+        shorter = [frames for frames in GROWTH if frames < longest and backbone.makes_clips(frames)]
         return (*shorter * settings.growing, longest)
 
     def _take(self, ahead: Ahead, begun: float) -> Shown:

@@ -4,7 +4,7 @@
 continues where it was stopped and repeats nothing that is done, so this may be stopped and started at any time.
 
 - Houses are collected with their cells: to train on, and of the test split, walks as well as interactions.
-- The codec, the model of scenes and the renderer are trained, the renderer on true cells first, then on imagined ones.
+- The three stages of a model of scenes and the renderer are trained, this on true cells first, then on imagined ones.
   With ``--scene-model`` and ``--renderer`` trained ones are measured, and nothing is trained in their place.
 - Completions of one image, walks of 1,000 steps, the cost, edits and interactions follow; then ways there and back, of
   the memories of the packaged model and of the renderer, and one of 1,000 frames.
@@ -60,7 +60,7 @@ class SceneFigures:
     @property
     def scene(self) -> str:
         """The model of scenes that is measured."""
-        return str(self.out / "scene") if self.scene_model is None else self.scene_model
+        return str(self.out / "scene-outcome") if self.scene_model is None else self.scene_model
 
     @property
     def drawing(self) -> str:
@@ -87,6 +87,8 @@ def training_commands(figures: SceneFigures) -> Iterator[str]:
     if figures.scene_model is None:
         yield f"finetune houses-64-scene-codec {data} --out {home}/codec"
         yield f"finetune houses-64-scene {data} --out {home}/scene base={home}/codec {TRAINED}"
+        acted = f"--data {home}/train/interact {kept}"
+        yield f"finetune houses-64-scene-outcome {acted} --out {home}/scene-outcome base={home}/scene"
     if figures.renderer is None:
         walks = f"--data {home}/train/path {kept}"
         yield f"finetune houses-64-stage2-scene {walks} --out {home}/renderer-true {base}"

@@ -42,7 +42,7 @@ from persist_cli.checkpoints.load import (
 )
 from persist_cli.checkpoints.placement import warn_if_slow
 from persist_cli.checkpoints.relink import weights_at
-from persist_cli.checkpoints.scene_models import find_scene_model
+from persist_cli.checkpoints.scene_models import check_stage, find_scene_model
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
@@ -241,13 +241,14 @@ def prepare_policy(recipe: Recipe, run: Path, plan: FinetunePlan) -> tuple[Polic
 def prepare_scene_model(recipe: Recipe, run: Path) -> tuple[SceneModel, TrainingScenes]:
     """The model to train, with the weights of its base or of the run's newest checkpoint, and the scenes of these.
 
-    A stage scene begins with the codec of a base of either stage.
+    A later stage begins with what its base has of the stages before it.
 
     Raises:
-        PersistError: when the base is not there, or is another model.
+        PersistError: when the base is not there, or is another model, or the model has no such stage.
     """
     assert recipe.scene is not None
     model = make_scene_model(recipe.scene.name, recipe.scene.settings)
+    check_stage(model, recipe.stage)
     steps = step_folders(run)
     if not steps and recipe.base is None:
         return model, TrainingScenes()
@@ -256,6 +257,8 @@ def prepare_scene_model(recipe: Recipe, run: Path) -> tuple[SceneModel, Training
         raise RecipeError(f"base {recipe.base} is a model of scenes {begun.plugin!r}, not {recipe.scene.name!r}")
     if begun.stage == "scene-codec" and recipe.stage == "scene-outcome":
         raise RecipeError(f"base {recipe.base} is the codec of a model of scenes alone; name a run of stage scene")
+    if not steps and SCENE_STAGES.index(begun.stage) > SCENE_STAGES.index(recipe.stage) > 0:
+        warn(f"base {recipe.base}: what stage {begun.stage} learned is not kept; train that stage again on this run")
     begun.load_into(model, min(begun.stage, recipe.stage, key=SCENE_STAGES.index))
     return model, begun.training_scenes or TrainingScenes(complete=False)
 

@@ -21,7 +21,7 @@ WHOLE_CELLS: Final = SampleShares(frame=1, walk=0, grown=0, interaction=0)
 
 ACTING: Final = SampleShares(frame=0, walk=0, grown=0, interaction=1)  # what becomes of cells by interactions
 
-SHARES: Final = {"scene-codec": WHOLE_CELLS, "scene-outcome": ACTING}  # of stages that are trained on some kinds alone
+SHARES: Final = {"scene-codec": WHOLE_CELLS, "scene-outcome": ACTING}  # of the stages that see some kinds alone
 
 
 class SceneTrainer(TrainingLoop[SceneModel]):

@@ -31,6 +31,7 @@ PALE = (0.85, 0.45)  # share of white in its stripes and between them
 EDITED_COLOR = "#d81b60"  # of the stripes on what was edited, which run the other way
 LONG_SIDE = 8.0  # inches
 BORDER = (0.75, 0.15, 0.55, 0.35)  # inches left and right of a map, below and above, for labels and title
+BAR = 1.3  # inches of a bar of colours with its label
 ARROW = 0.06  # length as a share of the long side
 Array = np.ndarray[Any, Any]
 
@@ -142,7 +143,7 @@ def draw_candidates(
     image, extent = paint(points, ground, _ceiling(places))
     target = {} if goal is None else {"goal": (goal.cpu().double()[None] @ ground.T).numpy()}
     low, high = _limits(None, places | target, AROUND)
-    figure, [axes] = _begin_figure([(image, extent)], high - low)
+    figure, [axes] = _begin_figure([(image, extent)], high - low, bar=True)
     ends = [_arrow(path, ground, max(high - low)) for path in paths]
     _draw_costs(figure, axes, [place[:, :2] for place in places.values()], [one.cost for one in candidates])
     _draw_path(axes, places["0"][:, :2], ends[0], PATH_COLORS[0], "chosen")
@@ -166,22 +167,32 @@ def _draw_costs(figure: Any, axes: Any, places: Sequence[Array], costs: Sequence
     lines = [places[number] for number in order]
     axes.add_collection(LineCollection(lines, colors=colors, linewidths=1.4, zorder=2.5))
     axes.scatter(*np.stack([line[-1] for line in lines]).T, s=14, c=colors, zorder=2.6)
-    figure.colorbar(scale, ax=axes, label="cost", shrink=0.8)
+    figure_width, box = figure.get_size_inches()[0], axes.get_position(original=True)
+    left, width = box.x1 + 0.2 / figure_width, 0.2 / figure_width
+    beside = figure.add_axes((left, box.y0 + 0.1 * box.height, width, 0.8 * box.height))
+    figure.colorbar(scale, cax=beside, label="cost")
 
 
 def _begin_figure(
-    painted: Sequence[tuple[Array | None, tuple[float, float, float, float] | None]], size: Array
+    painted: Sequence[tuple[Array | None, tuple[float, float, float, float] | None]], size: Array, bar: bool = False
 ) -> tuple[Any, list[Any]]:
-    """Return a figure and its axes, each with the picture of a map, for so many metres across and up."""
+    """Return a figure and its axes, each with the picture of a map, for so many metres across and up.
+
+    Args:
+        painted: each picture, and its extent.
+        size: metres across and up.
+        bar: whether a bar of colours will stand beside each map.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     width, height = size
     scale = LONG_SIDE / max(width, height)
-    across, up = max(3.2, width * scale + 1.0), max(2.6, height * scale + 0.8)
+    left, right, below, above = BORDER  # given, since a layout that matplotlib finds takes half of the time
+    right += BAR * bar
+    across, up = max(3.2, width * scale + 1.0) + BAR * bar, max(2.6, height * scale + 0.8)
     figure = Figure(figsize=(across * len(painted), up))
     FigureCanvasAgg(figure)
-    left, right, below, above = BORDER  # given, since a layout that matplotlib finds takes half of the time
     panels = [
         figure.add_axes(
             ((number + left / across) / len(painted), below / up,

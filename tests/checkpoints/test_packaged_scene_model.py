@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 
+from persist_cli.api.actions import walking_actions
 from persist_cli.api.cells import CellGrid
+from persist_cli.api.ground import Body
 from persist_cli.bench.scenes.connectedness import count_borders
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model, write_scene_card
 from persist_cli.memorize.memory_file import load_memory
+from tests.support.cell_rooms import camera_at, cell_room
+from tests.support.drawn_scenes import empty_scene
 from tests.support.packaged_models import check_files, check_sample_is_unseen
 
 MOST_BYTES = 15e6
@@ -36,6 +41,21 @@ def test_its_card_has_the_fingerprint_of_its_weights(packaged, tmp_path):
 def test_it_keeps_how_small_pieces_of_a_class_are(packaged):
     least = dict(zip(packaged.form.cells.palette, packaged.load().codec.least_cells.tolist(), strict=True))
     assert least["door"] > least["table"] > least["potion"] == least["free"] == 1
+
+
+def test_it_says_itself_what_interactions_change(packaged):
+    model, scene = packaged.load(), empty_scene(palette=list(packaged.form.cells.palette), evolution="model")
+    scene.imagine_with(lambda: model)
+    room, box = cell_room(), packaged.form.cells.palette.index("box")
+    classes = torch.zeros_like(room.classes)
+    for number, name in enumerate(room.form.palette):
+        classes[room.classes == number] = packaged.form.cells.palette.index(name)
+    scene.add(replace(room, classes=classes, form=packaged.form.cells))
+    assert packaged.stage == "scene-outcome"
+    assert int((scene.cells.classes == box).sum()) == 1
+    pose = camera_at(room, (5, 4, 5), (9, 4, 5)).world_from_camera[0]  # a metre before the box
+    assert scene.act(walking_actions()["pick_up"], pose, Body())
+    assert int((scene.cells.classes == box).sum()) == 0
 
 
 def test_it_was_not_trained_on_the_sample_houses(packaged):

@@ -17,9 +17,17 @@ def _not_imported(monkeypatch):
     """No environment is registered, and no module of theirs imported."""
     for name in [name for name in gymnasium.registry if name.startswith("persist/")]:
         monkeypatch.delitem(gymnasium.registry, name)
-    for name in [name for name in sys.modules if name.startswith("persist_cli.environments")]:
+    before = environment_modules()
+    for name in before:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr("persist_cli.environments", None, raising=False)
+    yield
+    for name in set(environment_modules()) - set(before):  # the others are put back
+        del sys.modules[name]
+
+
+def environment_modules():
+    return [name for name in sys.modules if name.startswith("persist_cli.environments")]
 
 
 def test_the_name_of_a_module_in_front_of_an_environment_is_enough_to_make_it():

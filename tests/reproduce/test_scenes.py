@@ -27,7 +27,7 @@ def test_every_command_is_one_that_persist_takes(line: str) -> None:
 def test_every_training_has_the_settings_of_a_recipe(line: str) -> None:
     words = parse_line(line)
     values = apply_overrides(read_recipe(words["recipe"]), words["overrides"])
-    assert make_recipe(values, line).stage in ("scene-codec", "scene", "2")
+    assert make_recipe(values, line).stage in ("scene-codec", "scene", "scene-outcome", "2")
 
 
 def test_what_is_given_is_measured_and_not_trained() -> None:

@@ -194,8 +194,11 @@ def test_a_killed_run_that_is_repeated_ends_as_an_uninterrupted_one(tmp_path: Pa
     process = persist(f"{COMMAND} 2", killed)
     while process.poll() is None and not (len(list(killed.glob("house-*"))) > 1 and list(killed.glob(".partial-*"))):
         time.sleep(0.005)
+    workers = children(process.pid)
     process.kill()  # some are whole, another is not
     assert process.wait() == -signal.SIGKILL
+    while any(map(is_running, workers)):  # they end by themselves, and may begin another file before
+        time.sleep(0.005)
     assert 1 < len(list(killed.glob("house-*"))) < 5
     run_collect(FIVE, killed, 1, json=True)
     assert contents(killed) == contents(whole)
@@ -221,6 +224,11 @@ def children(pid: int) -> list[int]:
     listing = subprocess.run(["ps", "ww", "-o", "pid=,args=", "--ppid", str(pid)], capture_output=True, text=True)
     workers = [line.split()[0] for line in listing.stdout.splitlines() if "spawn_main" in line]
     return [int(worker) for worker in workers]
+
+
+def is_running(pid: int) -> bool:
+    state = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout.strip()
+    return bool(state) and not state.startswith("Z")
 
 
 def test_a_worker_that_dies_is_reported_in_one_line(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from persist_cli.api.scene_model import SceneSamples
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors
+from persist_memory.scene_models.scene_diffusion import SceneDiffusion
 from tests.support.cell_houses import FORM, write_cell_houses, write_interactions
 from tests.support.micro_runs import equal_runs, losses, run_persist
 from tests.support.micro_scenes import MICRO_SCENE, micro_samples, scene_stage, write_scenes
@@ -150,6 +151,10 @@ def test_the_third_stage_learns_interactions_and_keeps_what_it_stands_on(persist
         one, other = (read_tensors(find_scene_model(run).folder / f"{name}.safetensors")[0]
                       for run in (tmp_path / "run", runs / "acting"))  # fmt: skip
         assert all(one[key].equal(value) for key, value in other.items())
+    again = persist(*scene_stage("tiny-scene", acted, tmp_path / "again", f"base={tmp_path / 'run'}", words[-1]))
+    assert again.code == 0, again.err
+    assert "what stage scene-outcome learned is not kept" in again.err
+    assert find_scene_model(tmp_path / "again").stage == "scene"
     shutil.copytree(tmp_path / "run", tmp_path / "halves")
     shutil.rmtree(tmp_path / "halves/step-00000004")
     ended = persist(*scene_stage("houses-64-scene-outcome", acted, tmp_path / "halves", *words, "--resume"))
@@ -162,7 +167,7 @@ def test_the_third_stage_learns_interactions_and_keeps_what_it_stands_on(persist
     [
         ("null", True, "stage scene-outcome needs base: the scene run it stands on"),
         ("acting-codec", True, "is the codec of a model of scenes alone; name a run of stage scene"),
-        ("acting", False, "nobody does pick_up, drop, toggle there; `persist collect miniworld --policy"),
+        ("acting", False, "no trajectory has an action pick_up, drop, toggle; `persist collect miniworld --policy"),
     ],
 )
 def test_the_third_stage_needs_a_whole_model_and_interactions(persist, acted, runs, tmp_path, case):
@@ -185,3 +190,11 @@ def test_a_model_of_scenes_is_no_world_model_and_no_data_set(persist, runs):
         find_checkpoint(runs / "scene")
     ended = persist("inspect", str(runs / "scene"))
     assert "a trained model of scenes" in ended.out + ended.err
+
+
+def test_a_model_without_a_stage_says_which_it_has(persist, runs, scenes, tmp_path, monkeypatch):
+    monkeypatch.setattr(SceneDiffusion, "stages", ("scene-codec", "scene"))
+    words = scene_stage("houses-64-scene-outcome", scenes, tmp_path / "run", f"base={runs / 'scene'}")
+    for ended in (persist(*words), persist("doctor", "houses-64-scene-outcome")):
+        assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
+        assert "the model of scenes 'scene' has no stage scene-outcome; it has scene-codec, scene" in ended.err

@@ -176,21 +176,20 @@ class Imagination:
             given, classes, colors, rgb, depth, turned.pose(pose, form), matrix, torch.tensor(action),
             torch.tensor(self.carried.kind), self.carried.color.cpu(), number,
         )  # fmt: skip
-        device = self.device
         with torch.inference_mode():
-            drawn = self.model.sample(SceneSamples.stack([sample.to("cpu")]).to(device), self.steps)
+            drawn = self.model.sample(SceneSamples.stack([sample.to("cpu")]).to(self.device), self.steps)
         here = window.classes.device
         classes, colors = (turned.back(part[0]).to(here) for part in drawn)
         return classes.clone(), colors.clone()
 
     def outcome(
-        self, window: CellGrid, past: Bool[Tensor, "first second level"], action: int, pose: Float[Tensor, "4 4"]
+        self, window: CellGrid, given: UInt8[Tensor, "first second level"], action: int, pose: Float[Tensor, "4 4"]
     ) -> CellGrid | None:
-        """Return a window after an interaction, ``None`` where the model does not say it but by ``sample``.
+        """Return a window after an interaction; ``None`` where the model has no network for that.
 
         Args:
             window: a box of the model's shape.
-            past: the cells that may change.
+            given: the ``Given`` of each cell.
             action: 1 + the number of the interaction.
             pose: world_from_camera of the agent.
         """
@@ -198,8 +197,6 @@ class Imagination:
         rgb, depth, _, matrix = no_view(form)
         pose = window_pose(window, pose.cpu())
         turned = Turn.ahead(pose, form.shape)
-        given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING))
-        given = torch.where(past, int(Given.PAST), given).to(torch.uint8)
         given, classes, colors = (turned.cells(part) for part in (given, window.classes, window.colors))
         sample = SceneSamples(
             given, classes, colors, rgb, depth, turned.pose(pose, form).float(), matrix, torch.tensor(action),
@@ -228,8 +225,7 @@ class Imagination:
         classes = torch.where(window.known & ~unnamed, window.classes, drawn.classes)
         colors = torch.where(window.known[..., None], window.colors, drawn.colors)
         turned = Turn.ahead(self._seen(window)[2], self.model.form.shape)  # the codec sees what ``sample`` lets it see
-        device = self.device
-        told = (turned.cells(part)[None].to(device) for part in (classes, colors))
+        told = (turned.cells(part)[None].to(self.device) for part in (classes, colors))
         with torch.inference_mode():
             held = self.model.reconstruct(*told)
         classes, colors = (turned.back(part[0]).to(window.classes.device).clone() for part in held)
@@ -351,11 +347,14 @@ def evolved(
         raise CheckpointError(f"the scene model knows the interactions {', '.join(known)}, not {action!r}")
     reach = cells_in_reach(window, world_from_camera) & window.known
     number = 1 + known.index(action)
-    said = imagination.outcome(window, reach, number, world_from_camera)
+    given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING))
+    given = torch.where(reach, int(Given.PAST), given).to(torch.uint8)
+    said = imagination.outcome(window, given, number, world_from_camera)
     if said is None:
-        said, differs = _drawn(imagination, window, reach, number, seed)
+        said, differs = _drawn(imagination, window, given, number, seed)
     else:
         differs = (said.classes != window.classes) | (said.colors != window.colors).any(-1)
+    differs &= reach
     if not bool(differs.any()):
         return None
     after = window.copy()
@@ -366,15 +365,13 @@ def evolved(
 
 
 def _drawn(
-    imagination: Imagination, window: CellGrid, reach: Bool[Tensor, "first second level"], action: int, seed: int
+    imagination: Imagination, window: CellGrid, given: UInt8[Tensor, "first second level"], action: int, seed: int
 ) -> tuple[CellGrid, Bool[Tensor, "first second level"]]:
-    """The window that the model draws after an action, and the cells in reach that the action changes by it."""
-    given = torch.where(window.known, int(Given.CONTENT), int(Given.NOTHING))
-    given = torch.where(reach, int(Given.PAST), given).to(torch.uint8)
+    """The window that the model draws after an action, and the cells that the action changes by it."""
     classes, colors = imagination.sample(window, given, action, seed)
     after = replace(window, classes=classes, colors=colors)
     before = imagination.coded(window, after)
     other = (classes != before.classes) & (window.classes != SOLID)  # else it is only told what it is
     repainted = after.solid & before.solid & ((colors.int() - before.colors.int()).abs().amax(-1) > REPAINTED)
     differs = (after.solid != before.solid) | (after.solid & other) | repainted
-    return after, differs & reach & ((classes != window.classes) | repainted)
+    return after, differs & ((classes != window.classes) | repainted)

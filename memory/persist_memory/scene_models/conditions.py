@@ -217,7 +217,7 @@ def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
 
 
 def changed_cells(samples: SceneSamples) -> Bool[Tensor, "batch first second level"]:
-    """Return which cells the action truly changes; of ``SOLID`` ones only the class is told besides."""
+    """Return which cells the action truly changes. One that was only known to be solid, and now has a class, is not."""
     classes, colors = truth(samples)
     before, after = is_solid(samples.classes), is_solid(classes)
     other = (samples.classes != classes) & (samples.classes != SOLID)

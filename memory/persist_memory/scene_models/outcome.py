@@ -1,7 +1,8 @@
 """What an interaction makes of the cells before the agent: a network of its own, trained on interactions alone.
 
 The transformer generates latents of 4 × 4 columns of cells, in which the one or two cells that an action changes are
-lost. This network looks at the cells themselves, and says of each one in reach whether it changes, and into what.
+lost. This network looks at the cells themselves, and says of each one in reach whether it changes, and into what. Those
+aside that lie more than ``BEHIND`` behind the agent it leaves out.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from persist_memory.scene_models.codec import COLORS, ResidualBlock
 from persist_memory.scene_models.conditions import WAVES, changed_cells, sines, truth
 from persist_memory.scene_models.settings import SceneDiffusionSettings
 
-BEHIND = 3  # cells along the first axis behind the agent, which looks along it within 45 degrees
+BEHIND = 0.75  # metres along the first axis behind the agent, which looks along it within 45 degrees
 RARE = -5.0  # logit of a change, to begin with: hardly a cell changes
 
 
@@ -34,7 +35,7 @@ class Around(NamedTuple):
         rows: their numbers along the first axis.
         columns: those along the second axis.
         inside: which of them are in the window; the numbers of others are those of cells at its sides.
-        places: metres ahead of the agent, beside it and above its camera.
+        places: metres ahead of the agent, to its left and above its camera.
     """
 
     rows: Int64[Tensor, "batch row 1"]
@@ -138,7 +139,7 @@ class Outcome(nn.Module):
         size, device = self.settings.cell, samples.given.device
         poses, reach = samples.window_from_camera.float(), math.ceil(CHANGED / size)
         center = (poses[:, :2, 3] / size).round().long()
-        rows = center[:, :1, None] + torch.arange(-BEHIND, reach + 1, device=device)[:, None]
+        rows = center[:, :1, None] + torch.arange(-math.ceil(BEHIND / size), reach + 1, device=device)[:, None]
         columns = center[:, 1:, None] + torch.arange(-reach, reach + 1, device=device)
         first, second, levels = self.settings.shape
         inside = (rows >= 0) & (rows < first) & (columns >= 0) & (columns < second)

@@ -78,6 +78,7 @@ class SceneDiffusion(SceneModel):
     """Fills windows of cells by diffusion in the latents of a codec."""
 
     settings_type = SceneDiffusionSettings
+    stages = SCENE_STAGES
     settings: SceneDiffusionSettings
     weights: Tensor
 

@@ -72,12 +72,12 @@ class EvolutionRow:
         return f"{PART} {self.name}"
 
 
-MODEL: Final = EvolutionRow("model", "model", "the scene model, from the true cells before and the present frame")
+MODEL: Final = EvolutionRow("model", "model", "the scene model, from the true cells before")
 
 UNTOLD: Final = EvolutionRow(
     "model, not told", "model",
     "the same without the action: what it would change for no reason. It still knows which cells may change, and what "
-    "is carried. A tenth of the training samples of stage scene-outcome are such, and none of those of stage scene",
+    "is carried. A share of the training samples of stage scene-outcome are such (outcome.drop_action), none of others",
 )  # fmt: skip
 
 RULES: Final = EvolutionRow("rules", "rules", "the rules of the memory, from the same cells")
