@@ -166,18 +166,10 @@ class Imagination:
             action: 0 for none, or 1 + the number of an interaction that the model knows.
             seed: seed of the draw; the window's place changes it.
         """
-        known, form = given > Given.NOTHING, self.model.form
-        rgb, depth, pose, matrix = self._seen(window)
-        turned = Turn.ahead(pose, form.shape)  # as in training the camera looks along the first axis
-        told = (given, window.classes * known, window.colors * known[..., None])
-        given, classes, colors = (turned.cells(part) for part in told)
-        number = torch.tensor(window_seed(seed, window.corner))
-        sample = SceneSamples(
-            given, classes, colors, rgb, depth, turned.pose(pose, form), matrix, torch.tensor(action),
-            torch.tensor(self.carried.kind), self.carried.color.cpu(), number,
-        )  # fmt: skip
+        number = window_seed(seed, window.corner)
+        turned, sample = self._sample_of(window, given, action, self._seen(window), number)
         with torch.inference_mode():
-            drawn = self.model.sample(SceneSamples.stack([sample.to("cpu")]).to(self.device), self.steps)
+            drawn = self.model.sample(sample, self.steps)
         here = window.classes.device
         classes, colors = (turned.back(part[0]).to(here) for part in drawn)
         return classes.clone(), colors.clone()
@@ -193,21 +185,43 @@ class Imagination:
             action: 1 + the number of the interaction.
             pose: world_from_camera of the agent.
         """
-        form = self.model.form
-        rgb, depth, _, matrix = no_view(form)
-        pose = window_pose(window, pose.cpu())
-        turned = Turn.ahead(pose, form.shape)
-        given, classes, colors = (turned.cells(part) for part in (given, window.classes, window.colors))
-        sample = SceneSamples(
-            given, classes, colors, rgb, depth, turned.pose(pose, form).float(), matrix, torch.tensor(action),
-            torch.tensor(self.carried.kind), self.carried.color.cpu(), torch.tensor(0),
-        )  # fmt: skip
+        rgb, depth, _, matrix = no_view(self.model.form)
+        view = rgb, depth, window_pose(window, pose.cpu()), matrix
+        turned, sample = self._sample_of(window, given, action, view)
         with torch.inference_mode():
-            said = self.model.outcome(SceneSamples.stack([sample.to("cpu")]).to(self.device))
+            said = self.model.outcome(sample)
         if said is None:
             return None
         classes, colors = (turned.back(part[0]).to(window.classes.device).clone() for part in said)
         return replace(window, classes=classes, colors=colors)
+
+    def _sample_of(
+        self,
+        window: CellGrid,
+        given: UInt8[Tensor, "first second level"],
+        action: int,
+        view: tuple[Tensor, Tensor, Tensor, Tensor],
+        seed: int = 0,
+    ) -> tuple[Turn, SceneSamples]:
+        """Return a batch of one sample, turned as in training so that its camera looks along the first axis, and how.
+
+        Args:
+            window: a box of the model's shape.
+            given: the ``Given`` of each cell.
+            action: 0 for none, or 1 + the number of an interaction that the model knows.
+            view: RGB, depth, pose in the window and intrinsics.
+            seed: of all random numbers.
+        """
+        rgb, depth, pose, matrix = view
+        known, form = given > Given.NOTHING, self.model.form
+        turned = Turn.ahead(pose, form.shape)
+        told = (given, window.classes * known, window.colors * known[..., None])
+        given, classes, colors = (turned.cells(part) for part in told)
+        sample = SceneSamples(
+            given, classes, colors, rgb, depth, turned.pose(pose, form).float(), matrix, torch.tensor(action),
+            torch.tensor(self.carried.kind), self.carried.color.cpu(), torch.tensor(seed),
+        )  # fmt: skip
+        return turned, SceneSamples.stack([sample.to("cpu")]).to(self.device)
 
     @property
     def device(self) -> torch.device:
