@@ -20,6 +20,7 @@ from persist_cli.api.ground import Body
 from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.scene_model import SceneModel
+from persist_cli.api.stages import Stage
 from persist_cli.errors import CheckpointError
 
 
@@ -43,6 +44,11 @@ class Scene(Memory):
     def wanted_model(self) -> str | None:
         """The name or path of the scene model that its settings ask for; whoever makes a scene gives it that model."""
         return None
+
+    @property
+    def wanted_stage(self) -> Stage:
+        """The stage that this model should have; with an earlier one a scene does what it can, and the tool says so."""
+        return "scene"
 
     @property
     def imagines(self) -> bool:

@@ -39,6 +39,7 @@ planning_app.add_typer(bench_app, name="bench")
 
 
 OF_PARTS = {  # parts of `bench scene` that have a use for options
+    "seeds": ("completion", "walk", "return", "evolution"),
     "walk_steps": ("walk",), "walks": ("walk", "return"), "return_steps": ("return",), "memories": ("return",),
     "edits": ("edits",), "interactions": ("evolution",),
 }  # fmt: skip
@@ -295,7 +296,7 @@ def bench_scene(
     train: Annotated[Path | None, typer.Option(help="Training houses, for the rows that look them up.")] = None,
     parts: Annotated[str, typer.Option(help="Of completion, walk, speed, return, edits, evolution.")] = "completion",
     images: Annotated[int, typer.Option(min=1, help="Most images, each of another house.")] = 32,
-    seeds: Annotated[int, typer.Option(min=1, help="Completions, and walks, of each image.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, help="Completions, and walks, of each image; edits have one each.")] = 3,
     radius: Annotated[float, typer.Option(min=0.5, help="Metres around the camera that are measured.")] = 5.0,
     houses: Annotated[int, typer.Option(min=1, help="Most training houses that are read.")] = 500,
     walk_steps: Annotated[int, typer.Option(min=1, help="Actions of a walk.")] = 1000,

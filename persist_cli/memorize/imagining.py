@@ -10,32 +10,47 @@ from persist_cli.api.cells import CellForm
 from persist_cli.api.memory import Memory
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_model import SceneModel
+from persist_cli.api.stages import SCENE_STAGES, Stage
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import CheckpointError
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
+from persist_cli.viewing.console import warn
 
 
 def with_scene_model(memory: Memory) -> Memory:
     """Return the memory; a scene whose settings name a model imagines with it, once something is to be imagined."""
     if isinstance(memory, Scene) and memory.wanted_model is not None:
-        memory.imagine_with(functools.partial(open_scene_model, memory.wanted_model))
+        memory.imagine_with(functools.partial(open_scene_model, memory.wanted_model, memory.wanted_stage))
     return memory
 
 
-def open_scene_model(path: str) -> SceneModel:
+def open_scene_model(path: str, wanted: Stage) -> SceneModel:
     """Return a trained model of scenes, ready to sample; it is loaded once in a process.
+
+    Args:
+        path: its folder, that of its run, or the name of the packaged one.
+        wanted: the stage that it should have; one line warns of a model that was not trained that far.
 
     Raises:
         CheckpointError: when there is none, or it is damaged.
     """
-    return _loaded(find_scene_model(path).folder)
+    found = find_scene_model(path)
+    if SCENE_STAGES.index(found.stage) < SCENE_STAGES.index(wanted):
+        _warn_once(found.folder, wanted)
+    return _loaded(found.folder)
 
 
 @functools.lru_cache(maxsize=2)
 def _loaded(folder: Path) -> SceneModel:
     return find_scene_model(folder).load()
+
+
+@functools.cache
+def _warn_once(folder: Path, wanted: Stage) -> None:
+    """Say that a model was not trained as far as a scene asks for."""
+    warn(f"{folder}: this scene model has no stage {wanted}; what interactions change is drawn by its transformer")
 
 
 def scene_model_fingerprint(config: MemoryConfig) -> str:

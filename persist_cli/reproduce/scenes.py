@@ -99,22 +99,23 @@ def training_commands(figures: SceneFigures) -> Iterator[str]:
 def measuring_commands(figures: SceneFigures) -> Iterator[str]:
     """Yield the command lines that measure."""
     home, packaged = shlex.quote(str(figures.out)), shlex.quote(figures.checkpoint)
-    scene, drawn = shlex.quote(figures.scene), shlex.quote(figures.drawing)
+    scene, renderer = shlex.quote(figures.scene), shlex.quote(figures.drawing)
     paths, interactions = f"--data {home}/test/path", f"--data {home}/test/interact"
 
     def bench(data: str, parts: str, name: str, options: str) -> str:
+        seeds = "" if parts == "edits" else f"--seeds {SEEDS} "  # each edit has a seed of its own
         return (
-            f"bench scene {scene} {data} --parts {parts} --seeds {SEEDS} {options} --out {home}/{name} "
+            f"bench scene {scene} {data} --parts {parts} {seeds}{options} --out {home}/{name} "
             f"--report {home}/report-{name}"
         )
 
     yield bench(paths, "completion,walk,speed", "completion", f"--train {home}/train/path --houses 600 --walks 8")
     yield bench(interactions, "evolution", "evolution", "--interactions 200")
-    for name, checkpoint, memories in (("packaged", packaged, MEMORIES), ("renderer", drawn, "scene")):
+    for name, checkpoint, memories in (("packaged", packaged, MEMORIES), ("renderer", renderer, "scene")):
         yield bench(paths, "edits", f"edits-{name}", f"--checkpoint {checkpoint}")
         there_and_back = f"--checkpoint {checkpoint} --memories {memories} {INVENTING}"
         yield bench(paths, "return", f"return-{name}", f"{there_and_back} --walks 8")
-    yield bench(paths, "return", "long", f"--checkpoint {drawn} {INVENTING} --walks 4 --return-steps 500")
+    yield bench(paths, "return", "long", f"--checkpoint {renderer} {INVENTING} --walks 4 --return-steps 500")
 
 
 def identity(figures: SceneFigures) -> dict[str, Any]:

@@ -163,6 +163,16 @@ def test_the_packaged_model_imagines_where_none_is_named(hall, model, tmp_path, 
     assert load_memory(out).wanted_model is None
 
 
+def test_a_model_that_never_learned_what_interactions_change_is_named(hall, tmp_path, capsys, model):
+    own = tmp_path / "untaught"
+    shutil.copytree(model, own)
+    arguments = (hall / "hall.png", "--depth", hall / "hall.npy", "--model", own, "--complete")
+    for index, asked in enumerate((("--set", "memory.evolution=model"), ())):
+        succeed(*arguments, *asked, "--out", tmp_path / f"{index}.safetensors")
+        said = f"{own}: this scene model has no stage scene-outcome; what interactions change is drawn by"
+        assert capsys.readouterr().err.count(said) == len(asked) // 2
+
+
 def test_a_picture_is_not_replaced_by_the_map_of_its_scene(hall, tmp_path, capsys):
     picture = tmp_path / "room.png"
     picture.write_bytes((hall / "hall.png").read_bytes())

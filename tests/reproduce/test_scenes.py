@@ -30,6 +30,11 @@ def test_every_training_has_the_settings_of_a_recipe(line: str) -> None:
     assert make_recipe(values, line).stage in ("scene-codec", "scene", "scene-outcome", "2")
 
 
+def test_edits_have_a_seed_each_and_all_else_is_measured_with_several() -> None:
+    measured = [line for line in LINES if line.startswith("bench scene")]
+    assert [line for line in measured if "--parts edits" in line] == [line for line in measured if "--seeds" not in line]
+
+
 def test_what_is_given_is_measured_and_not_trained() -> None:
     given = [*commands(replace(FIGURES, scene_model="a scene", renderer="a renderer"))]
     assert not [line for line in given if line.startswith("finetune")]

@@ -21,6 +21,7 @@ from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFi
 from persist_cli.api.observations import Observations, Origin
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_edits import Edit, EditOutcome
+from persist_cli.api.stages import Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, DataError
 from persist_memory.batched_reads import distinct_cameras, same_size
@@ -90,6 +91,11 @@ class GridScene(Scene):
     def wanted_model(self) -> str | None:
         """The setting ``model``."""
         return self.settings.model
+
+    @property
+    def wanted_stage(self) -> Stage:
+        """``scene-outcome`` where the model says what interactions change."""
+        return "scene-outcome" if self.settings.evolution == "model" else "scene"
 
     @property
     def floor(self) -> int:

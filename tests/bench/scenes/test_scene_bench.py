@@ -144,6 +144,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
         (("--parts", "edits"), "--checkpoint"),
         ((*WALKS, "--parts", "completion"), "--walk-steps: only with --parts walk"),
         (("--edits", 3, "--parts", "return"), "--edits: only with --parts edits"),
+        (("--seeds", 3, "--parts", "edits"), "--seeds: only with --parts completion or walk or return or evolution"),
         (("--dtype", "float32", "--denoising-steps", 2), "--denoising-steps, --dtype: only with --checkpoint"),
         (("--train", same), "is measured, too"),
         (("--data", walks), "no cells"),
