@@ -14,7 +14,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.memorize.imagining import of_known_cells, with_scene_model
-from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config
+from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config, with_usual_classes
 from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
 from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
@@ -38,7 +38,8 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     _check_out(out)
     config, origin = resolve_memory_config(plan)
     sources = find_sources(_with_picture(data, picture, out))
-    config = of_known_cells(config, sources[0].file, asked=origin is None or plan.checkpoint is not None)
+    asked = origin is None or plan.checkpoint is not None
+    config = with_usual_classes(of_known_cells(config, sources[0].file, asked))
     with busy("loading the encoder"):
         encoder = make_encoder(config.encoder, config.encoder_settings)
     memory = with_scene_model(make_memory(config.name, config.settings, encoder, common_reference(sources)))

@@ -94,6 +94,21 @@ def _with_model(plan: MemorizePlan) -> tuple[MemoryConfig, str | None]:
     return replace(config, settings=with_absolute_model(config.settings | {"model": plan.model})), origin
 
 
+def with_usual_classes(config: MemoryConfig) -> MemoryConfig:
+    """Return the configuration of a scene with the classes that the packaged model draws, if nothing names others.
+
+    Args:
+        config: of any memory; of one that is no scene, or that has classes, it stays as it is.
+    """
+    reference = _find_reference_checkpoint()
+    if config.name != SCENE or "palette" in config.settings or reference is None:
+        return config
+    if SCENE not in _memory_names(reference).values():
+        return config
+    palette = adapter_of(reference, SCENE)[0].settings.get("palette")
+    return config if palette is None else replace(config, settings=config.settings | {"palette": palette})
+
+
 def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig, str]:
     """Return the memory configuration of an adapter, and the adapter's name in words.
 

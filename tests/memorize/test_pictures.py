@@ -163,6 +163,20 @@ def test_the_packaged_model_imagines_where_none_is_named(hall, model, tmp_path, 
     assert load_memory(out).wanted_model is None
 
 
+def test_a_scene_of_own_settings_has_the_classes_that_the_packaged_model_draws(hall, tmp_path, monkeypatch):
+    monkeypatch.delenv("PERSIST_REFERENCE")
+    own = ("free", "solid", "outside", "wall")
+    picture = (hall / "hall.png", "--depth", hall / "hall.npy", "--memory", "scene")
+    forms = []
+    for index, words in enumerate(
+        ((), ("--set", "memory.foresight=3"), ("--set", f"memory.palette=[{','.join(own)}]"))
+    ):
+        succeed(*picture, *words, "--out", tmp_path / f"{index}.safetensors")
+        forms.append(load_memory(tmp_path / f"{index}.safetensors").cells.form.palette)
+    assert "office_desk" in forms[0]
+    assert forms == [forms[0], forms[0], own]
+
+
 def test_a_model_that_never_learned_what_interactions_change_is_named(hall, tmp_path, capsys, model):
     own = tmp_path / "untaught"
     shutil.copytree(model, own)
