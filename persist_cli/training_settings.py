@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import BeforeValidator, Field
 
-from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES
+from persist_cli.api.nearness import NEAR_DEGREES, NEAR_METRES
 
 CHANGEABLE: Final = "a run may be resumed with another value"
 Value = TypeVar("Value")

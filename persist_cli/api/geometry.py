@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, invert_rigid
-
-NEAR_METRES, NEAR_DEGREES = 0.2, 10.0  # of poses whose pictures are almost the same; a step is 0.25 m, a turn 15°
+from persist_cli.api.nearness import NEAR_DEGREES, NEAR_METRES
 
 SAME_SURFACE = 0.05  # relative depth within which two views show the same surface, plus as many metres
 

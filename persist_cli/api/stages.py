@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import torch
 from pydantic import Field
-from torch import nn
+
+if TYPE_CHECKING:  # recipes are read without torch
+    import torch
+    from torch import nn
 
 Stage = Literal["codec", "1", "2", "policy", "scene-codec", "scene", "scene-outcome"]
 STAGES: tuple[Stage, ...] = ("codec", "1", "2")  # of a backbone

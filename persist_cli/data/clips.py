@@ -14,7 +14,8 @@ from torch.utils.data import BatchSampler, Dataset
 from persist_cli.api.actions import ActionVocabulary
 from persist_cli.api.backbone import Clip, Interactions
 from persist_cli.api.cells import CellGrid
-from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses
+from persist_cli.api.geometry import near_poses
+from persist_cli.api.nearness import NEAR_DEGREES, NEAR_METRES
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.augment import Augmentation, View
 from persist_cli.data.store import Store, TrajectoryFile

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 
 from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.evaluate.backbones import BackboneLoader
-from persist_cli.evaluate.cases import read_case
+from persist_cli.evaluate.cases import CaseFrames, read_case
 from persist_cli.evaluate.columns import without_known_poses
 from persist_cli.evaluate.journal import ExampleClip, Unit
 from persist_cli.evaluate.measure import SHEET_CLIPS, predict
@@ -17,6 +18,8 @@ from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.report.pictures import ClipPicture, Pictures, RowPictures, Sheet
 from persist_cli.metrics.metric import Metric
 from persist_cli.viewing.console import add_task, progress
+
+ReadClip = Callable[[int], CaseFrames]  # of a clip's number
 
 
 def make_pictures(run: Evaluation, domains: dict[str, list[int]], loader: BackboneLoader) -> Pictures:
@@ -27,15 +30,21 @@ def make_pictures(run: Evaluation, domains: dict[str, list[int]], loader: Backbo
         domains: numbers of the clips of each table.
         loader: loader of the backbones that the rows were measured with.
     """
-    return Pictures(rows=tuple(row_pictures(run, domains, loader)), sheets=tuple(make_sheets(run)))
+
+    @functools.lru_cache(maxsize=8)  # rows often have their best, median and worst figure at the same clips
+    def read_clip(number: int) -> CaseFrames:
+        return read_case(run.cases[number])
+
+    rows = tuple(row_pictures(run, domains, loader, read_clip))
+    return Pictures(rows, sheets=tuple(make_sheets(run, read_clip)))
 
 
-def make_sheets(run: Evaluation) -> list[Sheet]:
+def make_sheets(run: Evaluation, read_clip: ReadClip) -> list[Sheet]:
     """A contact sheet for each of the first clips, with every row."""
     sheets = []
     for number, case in enumerate(run.cases[:SHEET_CLIPS]):
         batch, place = divmod(number, run.plan.batch)
-        rows = [("truth", read_case(case).observations.rgb)]
+        rows = [("truth", read_clip(number).observations.rgb)]
         for row_number, row in enumerate(run.rows):
             rows.append((row.name, run.journal.read(Unit(row_number, 0, batch))[VIDEO][place]))
         title = f"{case.trajectory}, frames {case.start} to {case.start + case.frames - 1}"
@@ -43,7 +52,9 @@ def make_sheets(run: Evaluation) -> list[Sheet]:
     return sheets
 
 
-def row_pictures(run: Evaluation, domains: dict[str, list[int]], loader: BackboneLoader) -> list[RowPictures]:
+def row_pictures(
+    run: Evaluation, domains: dict[str, list[int]], loader: BackboneLoader, read_clip: ReadClip
+) -> list[RowPictures]:
     """Best, median and worst clip of every row in every table, at the first seed.
 
     They are predicted once more, one by one and from the noise they had, and then kept, because keeping every video
@@ -58,10 +69,10 @@ def row_pictures(run: Evaluation, domains: dict[str, list[int]], loader: Backbon
             if metric is not None:
                 figures = first_figures(run, number)
                 for name, clips in domains.items():
-                    picks = [
-                        clip_picture(run, loader, ExampleClip(number, clip), f"{metric.title} {figures[clip]:.2f}")
-                        for clip in pick_clips(figures, clips, metric)
-                    ]
+                    picks = []
+                    for clip in pick_clips(figures, clips, metric):
+                        caption, example = f"{metric.title} {figures[clip]:.2f}", ExampleClip(number, clip)
+                        picks.append(clip_picture(run, loader, example, read_clip(clip), caption))
                     pictures.append(RowPictures(name, row.name, *picks))
             bar.advance(task)
     return pictures
@@ -81,9 +92,11 @@ def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Me
     return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
 
 
-def clip_picture(run: Evaluation, loader: BackboneLoader, example: ExampleClip, caption: str) -> ClipPicture:
+def clip_picture(
+    run: Evaluation, loader: BackboneLoader, example: ExampleClip, frames: CaseFrames, caption: str
+) -> ClipPicture:
     """The video that a row predicts for a clip at the first seed, beside the truth."""
-    row, frames = run.rows[example.row], read_case(run.cases[example.clip])
+    row = run.rows[example.row]
     if not run.journal.has(example):
         rgb, depth = predict(row, loader.load_for(row), [frames], 0, example.clip)
         run.journal.write(example, {"rgb": rgb[0], "depth": depth[0]})

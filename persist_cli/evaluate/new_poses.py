@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses, pose_differences
+from persist_cli.api.geometry import near_poses, pose_differences
+from persist_cli.api.nearness import NEAR_DEGREES, NEAR_METRES
 from persist_cli.errors import PersistError
 
 RETURN_METRES, RETURN_DEGREES = 1.0, 35.0  # of a pose to an earlier one, within which their views overlap

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import Checkpoint
-from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES, near_poses
+from persist_cli.api.geometry import near_poses
 from persist_cli.api.memory import Memory
+from persist_cli.api.nearness import NEAR_DEGREES, NEAR_METRES
 from persist_cli.api.observations import Observations
 from persist_cli.io.files import write_json, write_text
 from persist_cli.metrics import METRICS

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from persist_cli.api.geometry import NEAR_DEGREES, NEAR_METRES
+from persist_cli.api.nearness import NEAR_DEGREES, NEAR_METRES
 from persist_cli.api.simulator import Simulator
 from persist_cli.simulators.free_grid import FreeGrid, Ground
 

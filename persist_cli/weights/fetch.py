@@ -13,7 +13,6 @@ from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import file_sha256, folder_aside, read_json
 from persist_cli.io.hub import cached_weight, weights_home
 from persist_cli.viewing.console import busy, print_json, print_table, say
-from persist_cli.weights.cache import fill_folder
 from persist_cli.weights.catalog import WEIGHTS, Weight, find_weight
 from persist_cli.weights.weight_sources import DAY, find_source, from_directory, remove_downloads
 
@@ -76,6 +75,8 @@ def fetch_weight(weight: Weight, directory: Path | None, offline: bool) -> None:
         PersistError: one line when no source has it, its file is refused, or the cached one was made from a file with
             another hash than the user gives.
     """
+    from persist_cli.weights.cache import fill_folder  # with torch, which lists and paths do not need
+
     if is_whole(weight.name):
         if weight.original and weight.sha256 is not None:
             _check_cached(weight, weight.sha256)

@@ -42,6 +42,23 @@ def test_no_help_imports_torch():
     assert set(imports) <= {"[]", "['pydantic']"}  # which typer imports for the help of a command
 
 
+LISTING = """
+import contextlib, sys
+from persist_cli.cli.app import main
+for command in sys.argv[1:]:
+    with contextlib.suppress(SystemExit):
+        main(command.split())
+print("torch" in sys.modules)
+"""
+
+
+def test_lists_of_recipes_and_weights_do_without_torch():
+    command = [sys.executable, "-c", LISTING, "recipes", "recipes --json", "weights list"]
+    out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert '"houses-64-stage1"' in out
+    assert out.splitlines()[-1] == "False"
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(persist, command):
     ended = persist(command, "--help")

@@ -66,9 +66,10 @@ def check(runs: Sequence[Run]) -> None:
         assert estimate(run) == pytest.approx(measured, rel=WITHIN), run[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",  # activations then take most of the memory
-    [["training.batch=4"], pytest.param(["training.batch=2", CHECKPOINTING], marks=pytest.mark.slow)],
+    [["training.batch=4"], ["training.batch=2", CHECKPOINTING]],
     ids=["plain", "checkpointing"],
 )
 def test_estimates_hold_for_a_tiny_model(walks_of, change):

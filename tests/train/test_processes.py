@@ -320,7 +320,8 @@ def resume(persist, walks, codec, tmp_path):
     return of
 
 
-@pytest.mark.parametrize("killed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [0, 1])
 def test_a_killed_process_ends_the_run_with_one_line_and_a_checkpoint_to_resume(start, resume, killed):
     run = start("--use_fsdp", "--fsdp_version", "2")
     os.kill(run.processes[killed], signal.SIGKILL)
