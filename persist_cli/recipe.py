@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 import yaml
 from pydantic import BeforeValidator
 
-from persist_cli.api.stages import SCENE_STAGES, Adversarial, Distill, Lora, Stage
+from persist_cli.api.stages import SCENE_STAGES, STAGES, Adversarial, Distill, Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
 from persist_cli.training_settings import CHANGEABLE, DataSettings, TrainingSettings
@@ -28,6 +28,10 @@ SETTINGS_OF: Final = {"memory.encoder": "encoder_settings"} | dict.fromkeys(NAME
 # the stages of networks that are no backbones, and what of the data means something to them, by the key for one
 ALONE: Final[Mapping[str, tuple[Stage, ...]]] = {"policy": ("policy",), "scene": SCENE_STAGES}
 DATA_OF: Final = {"policy": ("path", "mirror", "detour"), "scene": ("path",)}
+OF_CONTEXTS: Final = (  # settings of the data that only what a memory is made of depends on
+    "context_frames", "exclude_targets", "exclude_metres", "exclude_degrees", "pose_drift", "pose_drift_degrees",
+    "depth_noise",
+)  # fmt: skip
 OF_A_BACKBONE: Final = ("gradient_checkpointing", "compile", "frozen_precision", "vae_slicing")  # settings of training
 Settings = Annotated[  # YAML reads a key with nothing behind it as null
     dict[str, Any], BeforeValidator(lambda value: {} if value is None else value)
@@ -322,6 +326,8 @@ def _contradictions(recipe: Recipe) -> list[str]:
         problems.append("stage 2 needs a memory, or adapter_from, which has one; the other stages take neither")
     if recipe.stage == "2" and recipe.base is None:
         problems.append("stage 2 needs base: the stage-1 run it stands on")
+    if recipe.adapter and recipe.stage != "2":
+        problems.append("adapter is for stage 2 only; leave it out")
     if recipe.lora is not None and recipe.stage != "1":
         problems.append("lora is for stage 1 only; leave it out")
     if recipe.adversarial is not None and (recipe.stage not in ("1", "2") or recipe.distill is not None):
@@ -349,6 +355,10 @@ def _of_data(recipe: Recipe) -> list[str]:
         problems.append("data.true_cells is for stage 2 only; leave it out")
     elif data.true_cells and (data.mirror or data.color_jitter):
         problems.append("data.true_cells takes no data.mirror and no data.color_jitter, which change frames, no cells")
+    if recipe.stage in STAGES and recipe.stage != "2":
+        usual = DataSettings()
+        wrong = [f"data.{key}" for key in OF_CONTEXTS if getattr(data, key) != getattr(usual, key)]
+        problems += [f"stage {recipe.stage} has no memory, so it takes no {', '.join(wrong)}"] if wrong else []
     return problems
 
 

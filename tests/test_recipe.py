@@ -65,8 +65,11 @@ def test_the_data_path_is_one_folder_or_a_list():
      (["training.precision=fp8"], "training.precision"), (["data.path=3"], "data.path"),
      (["training.batch=5", "training.accumulation=2"], "multiple of accumulation"),
      (["training.steps=200", "training.cooldown=201"], "set both, as in training.steps=200 training.cooldown=66"),
-     (["data.true_cells=1"], "data.true_cells is for stage 2 only"), (["a=[1"], "cannot read the value"),
-     (["a=2024-13-45"], "cannot read the value"), (["a=0x_"], "cannot read the value")],
+     (["data.true_cells=1"], "data.true_cells is for stage 2 only"),
+     (["adapter.form=canvas"], "adapter is for stage 2"),
+     (["data.pose_drift=1", "data.exclude_targets=1"], "takes no data.exclude_targets, data.pose_drift"),
+     (["a=[1"], "cannot read the value"), (["a=2024-13-45"], "cannot read the value"),
+     (["a=0x_"], "cannot read the value")],
 )  # fmt: skip
 def test_an_error_in_a_recipe_is_one_line(overrides, cause):
     with pytest.raises(RecipeError, match=cause) as error:

@@ -18,6 +18,7 @@ FREE = "free"  # a motion that no named action describes; only the poses of the 
 STAY = "stay"
 WALK = ("stay", "forward", "backward", "left", "right")  # the actions that move a camera over the ground
 STEP = 0.25  # metres of a step where nobody says another
+LONGEST_STEP = 10.0  # metres of a step that somebody gives; more are meant as millimetres, or take hours to check
 TURN = 15.0  # degrees of a turn
 WORD = re.compile(r"^(?P<name>[a-z_]+)(?:\*(?P<count>\d+))?$")
 
@@ -96,9 +97,12 @@ class ActionVocabulary:
             turn: degrees; ``None`` for those of the own ``left``, else 15.
 
         Raises:
-            DataError: when the step is not positive and finite, or the turn is not above 0 and at most 180.
+            DataError: when the step is not positive and finite, or given as more than 10 metres, or the turn is not
+                above 0 and at most 180.
         """
         own = {action.name: action for action in self.actions}
+        if step is not None and step > LONGEST_STEP:
+            raise DataError(f"a step of {step:g} m; give --step in metres, {LONGEST_STEP:g} at most")
         step = step if step is not None else own["forward"].forward if "forward" in own else STEP
         turn = turn if turn is not None else own["left"].turn if "left" in own else TURN
         if not 0 < step < math.inf or not 0 < turn <= 180:

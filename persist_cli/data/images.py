@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.errors import DataError
@@ -39,26 +41,46 @@ def encode_depth(depth: Array) -> bytes:
 
 
 def decode_rgb(data: bytes) -> Array:
-    """The uint8 ``[height, width, 3]`` image of PNG (or JPEG) bytes.
+    """The uint8 ``[height, width, 3]`` image of PNG (or JPEG) bytes, its pixels as they are stored.
 
     Raises:
-        OSError, SyntaxError, ValueError: as Pillow does, when the bytes are no whole image.
+        OSError, SyntaxError, ValueError: as Pillow does, when the bytes are no whole image, or too large a one.
     """
-    with Image.open(io.BytesIO(data)) as image:
+    with _opened(data) as image:
         return np.array(image.convert("RGB"))
+
+
+def decode_photo(data: bytes) -> Array:
+    """The same as viewers show it: a phone stores a photo as it is held, and says in EXIF how it is to be turned.
+
+    Raises:
+        OSError, SyntaxError, ValueError: as ``decode_rgb``.
+    """
+    with _opened(data) as image:
+        return np.array(ImageOps.exif_transpose(image).convert("RGB"))
 
 
 def decode_depth(data: bytes) -> Array:
     """The float32 ``[height, width]`` depth in metres of 16-bit PNG bytes; 0 = missing.
 
     Raises:
-        OSError, SyntaxError, ValueError: as Pillow does, when the bytes are no whole image.
+        OSError, SyntaxError, ValueError: as ``decode_rgb``, or when it has several channels.
     """
-    with Image.open(io.BytesIO(data)) as image:
+    with _opened(data) as image:
         millimetres = np.array(image)
     if millimetres.ndim != 2:
         raise ValueError("a depth image must have one channel")
     return (millimetres.astype(np.float32)) / np.float32(MILLIMETRES)
+
+
+@contextlib.contextmanager
+def _opened(data: bytes) -> Iterator[Image.Image]:
+    """The image of some bytes; ``ValueError`` also for one that Pillow refuses to decode for its size."""
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            yield image
+    except Image.DecompressionBombError as error:
+        raise ValueError(str(error)) from error
 
 
 def parse_size(text: str) -> tuple[int, int]:

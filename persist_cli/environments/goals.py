@@ -142,11 +142,14 @@ class KnownGround:
         self._kept: dict[tuple[float, ...], Distances] = {}
 
     def metres(self, positions: Float[Tensor, "place 3"], goal: Float[Tensor, " 3"]) -> Float[Tensor, " place"]:
-        """Return the metres from world positions to a goal, float64; always finite."""
+        """Return the metres from world positions to a goal, float64; always finite.
+
+        They are straight where the task says so, and where the goal is inside something to which no ground leads.
+        """
         places, there = self.ground.places(positions), self.ground.places(goal)
-        if self.task.distance == "straight":
+        distances = None if self.task.distance == "straight" else self._distances(there)
+        if distances is None or not bool(distances.metres.isfinite().any()):
             return torch.linalg.vector_norm(places - there, dim=1)  # type: ignore[no-any-return]
-        distances = self._distances(there)
         metres = distances.at(places)
         for number in metres.isinf().nonzero()[:, 0].tolist():
             metres[number] = nearest_way(distances, places[number])

@@ -14,7 +14,7 @@ from persist_cli.api.actions import walking_actions
 from persist_cli.api.ground import Body
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.images import crop_resize
-from persist_cli.data.importers.readers import read_color
+from persist_cli.data.importers.readers import read_photo
 from persist_cli.data.store import SUFFIX, Store, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.memorize.depth_model import estimate_depth
@@ -61,7 +61,7 @@ def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
     Raises:
         DataError: one line, when picture or depth cannot be read, do not fit, or there is no depth.
     """
-    rgb = read_color(picture)
+    rgb = read_photo(picture)
     depth = _depth_of(picture, rgb, options)
     if depth.shape != rgb.shape[:2]:
         sizes = " and ".join(f"{width}×{height}" for height, width in (rgb.shape[:2], depth.shape))
@@ -94,8 +94,9 @@ def read_depth(path: Path) -> Array:
     Raises:
         DataError: when the file is missing, damaged, or neither ``.npy`` in metres nor a PNG of 16 bits.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
+    broken = (EOFError, OSError, SyntaxError, ValueError, zipfile.BadZipFile, Image.DecompressionBombError)
     try:
         if path.suffix == ".npy":
             values = np.load(path, allow_pickle=False)
@@ -104,7 +105,7 @@ def read_depth(path: Path) -> Array:
                 values = np.array(image)
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such depth file") from error
-    except (UnidentifiedImageError, EOFError, OSError, SyntaxError, ValueError, zipfile.BadZipFile) as error:
+    except broken as error:
         raise DataError(f"{path}: cannot be read as depth ({str(error).splitlines()[0]})") from error
     if not isinstance(values, np.ndarray):
         raise DataError(f"{path}: cannot be read as depth (an archive of arrays, as .npz is; give a single array)")

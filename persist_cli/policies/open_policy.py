@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from persist_cli.api.policy import Policy
-from persist_cli.errors import PluginError, hint
+from persist_cli.errors import PersistError, PluginError, hint
 from persist_cli.plugins import list_plugins, make_policy
 from persist_cli.policies.trained import find_policy
 
@@ -29,6 +29,8 @@ def open_policy(text: str, settings: Mapping[str, Any] | None = None) -> Policy:
     if any(plugin.name == text for plugin in list_plugins("policy")):
         return make_policy(text, settings)
     if Path(text).exists() or len(Path(text).parts) > 1:
+        if "checkpoint" in settings:
+            raise PersistError(f"{text}: a trained policy; leave out policy.checkpoint, or name its plugin instead")
         trained = find_policy(Path(text))
         return make_policy(trained.policy, {**settings, "checkpoint": str(trained.folder)})
     names = sorted({plugin.name for plugin in list_plugins("policy")})

@@ -275,6 +275,12 @@ def write_choices(plan: Plan, choices: Mapping[str, Any], splits: Sequence[str])
         write_text(path, f"# chosen: {choice['reason']}\n{yaml.safe_dump(values, sort_keys=False)}")
 
 
+def kept_choices(out: Path) -> dict[str, Any]:
+    """What an earlier run chose for each memory, and its trials, as JSON values."""
+    path = out / CHOICES
+    return dict(read_json(path)["memories"]) if path.is_file() else {}
+
+
 def recipe_file(out: Path, memory: str) -> Path:
     """The recipe of a memory with what was chosen for it."""
     return out / "recipes" / f"{memory}.yaml"
@@ -334,11 +340,12 @@ def run_choose(plan: Plan) -> None:
     for line in preparations(plan):
         run_line(line)
     splits = splits_of(plan.validation)
-    choices: dict[str, Any] = {}
+    choices = kept_choices(plan.out)
     for memory in plan.memories:
         for trials in trials_of(plan, memory):
-            choices[memory] = choice_json(memory, trials, splits)
-            write_choices(plan, choices, splits)
+            if memory not in choices or len(trials) >= len(choices[memory]["trials"]):  # else it is read again only
+                choices[memory] = choice_json(memory, trials, splits)
+                write_choices(plan, choices, splits)
     say(f"\n{table_text(choices)}")
 
 

@@ -258,7 +258,7 @@ class MiniWorld(Simulator):
         return replace(self._carried, ground=before, heading=heading, elevation=CARRIED_HEIGHT)
 
     def _within_reach(self) -> Thing | None:
-        """The nearest movable thing ahead."""
+        """The nearest movable thing ahead; of a pile, which stands in one place, the thing on top."""
         x, z = self.ahead(self._heading)
         near = []
         for thing in self._things:
@@ -266,7 +266,7 @@ class MiniWorld(Simulator):
             distance, along = math.hypot(*offset), offset[0] * x + offset[1] * z
             if thing.movable and distance < REACH + thing.radius and along > 0.8 * distance:
                 near += [(distance, thing)] if self._no_wall_before(thing.ground) else []
-        return min(near, key=lambda item: item[0])[1] if near else None
+        return min(near, key=lambda item: (item[0], -item[1].elevation))[1] if near else None
 
     def _no_wall_before(self, ground: Ground) -> bool:
         """Whether the straight way from the agent stays within rooms and doorways."""

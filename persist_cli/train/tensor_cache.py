@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +18,7 @@ from typing import Any, Final
 from torch import Tensor
 
 from persist_cli.errors import CheckpointError, PersistError
-from persist_cli.io.files import ASIDE, read_tensors, write_tensors
+from persist_cli.io.files import ASIDE, read_tensors, remove_leftovers, write_tensors
 from persist_cli.viewing.console import say
 
 FORMAT: Final = 3  # of the entries; those of another format are not found
@@ -65,13 +63,14 @@ class TensorCache:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise PersistError(f"{self.folder}: no folder for a cache can be made there ({error.strerror})") from error
-        for aside in self.folder.glob(f"*/{ASIDE}*"):
-            _remove_stale(aside)
+        for part in self.folder.iterdir():
+            remove_leftovers(part, age=STALE)
         self.measure()
 
     def measure(self) -> None:
         """Count the bytes in the folder anew."""
-        self.used = sum(_size(path) for path in self.folder.glob("*/*.safetensors"))
+        entries = (path for path in self.folder.glob("*/*.safetensors") if not path.name.startswith(ASIDE))
+        self.used = sum(map(_size, entries))
         self.added = 0
 
     def path(self, key: str) -> Path:
@@ -130,11 +129,3 @@ def _size(path: Path) -> int:
         return path.stat().st_size
     except FileNotFoundError:  # another process may have removed it
         return 0
-
-
-def _remove_stale(aside: Path) -> None:
-    try:
-        if time.time() - aside.stat().st_mtime > STALE:
-            shutil.rmtree(aside, ignore_errors=True)
-    except FileNotFoundError:  # its writer may have renamed it
-        return

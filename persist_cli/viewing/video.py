@@ -103,7 +103,10 @@ def read_video(path: Path, height: int, width: int) -> UInt8[Tensor, "frame heig
 
     try:
         with av.open(str(path)) as container:
-            frames = [frame.reformat(width, height, format="rgb24").to_ndarray() for frame in container.decode(video=0)]
+            pictures = container.decode(video=0) if container.streams.video else ()
+            frames = [picture.reformat(width, height, format="rgb24").to_ndarray() for picture in pictures]
     except (OSError, av.error.FFmpegError) as error:
         raise DataError(f"{path}: cannot be read as a video ({error})") from error
+    if not frames:
+        raise DataError(f"{path}: holds no frames of a video")
     return torch.from_numpy(np.stack(frames))

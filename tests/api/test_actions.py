@@ -81,3 +81,8 @@ def test_walking_actions_of_another_size_replace_only_what_is_named():
 def test_a_step_or_turn_that_is_no_motion_is_refused(step, turn):
     with pytest.raises(DataError, match="give --step above 0 and --turn up to 180"):
         free_motion().walking(step, turn)
+
+
+def test_a_step_in_millimetres_is_refused():
+    with pytest.raises(DataError, match="a step of 250 m; give --step in metres, 10 at most"):
+        free_motion().walking(250.0)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 
-from persist_cli.data.images import crop_resize, parse_size
+from persist_cli.data.images import crop_resize, decode_photo, decode_rgb, parse_size
+from persist_cli.data.importers.readers import read_color, read_photo
 from persist_cli.errors import DataError
+from tests.support.damage import write_huge_image
 
 INTRINSICS = np.array([[50.0, 0, 33.0], [0, 52.0, 22.0], [0, 0, 1]])
 
@@ -65,3 +70,20 @@ def test_a_text_that_is_no_size_is_refused(text: str) -> None:
 
 def test_a_size_is_height_by_width() -> None:
     assert parse_size("240x320") == (240, 320)
+
+
+def test_a_photo_is_turned_as_its_exif_says_and_the_image_of_a_capture_is_not(tmp_path: Path) -> None:
+    stored, exif, path = np.zeros((8, 16, 3), np.uint8), Image.Exif(), tmp_path / "photo.png"
+    stored[:4] = 255  # the upper half
+    exif[0x0112] = 6  # the camera was held turned by a quarter
+    Image.fromarray(stored).save(path, exif=exif)
+    shown = np.rot90(stored, -1)
+    assert all(np.array_equal(photo, shown) for photo in (decode_photo(path.read_bytes()), read_photo(path)))
+    assert all(np.array_equal(image, stored) for image in (decode_rgb(path.read_bytes()), read_color(path)))
+
+
+def test_an_image_that_would_fill_the_memory_is_named(tmp_path: Path) -> None:
+    write_huge_image(tmp_path / "large.png")
+    for read in (read_color, read_photo):
+        with pytest.raises(DataError, match=r"large.png: not a whole image \(Image size \(900000000 pixels\) exceeds"):
+            read(tmp_path / "large.png")

@@ -111,6 +111,7 @@ def test_the_edits_are_not_saved_in_the_place_of_the_memory(persist, room, tmp_p
     ("options", "words"),
     [
         (["--list", "--remove", "box#1"], "--list only lists"),
+        (["--list", "--seed", "4", "--save-edits", "x.json"], "--save-edits, --seed: not with --list"),
         (["--remove", "box#1"], "give --out FILE"),
         (["--remove", "box#1", "--out", "x.png"], "name a memory file to write"),
         (["--remove", "box#1", "--out", "x.safetensors", "--checkpoint", "reference"], "add --camera DATA#trajectory"),

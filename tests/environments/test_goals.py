@@ -45,6 +45,12 @@ def test_unknown_ground_counts_as_free_and_far_places_have_a_way_too():
     assert metres(nothing, (0.0, 0.0), (2.0, 0.0)) == pytest.approx(2.0, abs=0.1)
 
 
+def test_a_goal_inside_something_thick_is_as_far_as_a_line_to_it():
+    ground = walled()
+    ground.states[:, 30:] = int(Cover.OCCUPIED)
+    assert metres(ground, (2.0, 2.0), (4.9, 2.0)) == pytest.approx(2.9)
+
+
 def test_free_places_are_those_that_can_be_reached_from_the_start_at_its_height():
     ground = walled()
     ground.states[30:, 30] = int(Cover.OCCUPIED)  # the wall now parts the house

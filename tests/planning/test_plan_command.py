@@ -11,6 +11,7 @@ from PIL import Image
 
 from persist_cli.api.ground import ground_axes
 from persist_cli.viewing.video import read_video
+from tests.support.damage import write_huge_image
 from tests.support.micro_runs import SIZE
 from tests.support.packages import install
 from tests.support.rooms import UP, Room, look
@@ -235,6 +236,7 @@ def test_a_plan_that_cannot_be_written_leaves_nothing_or_the_whole_plan_before(p
         ("{walks}#1:5", PLACE, "is of scene 'room-1', start and memory are of 'room-0'"),
         ("missing.png", (), "--goal missing.png: no such image; give an image file, a frame DATA#trajectory:frame"),
         ("{tmp}/text.png", (), "not a whole image"),
+        ("{tmp}/large.png", (), "not a whole image (Image size (900000000 pixels) exceeds limit"),
         ("1.0,2.0", ("--cost", "lpips"), "cost 'lpips' needs the image of the goal, which has none; give an image"),
         ("300,0", (), "m from all that is known, which is too far to plan a way; name a place within 50 m of it (the"),
         ("{tmp}/goal.png", PLACE, "cost 'distance' needs the place of the goal, which has none; give a place"),
@@ -242,6 +244,7 @@ def test_a_plan_that_cannot_be_written_leaves_nothing_or_the_whole_plan_before(p
 )
 def test_goals_that_cannot_be_used_are_one_line_and_leave_nothing(plan, walks, tmp_path, goal, options, message):
     (tmp_path / "text.png").write_text("no image")
+    write_huge_image(tmp_path / "large.png")
     Image.new("RGB", (SIZE, SIZE)).save(tmp_path / "goal.png")
     result = plan(*options, goal=goal.format(walks=walks, tmp=tmp_path))
     assert (result.code, result.out) == (1, "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shlex
 from dataclasses import replace
@@ -33,6 +34,7 @@ from persist_cli.reproduce.choose import (
     result_folder,
     run_choose,
     train_command,
+    trials_of,
 )
 from tests.support.command_lines import parse_line
 from tests.support.example_results import example_results
@@ -183,11 +185,17 @@ def test_figures_of_one_base_are_not_told_of_another(measured: tuple[Path, list[
         run_choose(plan(out, "none"))
 
 
-def test_memories_may_be_added(measured: tuple[Path, list[str]]) -> None:
+def test_memories_may_be_added_and_what_was_chosen_stays(
+    measured: tuple[Path, list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, _ = measured
     run_choose(plan(out, "none"))
-    run_choose(plan(out, "none", "snapshots"))
+    run_choose(plan(out, "snapshots"))
     assert list(chosen_sampling(out)) == ["none", "snapshots"]
+    before = (out / "choices.json").read_bytes()
+    monkeypatch.setattr(choose, "trials_of", lambda *_: itertools.islice(trials_of(plan(out), "snapshots"), 1))
+    run_choose(plan(out, "snapshots"))  # stopped after it has read one trial again
+    assert (out / "choices.json").read_bytes() == before
 
 
 def test_before_anything_is_chosen_an_error_says_what_chooses(tmp_path: Path) -> None:

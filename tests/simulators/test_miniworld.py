@@ -16,6 +16,7 @@ from persist_cli.api.observations import Frame
 from persist_cli.errors import DataError, RecipeError
 from persist_cli.plugins import make_simulator
 from persist_cli.simulators.building import build_house
+from persist_cli.simulators.houses import Thing
 from persist_cli.simulators.miniworld import MiniWorld, MiniWorldSettings
 from persist_cli.simulators.rendering import Renderer
 from tests.support.miniworlds import fingerprint, make_world, print_errors_without, print_fingerprint, put_somewhere
@@ -195,6 +196,26 @@ def test_pick_up_and_drop_move_a_thing(world: MiniWorld) -> None:
     assert world.act("drop")
     assert not np.array_equal(before, carried)
     assert not np.array_equal(carried, world.observe().rgb)
+
+
+def face_a_pile(world: MiniWorld) -> Thing:
+    """Stand before a movable box with something on it, and return that."""
+    for seed in range(50):
+        world.open_scene(seed)
+        for top in (thing for thing in world.house.things if thing.movable and thing.elevation > 0):
+            boxes = [thing for thing in world.house.things if thing.ground == top.ground and thing.elevation == 0]
+            x, z = top.ground[0] - 1.2, top.ground[1]
+            if boxes and boxes[0].movable and world.is_free((x, z)):
+                world.place((x, z), 0.0)
+                if world.act("pick_up"):
+                    return top
+    pytest.fail("no house has a pile with free ground before it")
+
+
+def test_what_stands_on_a_box_is_picked_up_before_the_box(world: MiniWorld) -> None:
+    top = face_a_pile(world)
+    left = [thing for thing in world._things if thing.ground == top.ground]
+    assert [thing.elevation for thing in left] == [0]
 
 
 def test_toggle_changes_a_thing_and_a_second_toggle_undoes_it(world: MiniWorld) -> None:

@@ -1,9 +1,11 @@
-"""Files damaged at random places: a bit flipped, bytes zeroed, or the end cut off."""
+"""Files damaged at random places: a bit flipped, bytes zeroed, or the end cut off; and an image too large to read."""
 
 from __future__ import annotations
 
 import random
 import shutil
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -53,3 +55,10 @@ def copied(folder: Path, target: Path) -> Path:
     """A copy of a folder, whose files a test may damage."""
     shutil.copytree(folder, target)
     return target
+
+
+def write_huge_image(path: Path) -> None:
+    """Write the beginning of a PNG of 30,000 × 30,000 pixels, which Pillow refuses to decode."""
+    header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 8) + b"IDAT" + bytes(12))

@@ -292,12 +292,14 @@ def test_a_full_disk_ends_the_storing_with_one_line(tmp_path, capsys):
 
 
 def test_leftovers_of_killed_writers_are_removed_and_files_of_living_ones_are_not(tmp_path):
-    stale, fresh = tmp_path / "aa" / f"{ASIDE}0-x", tmp_path / "bb" / f"{ASIDE}1-x"
-    for folder in (stale, fresh):
-        folder.mkdir(parents=True)
+    stale, fresh = tmp_path / "aa" / f"{ASIDE}0-x.safetensors", tmp_path / "bb" / f"{ASIDE}1-x.safetensors"
+    for path in (stale, fresh):
+        path.parent.mkdir()
+        path.write_bytes(bytes(1000))
     os.utime(stale, times=(0, stale.stat().st_mtime - STALE - 60))
-    TensorCache(CacheSettings(tmp_path, 1))
+    cache = TensorCache(CacheSettings(tmp_path, 1))
     assert (stale.exists(), fresh.exists()) == (False, True)
+    assert cache.used == 0
 
 
 def test_a_cache_may_be_unlimited_but_its_limit_must_be_a_number(tmp_path):

@@ -1,8 +1,12 @@
 """Videos and GIFs are read back nearly as they were written."""
 
+import av
+import numpy as np
+import pytest
 import torch
 from PIL import Image
 
+from persist_cli.errors import DataError
 from persist_cli.viewing.video import beside, enlarge, labelled, read_video, write_gif, write_video
 
 RAMP = (torch.linspace(0, 255, 64)[None, None, :, None] * torch.linspace(0.5, 1, 5)[:, None, None, None]).expand(
@@ -16,6 +20,16 @@ def test_a_video_is_read_back_with_the_codecs_losses_only(tmp_path):
     frames = read_video(tmp_path / "a.mp4", 64, 64)
     assert frames.shape == VIDEO.shape
     assert (frames.int() - VIDEO.int()).abs().float().mean() < 4
+
+
+def test_a_file_of_sound_alone_is_no_video(tmp_path):
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("aac", rate=16000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        sound.rate = 16000
+        container.mux([*stream.encode(sound), *stream.encode(None)])
+    with pytest.raises(DataError, match="holds no frames of a video"):
+        read_video(tmp_path / "a.mp4", 64, 64)
 
 
 def test_a_gif_is_endless_and_has_every_frame_in_nearly_its_colours(tmp_path):

@@ -220,5 +220,7 @@ class PublishedTransformer(VisionTransformer):
         return weights, False
 
     def _unavailable(self, cause: str) -> CheckpointError:
-        hint = "set the encoder's weights to a directory or to fetched weights (persist weights list), or take 'patches'"
+        hint = (
+            "set the encoder's weights to a directory or to fetched weights (persist weights list), or take 'patches'"
+        )
         return CheckpointError(f"{self.title} weights {self.settings.weights!r}: {cause}; {hint}")

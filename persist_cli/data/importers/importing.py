@@ -16,7 +16,7 @@ from persist_cli.data.images import CropResize, crop_resize, parse_size
 from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError, PluginError
-from persist_cli.io.files import ASIDE
+from persist_cli.io.files import remove_leftovers
 from persist_cli.plugins import find_plugin, make_importer
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 
@@ -35,6 +35,8 @@ class ImportPlan:
         skip_bad: leave out frames that cannot be used.
         hold_out: share of the frames at the end of each trajectory that are kept for tests; 0 for none.
         part: ``train`` for the frames before those, ``test`` for all, of which those at the end are held out.
+        usable: number of the kept frames of the trajectory that can be used, where that was counted: where frames are
+            held out and bad ones left out.
     """
 
     size: tuple[int, int] | None = None
@@ -44,6 +46,7 @@ class ImportPlan:
     skip_bad: bool = False
     hold_out: float = 0.0
     part: str = ""
+    usable: int | None = None
 
     @staticmethod
     def of(
@@ -120,12 +123,33 @@ class ImportPlan:
         if last is not None:
             yield replace(last, action=None)
 
-    def length(self, trajectory: ForeignTrajectory) -> int:
-        """Number of frames that are kept when none is bad."""
+    def count_usable(self, trajectory: ForeignTrajectory) -> int:
+        """Read the trajectory's frames, and return how many of those that are looked at can be used.
+
+        Raises:
+            DataError: when no frame can be used.
+        """
+        causes: list[DataError] = []
+        with progress() as bar:
+            task = add_task(bar, f"checking {trajectory.name}", self.chosen(trajectory), "frames")
+            for frame in islice(trajectory.frames, 0, None, self.every):
+                causes += [frame] if isinstance(frame, DataError) else []
+                bar.advance(task)
+        usable = self.chosen(trajectory) - len(causes)
+        if not usable:
+            raise DataError(f"{trajectory.name}: none of its frames can be used; {causes[0]}")
+        return usable
+
+    def chosen(self, trajectory: ForeignTrajectory) -> int:
+        """Number of frames that are looked at, bad ones included."""
         return -(-trajectory.length // self.every)
 
+    def length(self, trajectory: ForeignTrajectory) -> int:
+        """Number of frames that are kept, when none is bad or as counted."""
+        return self.chosen(trajectory) if self.usable is None else self.usable
+
     def written(self, trajectory: ForeignTrajectory) -> int:
-        """Number of frames of this part when none is bad."""
+        """Number of frames of this part, when none is bad or as counted."""
         return self.first_held_out(trajectory) if self.part == "train" else self.length(trajectory)
 
     def _vocabulary(self, own: ActionVocabulary) -> ActionVocabulary:
@@ -161,8 +185,11 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         raise DataError(f"{source}: no such file or folder")
     if not 0 <= plan.hold_out < 1:
         raise DataError(f"--hold-out {plan.hold_out:g}: give a share of the frames, 0 or more and below 1, as in 0.3")
+    usable: dict[str, int] = {}
+    if plan.hold_out and plan.skip_bad:  # the share that is held out is one of the usable frames
+        usable = {trajectory.name: plan.count_usable(trajectory) for trajectory in importer.trajectories(source)}
     rows = [
-        import_trajectory(importer, trajectory, part, folder)
+        import_trajectory(importer, trajectory, replace(part, usable=usable.get(trajectory.name)), folder)
         for part, folder in plan.parts(out)
         for trajectory in importer.trajectories(source)
     ]
@@ -193,11 +220,12 @@ def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: I
         _write(path, info, plan.written(trajectory), frames)
         state = "written"
     length = TrajectoryFile(path).length
+    looked_at = plan.written(trajectory) if plan.part == "train" else plan.chosen(trajectory)
     return {
         "name": f"{out.name}/{trajectory.name}" if plan.part else trajectory.name,
         "frames": length,
         # later frames take the places of those that are left out of the training part
-        "left_out": len(left_out) if state == "written" else max(0, plan.written(trajectory) - length),
+        "left_out": len(left_out) if state == "written" else max(0, looked_at - length),
         "causes": [str(cause) for cause in left_out[:MOST_CAUSES]],
         "height": info.height,
         "width": info.width,
@@ -230,8 +258,7 @@ def _is_imported(path: Path, info: TrajectoryInfo, plan: ImportPlan, trajectory:
 
 
 def _write(path: Path, info: TrajectoryInfo, length: int, frames: Iterator[Frame]) -> None:
-    for leftover in path.parent.glob(f"{ASIDE}*-{path.name}"):
-        leftover.unlink(missing_ok=True)  # of a killed run
+    remove_leftovers(path.parent, path.name)
     with progress() as bar:
         task = add_task(bar, path.name.removesuffix(SUFFIX), length, "frames")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from persist_cli.errors import DataError
 
@@ -18,6 +18,11 @@ def read_color(path: Path) -> np.ndarray[Any, Any]:
         DataError: when it is missing, truncated or no image.
     """
     return np.array(_read_image(path).convert("RGB"))
+
+
+def read_photo(path: Path) -> np.ndarray[Any, Any]:
+    """The same as viewers show it, turned as its EXIF says; not for captures, whose intrinsics are of stored pixels."""
+    return np.array(ImageOps.exif_transpose(_read_image(path)).convert("RGB"))
 
 
 def read_depth(path: Path, units_per_metre: float, missing: tuple[int, ...] = (0,)) -> np.ndarray[Any, Any]:
@@ -63,5 +68,5 @@ def _read_image(path: Path) -> Image.Image:
             return image
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file") from error
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: not a whole image ({error})") from error

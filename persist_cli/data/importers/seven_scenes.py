@@ -61,7 +61,8 @@ class SevenScenes(Importer):
         source = source.resolve()
         if not source.is_dir():
             raise DataError(f"{source}: no such folder")
-        sequences = sorted(path for path in source.iterdir() if path.is_dir() and SEQUENCE.match(path.name))
+        folders = [path for path in source.iterdir() if path.is_dir() and SEQUENCE.match(path.name)]
+        sequences = sorted(folders, key=lambda folder: _numbered(folder.name))
         if any(source.glob("frame-*")):
             sequences = [source]
         if not sequences:
@@ -120,8 +121,13 @@ def _frame_files(folder: Path) -> list[FrameFiles]:
             depth=paths.get("depth", folder / f"{stem}.depth.png"),
             pose=paths.get("pose", folder / f"{stem}.pose.txt"),
         )
-        for stem, paths in sorted(paths_by_stem.items())
+        for stem, paths in sorted(paths_by_stem.items(), key=lambda item: _numbered(item[0]))
     ]
+
+
+def _numbered(name: str) -> tuple[int, str]:
+    """The order of a name that ends with a number, which may lack leading zeros."""
+    return int(re.sub(r"^\D*", "", name)), name
 
 
 def _pose(frame: FrameFiles) -> Array | DataError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from persist_cli.data.importers.importing import ImportPlan, run_import
 from persist_cli.data.importers.seven_scenes import SevenScenes
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PluginError
+from persist_cli.io.files import ASIDE
 from tests.support.rooms import Room, walk, write_sequence
 
 ROOM = Room()
@@ -227,6 +229,35 @@ def test_bad_frames_before_the_held_out_ones_are_counted_in_both_parts(tmp_path:
         run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True, hold_out=0.3), True)
         rows = json.loads(capsys.readouterr().out)["trajectories"]
         assert [(row["state"], row["left_out"]) for row in rows] == [(state, count) for count in counts]
+
+
+def test_the_share_that_is_held_out_is_one_of_the_frames_that_can_be_used(tmp_path: Path) -> None:
+    sequence = write_sequence(tmp_path / "kitchen", 10)
+    for path in sorted(sequence.glob("*.pose.txt"))[1:5]:
+        path.write_text(LOST)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True, hold_out=0.3), False)
+    train, test = (Store(tmp_path / "out" / part)[0] for part in ("train", "test"))
+    assert (len(train), len(test), test.info.source["held_out_from"]) == (4, 6, 4)
+
+
+def test_frames_are_in_the_order_of_their_numbers_with_or_without_leading_zeros(tmp_path: Path) -> None:
+    sequence = write_sequence(tmp_path / "kitchen", 12)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(), False)
+    for path in sequence.glob("frame-*"):
+        path.rename(path.with_name(re.sub(r"frame-0*(?=\d)", "frame-", path.name)))
+    run_import("7scenes", sequence, tmp_path / "bare", ImportPlan(), False)
+    padded, bare = (Store(tmp_path / name)[0].read().observations for name in ("out", "bare"))
+    assert torch.equal(padded.rgb, bare.rgb)
+    assert torch.equal(padded.cameras.world_from_camera, bare.cameras.world_from_camera)
+
+
+def test_an_import_leaves_alone_what_another_one_is_writing(tmp_path: Path) -> None:
+    own, others = (tmp_path / "out" / f"{ASIDE}0a1b2c3d-{name}.parquet" for name in ("kitchen", "red-kitchen"))
+    own.parent.mkdir()
+    for path in (own, others):
+        path.touch()
+    run_import("7scenes", write_sequence(tmp_path / "kitchen", 2), tmp_path / "out", ImportPlan(), False)
+    assert (own.exists(), others.exists()) == (False, True)
 
 
 @pytest.mark.parametrize(("share", "cause"), [(1.0, "--hold-out 1: give a share"), (0.01, "leaves a part empty")])

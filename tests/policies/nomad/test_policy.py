@@ -11,7 +11,7 @@ import torch
 from persist_cli.api.ground import Cover, GroundMap
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.data.store import Store
-from persist_cli.errors import CheckpointError, PluginError, RecipeError
+from persist_cli.errors import CheckpointError, PersistError, PluginError, RecipeError
 from persist_cli.io.files import read_tensors
 from persist_cli.policies.nomad.network import GoalPlace, NomadNetwork
 from persist_cli.policies.nomad.policy import leaves_free
@@ -46,6 +46,11 @@ def test_it_proposes_ways_of_the_vocabulary_that_follow_from_the_seed(policy_run
     assert {name for way in ways for name in way} <= {"forward", "left", "right"}
     assert ways == policy.propose(situation, 6, 12, draw())
     assert ways != policy.propose(situation, 6, 12, draw(1))
+
+
+def test_the_folder_of_a_policy_and_another_checkpoint_are_refused(policy_run):
+    with pytest.raises(PersistError, match=r"a trained policy; leave out policy\.checkpoint, or name its plugin"):
+        open_policy(str(policy_run), {"checkpoint": "elsewhere"})
 
 
 def test_without_an_image_it_goes_where_a_masked_goal_leads_whatever_the_goal(policy_run, situation):
