@@ -138,18 +138,18 @@ def trace(
     thin = None if sheets is None else torch.nn.functional.pad(sheets, (1, 1, 1, 1, 1, 1)).flatten()
     walk = _Walk.begin(clear_border, start, direction)
     before, found = flat[walk.place] * (walk.now <= 0), torch.zeros_like(walk.ray)
+    inside = torch.ones_like(walk.ray, dtype=torch.bool)  # rays that have left are carried along until many have
     while len(walk.ray):
         thing, at = flat[walk.place], walk.now
         if thin is not None:
             thing, at = walk.across(thin[walk.place], thing)
-        new = ((thing != before) & (thing > 0) & (found < layers)).nonzero()[:, 0]
+        new = ((thing != before) & (thing > 0) & (found < layers) & inside).nonzero()[:, 0]
         layer, ray = found[new], walk.ray[new]
         depth[layer, ray], cells[layer, ray] = at[new], numbers[walk.place[new]]
         found[new] += 1
-        going = walk.advance(found < layers)
-        before = thing
-        if int(going.sum()) < KEPT_SHARE * len(going):
-            walk, before, found = walk.kept(going), before[going], found[going]
+        inside, before = walk.advance(inside & (found < layers)), thing
+        if int(inside.sum()) < KEPT_SHARE * len(inside):
+            walk, before, found, inside = walk.kept(inside), before[inside], found[inside], inside[inside]
     return depth, cells
 
 

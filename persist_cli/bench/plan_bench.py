@@ -181,6 +181,8 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     for loop in plan.loops:
         if loop not in LOOPS:
             raise PersistError(f"unknown loop {loop!r}; {hint(loop, LOOPS)}")
+    if not plan.loops:
+        raise PersistError(f"--loops names no loop; give {' or '.join(LOOPS)}")
     cost = make_cost(plan.cost, {})
     names = plan.rows if plan.rows is not None else default_rows(plan.policy, cost.reads)
     rows = RowChoice(names, plan.memories, plan.policy, cost.reads, plan.planning.cem.candidates).rows()
@@ -199,9 +201,8 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         episodes = journal.episodes() if journal.begun else plan.source.episodes()
         if checkpoint is not None:
             check_model(checkpoint, rows, episodes)
-        if not journal.begun or (checkpoint is not None and not journal.identity().get("checkpoint")):
-            known = known_scenes(checkpoint, trained_policy(policies[plan.policy]))
-            check_scenes(episodes.scenes, known, plan.allow_training_scenes)
+        known = known_scenes(checkpoint, trained_policy(policies[plan.policy]))
+        check_scenes(episodes.scenes, known, plan.allow_training_scenes)
         check_budget(plan, rows, episodes)
         journal.begin(values, episodes)
     processes.wait()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 
 from jaxtyping import Float
@@ -86,10 +87,16 @@ def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
 
 def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Metric) -> list[int]:
     """Numbers of the best, the median and the worst of some clips."""
-    sign = -1.0 if metric.better == "higher" else 1.0
     known = [clip for clip in clips if figures[clip].isfinite()] or list(clips)
-    ordered = sorted(known, key=lambda clip: sign * float(figures[clip]))
+    ordered = sorted(known, key=lambda clip: worseness(float(figures[clip]), metric))
     return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
+
+
+def worseness(figure: float, metric: Metric) -> float:
+    """How bad a figure is; one of a metric that is best at 1, such as sharpness, by its factor to that."""
+    if metric.better is None:
+        return abs(math.log(figure)) if figure > 0 else math.inf
+    return -figure if metric.better == "higher" else figure
 
 
 def clip_picture(

@@ -161,11 +161,14 @@ def prepare(
     )
     journal = Journal(out)
     if processes.main:
+        if not plan.allow_training_scenes:
+            protocol.refuse_training_scenes(search, ALLOW)
         values = identity(plan, sampling, checkpoints, metrics)
         journal.check(values)
         check_row_numbers(journal, checkpoints, plan.memories or ())
         if journal.cases() is None:
-            cases = find_cases(protocol, search, plan)
+            warn(f"finding clips for the protocol {protocol.name!r} in {search.where}")
+            cases = protocol.find(search)
             build_control_rows(models, checkpoints, config, protocol, cases)  # controls may not suit the clips
             with busy("hashing the data"):
                 journal.begin(values, cases)
@@ -203,18 +206,6 @@ def check_choices(plan: EvalPlan) -> None:
         raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
-
-
-def find_cases(protocol: Protocol, search: ClipSearch, plan: EvalPlan) -> list[Case]:
-    """Find the clips.
-
-    Raises:
-        DataError: when there is none, or when a model was trained on a scene of the data, unless the plan allows it.
-    """
-    if not plan.allow_training_scenes:
-        protocol.refuse_training_scenes(search, ALLOW)
-    warn(f"finding clips for the protocol {protocol.name!r} in {search.where}")
-    return protocol.find(search)
 
 
 def check_row_numbers(journal: Journal, checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> None:

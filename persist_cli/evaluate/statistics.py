@@ -49,6 +49,7 @@ models each that differ by chance alone had an interval that left zero out in 13
 Array = NDArray[np.float64]
 
 Counts = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 Distance = Callable[[Counts, int, int], float]  # takes how often each clip counts, a model and a sampling seed
 
@@ -102,6 +103,25 @@ class Draws:
 
 
 @dataclass(frozen=True)
+class ClipFigures:
+    """What the figure of a metric that every clip has was made of.
+
+    Args:
+        values: ``[model, seed, clip]``, NaN where a clip has no figure.
+        draws: draws of the row's clips and models.
+        weights: how much each value counts; ``None`` where all count the same.
+    """
+
+    values: Array
+    draws: Draws
+    weights: Array | None
+
+    def without(self, clips: Bools) -> Figure:
+        """The figure without some clips."""
+        return mean_figure(np.where(clips, np.nan, self.values), self.draws, self.weights)
+
+
+@dataclass(frozen=True)
 class Figure:
     """One cell of the table.
 
@@ -116,6 +136,7 @@ class Figure:
         by_model: mean of each training seed.
         resampled: mean of every bootstrap sample, for paired differences.
         clip_weights: how much each clip counts; ``None`` where all count the same.
+        clips: what it was made of; ``None`` where only a set of clips has a figure.
     """
 
     mean: float
@@ -128,6 +149,7 @@ class Figure:
     by_model: Array
     resampled: Array
     clip_weights: Array | None = None
+    clips: ClipFigures | None = None
 
     @property
     def units(self) -> int:
@@ -173,7 +195,7 @@ def mean_figure(values: Array, draws: Draws, weights: Array | None = None) -> Fi
     clip_weights = None if weights is None else weights.mean(axis=(0, 1))
     drawn = resampled_means(values[..., None], draws, None if weights is None else weights[..., None])[:, 0]
     figure = make_figure(by_seed, drawn, np.where(np.isfinite(per_clip), draws.clusters, -1), per_clip)
-    return replace(figure, clip_weights=clip_weights)
+    return replace(figure, clip_weights=clip_weights, clips=ClipFigures(values, draws, weights))
 
 
 def curve_figure(values: Array, weights: Array, of_curve: Callable[[Array], Array], draws: Draws) -> Figure:
@@ -260,14 +282,26 @@ def make_figure(by_seed: Array, drawn: Array, clusters: Counts, per_clip: Array 
 def difference(figure: Figure, reference: Figure) -> dict[str, float | None] | None:
     """Paired difference to another row's figure with its 95 % interval, from the same bootstrap samples.
 
-    The interval is ``None`` where fewer than ``LEAST_UNITS`` have both figures.
+    Where clips have figures, both are of the clips that have both. The interval is ``None`` where fewer than
+    ``LEAST_UNITS`` have them.
     """
     if len(figure.resampled) != len(reference.resampled):
         return None
+    figure, reference = on_common_clips(figure, reference)
     value = figure.mean - reference.mean
     both = np.where(reference.clusters >= 0, figure.clusters, -1)
     low, high = interval(figure.resampled - reference.resampled, count_clusters(both))
     return {"mean": number(value), "low": number(low), "high": number(high)}
+
+
+def on_common_clips(first: Figure, second: Figure) -> tuple[Figure, Figure]:
+    """Two figures of the same clips over those that both have; they stay where these are all, or clips have none."""
+    if first.clips is None or second.clips is None or len(first.clusters) != len(second.clusters):
+        return first, second
+    lacking = (first.clusters < 0) | (second.clusters < 0)
+    if not ((first.clusters < 0) != (second.clusters < 0)).any():
+        return first, second
+    return first.clips.without(lacking), second.clips.without(lacking)
 
 
 def count_clusters(clusters: Counts) -> int:

@@ -44,6 +44,8 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
         encoder = make_encoder(config.encoder, config.encoder_settings)
     memory = with_scene_model(make_memory(config.name, config.settings, encoder, common_reference(sources)))
     scene = imagining_scene(memory) if plan.complete else None
+    if plan.seed is not None and not isinstance(memory, Scene):
+        raise CheckpointError(f"--seed: a memory of kind {memory.name!r} imagines nothing; leave it out")
     seconds = write_sources(memory, sources)
     frames = sum(len(source.frames) for source in sources)
     paths: dict[str, Tensor] = {}
@@ -58,8 +60,9 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
         extra["seconds_imagining"] = time.perf_counter() - began
     map_file = out.with_suffix(".png")
     if is_picture(data[0]):
-        if map_file.exists() and map_file.samefile(data[0]):
-            map_file = out.with_suffix(".map.png")  # the picture is not replaced by the map of its scene
+        given = [Path(data[0]), *([] if picture.depth is None else [picture.depth])]
+        if map_file.exists() and any(map_file.samefile(path) for path in given):
+            map_file = out.with_suffix(".map.png")  # neither is replaced by the map of the scene
         extra["start"] = f"{sources[0].file.path.parent}#{sources[0].file.name}:0"
     _save_and_print(memory, paths, (out, map_file), json, extra)
     if "start" in extra and not json:

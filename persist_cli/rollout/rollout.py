@@ -31,6 +31,8 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
     """Roll out a checkpoint, or the reference model without a path, and write a folder for each branch."""
     if bool(plan.actions) == plan.follow:
         raise PersistError("give either --actions TEXT or --follow")
+    if plan.body is not None and plan.follow:
+        raise PersistError("--body and --no-body are for --actions; --follow takes the trajectory's own poses")
     if plan.frames and not plan.follow:
         raise PersistError("--frames: only with --follow; with --actions each of them is a frame")
     check_placement(plan.placement)  # a missing accelerator is an error before anything is loaded

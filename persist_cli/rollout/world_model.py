@@ -435,6 +435,6 @@ def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str])
 
 def clip_seed(seed: int, clip: int) -> int:
     """Return the seed of a clip of a rollout, distinct for all seeds below 2^31 and a million clips."""
-    if seed < 0 or clip >= 1_000_000:
-        raise PersistError(f"seed {seed} must not be negative, and a rollout has at most a million clips")
+    if not 0 <= seed < SEEDS or clip >= 1_000_000:
+        raise PersistError(f"seed {seed} must be 0 to {SEEDS - 1}, and a rollout has at most a million clips")
     return seed * 1_000_000 + clip

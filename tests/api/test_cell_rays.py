@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from persist_cli.api.cell_rays import first_surfaces
+from persist_cli.api.cell_rays import first_surfaces, trace
 from persist_cli.api.geometry import unproject
 from tests.support.cell_rooms import BOX, BOX_CELLS, TABLE, TABLE_CELLS, WALL, camera_at, cell_room
 
@@ -47,6 +47,17 @@ def test_unknown_cells_are_clear_and_a_camera_outside_of_the_grid_looks_in():
     outside.world_from_camera[0, :3, 3] -= 5 * camera.world_from_camera[0, :3, 2]
     depth = first_surfaces(grid, outside, layers=2).depth[:, 0, 16, 16]
     torch.testing.assert_close(depth, torch.tensor([5 - 1.5 * 0.25, 5 + 11.5 * 0.25], dtype=torch.float64))
+
+
+def test_a_ray_that_leaves_the_grid_meets_nothing_more_whatever_other_rays_do():
+    floor = torch.zeros(2, 6, 2, dtype=torch.bool)
+    floor[..., 0] = True
+    above, out = torch.tensor([[0.5], [0.5], [0.9]]).double(), torch.tensor([[1.0], [0.0], [-0.15]]).double()
+    start, along = torch.tensor([[0.5], [0.5], [1.5]]).double(), torch.tensor([[0.0], [1.0], [0.0]]).double()
+    starts, directions = torch.cat([above, start.expand(3, 9)], dim=1), torch.cat([out, along.expand(3, 9)], dim=1)
+    for rays in (slice(0, 1), slice(None)):
+        depth, cells = trace(floor.long(), starts[:, rays], directions[:, rays], 1, floor)
+        assert (float(depth[0, 0]), int(cells[0, 0])) == (torch.inf, -1)
 
 
 def test_a_grid_without_a_cell_has_no_surface():

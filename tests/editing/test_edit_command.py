@@ -75,10 +75,14 @@ def test_a_file_of_edits_gives_the_same_memory_to_the_bit(persist, room, tmp_pat
         ),
         (["--move", "table#1", "30,0,0"], "edit 1 (move): it would reach out of the scene"),
         (["--copy", "table#1", "0.25,0,0"], "let it replace them (--overwrite)"),
+        (["--edits", "{large}"], "a thing of 1e+09,1e+09,1e+09 m is larger than the scene"),
         ([], "nothing to edit; for example --remove table#1"),
     ],
 )
 def test_an_edit_that_cannot_be_done_is_one_line_and_writes_nothing(persist, room, tmp_path, options, words):
+    large = tmp_path.with_suffix(".json")
+    large.write_text(json.dumps([{"edit": "insert", "kind": "table", "at": [0, 1, 0], "size": [1e9, 1e9, 1e9]}]))
+    options = [option.format(large=large) for option in options]
     result = persist("edit", room, *options, "--out", tmp_path / "edited.safetensors")
     assert result.code == 1
     assert words in result.err

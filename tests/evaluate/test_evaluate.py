@@ -281,6 +281,10 @@ def test_a_checkpoint_is_named_that_was_trained_on_evaluated_scenes(persist, vox
     assert [warning in line for line in results(tmp_path / "o")["warnings"]] == [True]
     known = results(tmp_path / "o")["checkpoints"][0]["training_scenes"]
     assert known["evaluated"] == ["room-0", "room-1"]
+    command.remove("--allow-training-scenes")  # which must be given again where the evaluation goes on
+    again = persist(*command, "--controls", "copy", "--out", tmp_path / "o")
+    assert (again.code, "the model was trained on its scene 'room-0'" in again.err) == (1, True)
+    assert results(tmp_path / "o")["training_scenes_allowed"] is True
 
 
 def test_scenes_of_the_training_are_refused_and_the_message_says_what_to_do(persist, voxel, walks, tmp_path):

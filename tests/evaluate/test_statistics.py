@@ -111,6 +111,14 @@ def test_houses_that_both_rows_have_are_counted_for_a_paired_interval():
     assert difference(apart(one), apart(two))["low"] is None
 
 
+def test_a_difference_is_of_the_clips_that_both_rows_have():
+    easy, hard = clips(count=30), clips(count=30, offset=-10.0)
+    values = np.concatenate([easy, hard], axis=2)
+    lacking = values.copy()
+    lacking[..., 33:] = np.nan  # the other row has its figure of hard clips alone
+    assert difference(apart(lacking), apart(values)) == pytest.approx({"mean": 0.0, "low": 0.0, "high": 0.0})
+
+
 def test_weighted_clips_of_ratios_give_the_ratio_of_the_sums_in_the_mean_and_in_every_resample():
     energies = np.array([1.0, 400.0, 300.0, 500.0, 200.0, 600.0])  # the first clip is before a plain wall
     values = np.array([98.6, 1.4, 1.2, 1.3, 1.5, 1.1])[None, None]

@@ -170,6 +170,13 @@ def test_reading_paths_together_gives_what_each_read_gives():
         assert all(torch.equal(tensor, alone.tensors()[name]) for name, tensor in together.tensors().items())
 
 
+def test_a_scene_of_cells_too_small_for_what_a_frame_sees_is_refused_before_they_are_made():
+    memory = scene(size=1e-5)
+    with pytest.raises(DataError, match=r"more than 10,000,000 cells of 1e-05 m; take larger cells"):
+        memory.write(room_walk(1))
+    assert memory.figures().bounds is None
+
+
 def test_an_empty_scene_has_no_token_and_no_bounds():
     assert len(scene().read(room_walk(2).cameras, 100)) == 0
     assert scene().figures().bounds is None

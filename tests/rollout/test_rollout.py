@@ -103,6 +103,8 @@ def test_rollouts_that_cannot_work_are_refused_in_one_line(persist, voxel, stage
         (voxel, (), "either --actions TEXT or --follow"),
         (voxel, ("--actions", "lft"), "did you mean 'left'"),
         (voxel, (*left, "--frames", 5), "--frames: only with --follow"),
+        (voxel, ("--follow", "--no-body"), "--body and --no-body are for --actions"),
+        (voxel, (*left, "--seed", 2**40), f"seed {2**40} must be 0 to 2147483647"),
         (voxel, (*left, "--memory", tmp_path / "no.safetensors"), "no.safetensors"),
         (voxel, (*left, "--memory", foreign), "its reference is 'room-1', wanted here is 'room-0'"),
         (voxel, (*left, "--memory", patches), "its encoder settings"),

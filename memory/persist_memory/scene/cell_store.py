@@ -13,9 +13,8 @@ from torch.nn import functional
 from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellGrid, CellOrigin, is_solid
 from persist_cli.errors import CheckpointError, DataError
 from persist_memory.scene.fusion import Votes
+from persist_memory.scene.settings import MOST_CELLS
 from persist_memory.validation import ORIGINS, Shape, check_classes, check_tensors
-
-MOST_CELLS = 10_000_000  # of the box: some 500 MB, and at 0.25 m a house of 200 m by 200 m with four floors
 
 ROOM = 8  # cells that the box grows by beyond what it must along the ground, so that it seldom grows
 

@@ -246,7 +246,10 @@ def _insert(grid: CellGrid, edit: Insert) -> None:
     if rests and [value is None for value in edit.at] != [bool(part > 0.5) for part in grid.axes[2].abs()]:
         raise DataError(f"at {_point_text(edit.at)}: the height alone can be left open")
     extent, color = _usual(grid, edit)
-    counts = (extent / size).round().long().clamp(min=1)
+    counts = (extent / size).round().clamp(min=1)
+    if bool((counts > torch.tensor(grid.shape)).any()):
+        raise DataError(f"a thing of {_point_text(extent.tolist())} m is larger than the scene")
+    counts = counts.long()
     at = grid.axes @ torch.tensor([value or 0.0 for value in edit.at], dtype=torch.float64)
     low = torch.ceil(at / size - counts / 2 - BORDER).long() - torch.tensor(grid.corner)
     steps = [torch.arange(int(first), int(first + count)) for first, count in zip(low[:2], counts[:2], strict=True)]

@@ -20,7 +20,9 @@ from torch import Tensor
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import camera_rays
 from persist_cli.api.observations import Observations
+from persist_cli.errors import DataError
 from persist_memory.grid.storage import pack, unpack
+from persist_memory.scene.settings import MOST_CELLS
 
 UNDER = 0.25  # of a cell's edge that a pixel's point lies under the surface that the pixel sees
 
@@ -152,6 +154,11 @@ def _passed(
         return home
     ends = ends * (farthest / ends[:, 2:].clamp_min(farthest))  # each ray alone: one far pixel shortens no other
     low, high = (_extreme(ends @ lattice_from_camera.T + origin, home[0], largest) for largest in (False, True))
+    if float((high - low + 1).double().prod()) > MOST_CELLS:
+        raise DataError(
+            f"what a frame sees has more than {MOST_CELLS:,} cells of {size:g} m; take larger cells (memory.size) or a "
+            "smaller memory.farthest"
+        )
     numbers, local = _cells_in_front(low, high, lattice_from_camera, origin, size)
     matrix = view.camera.intrinsics.double()
     depth = local[:, 2]

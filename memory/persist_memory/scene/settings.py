@@ -9,6 +9,8 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 
 from persist_cli.api.cells import COMMON
 
+MOST_CELLS = 10_000_000  # of the box: some 500 MB, and at 0.25 m a house of 200 m by 200 m with four floors
+
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Distance = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Height = Annotated[float, Field(allow_inf_nan=False)]

@@ -38,11 +38,14 @@ from persist_cli.data.held_out import was_trained_on
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, PersistError, hint
+from persist_cli.io.files import file_sha256
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.recipe import MemoryConfig
 from persist_cli.viewing.console import add_task, progress, warn
+
+WIDEST: Final = 50.0  # metres around a camera that are measured at most
 
 PARTS: Final = ("completion", "walk", "return", "edits", "speed", "evolution")
 
@@ -199,6 +202,10 @@ def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], all
 
 def check_parts(plan: SceneBenchPlan) -> None:
     """Raise ``PersistError`` when a part is unknown, or needs what is not named."""
+    if not plan.parts:
+        raise PersistError(f"--parts names nothing to measure; give one of {', '.join(PARTS)}")
+    if not plan.radius <= WIDEST:
+        raise PersistError(f"--radius {plan.radius:g}: metres, {WIDEST:g} at most")
     for part in plan.parts:
         if part not in PARTS:
             raise PersistError(f"unknown part {part!r}; {hint(part, PARTS)}")
@@ -252,7 +259,8 @@ def read_view(file: TrajectoryFile, frame: int, radius: float, scenes: Scenes) -
     region = Region.around(cells, image.cameras.world_from_camera[0], radius)
     truth = true_region(cells, region)
     near = near_camera(truth, image.cameras.centers[0], radius)
-    view = View(f"{file.name}:{frame}", file.info.scene, file.info, image, region, truth, truth, near, cells)
+    name, sha256 = f"{file.name}:{frame}", file_sha256(file.path)
+    view = View(name, file.info.scene, file.info, image, region, truth, truth, near, cells, sha256)
     known = same_form(region.of(scenes.after(view).cells), truth.form, "the scene")
     return replace(view, known=known)
 
@@ -278,7 +286,7 @@ def training_houses(plan: SceneBenchPlan, views: Sequence[View]) -> list[House]:
 def identity(plan: SceneBenchPlan, views: Sequence[View]) -> dict[str, Any]:
     """Return JSON values of all that changes the figures of every part."""
     values: Mapping[str, Any] = {
-        "views": digest([f"{view.scene} {view.name}" for view in views]),
+        "views": digest([f"{view.scene} {view.name} {view.sha256}" for view in views]),
         "memory": asdict(plan.memory(views[0].truth.form)),
         "radius": plan.radius,
     }
@@ -300,7 +308,7 @@ def part_identities(
         parts["edits"] = rendering | {"seed": plan.seed, "kinds": EDIT_KINDS}
     found = {name: values for name, values in parts.items() if name in plan.parts}
     if "completion" in plan.parts:
-        looked_up = {"training houses": digest([house.scene for house in houses])}
+        looked_up = {"training houses": digest([f"{house.scene} {house.sha256}" for house in houses])}
         found |= {} if trained is None else {SceneCompletion.name: model}
         found |= {row.name: looked_up for row in (Prior, NearestHouse, NearestHouses) if houses}
     if "evolution" in plan.parts and trained is not None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from persist_cli.api.cells import CellForm, CellGrid, is_solid
 from persist_cli.bench.scenes.views import Region, View, same_form, true_region
 from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.io.files import file_sha256
 from persist_cli.viewing.console import add_task, progress
 
 AT_ONCE = 16  # views that are compared with a house together
@@ -27,11 +28,13 @@ class House:
         scene: its name.
         cells: all of its cells at the start.
         poses: some cameras in it, ``world_from_camera``.
+        sha256: of the file that it was read from.
     """
 
     scene: str
     cells: CellGrid
     poses: Float[Tensor, "pose 4 4"]
+    sha256: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def read_houses(store: Store, most: int, form: CellForm) -> list[House]:
             file = files[number]
             spread = np.unique(np.linspace(0, len(file) - 1, POSES).round().astype(int))
             cells = same_form(file.cells(0), form, str(file.path))
-            houses.append(House(file.info.scene, cells, file.poses()[spread]))
+            houses.append(House(file.info.scene, cells, file.poses()[spread], file_sha256(file.path)))
             bar.advance(task)
     return houses
 

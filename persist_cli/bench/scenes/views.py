@@ -81,6 +81,7 @@ class View:
         truth: the region's true cells, every one known.
         near: which cells of the region are measured when they are not known.
         house: all true cells of the house.
+        sha256: of the file that it was read from.
     """
 
     name: str
@@ -92,6 +93,7 @@ class View:
     truth: CellGrid
     near: Bool[Tensor, "first second level"]
     house: CellGrid
+    sha256: str = ""
 
     @property
     def unseen(self) -> Bool[Tensor, "first second level"]:

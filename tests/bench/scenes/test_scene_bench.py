@@ -140,6 +140,8 @@ def test_what_does_not_fit_is_refused_in_one_line(
     same = write_cell_houses(tmp_path / "test", [5])
     wrong = (
         (("--parts", "compeltion"), "completion"),
+        (("--parts", ","), "--parts names nothing to measure"),
+        (("--radius", "inf"), "--radius inf: metres, 50 at most"),
         (("--parts", "walk"), "needs a scene model"),
         (("--parts", "edits"), "--checkpoint"),
         ((*WALKS, "--parts", "completion"), "--walk-steps: only with --parts walk"),
