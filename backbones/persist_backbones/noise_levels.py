@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from persist_backbones.tensors import zero_init
@@ -50,6 +50,7 @@ def add_level(
     level: Float[Tensor, " batch"],
     generators: list[torch.Generator],
     unit: Float[Tensor, " batch"] | float = 1.0,
+    mask: Bool[Tensor, "batch place"] | None = None,
 ) -> Float[Tensor, batch * rest]:
     """Add noise of a level to each sample, from its own generator, in the values' precision.
 
@@ -58,7 +59,15 @@ def add_level(
         level: standard deviation of the noise of each sample, in units.
         generators: one generator a sample.
         unit: what a level of 1 means, by default for latents, whose standard deviation is about 1.
+        mask: which places of the second dimension are no padding. Noise is drawn for these alone, so that a sample's
+            noise, and what its generator draws next, do not depend on how long the others of its batch are.
     """
-    noise = torch.stack([torch.randn(values.shape[1:], generator=generator) for generator in generators])
+    shape = values.shape[1:]
+    if mask is None:
+        noise = torch.stack([torch.randn(shape, generator=generator) for generator in generators])
+    else:
+        noise = torch.zeros(values.shape)
+        for sample, places, generator in zip(noise, mask.cpu(), generators, strict=True):
+            sample[places] = torch.randn(int(places.sum()), *shape[1:], generator=generator)
     scale = (level.to(values.device) * unit).reshape(-1, *[1] * (values.ndim - 1))
     return (values.float() + scale * noise.to(values.device)).to(values.dtype)

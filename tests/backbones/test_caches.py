@@ -59,6 +59,14 @@ def test_a_cache_that_skips_nothing_changes_nothing(name):
     assert equal(backbone.generate(CLIPS, SAMPLING), plain)
 
 
+def test_with_a_cache_the_model_is_told_the_noise_of_its_memory():
+    backbone, sampling = with_adapter(micro(), noise=0.5), Sampling(4, "ddim", context_noise=0.3)
+    shaken(backbone)
+    plain = backbone.generate(CLIPS, sampling)
+    enable_cache(backbone.transformer, IDLE["first-block"]())
+    assert equal(backbone.generate(CLIPS, sampling), plain)
+
+
 @EVERY_CACHE
 def test_a_cache_changes_a_clip_and_not_the_next_one(name):
     backbone = trained()

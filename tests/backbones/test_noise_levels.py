@@ -10,6 +10,7 @@ import torch
 
 from persist_backbones.noise_levels import add_level, draw_levels
 from persist_cli.api.backbone import Sampling
+from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PersistError
 from tests.support.micro_model import equal, micro, predicted_of, random_clips, random_tokens, shaken, with_adapter
 
@@ -25,6 +26,20 @@ def test_each_sample_gets_noise_as_strong_as_its_level() -> None:
     noisy = add_level(values, levels, generators(), unit=torch.tensor([1.0, 3.0]))
     assert torch.equal(noisy[0], values[0])
     assert noisy[1].std().item() == pytest.approx(1.5, rel=0.1)
+
+
+def test_the_noise_of_a_memory_and_what_is_drawn_next_do_not_depend_on_longer_ones_in_its_batch() -> None:
+    backbone, both = with_adapter(micro(), noise=0.5), random_tokens(2, 40)
+    both.mask[0, 5:] = False
+    alone = MemoryTokens(both.features[:1, :5], both.positions[:1, :5], both.mask[:1, :5])
+    noisy, drawn = [], []
+    for batch in (alone, both):
+        seeded = generators()[: len(batch.mask)]
+        tokens = backbone.adapters["voxel"].noisy(batch, torch.full((len(batch.mask),), 0.3), seeded)
+        noisy.append(tokens.features[0, :5])
+        drawn.append(torch.rand(1, generator=seeded[0]))
+    assert torch.equal(*noisy)
+    assert torch.equal(*drawn)
 
 
 def test_levels_lie_below_the_largest_and_a_sample_draws_its_own() -> None:

@@ -262,7 +262,8 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
         mask = tokens.mask[..., None].to(tokens.features.dtype)
         count = (mask.sum((1, 2)) * tokens.features.shape[-1]).clamp_min(1)
         unit = ((tokens.features * mask).square().sum((1, 2)) / count).sqrt()
-        return dataclasses.replace(tokens, features=add_level(tokens.features, level, generators, unit))
+        features = add_level(tokens.features, level, generators, unit, tokens.mask)
+        return dataclasses.replace(tokens, features=features)
 
     def time(self, time: Float[Tensor, "batch time"], memory: Prepared) -> Float[Tensor, "batch time"]:
         """Return the time embedding with that of the memory's noise level, unchanged for samples without a token."""

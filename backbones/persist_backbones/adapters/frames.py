@@ -91,7 +91,7 @@ class FramesAdapter(Adapter[PreparedMemory]):
         """Return the frames of a batch with noise of a level on their latents."""
         if tokens.latents is None:
             return tokens
-        return dataclasses.replace(tokens, latents=add_level(tokens.latents, level, generators))
+        return dataclasses.replace(tokens, latents=add_level(tokens.latents, level, generators, mask=tokens.mask))
 
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
         """Embed latents, rays and origins of the patches of all frames, and add them."""

@@ -27,6 +27,7 @@ from persist_backbones.cogvideox.diffusion import (
     NoisedPrediction,
     SamplingSchedule,
     SamplingStep,
+    check_steps,
     draw_timesteps,
     loss_parts,
     loss_weights,
@@ -343,9 +344,7 @@ class CogVideoX(AdaptedBackbone):
     def check_sampling(self, sampling: Sampling) -> None:
         """Raise ``PersistError`` for an unknown sampler, bad guidance, or more steps than training has noise levels."""
         super().check_sampling(sampling)
-        levels = self.scheduler.config.num_train_timesteps
-        if sampling.steps > levels:
-            raise PersistError(f"{sampling.steps} denoising steps; it must be 1 to {levels}")
+        check_steps(sampling.sampler, sampling.steps, self.scheduler.config.num_train_timesteps)
         adapters = [adapter.settings.noise for adapter in self.adapters.values() if isinstance(adapter, Adapter)]
         known = max(self.settings.image_noise, *adapters, 0.0)
         if sampling.context_noise > known:

@@ -22,6 +22,7 @@ from persist_backbones.diffusers_models import (
     UniPCMultistepScheduler,
 )
 from persist_cli.api.inference import CONSISTENCY
+from persist_cli.errors import PersistError
 
 Prediction = Literal["v_prediction", "sample"]
 Weighting = Literal["uniform", "min-snr", "min-snr-plus-one"]
@@ -154,6 +155,18 @@ def loss_parts(error: Float[Tensor, "batch frame channel height width"], depth: 
     """Return the mean error of latents as the loss, and its parts of RGB and, for a model with depth, of depth."""
     color, metres = (part.mean() for part in error.chunk(2, dim=2))
     return {"loss": error.mean(), "rgb": color, "depth": metres} if depth else {"loss": color, "rgb": color}
+
+
+def check_steps(sampler: str, steps: int, levels: int) -> None:
+    """Raise ``PersistError`` for more steps than training has noise levels, or than diffusers' schedulers can take.
+
+    CogVideoX's own ones step by ``levels // steps`` levels, and ask the model at levels ``levels / steps`` apart. Above
+    half of the levels this is one against up to two, and noise stays.
+    """
+    if steps > levels:
+        raise PersistError(f"{steps} denoising steps; it must be 1 to {levels}")
+    if sampler in ("ddim", "dpm") and levels // 2 < steps < levels:
+        raise PersistError(f"{steps} denoising steps; {sampler} takes up to {levels // 2}, or {levels}")
 
 
 class SamplingSchedule:

@@ -155,6 +155,10 @@ class SkippedMemory(MemoryCondition):
     memory: MemoryCondition
     blocks: nn.ModuleList
 
+    def time(self, time: Tensor) -> Tensor:
+        """Return the time embedding with that of the memory's noise level."""
+        return self.memory.time(time)
+
     def begin(self, video: Tensor) -> Tensor:
         """Return the embedded video tokens, before the first transformer block."""
         return self.memory.begin(video)
