@@ -88,9 +88,7 @@ def edit(
     from persist_cli.editing.views import Imagination
 
     if list_things:
-        if context.obj or out is not None:
-            raise PersistError("--list only lists the things of a scene; leave out the edits and --out, or --list")
-        unused = "save_edits overwrite seed camera checkpoint adapter steps sampler guidance"
+        unused = f"{' '.join(EDITS)} out save_edits overwrite seed camera checkpoint adapter steps sampler guidance"
         refuse_options(context, unused, "not with --list, which only lists the things of a scene")
         return run_list(memory, json)
     if out is None:

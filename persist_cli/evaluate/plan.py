@@ -161,14 +161,13 @@ def prepare(
     )
     journal = Journal(out)
     if processes.main:
-        if not plan.allow_training_scenes:
-            protocol.refuse_training_scenes(search, ALLOW)
         values = identity(plan, sampling, checkpoints, metrics)
         journal.check(values)
+        if not plan.allow_training_scenes:
+            protocol.refuse_training_scenes(search, ALLOW)
         check_row_numbers(journal, checkpoints, plan.memories or ())
         if journal.cases() is None:
-            warn(f"finding clips for the protocol {protocol.name!r} in {search.where}")
-            cases = protocol.find(search)
+            cases = find_cases(protocol, search)
             build_control_rows(models, checkpoints, config, protocol, cases)  # controls may not suit the clips
             with busy("hashing the data"):
                 journal.begin(values, cases)
@@ -206,6 +205,12 @@ def check_choices(plan: EvalPlan) -> None:
         raise PersistError(f"unknown --resample {plan.resample!r}; {hint(plan.resample, RESAMPLE_UNITS)}")
     if plan.protocol not in PROTOCOLS:
         raise PersistError(f"unknown protocol {plan.protocol!r}; {hint(plan.protocol, PROTOCOLS)}")
+
+
+def find_cases(protocol: Protocol, search: ClipSearch) -> list[Case]:
+    """Find the clips; ``DataError`` when there is none."""
+    warn(f"finding clips for the protocol {protocol.name!r} in {search.where}")
+    return protocol.find(search)
 
 
 def check_row_numbers(journal: Journal, checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> None:

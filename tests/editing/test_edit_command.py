@@ -114,7 +114,7 @@ def test_the_edits_are_not_saved_in_the_place_of_the_memory(persist, room, tmp_p
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--list", "--remove", "box#1"], "--list only lists"),
+        (["--list", "--remove", "box#1"], "--remove: not with --list, which only lists"),
         (["--list", "--seed", "4", "--save-edits", "x.json"], "--save-edits, --seed: not with --list"),
         (["--remove", "box#1"], "give --out FILE"),
         (["--remove", "box#1", "--out", "x.png"], "name a memory file to write"),
