@@ -308,14 +308,13 @@ def chosen_sampling(out: Path) -> dict[str, Sampling]:
     """
     if not (out / CHOICES).is_file():
         raise PersistError(f"{out / CHOICES}: not there yet; `python -m persist_cli.reproduce.choose {out}` makes it")
-    memories = read_json(out / CHOICES)["memories"]
-    return {memory: Sampling(**choice["sampling"]) for memory, choice in memories.items()}
+    return {memory: Sampling(**choice["sampling"]) for memory, choice in kept_choices(out).items()}
 
 
 def chosen_costs(out: Path) -> dict[str, float]:
     """The cost of what was chosen for each memory; ``PersistError`` when nothing was chosen yet."""
     chosen_sampling(out)
-    choices = read_json(out / CHOICES)["memories"]
+    choices = kept_choices(out)
     return {memory: float("inf") if choice["cost"] is None else choice["cost"] for memory, choice in choices.items()}
 
 
