@@ -10,8 +10,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from persist_backbones.cogvideox.diffusion import sample_generators
+from persist_backbones.cogvideox.given_view import render_given
+from persist_backbones.noise_levels import draw_noise
 from persist_cli.api.actions import walking_actions
 from persist_cli.api.backbone import Sampling
+from persist_cli.api.cameras import Cameras
 from persist_cli.api.cells import Box
 from persist_cli.api.ground import Body
 from persist_cli.api.scene_edits import Insert, Remove
@@ -74,6 +78,25 @@ def test_what_a_clip_remembers_is_made_where_it_trains(name, walks):
     assert len(here) > 0
     assert close(here.features, there.features)
     assert close(here.positions, there.positions)
+
+
+def test_noise_is_that_of_the_cpu():
+    here, there = (draw_noise((3, 4), sample_generators([5, 6, 7]), torch.device(name)) for name in ("cpu", DEVICE))
+    assert everywhere([there])
+    assert torch.equal(here, there.cpu())
+
+
+def test_clips_drawn_at_once_show_what_each_shows_alone():
+    """On a GPU many clips are drawn in one step, on a CPU one after the other."""
+    seen = room_walk(6)
+    cameras = Cameras.stack([seen[first : first + 4].cameras for first in range(3)])
+    here, there = (
+        render_given(seen.rgb[:3].to(device), seen.depth[:3].to(device), cameras.to(device))
+        for device in ("cpu", DEVICE)
+    )
+    assert everywhere(there)
+    assert torch.equal(here.covered, there.covered.cpu())
+    assert (here.rgb.int() - there.rgb.cpu().int()).abs().float().mean() < 0.01
 
 
 def test_a_map_of_means_is_that_of_the_cpu_but_for_the_order_of_sums():

@@ -9,6 +9,9 @@ diffusion forcing does (2407.01392).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +20,7 @@ from torch import Tensor, nn
 from persist_backbones.tensors import zero_init
 
 WAVES = 16  # sines, and as many cosines, of a level
+DRAWING_THREADS: Final = 8  # at once; more would wait for memory
 
 
 class LevelEmbedding(nn.Module):
@@ -45,6 +49,25 @@ def draw_levels(generators: list[torch.Generator], largest: float) -> Float[Tens
     return torch.cat([torch.rand(1, generator=generator) for generator in generators]) * largest
 
 
+def draw_noise(
+    shape: Sequence[int], generators: list[torch.Generator], device: torch.device
+) -> Float[Tensor, batch * shape]:
+    """Draw Gaussian noise, each sample from its own generator on the CPU; several at once while a GPU waits for it."""
+    noise = torch.empty(len(generators), *shape)
+
+    def draw(number: int) -> None:
+        torch.randn(tuple(shape), generator=generators[number], out=noise[number])
+
+    if device.type == "cpu":
+        for number in range(len(generators)):
+            draw(number)
+        return noise
+    with ThreadPoolExecutor(DRAWING_THREADS) as threads:
+        for _ in threads.map(draw, range(len(generators))):
+            pass
+    return noise.to(device)
+
+
 def add_level(
     values: Float[Tensor, batch * rest],
     level: Float[Tensor, " batch"],
@@ -64,7 +87,7 @@ def add_level(
     """
     shape = values.shape[1:]
     if mask is None:
-        noise = torch.stack([torch.randn(shape, generator=generator) for generator in generators])
+        noise = draw_noise(shape, generators, values.device)
     else:
         noise = torch.zeros(values.shape)
         for sample, places, generator in zip(noise, mask.cpu(), generators, strict=True):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
+
+MOST_PLACES: Final = 2**25  # points times views that a GPU draws at once: some gigabytes
 
 
 def frames_per_token(config: Any) -> int:
@@ -77,15 +79,21 @@ def tokens_of(
     return tokens
 
 
-def clip_by_clip(draw: Callable[..., tuple[Tensor, ...]], *batches: Any, clips: int) -> tuple[Tensor, ...]:
-    """Call a function with one clip of all batches at a time, which fits into a processor's cache; join the results.
+def clip_by_clip(draw: Callable[..., tuple[Tensor, ...]], *batches: Any, places: int) -> tuple[Tensor, ...]:
+    """Call a function with a few clips of all batches at a time and join the results.
+
+    On a CPU it is one clip, which fits into its cache; on a GPU as many as keep it busy.
 
     Args:
-        draw: returns tensors with a batch axis of one.
-        batches: what has a batch axis and takes slices: tensors, cameras or tokens.
-        clips: their number.
+        draw: returns tensors with a batch axis.
+        batches: what has a batch axis and takes slices: tensors, cameras or tokens, cameras not first.
+        places: points that are drawn into the views of a clip, each view's counted.
     """
-    results = [draw(*(batch[number : number + 1] for batch in batches)) for number in range(clips)]
+    first = batches[0] if isinstance(batches[0], Tensor) else batches[0].mask
+    at_once = 1 if first.device.type == "cpu" else max(1, MOST_PLACES // max(1, places))
+    results = [
+        draw(*(batch[number : number + at_once] for batch in batches)) for number in range(0, len(first), at_once)
+    ]
     return tuple(torch.cat(parts) for parts in zip(*results, strict=True))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import torch
@@ -44,6 +45,8 @@ class ClipPlan:
         segments: number of segments of a chained sample, the clip included.
         noise: errors of the frames of contexts.
         true_cells: share of the samples that come with the true cells of their scene in the place of a context.
+        lengths: of the clips in frames, one for each batch; empty for ``frames`` always.
+        batch: number of samples that have one length.
     """
 
     frames: int
@@ -61,6 +64,8 @@ class ClipPlan:
     segments: int = 2
     noise: WritingNoise = NO_ERRORS
     true_cells: float = 0.0
+    lengths: tuple[int, ...] = ()
+    batch: int = 1
 
 
 @dataclass(frozen=True)
@@ -167,7 +172,9 @@ class ClipDataset(Dataset[ClipSample]):
             # plus one: numpy reads missing numbers as zeros, and (seed, place) is a sample's own
             key = (plan.seed, place, clip + 1, *([segments] if segments > 1 else []))
             frames = self._draw(file, np.random.default_rng(key), segments)
-        return replace(frames, seed=int(random.integers(2**31)))
+        seed, whole = int(random.integers(2**31)), frames.frames
+        length = clip_length(plan.lengths, plan.seed, number // plan.batch) if plan.lengths else len(whole)
+        return replace(frames, frames=whole[:length], seed=seed)
 
     def read(self, choice: ClipFrames, images: bool = True, context: bool = True) -> ClipSample:
         """The sample with these frame numbers.
@@ -222,6 +229,12 @@ class ClipDataset(Dataset[ClipSample]):
             earlier = earlier[~near.any(dim=1).numpy()]
         chosen = random.permutation(earlier)[: plan.context_frames - 1]
         return [*sorted(int(frame) for frame in chosen), start]
+
+
+def clip_length(lengths: Sequence[int], seed: int, step: int) -> int:
+    """One of some lengths of clips, the same for all samples of a training step."""
+    # a text as the seed: no other random numbers of a training begin like these
+    return Random(f"clip_frames {seed} {step}").choice(lengths)
 
 
 class DistributedBatches(BatchSampler):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import zlib
 from pathlib import Path
@@ -112,9 +113,15 @@ def _parse_header(header: dict[str, Any]) -> TrajectoryInfo:
         height=int(header["height"]),
         width=int(header["width"]),
         world_up=(x, y, z),
-        vocabulary=ActionVocabulary.from_json(header["vocabulary"]),
+        vocabulary=_vocabulary(json.dumps(header["vocabulary"])),
         source=dict(header["source"]),
     )
+
+
+@functools.cache
+def _vocabulary(text: str) -> ActionVocabulary:
+    """The actions of a header, one object for all trajectories that have the same."""
+    return ActionVocabulary.from_json(json.loads(text))
 
 
 def _hugging_face_info(cells: bool) -> dict[str, Any]:

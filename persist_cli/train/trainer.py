@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from random import Random
 from typing import Any, Final
 
 import torch
@@ -13,7 +12,7 @@ from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.data.augment import Augmentation
 from persist_cli.data.cameras import vertical_view
-from persist_cli.data.clips import ClipDataset, ClipPlan
+from persist_cli.data.clips import ClipDataset, ClipPlan, clip_length
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.writing_noise import WritingNoise
@@ -111,6 +110,9 @@ class Trainer(TrainingLoop[Backbone]):
             segments=recipe.data.own_segments,
             noise=WritingNoise.of(recipe.data),
             true_cells=recipe.data.true_cells if self.factory else 0.0,
+            # what is not needed is not read; a memory is read for the whole clip
+            lengths=() if self.factory else recipe.data.clip_frames,
+            batch=recipe.training.batch,
         )
         return ClipDataset([data_folder(path) for path in recipe.data.path], plan)
 
@@ -161,8 +163,7 @@ class Trainer(TrainingLoop[Backbone]):
     def shortened(self, clips: Clips) -> Clips:
         """The clips, cut to one of the lengths of ``data.clip_frames``: one for all micro-batches of a step."""
         lengths, seed = self.recipe.data.clip_frames, self.recipe.training.seed
-        # a text as the seed: no other random numbers of the training begin like these
-        return clips.shortened(Random(f"clip_frames {seed} {self.state.step}").choice(lengths)) if lengths else clips
+        return clips.shortened(clip_length(lengths, seed, self.state.step)) if lengths else clips
 
     def encoded(self, clips: Clips) -> Clips:
         """The clips, at the step's length; when times are taken, with latents that the forward pass would else make."""

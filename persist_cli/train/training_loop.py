@@ -24,6 +24,7 @@ from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import Sharding, ZeroState, is_sharded, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import Opponent, make_average, make_optimizer, set_learning_rate, update_average
+from persist_cli.train.packing import pack, unpack
 from persist_cli.train.state import TrainingState
 from persist_cli.training_settings import TrainingSettings
 from persist_cli.viewing.console import add_task, progress
@@ -151,7 +152,7 @@ class TrainingLoop(ABC, Generic[Model]):
             CaughtErrors(self.dataset),
             batch_sampler=batches,
             num_workers=settings.workers,
-            collate_fn=list,
+            collate_fn=pack if settings.workers else list,
             worker_init_fn=outlive_signals,
             generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
         )
@@ -159,9 +160,10 @@ class TrainingLoop(ABC, Generic[Model]):
         try:
             while True:
                 with self.times.part("data"):
-                    samples = next(remaining, None)
-                if samples is None:
-                    return
+                    read = next(remaining, None)
+                    if read is None:
+                        return
+                    samples = unpack(read) if settings.workers else read
                 errors = [sample for sample in samples if isinstance(sample, PersistError)]
                 if errors:
                     raise errors[0]

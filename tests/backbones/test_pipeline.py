@@ -109,11 +109,13 @@ def test_offloaded_weights_change_no_result(form, settings):
 def test_offloaded_weights_sample_on_the_gpu(form, offload):
     exact = call(WorldPipeline.of(trained(form)).to("cuda"))
     pipeline = WorldPipeline.of(trained(form))
+    before = torch.cuda.memory_allocated()  # cuBLAS keeps some bytes once it was used
     getattr(pipeline, offload)()
     output = call(pipeline)
     assert output.frames.device.type == "cuda"
     assert torch.allclose(output.frames, exact.frames, atol=1e-3)
-    assert torch.cuda.memory_allocated() < sum(weight.nbytes for weight in pipeline.transformer.parameters())
+    held = torch.cuda.memory_allocated() - before - output.frames.nbytes
+    assert held < sum(weight.nbytes for weight in pipeline.transformer.parameters())
 
 
 def test_slicing_and_tiling_of_the_codec_hardly_change_a_clip():

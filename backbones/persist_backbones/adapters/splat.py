@@ -165,43 +165,52 @@ def rasterize(
         most: limit of a square's size: it reaches at most ``most // 2`` pixels to each side of the one of its middle.
             So its edge is at most ``most`` pixels where that is odd, and one more where it is even.
     """
-    samples, frames = views.world_from_camera.shape[:2]
-    pixels = frames * views.height * views.width
+    clips, frames = views.world_from_camera.shape[:2]
     sizes = torch.as_tensor(token_size, dtype=torch.float64, device=mask.device).expand(mask.shape)
+    limit = most // 2
+    if mask.device.type != "cpu":  # all at once: many small steps would leave a GPU idle
+        return _rasterize_clips(positions, mask, views, sizes, limit)
     parts = []
-    for sample in range(samples):  # one at a time: the data of one clip fits into the processor's cache
-        present = mask[sample].nonzero()[:, 0]
-        splats = _rasterize_clip(positions[sample, present], views[sample], sizes[sample, present], most // 2)
-        token = sample * positions.shape[1] + present[splats.token]
-        parts.append(Splats(sample * pixels + splats.pixel, token, splats.depth))
+    for clip in range(clips):  # one at a time: the data of one clip fits into the processor's cache
+        present = mask[clip].nonzero()[:, 0]
+        chosen = positions[clip, None, present], mask[clip, None, present]
+        splats = _rasterize_clips(*chosen, views[clip : clip + 1], sizes[clip, None, present], limit)
+        token = clip * positions.shape[1] + present[splats.token]
+        parts.append(Splats(clip * frames * views.height * views.width + splats.pixel, token, splats.depth))
     return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 
-def _rasterize_clip(
-    positions: Float[Tensor, "token 3"], views: Cameras, sizes: Float[Tensor, " token"], reach: int
+def _rasterize_clips(
+    positions: Float[Tensor, "clip token 3"],
+    mask: Bool[Tensor, "clip token"],
+    views: Cameras,
+    sizes: Float[Tensor, "clip token"],
+    reach: int,
 ) -> Splats:
-    """Return the splats in one clip's views, with squares of at most ``reach`` pixels to each side of their middle."""
-    middles, depth = project(positions.expand(len(views.world_from_camera), -1, -1), views)
+    """Return the splats in views of clips, with squares of at most ``reach`` pixels to each side of their middle."""
+    frames, count = views.world_from_camera.shape[1], positions.shape[1]
+    flat = Cameras(views.world_from_camera.flatten(0, 1), views.intrinsics.flatten(0, 1), views.height, views.width)
+    middles, depth = project(positions[:, None].expand(-1, frames, -1, -1).flatten(0, 1), flat)
     axes = [places.contiguous() for places in middles.unbind(-1)]  # columns, rows: one after the other is faster
-    lengths = (views.width, views.height)
-    close = depth > NEAR
-    for places, length in zip(axes, lengths, strict=True):
+    close = (depth > NEAR) & mask[:, None].expand(-1, frames, -1).flatten(0, 1)
+    for places, length in zip(axes, (flat.width, flat.height), strict=True):
         close &= (places + SNAP >= -reach) & (places + SNAP < length + reach)
     chosen = close.flatten().nonzero()[:, 0]
-    frame, token = chosen // close.shape[1], chosen % close.shape[1]
+    view = chosen // count
+    token = view // frames * count + chosen % count
     depth = depth.flatten().index_select(0, chosen)
-    scale = 0.5 * sizes[token] / depth
+    scale = 0.5 * sizes.flatten().index_select(0, token) / depth
     ranges = []
-    for axis, (places, length) in enumerate(zip(axes, lengths, strict=True)):
+    for axis, (places, length) in enumerate(zip(axes, (flat.width, flat.height), strict=True)):
         middle = places.flatten().index_select(0, chosen)
-        half = scale * views.intrinsics.double()[:, axis, axis][frame]
+        half = scale * flat.intrinsics.double()[:, axis, axis][view]
         center = (middle + SNAP).floor()
         first = (middle - half - 0.5 + SNAP).ceil().minimum(center).maximum(center - reach).clamp_min(0)
         last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).clamp_max(length - 1)
         ranges.append((first.long(), (last - first + 1).clamp_min(0).long()))
     (left, width), (top, height) = ranges
-    square, row = _counted(frame * views.height + top, height)
-    line, pixel = _counted(row * views.width + left[square], width[square])
+    square, row = _counted(view * flat.height + top, height)
+    line, pixel = _counted(row * flat.width + left[square], width[square])
     return Splats(pixel, token[square].index_select(0, line), depth[square].index_select(0, line))
 
 

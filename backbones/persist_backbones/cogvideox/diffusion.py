@@ -21,6 +21,7 @@ from persist_backbones.diffusers_models import (
     DPMSolverMultistepScheduler,
     UniPCMultistepScheduler,
 )
+from persist_backbones.noise_levels import draw_noise
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.errors import PersistError
 
@@ -99,8 +100,7 @@ def sample_generators(seeds: Sequence[int]) -> list[torch.Generator]:
 
 def noise_like(latents: Tensor, generators: list[torch.Generator]) -> Tensor:
     """Draw Gaussian noise, each sample from its own generator."""
-    noise = torch.stack([torch.randn(latents.shape[1:], generator=generator) for generator in generators])
-    return noise.to(latents)
+    return draw_noise(latents.shape[1:], generators, latents.device).to(latents)
 
 
 def draw_timesteps(scheduler: CogVideoXDDIMScheduler, generators: list[torch.Generator]) -> Int[Tensor, " batch"]:

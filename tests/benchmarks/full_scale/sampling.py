@@ -85,7 +85,8 @@ def clip_functions(scene: Scene, plain: Plain, steps: int) -> dict[str, Work]:
     """Functions that make a clip: by the plain pipeline, and by a rollout without and with memory."""
     bench = scene.bench
     first_images = plain_images(bench)[:, :, :1]
-    camera = bench.backbone.conditions(bench.clips(1, 1), torch.zeros(1).long()).camera.to(bench.precision)
+    camera = bench.backbone.conditions(bench.clips(1, 1), torch.zeros(1).long()).camera
+    camera = camera.to(bench.device, bench.precision)
 
     def roll(world: WorldModel, adapter: str | None) -> None:
         bench.backbone.use_adapter(adapter)

@@ -85,7 +85,11 @@ def plain_batch(bench: Bench, clips: Clips) -> tuple[Tensor, Tensor, Tensor]:
     assert clips.latents is not None
     camera = bench.backbone.conditions(clips, torch.zeros(len(clips.seeds)).long()).camera
     image = bench.backbone.image_condition(clips.latents.image, bench.backbone.shape)
-    return bench.backbone.shape.pad(clips.latents.video), image.to(bench.precision), camera.to(bench.precision)
+    latents, image, camera = (
+        part.to(bench.device, bench.precision)
+        for part in (bench.backbone.shape.pad(clips.latents.video), image, camera)
+    )
+    return latents, image, camera
 
 
 def stage1_steps(bench: Bench, batch: int) -> dict[str, Work]:
