@@ -48,7 +48,7 @@ def true_house(options: argparse.Namespace, count: int) -> gymnasium.vector.Vect
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--start", default="sample#0:0-33", help="frames of a test house at which episodes start")
-    parser.add_argument("--memory", help="a file of persist memorize; else the start frames are remembered")
+    parser.add_argument("--memory", help="a file of persist memorize, or frames as DATA#t:a-b; else the start frames")
     parser.add_argument("--checkpoint", default="reference", help="run or checkpoint of the world model")
     parser.add_argument("--adapter", help="its memory adapter, as in scene; else its default")
     parser.add_argument("--steps", type=int, default=4096, help="of all agents together")

@@ -247,7 +247,7 @@ class Commands(TyperGroup):
         except OSError as error:
             raise PersistError(system_error(error)) from error
         except KeyboardInterrupt as stop:
-            typer.secho("stopped; what is written is whole, run the same command to go on", err=True)
+            typer.secho("stopped; what is written is whole, the same command goes on with it or begins anew", err=True)
             raise typer.Exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED) from None
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.errors import DataError
@@ -48,16 +48,6 @@ def decode_rgb(data: bytes) -> Array:
     """
     with _opened(data) as image:
         return np.array(image.convert("RGB"))
-
-
-def decode_photo(data: bytes) -> Array:
-    """The same as viewers show it: a phone stores a photo as it is held, and says in EXIF how it is to be turned.
-
-    Raises:
-        OSError, SyntaxError, ValueError: as ``decode_rgb``.
-    """
-    with _opened(data) as image:
-        return np.array(ImageOps.exif_transpose(image).convert("RGB"))
 
 
 def decode_depth(data: bytes) -> Array:

@@ -18,7 +18,7 @@ from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_conf
 from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
 from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
-from persist_cli.plugins import make_encoder, make_memory
+from persist_cli.plugins import load_plugin, make_encoder, make_memory
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, watched
 from persist_cli.viewing.map import draw_map
 
@@ -40,12 +40,12 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     sources = find_sources(_with_picture(data, picture, out))
     asked = origin is None or plan.checkpoint is not None
     config = with_usual_classes(of_known_cells(config, sources[0].file, asked))
+    if plan.seed is not None and not issubclass(load_plugin("memory", config.name), Scene):
+        raise CheckpointError(f"--seed: a memory of kind {config.name!r} imagines nothing; leave it out")
     with busy("loading the encoder"):
         encoder = make_encoder(config.encoder, config.encoder_settings)
     memory = with_scene_model(make_memory(config.name, config.settings, encoder, common_reference(sources)))
     scene = imagining_scene(memory) if plan.complete else None
-    if plan.seed is not None and not isinstance(memory, Scene):
-        raise CheckpointError(f"--seed: a memory of kind {memory.name!r} imagines nothing; leave it out")
     seconds = write_sources(memory, sources)
     frames = sum(len(source.frames) for source in sources)
     paths: dict[str, Tensor] = {}

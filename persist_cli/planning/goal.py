@@ -13,7 +13,8 @@ from torch import Tensor
 from persist_cli.api.ground import GroundMap, ground_axes
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal
-from persist_cli.data.images import crop_resize, decode_photo
+from persist_cli.data.images import crop_resize
+from persist_cli.data.importers.readers import read_photo
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import DataError
 from persist_cli.navigation.routes import check_within_reach
@@ -88,9 +89,9 @@ def image_of(text: str) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"--goal {text}: no such image; give {FORMS}")
     try:
-        return decode_photo(path.read_bytes())
-    except (OSError, SyntaxError, ValueError) as error:
-        raise DataError(f"--goal {text}: not a whole image ({str(error).splitlines()[0]}); give {FORMS}") from error
+        return read_photo(path)
+    except DataError as error:
+        raise DataError(f"--goal {error}; give {FORMS}") from error
 
 
 def fitted(

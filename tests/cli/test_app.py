@@ -112,7 +112,10 @@ def test_sigterm_ends_a_command_in_one_line_with_the_exit_code_of_that_signal(pe
     monkeypatch.setattr("persist_cli.viewing.listings.show_recipes", lambda _: signal.raise_signal(signal.SIGTERM))
     before = signal.getsignal(signal.SIGTERM)
     ended = persist("recipes")
-    assert (ended.code, ended.err) == (143, "stopped; what is written is whole, run the same command to go on\n")
+    assert (ended.code, ended.err) == (
+        143,
+        "stopped; what is written is whole, the same command goes on with it or begins anew\n",
+    )
     assert signal.getsignal(signal.SIGTERM) == before
 
 
