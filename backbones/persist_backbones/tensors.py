@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
-MOST_PLACES: Final = 2**25  # points times views that a GPU draws at once: some gigabytes
+MOST_PLACES: Final = 2**22  # points and pixels of all views that a GPU draws at once, or else one clip
 
 
 def frames_per_token(config: Any) -> int:
@@ -79,18 +79,26 @@ def tokens_of(
     return tokens
 
 
+def clips_at_once(device: torch.device, places: int) -> int:
+    """Return how many clips are drawn at once: one on a CPU, into whose cache it fits; on a GPU as keeps it busy.
+
+    Args:
+        device: where they are drawn.
+        places: points that are drawn into the views of a clip, each view's counted, and pixels of these views.
+    """
+    return 1 if device.type == "cpu" else max(1, MOST_PLACES // max(1, places))
+
+
 def clip_by_clip(draw: Callable[..., tuple[Tensor, ...]], *batches: Any, places: int) -> tuple[Tensor, ...]:
     """Call a function with a few clips of all batches at a time and join the results.
-
-    On a CPU it is one clip, which fits into its cache; on a GPU as many as keep it busy.
 
     Args:
         draw: returns tensors with a batch axis.
         batches: what has a batch axis and takes slices: tensors, cameras or tokens, cameras not first.
-        places: points that are drawn into the views of a clip, each view's counted.
+        places: of a clip, as for ``clips_at_once``.
     """
     first = batches[0] if isinstance(batches[0], Tensor) else batches[0].mask
-    at_once = 1 if first.device.type == "cpu" else max(1, MOST_PLACES // max(1, places))
+    at_once = clips_at_once(first.device, places)
     results = [
         draw(*(batch[number : number + at_once] for batch in batches)) for number in range(0, len(first), at_once)
     ]

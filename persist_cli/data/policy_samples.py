@@ -193,7 +193,8 @@ class GroundPath:
         """Return how many frames the direct way takes from one frame to others, if nothing is in between.
 
         That is to turn to the place, to go straight there, and to turn to the heading, each at the greatest speed of
-        this path. For an agent that steps and turns by fixed amounts it is the number of its actions.
+        this path, or of the other one where this one never goes or never turns; infinitely many where neither does. For
+        an agent that steps and turns by fixed amounts it is the number of its actions.
 
         Args:
             start: number of the frame where the way begins.
@@ -204,17 +205,22 @@ class GroundPath:
         metres, ahead = way.norm(dim=-1), functional.normalize(way, dim=-1)
         before, after = self.headings[start].expand_as(ahead), path.headings[ends]
         ahead = torch.where(metres[:, None] > ROUNDING, ahead, before)  # there is no way to turn to
-        step, turn = self._speeds
-        frames: Tensor = metres / step + (_angles(before, ahead) + _angles(ahead, after)) / turn
+        step, turn = (own or other for own, other in zip(self._speeds, path._speeds, strict=True))
+        frames: Tensor = _over(metres, step) + _over(_angles(before, ahead), turn) + _over(_angles(ahead, after), turn)
         return frames
 
     @cached_property
     def _speeds(self) -> tuple[float, float]:
-        """The most metres and radians from one frame to the next; infinite where it never goes, or never turns."""
+        """The most metres and radians from one frame to the next, 0 where it never goes, or never turns."""
         metres = (self.places[1:] - self.places[:-1]).norm(dim=-1).max()
         radians = _angles(self.headings[:-1], self.headings[1:]).max()
-        step, turn = (float(speed) if speed > ROUNDING else math.inf for speed in (metres, radians))
+        step, turn = (float(speed) if speed > ROUNDING else 0.0 for speed in (metres, radians))
         return step, turn
+
+
+def _over(amounts: Float[Tensor, " row"], speed: float) -> Float[Tensor, " row"]:
+    """The frames that amounts take at a speed: none for nothing, infinitely many at a speed of 0."""
+    return torch.where(amounts > ROUNDING, amounts / speed if speed else math.inf, 0.0)
 
 
 def _angles(first: Float[Tensor, "row 2"], second: Float[Tensor, "row 2"]) -> Float[Tensor, " row"]:

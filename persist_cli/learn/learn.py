@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -420,7 +421,8 @@ def report(learning: Learning, results: dict[str, Any], as_json: bool) -> None:
     columns = ["round", "actions of practice", "blocked", *(FIGURES if learning.episodes else ())]
     rows = []
     for row in results["rounds"]:
-        figures = [f"{row['figures'][name]:.2f}" for name in FIGURES] if learning.episodes else []
+        means = [row["figures"][name] for name in FIGURES] if learning.episodes else []
+        figures = ["–" if mean is None or math.isnan(mean) else f"{mean:.2f}" for mean in means]
         blocked = str(row["practice"]["blocked"]) if row["round"] else "–"
         rows.append([str(row["round"]), str(row["walked"]), blocked, *figures])
     print_table(

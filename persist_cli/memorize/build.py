@@ -37,11 +37,10 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     """
     _check_out(out)
     config, origin = resolve_memory_config(plan)
+    check_imagines(config.name, plan)  # before a picture is written, which replaces others beside the memory
     sources = find_sources(_with_picture(data, picture, out))
     asked = origin is None or plan.checkpoint is not None
     config = with_usual_classes(of_known_cells(config, sources[0].file, asked))
-    if plan.seed is not None and not issubclass(load_plugin("memory", config.name), Scene):
-        raise CheckpointError(f"--seed: a memory of kind {config.name!r} imagines nothing; leave it out")
     with busy("loading the encoder"):
         encoder = make_encoder(config.encoder, config.encoder_settings)
     memory = with_scene_model(make_memory(config.name, config.settings, encoder, common_reference(sources)))
@@ -80,14 +79,23 @@ def _with_picture(data: list[str], options: PictureOptions, out: Path) -> list[s
     return [str(write_picture(Path(pictures[0]), options, out.with_suffix(".frame")))]
 
 
+def check_imagines(kind: str, plan: MemorizePlan) -> None:
+    """Raise ``CheckpointError`` where a memory of this kind is to imagine and is no scene."""
+    if issubclass(load_plugin("memory", kind), Scene):
+        return
+    if plan.complete:
+        raise CheckpointError(f"--complete: a memory of kind {kind!r} imagines nothing; take --memory scene")
+    if plan.seed is not None:
+        raise CheckpointError(f"--seed: a memory of kind {kind!r} imagines nothing; leave it out")
+
+
 def imagining_scene(memory: Memory) -> Scene:
-    """Return a memory that can be completed.
+    """Return a scene that can be completed.
 
     Raises:
-        CheckpointError: when it is no scene, or has no model.
+        CheckpointError: when it has no model.
     """
-    if not isinstance(memory, Scene):
-        raise CheckpointError(f"--complete: a memory of kind {memory.name!r} imagines nothing; take --memory scene")
+    assert isinstance(memory, Scene)
     memory.model()
     return memory
 

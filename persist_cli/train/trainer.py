@@ -110,8 +110,8 @@ class Trainer(TrainingLoop[Backbone]):
             segments=recipe.data.own_segments,
             noise=WritingNoise.of(recipe.data),
             true_cells=recipe.data.true_cells if self.factory else 0.0,
-            # what is not needed is not read; a memory is read for the whole clip
-            lengths=() if self.factory else recipe.data.clip_frames,
+            # what is not needed is not read; memories are read, and clips that come again kept, for their whole length
+            lengths=() if self.factory or recipe.data.clips_per_trajectory else recipe.data.clip_frames,
             batch=recipe.training.batch,
         )
         return ClipDataset([data_folder(path) for path in recipe.data.path], plan)

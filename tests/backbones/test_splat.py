@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from persist_backbones.adapters.splat import Splats, _rasterize_clips, hide_covered, rasterize, splat
+from persist_backbones.adapters.splat import Splats, hide_covered, rasterize, splat
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.cameras import Cameras
 
@@ -95,8 +95,8 @@ def test_every_frame_has_its_own_view():
     assert not canvas[0, 1].any()
 
 
-def test_clips_are_drawn_together_as_they_are_one_after_the_other():
-    """On a GPU clips are drawn at once, on a CPU one by one."""
+def test_clips_are_drawn_together_as_they_are_one_after_the_other(monkeypatch):
+    """On a GPU several are drawn at once, on a CPU one."""
     random = torch.Generator().manual_seed(0)
     positions = torch.rand(3, 50, 3, generator=random, dtype=torch.float64) * 4 - 2
     mask, sizes = torch.rand(3, 50, generator=random) < 0.7, torch.rand(3, 50, generator=random, dtype=torch.float64)
@@ -104,7 +104,8 @@ def test_clips_are_drawn_together_as_they_are_one_after_the_other():
     cameras = Cameras(camera.world_from_camera.repeat(3, 1, 1, 1), camera.intrinsics.repeat(3, 1, 1, 1), SIDE, SIDE)
     cameras.world_from_camera[:, 1, 2, 3] = torch.tensor([-1.0, 0.5, 1.0])
     apart = rasterize(positions, mask, cameras, sizes, 5)
-    together = _rasterize_clips(positions, mask, cameras, sizes, 2)
+    monkeypatch.setattr("persist_backbones.adapters.splat.clips_at_once", lambda *_: 2)
+    together = rasterize(positions, mask, cameras, sizes, 5)
     assert len(apart.pixel) > 100
     assert all(torch.equal(one, other) for one, other in zip(apart, together, strict=True))
 

@@ -82,6 +82,13 @@ def test_a_photo_is_turned_as_its_exif_says_and_the_image_of_a_capture_is_not(tm
     assert all(np.array_equal(image, stored) for image in (decode_rgb(path.read_bytes()), read_color(path)))
 
 
+def test_a_photo_with_damaged_exif_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "photo.png"
+    Image.fromarray(np.zeros((8, 16, 3), np.uint8)).save(path, exif=b"Exif\x00\x00no header of TIFF")
+    with pytest.raises(DataError, match=r"photo.png: its EXIF is damaged \(.*\); save the image anew"):
+        read_photo(path)
+
+
 def test_an_image_that_would_fill_the_memory_is_named(tmp_path: Path) -> None:
     write_huge_image(tmp_path / "large.png")
     for read in (read_color, read_photo):

@@ -104,6 +104,19 @@ def test_the_direct_way_of_an_agent_has_as_many_frames_as_it_takes_actions(tmp_p
     assert direct.tolist() == pytest.approx([3, 7, 9, 9], abs=1e-3)  # at the end it only turned to and fro
 
 
+def test_a_walk_that_only_turns_goes_as_fast_as_the_one_that_it_is_to_reach(tmp_path):
+    paths = []
+    for name, word in (("turns", "lr" * 6), ("goes", "ffff" + "lr" * 3), ("stands", "rl" * 6)):
+        file = Store(write_actions(tmp_path / name, word))[0]
+        paths.append(GroundPath(*ground_places(file.poses(), UP)))
+    turns, goes, stands = paths
+    end = torch.tensor([4])
+    assert turns.direct_frames(0, goes, end).tolist() == pytest.approx([4], abs=1e-3)
+    assert stands.direct_frames(0, turns, end).tolist() == pytest.approx([0], abs=1e-3)  # it is there already
+    away = dataclasses.replace(stands, places=stands.places + 1.0)
+    assert turns.direct_frames(0, away, end).tolist() == [torch.inf]
+
+
 def test_what_a_walk_only_came_to_by_wandering_is_far_and_not_led_to(tmp_path):
     folder = write_actions(tmp_path, "ffffff" + "lr" * 6 + "ffffff")
     form = dataclasses.replace(FORM, negatives=0.0, nearest=0, farthest=20)

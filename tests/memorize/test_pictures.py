@@ -258,6 +258,16 @@ def test_other_memories_are_not_completed_and_data_have_depth_of_their_own(hall,
     assert "made of one picture" in failure(capsys, hall / "hall.png", data, "--memory", "scene", "--out", out)
 
 
+@pytest.mark.parametrize("option", [("--seed", 3), ("--complete",)])
+def test_what_is_refused_leaves_the_frame_of_an_earlier_picture(hall, tmp_path, capsys, option):
+    out, other = tmp_path / "room.safetensors", tmp_path / "other.png"
+    first = ("--memory", "voxel", "--fov", FOV, "--depth", hall / "hall.npy", "--out", out)
+    before = memorize(capsys, hall / "hall.png", *first)
+    shutil.copy(hall / "hall.png", other)
+    assert "imagines nothing" in failure(capsys, other, *first, *option)
+    assert len(parse_reference(before["start"]).trajectories()[0].read().observations) == 1
+
+
 def test_depth_comes_from_a_model_of_metres_and_one_without_a_unit_is_refused(hall, tmp_path, capsys):
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config, DPTImageProcessor
 

@@ -60,6 +60,15 @@ def test_each_batch_has_one_of_the_lengths_with_cameras_and_interactions_of_as_m
     assert seen == {2, 5, 9}
 
 
+def test_clips_that_come_again_are_read_whole_so_that_a_cache_keeps_each_once(walks):
+    plan = trainer(walks).dataset.plan
+    assert plan.lengths == (2, 5, 9)
+    values = {"path": str(walks), "clip_frames": (2, 5, 9), "clips_per_trajectory": 4}
+    recipe = make_recipe({"stage": "1", "base": "elsewhere", "data": values, "training": {"batch": 2}}, "mine")
+    again = Trainer(recipe, micro(**FRAMEWISE), None, Accelerator(cpu=True))
+    assert again.all_clips().plan.lengths == ()
+
+
 def test_all_micro_batches_of_a_step_have_one_length_which_the_seed_draws(walks):
     halves = lengths_of(trainer(walks, accumulation=2), 12)
     assert halves[::2] == halves[1::2]

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from persist_backbones.adapters.base import NEAR
+from persist_backbones.tensors import clips_at_once
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import nearest_at, project
 
@@ -167,16 +168,17 @@ def rasterize(
     """
     clips, frames = views.world_from_camera.shape[:2]
     sizes = torch.as_tensor(token_size, dtype=torch.float64, device=mask.device).expand(mask.shape)
-    limit = most // 2
-    if mask.device.type != "cpu":  # all at once: many small steps would leave a GPU idle
-        return _rasterize_clips(positions, mask, views, sizes, limit)
+    at_once = clips_at_once(mask.device, frames * (positions.shape[1] + views.height * views.width))
     parts = []
-    for clip in range(clips):  # one at a time: the data of one clip fits into the processor's cache
-        present = mask[clip].nonzero()[:, 0]
-        chosen = positions[clip, None, present], mask[clip, None, present]
-        splats = _rasterize_clips(*chosen, views[clip : clip + 1], sizes[clip, None, present], limit)
-        token = clip * positions.shape[1] + present[splats.token]
-        parts.append(Splats(clip * frames * views.height * views.width + splats.pixel, token, splats.depth))
+    for first in range(0, clips, at_once):
+        part = slice(first, first + at_once)
+        chosen = mask[first].nonzero()[:, 0] if at_once == 1 else slice(None)  # of one clip only what is no padding
+        splats = _rasterize_clips(
+            positions[part, chosen], mask[part, chosen], views[part], sizes[part, chosen], most // 2
+        )
+        token = splats.token if isinstance(chosen, slice) else chosen[splats.token]
+        pixels = first * frames * views.height * views.width
+        parts.append(Splats(pixels + splats.pixel, first * positions.shape[1] + token, splats.depth))
     return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 

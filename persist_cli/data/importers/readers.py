@@ -21,8 +21,16 @@ def read_color(path: Path) -> np.ndarray[Any, Any]:
 
 
 def read_photo(path: Path) -> np.ndarray[Any, Any]:
-    """The same as viewers show it, turned as its EXIF says; not for captures, whose intrinsics are of stored pixels."""
-    return np.array(ImageOps.exif_transpose(_read_image(path)).convert("RGB"))
+    """The same as viewers show it, turned as its EXIF says; not for captures, whose intrinsics are of stored pixels.
+
+    Raises:
+        DataError: as ``read_color``, and when its EXIF is damaged.
+    """
+    image = _read_image(path)
+    try:
+        return np.array(ImageOps.exif_transpose(image).convert("RGB"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DataError(f"{path}: its EXIF is damaged ({error}); save the image anew") from error
 
 
 def read_depth(path: Path, units_per_metre: float, missing: tuple[int, ...] = (0,)) -> np.ndarray[Any, Any]:
