@@ -81,9 +81,11 @@ class RunFolder:
         if step == self.saved:
             return
         try:
-            self._save()
+            save_state(self.path, self.trainer.state, self._save_model)
         except (OSError, SafetensorError) as error:  # a backbone may write with safetensors itself
             raise PersistError(f"{self.path}: a checkpoint cannot be written there ({error})") from error
+        if self.log is not None:
+            self._follow(self.log)
         self.trainer.accelerator.wait_for_everyone()
         self.saved = step
 
@@ -103,15 +105,12 @@ class RunFolder:
             remove_superseded(self.path, newest)
         return kept_checkpoints(self.path, newest)
 
-    def _save(self) -> None:
-        state, main = self.trainer.state, self.trainer.accelerator.is_main_process
-        if main:
-            self.speed.add(state.step, self.trainer.figures())
-        save_state(self.path, state, self._save_model)
-        if main:
-            remove_superseded(self.path, self.trainer.recipe.training.keep_checkpoints)
-        if self.log is not None:
-            self.log.draw(self.path / "loss.png")
+    def _follow(self, log: StepLog) -> None:
+        """Do what follows a checkpoint, which is whole by now: log the speed, remove older ones, draw the loss."""
+        trainer = self.trainer
+        self.speed.add(trainer.state.step, trainer.figures())
+        remove_superseded(self.path, trainer.recipe.training.keep_checkpoints)
+        log.draw(self.path / "loss.png")
 
     def _save_model(self, folder: Path, home: Path) -> None:
         trainer, main = self.trainer, self.trainer.accelerator.is_main_process
