@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import random
 import shutil
@@ -188,6 +189,17 @@ def test_a_signal_right_after_the_check_for_signals_loses_no_step(persist, walks
     code, message = {3: (143, "stopped at step 4 of 5"), 5: (0, "trained 5 steps")}[step]
     assert (ended.code, message in ended.out) == (code, True)
     assert saved_steps(tmp_path / "run") == [min(step + 1, 5)]
+
+
+def test_a_disk_that_is_full_at_the_picture_of_the_loss_is_told_as_that(persist, walks, codec, tmp_path, monkeypatch):
+    def draw(_log, path):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(StepLog, "draw", draw)
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=1"))
+    assert ended.code == 1
+    assert "loss.png: No space left on device; make room there" in ended.err
+    assert saved_steps(tmp_path / "run") == [1]  # whole, so that the run goes on
 
 
 def test_a_full_disk_ends_a_run_with_one_line_and_leaves_the_last_checkpoint(persist, walks, codec, tmp_path):
