@@ -55,16 +55,15 @@ def draw_noise(
     """Draw Gaussian noise, each sample from its own generator on the CPU; several at once while a GPU waits for it."""
     noise = torch.empty(len(generators), *shape)
 
-    def draw(number: int) -> None:
-        torch.randn(tuple(shape), generator=generators[number], out=noise[number])
+    def draw(sample: Tensor, generator: torch.Generator) -> None:
+        torch.randn(sample.shape, generator=generator, out=sample)
 
     if device.type == "cpu":
-        for number in range(len(generators)):
-            draw(number)
+        for sample, generator in zip(noise, generators, strict=True):
+            draw(sample, generator)
         return noise
     with ThreadPoolExecutor(DRAWING_THREADS) as threads:
-        for _ in threads.map(draw, range(len(generators))):
-            pass
+        list(threads.map(draw, noise, generators))  # so that an error in one of them is raised here
     return noise.to(device)
 
 

@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
+from persist_cli.api.cameras import Cameras
+
 MOST_PLACES: Final = 2**22  # points and pixels of all views that a GPU draws at once, or else one clip
 
 
@@ -79,30 +81,35 @@ def tokens_of(
     return tokens
 
 
-def clips_at_once(device: torch.device, places: int) -> int:
+def clips_at_once(cameras: Cameras, points: int, finer: int = 1) -> int:
     """Return how many clips are drawn at once: one on a CPU, into whose cache it fits; on a GPU as keeps it busy.
 
     Args:
-        device: where they are drawn.
-        places: points that are drawn into the views of a clip, each view's counted, and pixels of these views.
+        cameras: axes ``batch frame``.
+        points: number of points that are drawn into each view of a clip.
+        finer: pixels that are drawn along the edge of a pixel.
     """
-    return 1 if device.type == "cpu" else max(1, MOST_PLACES // max(1, places))
+    if cameras.world_from_camera.device.type == "cpu":
+        return 1
+    places = cameras.world_from_camera.shape[1] * (points + cameras.height * cameras.width * finer**2)
+    return max(1, MOST_PLACES // places)
 
 
-def clip_by_clip(draw: Callable[..., tuple[Tensor, ...]], *batches: Any, places: int) -> tuple[Tensor, ...]:
-    """Call a function with a few clips of all batches at a time and join the results.
+def clip_by_clip(
+    draw: Callable[..., tuple[Tensor, ...]], *batches: Any, cameras: Cameras, points: int, finer: int
+) -> tuple[Tensor, ...]:
+    """Call a function with a few clips of all batches and of the cameras at a time, and join the results.
 
     Args:
         draw: returns tensors with a batch axis.
-        batches: what has a batch axis and takes slices: tensors, cameras or tokens, cameras not first.
-        places: of a clip, as for ``clips_at_once``.
+        batches: what has a batch axis and takes slices: tensors or tokens.
+        cameras: axes ``batch frame``, the last argument of ``draw``.
+        points, finer: as for ``clips_at_once``.
     """
-    first = batches[0] if isinstance(batches[0], Tensor) else batches[0].mask
-    at_once = clips_at_once(first.device, places)
-    results = [
-        draw(*(batch[number : number + at_once] for batch in batches)) for number in range(0, len(first), at_once)
-    ]
-    return tuple(torch.cat(parts) for parts in zip(*results, strict=True))
+    at_once = clips_at_once(cameras, points, finer)
+    parts = [slice(first, first + at_once) for first in range(0, len(cameras), at_once)]
+    results = [draw(*(batch[part] for batch in batches), cameras[part]) for part in parts]
+    return tuple(torch.cat(joined) for joined in zip(*results, strict=True))
 
 
 def push_pull(

@@ -281,6 +281,13 @@ def kept_choices(out: Path) -> dict[str, Any]:
     return dict(read_json(path)["memories"]) if path.is_file() else {}
 
 
+def finished_choices(out: Path) -> dict[str, Any]:
+    """The same; ``PersistError`` when nothing was chosen yet."""
+    if not (out / CHOICES).is_file():
+        raise PersistError(f"{out / CHOICES}: not there yet; `python -m persist_cli.reproduce.choose {out}` makes it")
+    return kept_choices(out)
+
+
 def recipe_file(out: Path, memory: str) -> Path:
     """The recipe of a memory with what was chosen for it."""
     return out / "recipes" / f"{memory}.yaml"
@@ -306,15 +313,12 @@ def chosen_sampling(out: Path) -> dict[str, Sampling]:
     Raises:
         PersistError: when nothing was chosen yet.
     """
-    if not (out / CHOICES).is_file():
-        raise PersistError(f"{out / CHOICES}: not there yet; `python -m persist_cli.reproduce.choose {out}` makes it")
-    return {memory: Sampling(**choice["sampling"]) for memory, choice in kept_choices(out).items()}
+    return {memory: Sampling(**choice["sampling"]) for memory, choice in finished_choices(out).items()}
 
 
 def chosen_costs(out: Path) -> dict[str, float]:
     """The cost of what was chosen for each memory; ``PersistError`` when nothing was chosen yet."""
-    chosen_sampling(out)
-    choices = kept_choices(out)
+    choices = finished_choices(out)
     return {memory: float("inf") if choice["cost"] is None else choice["cost"] for memory, choice in choices.items()}
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,7 +23,7 @@ from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.learn.evaluation import mean_figures
-from persist_cli.learn.learn import LearnPlan, open_place, prepare
+from persist_cli.learn.learn import FIGURES, LearnPlan, open_place, prepare, report
 from persist_cli.learn.places import ImaginedPlace
 from persist_cli.learn.practice import PracticeSettings, PracticeWalk, Walker, ground_of, practise
 from persist_cli.memorize.factory import MemoryFactory
@@ -329,3 +331,14 @@ def test_what_cannot_be_is_refused_in_one_line(learn, tmp_path, option, value, m
     assert message in result.err
     assert result.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("mean", [None, math.nan])
+def test_a_figure_that_no_episode_has_is_a_dash_in_the_table(tmp_path, capsys, mean):
+    figures = dict.fromkeys(FIGURES, 0.5) | {"end_metres": mean}  # no way was known: NaN, and null in JSON
+    row = {"round": 0, "walked": 0, "policy": "begin", "figures": figures}
+    results = {"inside": "model", "views": 1, "scene": "house", "episodes": 1, "rounds": [row]}
+    report(SimpleNamespace(episodes=[None], out=tmp_path), results, as_json=False)
+    printed = capsys.readouterr().out
+    assert printed.count("0.50") == len(FIGURES) - 1
+    assert printed.count("–") == 2  # also for what is blocked in the round before practice

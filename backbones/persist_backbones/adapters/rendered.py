@@ -330,8 +330,8 @@ class RenderedAdapter(Adapter[PreparedRendering]):
         self, tokens: MemoryTokens, cameras: Cameras, encode: Encode
     ) -> tuple[Float[Tensor, "batch frame channel height width"], Bool[Tensor, "batch token"]]:
         """Return latents, mask and layers of the views, and which tokens any view of their clip shows."""
-        places = cameras.world_from_camera.shape[1] * (tokens.mask.shape[1] + cameras.height * cameras.width)
-        rgb, depth, mask, shown, *layers = clip_by_clip(self.drawn, tokens, cameras, places=places)
+        points, finer = tokens.mask.shape[1], self.settings.supersampling
+        rgb, depth, mask, shown, *layers = clip_by_clip(self.drawn, tokens, cameras=cameras, points=points, finer=finer)
         latents = encode(rgb, depth) * mask.any(dim=2, keepdim=True)
         return torch.cat([latents, mask.to(latents), *layers], dim=2), shown
 

@@ -168,17 +168,16 @@ def rasterize(
     """
     clips, frames = views.world_from_camera.shape[:2]
     sizes = torch.as_tensor(token_size, dtype=torch.float64, device=mask.device).expand(mask.shape)
-    at_once = clips_at_once(mask.device, frames * (positions.shape[1] + views.height * views.width))
+    at_once = clips_at_once(views, positions.shape[1])
     parts = []
     for first in range(0, clips, at_once):
         part = slice(first, first + at_once)
-        chosen = mask[first].nonzero()[:, 0] if at_once == 1 else slice(None)  # of one clip only what is no padding
-        splats = _rasterize_clips(
-            positions[part, chosen], mask[part, chosen], views[part], sizes[part, chosen], most // 2
-        )
-        token = splats.token if isinstance(chosen, slice) else chosen[splats.token]
+        present = mask[part].any(dim=0).nonzero()[:, 0]  # what is padding in all of them is left out
+        chosen = positions[part, present], mask[part, present]
+        splats = _rasterize_clips(*chosen, views[part], sizes[part, present], most // 2)
+        clip, token = first + splats.token // len(present), present[splats.token % len(present)]
         pixels = first * frames * views.height * views.width
-        parts.append(Splats(pixels + splats.pixel, first * positions.shape[1] + token, splats.depth))
+        parts.append(Splats(pixels + splats.pixel, clip * positions.shape[1] + token, splats.depth))
     return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 

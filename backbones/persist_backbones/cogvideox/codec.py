@@ -18,6 +18,7 @@ from persist_backbones.diffusers_models import (
     CogVideoXSafeConv3d,
     DiagonalGaussianDistribution,
 )
+from persist_backbones.noise_levels import draw_noise
 from persist_backbones.tensors import push_pull
 from persist_cli.errors import CheckpointError
 
@@ -320,7 +321,7 @@ class Codec(nn.Module):
         images = self.images(rgb, depth)
         posterior = self.posterior(images)
         shape = posterior.mean.shape[1:]
-        noise = torch.stack([torch.randn(2, *shape, generator=draw) for draw in generators], dim=1).flatten(0, 1)
+        noise = draw_noise((2, *shape), generators, images.device).transpose(0, 1).flatten(0, 1)
         decoded = self.images_of(posterior.mean + posterior.std * noise.to(posterior.mean))
         error = (decoded.float() - images).abs()
         reconstruction = error.mean() + error.square().mean()

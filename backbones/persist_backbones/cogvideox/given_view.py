@@ -71,8 +71,8 @@ def _later_latents(
 ) -> Float[Tensor, "batch later channel height width"]:
     """Return latents of what given frames show in the views after the first, zeros where they show nothing."""
     rgb, depth = (part.expand(len(cameras), *part.shape[1:]) for part in (rgb, depth))
-    places = cameras.world_from_camera.shape[1] * depth[0].numel() * (1 + FINER**2)
-    views = GivenViews(*clip_by_clip(render_given, rgb, depth, cameras, places=places))
+    drawn = clip_by_clip(render_given, rgb, depth, cameras=cameras, points=depth[0].numel(), finer=FINER)
+    views = GivenViews(*drawn)
     shown = latent_shares(views.covered, codec.spatial, codec.temporal).any(dim=2, keepdim=True)
     if codec.framewise:  # the given frame is encoded already
         return codec.encode(views.rgb[:, 1:], views.depth[:, 1:]) * shown[:, 1:]
