@@ -1,7 +1,9 @@
 """``make scenes``: a model of scenes and its renderer from nothing to their figures, by commands of a user.
 
 ``python -m persist_cli.reproduce.scenes [OUT]`` runs them in order, each in a process of its own. Every command
-continues where it was stopped and repeats nothing that is done, so this may be stopped and started at any time.
+continues where it was stopped and repeats nothing that is done, so this may be stopped and started at any time. With
+``--trial`` each command runs in its smallest form, to see in minutes that all of them work here; its figures are worth
+nothing.
 
 - Houses are collected with their cells: to train on, and of the test split, walks as well as interactions.
 - The three stages of a model of scenes and the renderer are trained, this on true cells first, then on imagined ones.
@@ -25,6 +27,7 @@ from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.reproduce import scene_agents
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 from persist_cli.reproduce.plan_file import keep_plan, model_json
+from persist_cli.reproduce.trial import run_small, trial_folder
 
 WEIGHTS: Final = ("lpips-alex", "i3d-kinetics-400")
 
@@ -39,6 +42,8 @@ MEMORIES: Final = "scene,voxel,map2d,snapshots,none"  # of the packaged model
 INVENTING: Final = "--denoising-steps 10 --sampler ddim"  # few steps blur what is invented
 
 SEEDS: Final = 3
+
+SMALL_AGENTS: Final = "--houses 1 --seeds 1 --steps 16 --envs 2 --episodes 2"  # of a trial
 
 
 @dataclass(frozen=True)
@@ -143,12 +148,15 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--checkpoint", default=REFERENCE, help="the world model; else that of the package")
     parser.add_argument("--scene-model", help="run of a trained model of scenes; else one is trained")
     parser.add_argument("--renderer", help="run of a trained adapter that draws scenes; else one is trained")
+    parser.add_argument("--trial", action="store_true", help="every command in its smallest form, in OUT/trial")
     options = parser.parse_args(arguments)
-    figures = SceneFigures(options.out, options.checkpoint, options.scene_model, options.renderer)
+    out, run = (trial_folder(options.out), run_small) if options.trial else (options.out, run_line)
+    figures = SceneFigures(out, options.checkpoint, options.scene_model, options.renderer)
     keep_plan(figures.out, identity(figures), "*/metrics.json")
     for line in commands(figures):
-        run_line(line)
-    scene_agents.main([str(figures.out / "agents"), "--model", figures.checkpoint, "--scene-model", figures.scene])
+        run(line)
+    models = ["--model", figures.checkpoint, "--scene-model", figures.scene]
+    scene_agents.main([str(figures.out / "agents"), *models, *(SMALL_AGENTS.split() if options.trial else [])])
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 ``python -m persist_cli.reproduce.table1 [OUT]`` runs them in order, each in a process of its own; with ``--reference``
 it trains nothing and measures the model that comes with the package, as its card says. Every command continues where it
-was stopped and repeats nothing that is done, so this may be stopped and started at any time.
+was stopped and repeats nothing that is done, so this may be stopped and started at any time. With ``--trial`` each
+command runs in its smallest form, to see within an hour that all of them work here; its figures are worth nothing.
 
 Houses for training, validation and test share no scene. Cells, head and sampling are chosen for each memory by itself
 on validation houses, by ``persist_cli.reproduce.choose``, before any of the tables is measured.
@@ -13,12 +14,13 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.reproduce import choose
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
+from persist_cli.reproduce.trial import CLIPS, STEPS, run_small, trial_folder
 
 PACKAGED = ("none", "voxel", "map2d", "snapshots")  # memories of the model that comes with the package
 CHOSEN = (*PACKAGED, "views", "context")  # memories for which choices are made; the first is the baseline
@@ -256,15 +258,18 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m persist_cli.reproduce.table1")
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/table1"), help="folder of everything")
     parser.add_argument("--reference", action="store_true", help="measure the model of the package, train none")
+    parser.add_argument("--trial", action="store_true", help="every command in its smallest form, in OUT/trial")
     options = parser.parse_args(arguments)
-    for line in reference_commands(options.out) if options.reference else base_commands(options.out):
-        run_line(line)
+    out, run = (trial_folder(options.out), run_small) if options.trial else (options.out, run_line)
+    for line in reference_commands(out) if options.reference else base_commands(out):
+        run(line)
     if options.reference:
         return
-    choose.run_choose(choice_plan(options.out))
-    chosen = Chosen.of(options.out / "choices")
-    for line in [*memory_commands(options.out, chosen), *evaluate_commands(options.out, chosen)]:
-        run_line(line)
+    plan = choice_plan(out)
+    choose.run_choose(replace(plan, steps=STEPS, clips=CLIPS) if options.trial else plan)
+    chosen = Chosen.of(out / "choices")
+    for line in [*memory_commands(out, chosen), *evaluate_commands(out, chosen)]:
+        run(line)
 
 
 if __name__ == "__main__":
