@@ -24,8 +24,14 @@ CLIPS: Final = 2  # of each evaluation
 APPENDED: Final = {  # of an option that is given twice, the last counts
     "finetune": f"training.steps={STEPS} training.batch=2 training.warmup=0 training.cooldown=0",
     "eval": f"--clips {CLIPS} --seeds 1 --steps 1",
-    "bench scene": f"--images {HOUSES} --houses {HOUSES} --walks 1 --walk-steps 8 --return-steps 8 --edits 2 "
-    "--interactions 2",
+    "bench scene": f"--images {HOUSES} --houses {HOUSES}",
+}
+
+OF_PARTS: Final = {  # of `bench scene`, which refuses them where it measures another part
+    "walk": "--walks 1 --walk-steps 8",
+    "return": "--walks 1 --return-steps 8",
+    "edits": "--edits 2",
+    "evolution": "--interactions 2",
 }
 
 
@@ -39,6 +45,8 @@ def small(line: str) -> str:
     line = re.sub(r"--scenes (\d+):\d+", lambda found: f"--scenes {found[1]}:{int(found[1]) + HOUSES}", line)
     line = re.sub(r"--seeds \d+", "--seeds 1", line)
     appended = [options for command, options in APPENDED.items() if line.startswith(f"{command} ")]
+    if (parts := re.search(r"--parts (\S+)", line)) is not None:
+        appended += [OF_PARTS[part] for part in parts[1].split(",") if part in OF_PARTS]
     return " ".join([line, *appended])
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from persist_cli.cli.app import commands
+from persist_cli.cli.planning import refuse_other_parts
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.reproduce import scenes, table1
 from persist_cli.reproduce.trial import small, trial_folder
@@ -17,20 +20,23 @@ OUT = trial_folder(Path("my runs/all"))
 LINES = [*scenes.commands(scenes.SceneFigures(OUT)), *table1.commands(OUT), *table1.reference_commands(OUT)]
 
 
-def limits(command: str) -> dict[str, int]:
+LIMITS = {
+    "eval": {"clips": 2, "seeds": 1, "steps": 1}, "bench": {"images": 2, "houses": 2},
+    "walk": {"walks": 1, "walk_steps": 8, "seeds": 1}, "return": {"walks": 1, "return_steps": 8, "seeds": 1},
+    "completion": {"seeds": 1}, "edits": {"edits": 2}, "evolution": {"interactions": 2, "seeds": 1},
+}  # fmt: skip
+
+
+def limits(line: str) -> dict[str, int]:
     """The most that a command of a trial may be asked for, by parameter."""
-    return {
-        "eval": {"clips": 2, "seeds": 1, "steps": 1},
-        "bench": {"images": 2, "houses": 2, "walks": 1, "walk_steps": 8, "return_steps": 8, "edits": 2,
-                  "interactions": 2},
-    }.get(command, {})  # fmt: skip
+    parts = str(parse_line(line).get("parts", "")).split(",")
+    return {name: most for part in [line.split()[0], *parts] for name, most in LIMITS.get(part, {}).items()}
 
 
 @pytest.mark.parametrize("line", LINES)
 def test_every_command_is_small(line: str) -> None:
-    words = parse_line(small(line))
-    command = line.split()[0]
-    assert all(words[name] <= most for name, most in limits(command).items())
+    words, command = parse_line(small(line)), line.split()[0]
+    assert all(words[name] <= most for name, most in limits(line).items())
     if command == "collect":
         low, high = map(int, words["scenes"].split(":"))
         assert high == low + 2
@@ -40,11 +46,20 @@ def test_every_command_is_small(line: str) -> None:
         assert (training.steps, training.batch, training.cooldown) == (2, 2, 0)
 
 
+@pytest.mark.parametrize("line", [line for line in LINES if line.startswith("bench scene")])
+def test_parts_get_the_options_that_they_have_a_use_for(line: str) -> None:
+    command = commands()
+    for word in ("bench", "scene"):
+        command = command.commands[word]
+    context = command.make_context("persist", shlex.split(small(line))[2:])
+    refuse_other_parts(context, context.params["parts"].split(","))
+
+
 @pytest.mark.parametrize("line", LINES)
 def test_all_else_stays_as_in_the_chain(line: str) -> None:
     long, short = parse_line(line), parse_line(small(line))
     changed = {name for name in long if long[name] != short[name]}
-    assert changed <= {"scenes", "seeds", "overrides", *limits(line.split()[0])}
+    assert changed <= {"scenes", "seeds", "overrides", *limits(line)}
 
 
 @pytest.mark.parametrize("chain", [scenes, table1])
