@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, find_checkpoint, read_card
+from persist_cli.checkpoints.scene_models import find_scene_model, with_model_beside
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
-from persist_cli.io.files import write_text
+from persist_cli.io.files import read_json, write_text
 from persist_cli.recipe import parse_yaml_mapping, read_recipe_file, recipe_values
 from persist_cli.viewing.console import warn
 
@@ -75,6 +77,26 @@ def save_stage_recipes(folder: Path, recipes: dict[str, str]) -> None:
 
 
 def training_scenes(checkpoint: Checkpoint) -> TrainingScenes:
+    """The scenes that base and adapters were trained on, and the models that imagine in the adapters' scenes."""
+    scenes = _scenes_of_stages(checkpoint)
+    for adapter in checkpoint.adapters:
+        scenes |= _scenes_of_imagination(checkpoint.adapter_folder(adapter))
+    return scenes
+
+
+def _scenes_of_imagination(adapter: Path) -> TrainingScenes:
+    """What the model has seen that imagines in the scenes of an adapter; none without one. Its views do not count."""
+    settings = with_model_beside(read_json(adapter / MEMORY_FILE).get("settings", {}), adapter)
+    if settings.get("model") is None:
+        return TrainingScenes()
+    try:
+        scenes = find_scene_model(str(settings["model"])).training_scenes
+    except PersistError:
+        scenes = None
+    return TrainingScenes(complete=False) if scenes is None else replace(scenes, fov=None)
+
+
+def _scenes_of_stages(checkpoint: Checkpoint) -> TrainingScenes:
     """The scenes that base and adapters were trained on, as the checkpoint's card says.
 
     Cards of earlier versions do not say so. Then they are the scenes in the data sets that the recipes of the

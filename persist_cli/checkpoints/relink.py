@@ -83,7 +83,7 @@ def run_relink(run: Path, base: Path) -> None:
     for path, card in cards.items():
         pointer = base_pointer(card)
         if pointer is None:
-            raise CheckpointError(f"{run}: stands on no other checkpoint, so there is nothing to relink")
+            raise CheckpointError(f"{run}: {_without_base(card)}")
         place = _same_weights(run, base, pointer)
         pointer |= pointer_to(place, pointer["fingerprint"], path.parent)
         places.add(place)
@@ -93,6 +93,14 @@ def run_relink(run: Path, base: Path) -> None:
     for place in places:
         mark_in_use(find_checkpoint(place), run)
         say(f"{run}: its base is now {place}")
+
+
+def _without_base(card: dict[str, Any]) -> str:
+    """Say why there is nothing to relink."""
+    pretrained = card.get("changes", {}).get("settings", {}).get("pretrained")
+    if pretrained is None:
+        return "stands on no other checkpoint, so there is nothing to relink"
+    return f"changes the weights of diffusers in {pretrained}, which cannot be relinked; put that folder back"
 
 
 def _same_weights(run: Path, base: Path, pointer: dict[str, Any]) -> Path:

@@ -9,13 +9,19 @@ from persist_cli.api.observations import TrajectoryInfo
 
 HELD_OUT_FROM = "held_out_from"  # key of a test trajectory's source: number of its first frame that no training saw
 ONLY_BEFORE = "only_before"  # key of the training part's source: the same number
-PART = re.compile(r"(?P<scene>.+) before frame (?P<end>\d+)")
+SEQUENCE = "folder"  # key of a source: which of a scene's sequences the trajectory is
+PART = re.compile(r"(?: \((?P<sequence>.+)\))? before frame (?P<end>\d+)")  # after the name of the scene
 
 
 def trained_scene(info: TrajectoryInfo) -> str:
-    """The name by which a model that was trained on a trajectory knows its scene, or the part that it shows."""
-    end = info.source.get(ONLY_BEFORE)
-    return info.scene if end is None else f"{info.scene} before frame {end}"
+    """The name by which a model that was trained on a trajectory knows its scene, or the part that it shows.
+
+    The part is told by its last frame and, where the source names one, by its sequence: others may be shorter.
+    """
+    end, sequence = info.source.get(ONLY_BEFORE), info.source.get(SEQUENCE)
+    if end is None:
+        return info.scene
+    return f"{info.scene}{f' ({sequence})' if sequence else ''} before frame {end}"
 
 
 def was_trained_on(info: TrajectoryInfo, names: Collection[str], first: int = 0) -> bool:
@@ -23,9 +29,11 @@ def was_trained_on(info: TrajectoryInfo, names: Collection[str], first: int = 0)
 
     Args:
         info: of the trajectory that shows the scene.
-        names: names of ``trained_scene``.
+        names: names of ``trained_scene``. A part without a sequence, as earlier versions named them, is one of each.
         first: number of the first frame that matters.
     """
-    parts = (PART.fullmatch(name) for name in names if name.startswith(info.scene))
-    ends = [int(part["end"]) for part in parts if part and part["scene"] == info.scene]
-    return info.scene in names or any(end > first for end in ends)
+    rests = [name.removeprefix(info.scene) for name in names if name.startswith(info.scene)]
+    parts = [part for rest in rests if (part := PART.fullmatch(rest))]
+    sequence = info.source.get(SEQUENCE)
+    own = [part for part in parts if None in (sequence, part["sequence"]) or part["sequence"] == sequence]
+    return info.scene in names or any(int(part["end"]) > first for part in own)

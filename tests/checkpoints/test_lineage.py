@@ -9,6 +9,7 @@ import pytest
 
 from persist_cli.api.checkpoint import TrainingScenes, find_checkpoint
 from persist_cli.checkpoints.lineage import chosen_on, stage_recipes, training_scenes
+from persist_cli.checkpoints.scene_models import find_scene_model, write_scene_card
 from persist_cli.evaluate.provenance import checkpoint_json, scenes_json
 from persist_cli.evaluate.provenance import training_scenes as scenes_to_avoid
 from tests.support.damage import without_sums
@@ -127,3 +128,29 @@ def test_a_run_without_those_recipes_reads_its_bases_or_warns(persist, walks, co
     shutil.rmtree(tmp_path / "codec")
     assert list(stage_recipes(folder)) == ["stage1.yaml"]
     assert "its base" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("scenes", "known"),
+    [(TrainingScenes(frozenset({"house-5"}), fov=(20.0, 30.0)), True), (None, False)],
+    ids=["known", "unknown"],
+)
+def test_a_renderers_scenes_are_also_those_of_the_model_that_imagines_for_it(
+    stage1, scene_renderer, scene_model, tmp_path, scenes, known
+):
+    before = training_scenes(find_checkpoint(scene_renderer))
+    for folder, name in {scene_renderer: "run", stage1: "stage1", scene_model: "scene"}.items():
+        shutil.copytree(folder, tmp_path / name)
+    without_sums(next((tmp_path / "run").glob("step-*")) / "model")
+    trained = find_scene_model(tmp_path / "scene")
+    write_scene_card(tmp_path / "scene", trained.plugin, trained.settings, trained.stage, scenes)
+    memory = find_checkpoint(tmp_path / "run").adapter_folder("scene") / "memory.json"
+    values = json.loads(memory.read_text())
+    values["settings"]["model"] = str(tmp_path / "scene")
+    memory.write_text(json.dumps(values))
+    after = training_scenes(find_checkpoint(tmp_path / "run"))
+    assert after.names - before.names == ({"house-5"} if known else set())
+    assert after.complete is (known and before.complete)
+    assert after.fov == before.fov
+    shutil.rmtree(tmp_path / "scene")
+    assert not training_scenes(find_checkpoint(tmp_path / "run")).complete

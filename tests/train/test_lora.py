@@ -157,6 +157,7 @@ def test_lora_may_change_a_pretrained_directory_of_diffusers(persist, walks, pre
     ended = persist("rollout", tmp_path / "run", "--start", f"{walks}#0", "--follow", "--out", tmp_path / "o")
     path.write_bytes(whole)
     assert (ended.code, "was trained on other weights than those" in ended.err) == (1, True)
+    assert f"changes the weights of diffusers in {pretrained}" in persist("relink", tmp_path / "run", pretrained).err
 
 
 def test_the_digest_of_the_base_weights_covers_position_embeddings(tmp_path):
